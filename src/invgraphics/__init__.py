@@ -1,0 +1,1 @@
+"""Compare and teach differentiable rendering: NeRF volume rendering versus splatting, on one ruler."""

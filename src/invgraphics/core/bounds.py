@@ -1,0 +1,100 @@
+"""The region a field describes, and the map from it to the unit cube in which encodings live."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core.rays import Rays
+
+Space = Literal["box", "contracted"]
+
+FAR = 1e3
+"""Where contracted rays end, in half-extents of the inner box: the remaining shell is 1/1000 of the contracted radius."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """An axis-aligned box in the local frame; all there is (``box``) or the detailed core of all space (``contracted``).
+
+    Attributes:
+        lo: lowest corner.
+        hi: highest corner.
+        space: ``box`` ends rays at the box; ``contracted`` maps all space into a ball of twice the box's size
+            (mip-NeRF 360, equation 10).
+        near: no sample is taken closer to a camera than this, in local units.
+    """
+
+    lo: Float[Tensor, 3]
+    hi: Float[Tensor, 3]
+    space: Space = "box"
+    near: float = 0.05
+
+    @property
+    def centre(self) -> Float[Tensor, 3]:
+        """Centre of the box."""
+        return (self.lo + self.hi) / 2
+
+    @property
+    def half(self) -> Float[Tensor, 3]:
+        """Half the box's edges."""
+        return (self.hi - self.lo) / 2
+
+    @property
+    def radius(self) -> float:
+        """Half the box's diagonal, in local units."""
+        return float(self.half.norm())
+
+    def to_unit(self, position: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:
+        """Map positions to the unit cube. In a box, points outside it fall outside [0, 1]."""
+        x = (position - self.centre) / self.half
+        return (contract(x) / 2 + 1) / 2 if self.space == "contracted" else (x + 1) / 2
+
+    def from_unit(self, unit: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:
+        """Inverse of `to_unit`; corners of the cube beyond the contracted ball are pulled onto its rim."""
+        x = uncontract((unit * 2 - 1) * 2) if self.space == "contracted" else unit * 2 - 1
+        return self.centre + x * self.half
+
+    def contains(self, position: Float[Tensor, "*m 3"]) -> Tensor:
+        """Whether a position is described by the field (everything, in a contracted space)."""
+        if self.space == "contracted":
+            return torch.ones_like(position[..., 0], dtype=torch.bool)
+        return ((position >= self.lo) & (position <= self.hi)).all(dim=-1)
+
+    def clip(self, rays: Rays) -> Rays:
+        """Give rays their sampling interval: the box's entry and exit, or [near, FAR half-extents] when contracted.
+
+        A ray that misses the box gets ``far = near``.
+        """
+        if self.space == "contracted":
+            far = FAR * float(self.half.max())
+            return rays.within(rays.near.clamp_min(self.near), rays.far.clamp_max(far))
+        # Slab test; an axis-parallel ray divides by zero, and the infinities then sort themselves out.
+        direction = torch.where(rays.directions == 0, torch.full_like(rays.directions, 1e-20), rays.directions)
+        a, b = (self.lo - rays.origins) / direction, (self.hi - rays.origins) / direction
+        near = torch.minimum(a, b).amax(dim=1).maximum(rays.near.clamp_min(self.near))
+        far = torch.maximum(a, b).amin(dim=1).minimum(rays.far)
+        return rays.within(near, far.maximum(near))
+
+    def to(self, *args: Any) -> Bounds:
+        """Move or cast the tensors."""
+        return replace(self, lo=self.lo.to(*args), hi=self.hi.to(*args))
+
+
+def contract(x: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:
+    """Mip-NeRF 360's contraction (equation 10): identity in the unit ball, all space outside into the shell up to radius 2."""
+    # Clamped inside the ball so that the unused branch of `where` has finite gradients.
+    squared = x.square().sum(dim=-1, keepdim=True).clamp_min(1.0)
+    norm = squared.sqrt()
+    return torch.where(squared > 1, (2 - 1 / norm) * (x / norm), x)
+
+
+def uncontract(y: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:
+    """Inverse of `contract`, with radii clamped below 2."""
+    norm = y.norm(dim=-1, keepdim=True).clamp(1.0, 2 - 1 / FAR)
+    unit = y / y.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    return torch.where(y.norm(dim=-1, keepdim=True) > 1, unit / (2 - norm), y)

@@ -1,0 +1,87 @@
+"""The one camera: a pinhole with OpenCV axes and its principal point in pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core.rays import Rays
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera (see CONVENTIONS.md). All tensors may carry gradients, so poses can be optimised.
+
+    Attributes:
+        cam_to_world: rigid transform whose columns are the camera's +x (right), +y (down), +z (forward) and position.
+        focal: focal lengths (fx, fy) in pixels.
+        centre: principal point (cx, cy) in pixels; the first pixel's centre is (0.5, 0.5).
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+
+    cam_to_world: Float[Tensor, "4 4"]
+    focal: Float[Tensor, 2]
+    centre: Float[Tensor, 2]
+    width: int
+    height: int
+
+    @property
+    def position(self) -> Float[Tensor, 3]:
+        """The camera's centre of projection, in the scene's frame."""
+        return self.cam_to_world[:3, 3]
+
+    @property
+    def world_to_cam(self) -> Float[Tensor, "4 4"]:
+        """The inverse pose. Rigid by contract, so the rotation is transposed rather than inverted."""
+        rotation = self.cam_to_world[:3, :3].T
+        top = torch.cat([rotation, -(rotation @ self.position)[:, None]], dim=1)
+        return torch.cat([top, self.cam_to_world[3:]], dim=0)
+
+    def pixel_centres(self) -> Float[Tensor, "h w 2"]:
+        """Image coordinates (x, y) of every pixel centre."""
+        like: Any = {"device": self.focal.device, "dtype": self.focal.dtype}
+        y, x = torch.meshgrid(torch.arange(self.height, **like) + 0.5, torch.arange(self.width, **like) + 0.5, indexing="ij")
+        return torch.stack([x, y], dim=-1)
+
+    def rays(self, pixels: Float[Tensor, "n 2"] | None = None, view: int = -1) -> Rays:
+        """Rays through image points.
+
+        Args:
+            pixels: image coordinates (x, y); ``None`` means every pixel centre, row by row.
+            view: training-view index to record in the rays.
+        """
+        pixels = self.pixel_centres().reshape(-1, 2) if pixels is None else pixels
+        plane = (pixels - self.centre) / self.focal
+        in_camera = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
+        length = in_camera.norm(dim=1, keepdim=True)
+        directions = (in_camera / length) @ self.cam_to_world[:3, :3].T
+        # mip-NeRF (§3.1) sets the cone's radius at distance 1 to the pixel's width times 2/sqrt(12).
+        radius = (2 / 12**0.5) / self.focal.mean() / length[:, 0]
+        return Rays.make(self.position.expand(len(pixels), 3), directions, radius, view)
+
+    def project(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+        """Image coordinates (x, y) of world points and their depth along the optical axis (z in camera axes).
+
+        Points with z <= 0 are behind the camera and their image coordinates mean nothing.
+        """
+        in_camera = (points - self.position) @ self.cam_to_world[:3, :3]
+        z = in_camera[:, 2]
+        return self.centre + self.focal * in_camera[:, :2] / z[:, None], z
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same photograph resampled to ``width`` x ``height``."""
+        scale = self.focal.new_tensor([width / self.width, height / self.height])
+        return replace(self, focal=self.focal * scale, centre=self.centre * scale, width=width, height=height)
+
+    def moved(self, cam_to_world: Float[Tensor, "4 4"]) -> Camera:
+        """The same lens at another pose."""
+        return replace(self, cam_to_world=cam_to_world)
+
+    def to(self, *args: Any) -> Camera:
+        """Move or cast all tensors."""
+        return replace(self, cam_to_world=self.cam_to_world.to(*args), focal=self.focal.to(*args), centre=self.centre.to(*args))

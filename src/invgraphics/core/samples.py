@@ -1,0 +1,95 @@
+"""Packed samples along rays, and what a field says about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from invgraphics.core.rays import Rays
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """m intervals [t0, t1] on n rays, packed and sorted by ray, then by distance.
+
+    Attributes:
+        ray: index of each sample's ray, non-decreasing.
+        t0: where the interval begins, distance along the ray.
+        t1: where it ends.
+        position: representative point, the interval's middle.
+        direction: unit direction of the ray.
+        radius: pixel footprint of the ray at distance 1.
+        view: training-view index of the ray, -1 where there is none.
+    """
+
+    ray: Int[Tensor, " m"]
+    t0: Float[Tensor, " m"]
+    t1: Float[Tensor, " m"]
+    position: Float[Tensor, "m 3"]
+    direction: Float[Tensor, "m 3"]
+    radius: Float[Tensor, " m"]
+    view: Int[Tensor, " m"]
+
+    @staticmethod
+    def on(rays: Rays, ray: Int[Tensor, " m"], t0: Float[Tensor, " m"], t1: Float[Tensor, " m"]) -> Samples:
+        """Samples from intervals on ``rays``."""
+        direction = rays.directions[ray]
+        position = torch.addcmul(rays.origins[ray], ((t0 + t1) / 2)[:, None], direction)
+        return Samples(ray, t0, t1, position, direction, rays.radius[ray], rays.view[ray])
+
+    @staticmethod
+    def at(position: Float[Tensor, "m 3"], direction: Float[Tensor, "m 3"] | None = None) -> Samples:
+        """Free-standing points, for asking a field outside a rendering; without a direction they look along +z."""
+        m, none = len(position), torch.zeros_like(position[:, 0])
+        if direction is None:
+            direction = position.new_tensor([0.0, 0.0, 1.0]).expand(m, 3)
+        index = torch.arange(m, device=position.device)
+        return Samples(index, none, none, position, direction, none, torch.full_like(index, -1))
+
+    def __len__(self) -> int:
+        return len(self.t0)
+
+    def __getitem__(self, index: slice | Int[Tensor, " k"] | Bool[Tensor, " m"]) -> Samples:
+        return Samples(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+    @property
+    def mid(self) -> Float[Tensor, " m"]:
+        """Distance of each interval's middle."""
+        return (self.t0 + self.t1) / 2
+
+    @property
+    def delta(self) -> Float[Tensor, " m"]:
+        """Length of each interval."""
+        return self.t1 - self.t0
+
+    @property
+    def covariance(self) -> Float[Tensor, "m 3 3"]:
+        """Covariance of the cone frustum behind each sample (mip-NeRF, equations 7 and 8 and 14)."""
+        middle, half = self.mid, self.delta / 2
+        along = half**2 / 3 - (4 / 15) * half**4 * (12 * middle**2 - half**2) / (3 * middle**2 + half**2) ** 2
+        across = self.radius**2 * (middle**2 / 4 + (5 / 12) * half**2 - (4 / 15) * half**4 / (3 * middle**2 + half**2))
+        outer = self.direction[:, :, None] * self.direction[:, None, :]
+        eye = torch.eye(3, dtype=outer.dtype, device=outer.device)
+        return along[:, None, None] * outer + across[:, None, None] * (eye - outer)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldValues:
+    """What a field says at m samples; what was not asked for is ``None``.
+
+    Attributes:
+        density: volume density, per local length unit, >= 0.
+        sdf: signed distance, local units, negative inside.
+        radiance: colour seen along the sample's direction, in the scene's colour space, [0, 1] for sRGB.
+        normal: unit normal, pointing out of the surface.
+        features: anything else a renderer and a field agree on.
+    """
+
+    density: Float[Tensor, " m"] | None = None
+    sdf: Float[Tensor, " m"] | None = None
+    radiance: Float[Tensor, "m 3"] | None = None
+    normal: Float[Tensor, "m 3"] | None = None
+    features: Float[Tensor, "m f"] | None = None

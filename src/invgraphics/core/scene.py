@@ -1,0 +1,173 @@
+"""A scene: views with known cameras, and what is known about the world they show."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.camera import Camera
+
+Pixels = UInt8[Tensor, "h w c"] | Float[Tensor, "h w c"]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photograph with its camera.
+
+    Attributes:
+        camera: pose in the scene's local frame.
+        image: straight (not premultiplied) colour; bytes for 8-bit photographs, float32 for linear scenes.
+        name: what the data set calls it.
+        alpha: coverage in [0, 1] or bytes; ``None`` means opaque everywhere.
+        depth: true distance along the unit ray, local units, inf where nothing is hit; one ray per pixel centre.
+        normal: true unit normal, local frame, facing the camera; zero where nothing is hit.
+        mask: True where the pixel counts; ``None`` means everywhere.
+    """
+
+    camera: Camera
+    image: Pixels
+    name: str
+    alpha: UInt8[Tensor, "h w"] | Float[Tensor, "h w"] | None = None
+    depth: Float[Tensor, "h w"] | None = None
+    normal: Float[Tensor, "h w 3"] | None = None
+    mask: Tensor | None = None
+
+    def colour(self, index: Tensor | None = None) -> Float[Tensor, "*p 3"]:
+        """Straight colour as floats: the whole image, or the pixels with flat indices ``index`` only."""
+        return _floats(self.image.reshape(-1, 3)[index] if index is not None else self.image)
+
+    def opacity(self, index: Tensor | None = None) -> Float[Tensor, "*p"]:
+        """Alpha as floats: the whole image, or the pixels with flat indices ``index`` only."""
+        if self.alpha is None:
+            shape = self.image.shape[:2] if index is None else index.shape
+            return torch.ones(shape, device=self.image.device)
+        return _floats(self.alpha.reshape(-1)[index] if index is not None else self.alpha)
+
+    def over(self, background: Float[Tensor, 3], index: Tensor | None = None) -> Float[Tensor, "*p 3"]:
+        """The photograph in front of ``background``."""
+        if self.alpha is None:
+            return self.colour(index)
+        alpha = self.opacity(index)[..., None]
+        return self.colour(index) * alpha + (1 - alpha) * background
+
+
+def _floats(values: Tensor) -> Tensor:
+    return values.float() / 255 if values.dtype == torch.uint8 else values.float()
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """A coloured point cloud (from SfM or truth), local frame; colours in [0, 1] display sRGB."""
+
+    position: Float[Tensor, "n 3"]
+    rgb: Float[Tensor, "n 3"]
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh, local frame."""
+
+    vertices: Float[Tensor, "v 3"]
+    faces: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything a fit and its evaluation may know.
+
+    Attributes:
+        name: short name.
+        train: views to fit.
+        val: views to look at during a fit.
+        test: views to score; never shares a camera with ``train`` or ``val``.
+        background: declared background colour for scores, in the scene's colour space.
+        bounds: the region to describe, local frame.
+        points: known surface points, if any.
+        mesh: known surface, if any.
+        colour: the space of the pixels, in which everything is fitted and composited.
+        world_from_local: similarity from the local frame (all cameras, depths, points here) to the data set's world.
+        noise_ceiling: PSNR in dB between two independent half-sample renders of the truth; ``None`` for photographs.
+        notes: how the pixels came about (resize filter, undistortion, files skipped), recorded in each run.
+    """
+
+    name: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    background: Float[Tensor, 3]
+    bounds: Bounds
+    val: tuple[View, ...] = ()
+    points: Points | None = None
+    mesh: Mesh | None = None
+    colour: Literal["srgb", "linear"] = "srgb"
+    world_from_local: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
+    noise_ceiling: float | None = None
+    notes: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def scale(self) -> float:
+        """World length of one local unit."""
+        return float(torch.linalg.det(self.world_from_local[:3, :3].double()).abs() ** (1 / 3))
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether any training view has transparency, so that fits use a random background."""
+        return any(view.alpha is not None for view in self.train)
+
+    @property
+    def extent(self) -> float:
+        """3DGS's scene extent: 1.1 times the largest distance of a training camera from their mean, local units."""
+        positions = torch.stack([view.camera.position for view in self.train])
+        return 1.1 * max(float((positions - positions.mean(0)).norm(dim=1).max()), 1e-3)
+
+    def with_views(self, **views: tuple[View, ...]) -> Scene:
+        """The same scene with other views for ``train``, ``val`` or ``test``."""
+        return replace(self, **views)
+
+    def digest(self, split: Literal["train", "val", "test"]) -> str:
+        """SHA-256 of the split's pixels (colour and alpha), as hexadecimal digits."""
+        sha = hashlib.sha256()
+        for view in getattr(self, split):
+            for values in (view.image, view.alpha):
+                if values is not None:
+                    sha.update(repr((tuple(values.shape), str(values.dtype))).encode())
+                    sha.update(np.ascontiguousarray(values.cpu().numpy()).tobytes())
+        return sha.hexdigest()
+
+    def camera_digest(self) -> str:
+        """SHA-256 of all cameras of all splits, in world order of the views."""
+        sha = hashlib.sha256()
+        for split in (self.train, self.val, self.test):
+            for view in split:
+                camera = view.camera
+                for values in (camera.cam_to_world, camera.focal, camera.centre):
+                    sha.update(values.detach().cpu().double().numpy().tobytes())
+                sha.update(f"{camera.width}x{camera.height}".encode())
+            sha.update(b"|")
+        return sha.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What one training step is compared with.
+
+    Attributes:
+        target: true colour, already in front of ``background``.
+        alpha: true coverage.
+        background: colour the prediction must be put in front of: one for all, or one per pixel.
+        view: index of the training view, -1 for rays of several views.
+    """
+
+    target: Float[Tensor, "*p 3"]
+    alpha: Float[Tensor, "*p"]
+    background: Tensor
+    view: int = -1

@@ -1,0 +1,120 @@
+"""The only place where an axis is flipped: other programs' camera poses to and from ours.
+
+Ours (OpenCV): +x right, +y down, +z forward; camera-to-world. Every function takes and returns 4x4 camera-to-world unless
+its name says otherwise, and every ``x_to_opencv`` has its inverse ``opencv_to_x``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Pose = Float[Tensor, "4 4"]
+
+
+def _flipped(pose: Pose, signs: tuple[float, float, float]) -> Pose:
+    return pose * pose.new_tensor([*signs, 1.0])
+
+
+def opengl_to_opencv(pose: Pose) -> Pose:
+    """OpenGL and Blender (``transforms.json``): +x right, +y up, +z backward."""
+    return _flipped(pose, (1, -1, -1))
+
+
+def opencv_to_opengl(pose: Pose) -> Pose:
+    """Inverse of `opengl_to_opencv` (the map is its own inverse)."""
+    return _flipped(pose, (1, -1, -1))
+
+
+def mitsuba_to_opencv(pose: Pose) -> Pose:
+    """Mitsuba 3 sensors: +x left, +y up, +z forward."""
+    return _flipped(pose, (-1, -1, 1))
+
+
+def opencv_to_mitsuba(pose: Pose) -> Pose:
+    """Inverse of `mitsuba_to_opencv` (the map is its own inverse)."""
+    return _flipped(pose, (-1, -1, 1))
+
+
+def colmap_to_opencv(world_to_cam: Float[Tensor, "3 4"]) -> Pose:
+    """COLMAP: OpenCV axes already, but world-to-camera."""
+    rotation, translation = world_to_cam[:, :3].T, world_to_cam[:, 3]
+    return rigid(rotation, -(rotation @ translation))
+
+
+def opencv_to_colmap(pose: Pose) -> Float[Tensor, "3 4"]:
+    """Inverse of `colmap_to_opencv`."""
+    rotation = pose[:3, :3].T
+    return torch.cat([rotation, -(rotation @ pose[:3, 3])[:, None]], dim=1)
+
+
+def llff_to_opencv(pose: Float[Tensor, "3 4"]) -> Pose:
+    """LLFF ``poses_bounds.npy`` (first four columns): columns are down, right, backward, position."""
+    down, right, back, position = pose.unbind(dim=1)
+    return rigid(torch.stack([right, down, -back], dim=1), position)
+
+
+def opencv_to_llff(pose: Pose) -> Float[Tensor, "3 4"]:
+    """Inverse of `llff_to_opencv`."""
+    right, down, forward, position = pose[:3].unbind(dim=1)
+    return torch.stack([down, right, -forward, position], dim=1)
+
+
+def rigid(rotation: Float[Tensor, "3 3"], translation: Float[Tensor, 3]) -> Pose:
+    """A 4x4 from a rotation and a translation."""
+    bottom = rotation.new_tensor([[0.0, 0.0, 0.0, 1.0]])
+    return torch.cat([torch.cat([rotation, translation[:, None]], dim=1), bottom])
+
+
+def look_at(eye: Float[Tensor, 3], target: Float[Tensor, 3], up: Float[Tensor, 3]) -> Pose:
+    """The pose of a camera at ``eye`` that sees ``target`` in the middle and ``up`` upwards."""
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    return rigid(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1), eye)
+
+
+def apply_similarity(similarity: Pose, pose: Pose) -> Pose:
+    """Move a camera by a similarity: the position is scaled, the rotation stays rigid."""
+    scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
+    return rigid(similarity[:3, :3] / scale @ pose[:3, :3], similarity[:3, :3] @ pose[:3, 3] + similarity[:3, 3])
+
+
+def transform_points(transform: Pose, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Apply a 4x4 affine transform to points."""
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def quaternion_to_matrix(quaternion: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
+    """Rotation matrices of quaternions (w, x, y, z), which are normalised first."""
+    w, x, y, z = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def se3_exp(twist: Float[Tensor, 6]) -> Pose:
+    """Exponential of a twist (rotation vector, translation): the rigid motion it generates, smooth at zero."""
+    skew = twist.new_zeros(4, 4)
+    generators = _generators(twist)
+    skew = skew + torch.einsum("k,kij->ij", twist, generators)
+    return torch.linalg.matrix_exp(skew)
+
+
+def _generators(like: Tensor) -> Float[Tensor, "6 4 4"]:
+    basis = like.new_zeros(6, 4, 4)
+    for axis, (i, j) in enumerate([(2, 1), (0, 2), (1, 0)]):
+        basis[axis, i, j], basis[axis, j, i] = 1.0, -1.0
+    for axis in range(3):
+        basis[3 + axis, axis, 3] = 1.0
+    return basis
+
+
+def focal_from_fov(fov: float, width: int) -> float:
+    """Focal length in pixels of a horizontal field of view in radians (Blender's ``camera_angle_x``)."""
+    return 0.5 * width / math.tan(0.5 * fov)

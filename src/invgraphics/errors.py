@@ -1,0 +1,27 @@
+"""What a person is told when their input cannot be used."""
+
+from __future__ import annotations
+
+
+class InputError(Exception):
+    """Bad input, said in one clear sentence and, where there is one, the remedy.
+
+    The command line prints at most four lines of it and exits with status 2; library users catch it as an exception.
+
+    Args:
+        sentence: what is wrong: which file or key, and what was expected.
+        remedy: what to do about it, one line; empty where there is nothing to add.
+    """
+
+    def __init__(self, sentence: str, remedy: str = "") -> None:
+        super().__init__(sentence if not remedy else f"{sentence}\n{remedy}")
+        self.sentence = sentence
+        self.remedy = remedy
+
+
+class NotComposableError(InputError):
+    """A field and a renderer that cannot work together; the sentence names the missing quantity."""
+
+
+class NumericalError(Exception):
+    """A fit produced a number that is not finite; the sentence names the step and the tensor."""

@@ -1,0 +1,121 @@
+"""The hot operations, one function each; which implementation runs is decided in `dispatch`.
+
+``reference`` is plain torch, any dtype, meant to be read; it is the oracle of the others. ``numba`` is float32 on the CPU.
+All are differentiable where their docstring says so, and deterministic for a given number of threads.
+"""
+
+from __future__ import annotations
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.camera import Camera
+from invgraphics.core.field import Gaussians
+from invgraphics.core.rays import Rays
+from invgraphics.kernels.dispatch import choose
+from invgraphics.kernels.dispatch import in_use as in_use
+from invgraphics.kernels.dispatch import use as use
+from invgraphics.kernels.dispatch import using as using
+from invgraphics.kernels.types import Bins, Footprints, HashGrid, March, MarchSteps
+
+
+def hash_encode(
+    unit: Float[Tensor, "m 3"], table: Float[Tensor, "entries f"], grid: HashGrid, jacobian: bool = False
+) -> tuple[Float[Tensor, "m width"], Float[Tensor, "m width 3"] | None]:
+    """Multi-resolution hash encoding (Instant-NGP, §3): trilinear look-ups on every level, concatenated coarse to fine.
+
+    Args:
+        unit: positions in [0, 1]; those outside are clamped.
+        table: features of all levels, `HashGrid.entries` rows.
+        grid: geometry of the levels.
+        jacobian: whether to return d features / d unit as well.
+
+    Returns:
+        Features (m, levels * f), differentiable in ``table`` and ``unit``; and the Jacobian, differentiable in ``table``.
+    """
+    return choose("hash_encode", unit)(unit, table, grid, jacobian)
+
+
+def grid_sample(unit: Float[Tensor, "m 3"], grid: Float[Tensor, "x y z c"]) -> Float[Tensor, "m c"]:
+    """Trilinear interpolation in a dense grid whose corner vertices lie at 0 and 1; differentiable in both."""
+    return choose("grid_sample", unit)(unit, grid)
+
+
+def ray_march(
+    rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps, start: Float[Tensor, " n"]
+) -> March:
+    """Walk along rays in steps and keep the intervals whose middle lies in an occupied cell of the unit cube.
+
+    Args:
+        rays: with near and far set; marching ends at far.
+        occupied: cells of the unit cube (see `Bounds.to_unit`), indexed [x, y, z].
+        bounds: the region's map to the unit cube.
+        steps: step lengths and the most samples to keep per ray.
+        start: where each ray begins or resumes (``resume`` of an earlier march).
+    """
+    return choose("ray_march", rays.origins)(rays, occupied, bounds, steps, start)
+
+
+def composite(
+    optical_depth: Float[Tensor, " m"], channels: Float[Tensor, "m c"], ray: Int[Tensor, " m"], rays: int
+) -> tuple[Float[Tensor, " m"], Float[Tensor, "n c"], Float[Tensor, " n"]]:
+    """Emission-absorption along packed rays: alpha_i = 1 - exp(-tau_i), T_i = exp(-sum_{j<i} tau_j), w_i = T_i alpha_i.
+
+    Args:
+        optical_depth: tau_i = sigma_i * length, >= 0; sorted by ray, then distance.
+        channels: what to sum along each ray.
+        ray: ray index of each sample, non-decreasing.
+        rays: number of rays.
+
+    Returns:
+        Weights w_i; sums over each ray of w_i * channels_i; alpha = sum of w_i. Differentiable in the first two arguments.
+    """
+    return choose("composite", optical_depth)(optical_depth, channels, ray, rays)
+
+
+def splat_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.3) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+    """EWA projection of 3D Gaussians (Zwicker et al. 2001; 3DGS §4) and their colours towards the camera.
+
+    Args:
+        gaussians: activated primitives.
+        camera: pinhole camera, differentiable in its pose.
+        dilation: variance in square pixels added to both screen axes (low-pass filter).
+
+    Returns:
+        Conic footprints, culled where the 99% ellipsoid misses the frustum; and rgb = max(0, SH(direction) + 0.5).
+    """
+    return choose("splat_project", gaussians.means)(gaussians, camera, dilation)
+
+
+def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bins:
+    """Sort footprints by depth and list, per tile, those whose square touches it. Not differentiable."""
+    return choose("splat_bin", footprints.means2d)(footprints, width, height, tile)
+
+
+def splat_rasterise(
+    footprints: Footprints, features: Float[Tensor, "n c"], width: int, height: int, tile: int | None = None
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """Front-to-back alpha compositing of footprints at pixel centres (3DGS, appendix C).
+
+    alpha = min(0.99, response), skipped below 1/255; a pixel stops before its transmittance falls below 1e-4.
+
+    Args:
+        footprints: conics, or discs where ``homography`` is set.
+        features: what to sum, per footprint (colour, depth coefficients, normals).
+        width: image width in pixels.
+        height: image height in pixels.
+        tile: edge of a tile in pixels; ``None`` for the implementation's own.
+
+    Returns:
+        Sums of w * features and of w per pixel, differentiable in means2d, conics (or homography), opacities and features.
+    """
+    return choose("splat_rasterise", footprints.means2d)(footprints, features, width, height, tile)
+
+
+def ssim(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+    """Mean SSIM as a loss needs it (Wang et al. 2004; 11x11 Gaussian window, sigma 1.5, zero-padded as in 3DGS).
+
+    Values in [0, 1] are assumed (data range 1). Differentiable in ``image``.
+    """
+    return choose("ssim", image)(image, target)

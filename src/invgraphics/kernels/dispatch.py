@@ -1,0 +1,79 @@
+"""Which implementation of a kernel runs: chosen by device, dtype and availability, or forced by name."""
+
+from __future__ import annotations
+
+import importlib
+from contextlib import contextmanager
+from functools import cache
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from invgraphics.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+IMPLEMENTATIONS = ("reference", "numba")
+"""Packages beside this file; each exposes the operations it has, under the names of `invgraphics.kernels`."""
+
+_forced: str | None = None
+
+
+def use(name: str | None) -> None:
+    """Force an implementation for all operations (``None``: choose automatically).
+
+    Raises:
+        InputError: unknown name, or the implementation does not work on this machine.
+    """
+    if name is not None and name not in IMPLEMENTATIONS:
+        raise InputError(f"There are no '{name}' kernels.", f"Known kernels: {', '.join(IMPLEMENTATIONS)}.")
+    if name is not None and why_not(name):
+        raise InputError(f"The {name} kernels cannot be used here: {why_not(name)}.")
+    global _forced  # noqa: PLW0603
+    _forced = name
+
+
+@contextmanager
+def using(name: str | None) -> Iterator[None]:
+    """Force an implementation for the length of a ``with`` block."""
+    before = _forced
+    use(name)
+    try:
+        yield
+    finally:
+        use(before)
+
+
+@cache
+def _module(name: str) -> ModuleType | str:
+    """The implementation's package, or why it cannot be imported."""
+    try:
+        return importlib.import_module(f"invgraphics.kernels.{name}")
+    except Exception as error:  # a broken Numba raises anything from ImportError to OSError
+        return f"{type(error).__name__}: {error}"
+
+
+def why_not(name: str) -> str:
+    """Why an implementation cannot run here; empty if it can."""
+    module = _module(name)
+    return module if isinstance(module, str) else ""
+
+
+def choose(operation: str, like: torch.Tensor) -> Any:
+    """The function that runs ``operation`` for tensors like ``like``.
+
+    Numba kernels are written for float32 on the CPU; everything else runs on the plain torch reference.
+    """
+    name = _forced or ("numba" if like.device.type == "cpu" else "reference")
+    if name == "numba" and like.dtype == torch.float32 and like.device.type == "cpu":
+        module = _module("numba")
+        if isinstance(module, ModuleType) and hasattr(module, operation):
+            return getattr(module, operation)
+    return getattr(_module("reference"), operation)
+
+
+def in_use() -> str:
+    """Name of the kernels that float32 tensors on the CPU get, for a run's record."""
+    return _forced or ("numba" if not why_not("numba") else "reference")

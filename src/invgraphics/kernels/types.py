@@ -1,0 +1,151 @@
+"""What kernels exchange: flat arrays with names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class HashGrid:
+    """Geometry of a multi-resolution hash grid (Instant-NGP, §3).
+
+    Level l has ``resolution[l]`` cells along an edge, its vertices are stored densely while they fit into ``2**log2_size``
+    entries and are hashed beyond. All levels lie behind one another in one table.
+
+    Attributes:
+        levels: number of resolutions.
+        features: features per entry.
+        log2_size: most entries of a level, as a power of two.
+        base: cells along an edge on the coarsest level.
+        finest: cells along an edge on the finest level.
+    """
+
+    levels: int = 16
+    features: int = 2
+    log2_size: int = 17
+    base: int = 16
+    finest: int = 2048
+
+    @property
+    def resolutions(self) -> tuple[int, ...]:
+        """Cells along an edge, per level: a geometric progression from ``base`` to ``finest``."""
+        if self.levels == 1:
+            return (self.base,)
+        growth = np.exp(np.log(self.finest / self.base) / (self.levels - 1))
+        return tuple(int(np.floor(self.base * growth**level + 1e-9)) for level in range(self.levels))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Entries per level: all (r+1)^3 vertices, or the hash table's size."""
+        return tuple(min((r + 1) ** 3, 2**self.log2_size) for r in self.resolutions)
+
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """First entry of each level, and the total at the end."""
+        return (0, *(int(total) for total in np.cumsum(self.sizes)))
+
+    @property
+    def entries(self) -> int:
+        """Entries of the whole table."""
+        return self.offsets[-1]
+
+
+@dataclass(frozen=True)
+class MarchSteps:
+    """How a ray is walked: t grows by ``max(step, cone * t)``.
+
+    Attributes:
+        step: shortest step, local units.
+        cone: growth of the step with distance (0 for bounded scenes, 1/256 in Instant-NGP's unbounded ones).
+        limit: most samples kept per ray in one march.
+    """
+
+    step: float
+    cone: float = 0.0
+    limit: int = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class March:
+    """Sample intervals on n rays, packed by ray then distance, and where each ray would go on.
+
+    Attributes:
+        ray: ray index of each sample.
+        t0: interval starts.
+        t1: interval ends.
+        resume: distance at which marching continues; ``>= far`` on finished rays.
+    """
+
+    ray: Int[Tensor, " m"]
+    t0: Float[Tensor, " m"]
+    t1: Float[Tensor, " m"]
+    resume: Float[Tensor, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """n primitives on the screen.
+
+    A footprint's response at pixel p is ``opacity * exp(-0.5 q)``. For conics ``q = d^T C d`` with ``d = p - mean``; for flat
+    discs ``q = u² + v²`` with ``(u, v) = (a, b) / c`` and ``(a, b, c) = H (x, y, 1)``, where ``homography`` is H.
+
+    Attributes:
+        means2d: centres in pixels.
+        conics: inverse 2D covariances (C_xx, C_xy, C_yy), per square pixel.
+        opacities: peak alpha, in [0, 1].
+        depths: sort key, depth of the centre along the optical axis.
+        planes: distance along the pixel's unit ray of the maximal response, to first order:
+            ``t(p) = planes[0] + planes[1] (x - mean_x) + planes[2] (y - mean_y)``.
+        radii: half-width in pixels of the square outside which the response is below the smallest visible alpha;
+            0 for culled primitives.
+        homography: pixel to disc coordinates, where the footprints are discs.
+    """
+
+    means2d: Float[Tensor, "n 2"]
+    conics: Float[Tensor, "n 3"]
+    opacities: Float[Tensor, " n"]
+    depths: Float[Tensor, " n"]
+    planes: Float[Tensor, "n 3"]
+    radii: Float[Tensor, " n"]
+    homography: Float[Tensor, "n 3 3"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.means2d)
+
+
+@dataclass(frozen=True, eq=False)
+class Bins:
+    """Which footprints touch which tile, front to back.
+
+    Attributes:
+        splats: footprint indices, tile after tile (row by row), each tile sorted by depth (ties by index).
+        starts: first entry of each tile, and the total at the end.
+        tile: edge of a tile in pixels.
+        columns: tiles per row.
+        rows: tiles per column.
+    """
+
+    splats: Int[Tensor, " k"]
+    starts: Int[Tensor, " tiles_plus_1"]
+    tile: int
+    columns: int
+    rows: int
+
+
+ALPHA_MIN = 1 / 255
+"""Responses below this are skipped (3DGS, appendix C)."""
+ALPHA_MAX = 0.99
+"""Alpha is clamped here for numerical stability (3DGS, appendix C)."""
+TRANSMITTANCE_MIN = 1e-4
+"""Compositing of a pixel stops before transmittance falls below this (3DGS, appendix C)."""
+
+
+def empty_bins(tile: int, columns: int, rows: int) -> Bins:
+    """Bins without any footprint."""
+    starts = torch.zeros(columns * rows + 1, dtype=torch.int64)
+    return Bins(torch.zeros(0, dtype=torch.int64), starts, tile, columns, rows)

@@ -1,0 +1,13 @@
+"""Pure functions of a picture and the truth, each with its unit and direction, and the protocols they are used under."""
+
+METRICS = {
+    "psnr": "invgraphics.metrics.image:PSNR",
+    "ssim": "invgraphics.metrics.image:SSIM",
+    "ms_ssim": "invgraphics.metrics.image:MS_SSIM",
+    "flip": "invgraphics.metrics.perceptual:FLIP",
+    "lpips": "invgraphics.metrics.perceptual:LPIPS",
+    "depth_abs_rel": "invgraphics.metrics.geometry:DEPTH_ABS_REL",
+    "depth_rmse": "invgraphics.metrics.geometry:DEPTH_RMSE",
+    "normal_deg": "invgraphics.metrics.geometry:NORMAL_DEG",
+    "alpha_iou": "invgraphics.metrics.geometry:ALPHA_IOU",
+}

@@ -1,0 +1,82 @@
+"""Registries: literal dictionaries of ``"module:object"``, extended by entry points.
+
+Nothing heavy is imported to *list* what there is; an object is imported when it is used.
+A stranger's package joins by declaring an entry point in the group ``invgraphics.<registry>``,
+for instance ``[project.entry-points."invgraphics.fields"] mine = "my_package:MyFieldConfig"``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from invgraphics.errors import InputError
+
+REGISTRIES = {
+    "fields": ("invgraphics.fields", "FIELDS"),
+    "encodings": ("invgraphics.fields.encodings", "ENCODINGS"),
+    "renderers": ("invgraphics.renderers", "RENDERERS"),
+    "samplers": ("invgraphics.renderers", "SAMPLERS"),
+    "losses": ("invgraphics.training", "LOSSES"),
+    "hooks": ("invgraphics.training", "HOOKS"),
+    "scenes": ("invgraphics.scenes", "LOADERS"),
+    "metrics": ("invgraphics.metrics", "METRICS"),
+    "recipes": ("invgraphics.experiments", "RECIPES"),
+}
+"""Registry name -> (module, dictionary). ``recipes`` starts empty: built-in recipes are TOML files."""
+
+
+@cache
+def _own(registry: str) -> dict[str, str]:
+    module, name = REGISTRIES[registry]
+    return dict(getattr(importlib.import_module(module), name))
+
+
+def _foreign(registry: str) -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=f"invgraphics.{registry}")}
+
+
+def names(registry: str) -> dict[str, str]:
+    """Name -> where it comes from (``"module:object"``), own entries first; imports no implementation."""
+    foreign = {name: point.value for name, point in _foreign(registry).items()}
+    return _own(registry) | {name: value for name, value in foreign.items() if name not in _own(registry)}
+
+
+def origin(registry: str, name: str) -> str:
+    """``"built in"`` or the name of the distribution that brought ``name``."""
+    if name in _own(registry):
+        return "built in"
+    point = _foreign(registry).get(name)
+    return point.dist.name if point is not None and point.dist is not None else "unknown package"
+
+
+def load(registry: str, name: str) -> Any:
+    """Import and return the object registered as ``name``.
+
+    Raises:
+        InputError: unknown name (the known ones are listed), or a plug-in that fails to import.
+    """
+    target = names(registry).get(name)
+    if target is None:
+        known = ", ".join(sorted(names(registry))) or "none"
+        raise InputError(f"There is no '{name}' among the {registry}.", f"Known {registry}: {known}.")
+    module, _, attribute = target.partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        source = origin(registry, name)
+        raise InputError(f"'{name}' of the {registry} ({target}, {source}) cannot be imported: {error}.") from error
+
+
+def name_of(registry: str, kind: type) -> str:
+    """The name under which the class ``kind`` is registered (inverse of `load`)."""
+    wanted = f"{kind.__module__}:{kind.__qualname__}"
+    for name, target in names(registry).items():
+        if target == wanted:
+            return name
+    for name in _foreign(registry):
+        if load(registry, name) is kind:
+            return name
+    raise InputError(f"{wanted} is not registered among the {registry}.")

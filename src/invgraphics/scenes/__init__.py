@@ -1,0 +1,11 @@
+"""Loaders and makers of `invgraphics.core.Scene`."""
+
+LOADERS = {
+    "blender": "invgraphics.scenes.blender:Blender",
+    "nerfstudio": "invgraphics.scenes.nerfstudio:Nerfstudio",
+    "llff": "invgraphics.scenes.llff:Llff",
+    "colmap": "invgraphics.scenes.colmap:Colmap",
+    "idr": "invgraphics.scenes.idr:Idr",
+    "npz": "invgraphics.scenes.npz:Npz",
+}
+"""Formats of data sets on disk, in the order in which a folder is tried."""

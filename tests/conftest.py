@@ -1,0 +1,29 @@
+"""Fixtures shared by all tests."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def data() -> Callable[[str], Path]:
+    """Path of a real data set under $INVGRAPHICS_DATA, or a skip that says why."""
+
+    def find(name: str) -> Path:
+        root = os.environ.get("INVGRAPHICS_DATA")
+        if not root:
+            pytest.skip("INVGRAPHICS_DATA is not set")
+        path = Path(root).resolve() / name
+        if not path.exists():
+            pytest.skip(f"{path.name} is not in INVGRAPHICS_DATA")
+        return path
+
+    return find
