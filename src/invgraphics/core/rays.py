@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -54,6 +54,11 @@ class Rays:
 
     def __getitem__(self, index: slice | Tensor) -> Rays:
         return Rays(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+    @staticmethod
+    def cat(parts: Sequence[Rays]) -> Rays:
+        """Join sets of rays, in order."""
+        return Rays(**{field.name: torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Rays)})
 
     def at(self, t: Float[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
         """Points at distance ``t`` along each ray."""

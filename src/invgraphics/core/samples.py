@@ -67,10 +67,11 @@ class Samples:
 
     @property
     def covariance(self) -> Float[Tensor, "m 3 3"]:
-        """Covariance of the cone frustum behind each sample (mip-NeRF, equations 7 and 8 and 14)."""
+        """Covariance of the cone frustum behind each sample (mip-NeRF, equations 7 and 8 and 14); zero for a lone point."""
         middle, half = self.mid, self.delta / 2
-        along = half**2 / 3 - (4 / 15) * half**4 * (12 * middle**2 - half**2) / (3 * middle**2 + half**2) ** 2
-        across = self.radius**2 * (middle**2 / 4 + (5 / 12) * half**2 - (4 / 15) * half**4 / (3 * middle**2 + half**2))
+        share = half**2 / (3 * middle**2 + half**2).clamp_min(torch.finfo(half.dtype).tiny)
+        along = half**2 / 3 - (4 / 15) * share**2 * (12 * middle**2 - half**2)
+        across = self.radius**2 * (middle**2 / 4 + (5 / 12) * half**2 - (4 / 15) * half**2 * share)
         outer = self.direction[:, :, None] * self.direction[:, None, :]
         eye = torch.eye(3, dtype=outer.dtype, device=outer.device)
         return along[:, None, None] * outer + across[:, None, None] * (eye - outer)

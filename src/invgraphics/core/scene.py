@@ -171,3 +171,7 @@ class Batch:
     alpha: Float[Tensor, "*p"]
     background: Tensor
     view: int = -1
+
+    def to(self, device: torch.device) -> Batch:
+        """Move all tensors."""
+        return Batch(self.target.to(device), self.alpha.to(device), self.background.to(device), self.view)

@@ -17,6 +17,7 @@ from invgraphics.kernels.dispatch import choose
 from invgraphics.kernels.dispatch import in_use as in_use
 from invgraphics.kernels.dispatch import use as use
 from invgraphics.kernels.dispatch import using as using
+from invgraphics.kernels.dispatch import warm_up as warm_up
 from invgraphics.kernels.types import Bins, Footprints, HashGrid, March, MarchSteps
 
 

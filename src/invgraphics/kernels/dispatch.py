@@ -77,3 +77,9 @@ def choose(operation: str, like: torch.Tensor) -> Any:
 def in_use() -> str:
     """Name of the kernels that float32 tensors on the CPU get, for a run's record."""
     return _forced or ("numba" if not why_not("numba") else "reference")
+
+
+def warm_up() -> float:
+    """Compile what needs compiling, so that no clock of a fit counts it; returns the seconds it took."""
+    module = _module("numba") if in_use() == "numba" else None
+    return module.warm_up() if isinstance(module, ModuleType) and hasattr(module, "warm_up") else 0.0

@@ -8,6 +8,8 @@ METRICS = {
     "lpips": "invgraphics.metrics.perceptual:LPIPS",
     "depth_abs_rel": "invgraphics.metrics.geometry:DEPTH_ABS_REL",
     "depth_rmse": "invgraphics.metrics.geometry:DEPTH_RMSE",
+    "depth_abs_rel_smooth": "invgraphics.metrics.geometry:DEPTH_ABS_REL_SMOOTH",
+    "depth_rmse_smooth": "invgraphics.metrics.geometry:DEPTH_RMSE_SMOOTH",
     "normal_deg": "invgraphics.metrics.geometry:NORMAL_DEG",
     "alpha_iou": "invgraphics.metrics.geometry:ALPHA_IOU",
 }

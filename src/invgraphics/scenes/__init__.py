@@ -1,6 +1,7 @@
 """Loaders and makers of `invgraphics.core.Scene`."""
 
 LOADERS = {
+    "truth": "invgraphics.scenes.truth:Truth",
     "blender": "invgraphics.scenes.blender:Blender",
     "nerfstudio": "invgraphics.scenes.nerfstudio:Nerfstudio",
     "llff": "invgraphics.scenes.llff:Llff",

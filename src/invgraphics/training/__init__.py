@@ -4,6 +4,7 @@ LOSSES = {
     "photometric": "invgraphics.training.losses:PhotometricConfig",
     "coarse": "invgraphics.training.losses:CoarseConfig",
     "ssim": "invgraphics.training.losses:SsimConfig",
+    "distortion": "invgraphics.training.losses:DistortionConfig",
 }
 
 HOOKS = {

@@ -1,0 +1,33 @@
+"""Where the packaged data lives: scene descriptions, recipes and studies, which are data and travel inside the wheel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from invgraphics.errors import InputError
+
+Kind = Literal["scenes", "renderers", "studies"]
+
+
+def find(kind: Kind, name: str = "") -> Path:
+    """Path of the packaged ``kind`` folder, or of the entry ``name`` in it.
+
+    An installed wheel carries the folders beside this file; a checkout, whose editable install ignores the wheel's
+    ``force-include``, has them at the repository root.
+
+    Raises:
+        InputError: there is no such entry; the ones there are, are listed.
+    """
+    folder = next((root / kind for root in _roots() if (root / kind).is_dir()), None)
+    if folder is None:
+        raise InputError(f"The packaged folder '{kind}' is missing.", "Reinstall invgraphics, or run from its repository.")
+    if name and not (folder / name).exists():
+        known = ", ".join(sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))) or "none"
+        raise InputError(f"There is no '{name}' among the {kind}.", f"Known {kind}: {known}.")
+    return folder / name
+
+
+def _roots() -> tuple[Path, ...]:
+    here = Path(__file__).resolve()
+    return here.parent, here.parents[3]

@@ -1,0 +1,60 @@
+"""From a method and a scene to the objects of a fit."""
+
+from __future__ import annotations
+
+import torch
+
+from invgraphics import kernels
+from invgraphics.core import Field, Renderer, Scene, check
+from invgraphics.errors import InputError
+from invgraphics.experiments.recipe import Method
+from invgraphics.training.budget import Budget
+from invgraphics.training.fit import Plan
+
+
+def device_of(name: str | None) -> torch.device:
+    """The device a run uses: the one that was asked for, else the CPU.
+
+    Raises:
+        InputError: no such device here.
+    """
+    if name in (None, "cpu"):
+        return torch.device("cpu")
+    if name == "cuda":
+        if not torch.cuda.is_available():
+            raise InputError("--device cuda: this machine offers torch no CUDA device.", "Use --device cpu.")
+        return torch.device("cuda")
+    raise InputError(f"--device cannot be '{name}'.", "Expected: cpu or cuda.")
+
+
+def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -> tuple[Field, Renderer]:
+    """Field and renderer of a method for a scene, checked against each other; initial values depend on ``seed`` only."""
+    torch.manual_seed(seed)
+    field: Field = method.recipe.field.build(scene)
+    renderer: Renderer = method.recipe.renderer.build(scene)
+    check(field, renderer)
+    return field.to(device), renderer.to(device)
+
+
+def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: torch.device) -> Plan:
+    """Everything a fit is made of."""
+    recipe = method.recipe
+    field, renderer = build_model(method, scene, seed, device)
+    return Plan(
+        field=field,
+        renderer=renderer,
+        scene=scene,
+        losses=[loss.build() for loss in recipe.losses],
+        hooks=[hook.build() for hook in recipe.hooks],
+        optimiser=recipe.optimiser,
+        batches=recipe.batches,
+        budget=budget,
+        seed=seed,
+        device=device,
+    )
+
+
+def use_kernels(name: str | None) -> None:
+    """Choose kernels by name, and compile what needs compiling before any clock runs."""
+    kernels.use(name)
+    kernels.warm_up()

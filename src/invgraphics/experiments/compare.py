@@ -1,0 +1,132 @@
+"""The main job: several methods on one scene under one budget, each fit in its own process, one report."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from invgraphics.core import Scene
+from invgraphics.errors import InputError
+from invgraphics.experiments.build import device_of
+from invgraphics.experiments.environment import environment
+from invgraphics.experiments.folder import RunFolder, write_json
+from invgraphics.experiments.recipe import load_method
+from invgraphics.experiments.recorder import Cadence
+from invgraphics.experiments.request import CompareRequest, FitRequest, slug
+from invgraphics.metrics.baselines import baseline_scores
+from invgraphics.metrics.protocols import protocol_named
+from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.training.budget import Budget
+
+
+def compare(request: CompareRequest) -> tuple[Path, int]:
+    """Fit and evaluate every cell, then write ``compare.json`` for the report.
+
+    Cells that an earlier, identical command finished are kept; one that it left half done goes on from its checkpoint.
+
+    Returns:
+        The comparison's folder, and how many cells failed.
+
+    Raises:
+        InputError: anything that cannot be used; found before the first fit.
+        KeyboardInterrupt: interrupted; ``compare.json`` covers what is finished.
+    """
+    began = time.monotonic()
+    scene = _validate(request)
+    folder = RunFolder(Path(request.out))
+    folder.create()
+    failures: list[dict[str, Any]] = []
+    summary = _summary(request, scene)
+    interrupted = False
+    for fit in request.fits():
+        status, error = _fit_in_own_process(fit, folder.root)
+        if status == 130:
+            interrupted = True
+            break
+        if status != 0:
+            failures.append({"method": fit.method, "seed": fit.seed, "error": error})
+    done = [fit for fit in request.fits() if RunFolder(Path(fit.out)).finished]
+    summary["runs"] = [Path(fit.out).relative_to(request.out).as_posix() for fit in done]
+    summary["failures"] = failures
+    summary["wall_seconds"] = round(time.monotonic() - began, 1)
+    folder.write_json("compare.json", summary)
+    if interrupted:
+        raise KeyboardInterrupt
+    return folder.root, len(failures)
+
+
+def _validate(request: CompareRequest) -> Scene:
+    """Look at everything that could be wrong before any time is spent."""
+    if not request.methods:
+        raise InputError("--methods is empty.", "Example: --methods volumetric/hash,splatting/gaussians.")
+    if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
+        raise InputError("A method or a seed is named twice.")
+    Budget.parse(request.budget)
+    Cadence.parse(request.checkpoint_every)
+    device_of(request.device)
+    protocol_named(request.protocol)
+    for name in request.methods:
+        load_method(name, request.preset, request.overrides)
+    RunFolder(Path(request.out)).create()
+    return open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+
+
+def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
+    """Everything of ``compare.json`` that is known before the fits."""
+    protocol = protocol_named(request.protocol)
+    camera = scene.test[0].camera
+    names = ", ".join(request.methods)
+    return {
+        "schema": 1,
+        "scene": scene.name,
+        "question": f"Given {request.budget} of optimisation each, how well do {names} show new views, at what cost?",
+        "methods": list(request.methods),
+        "summaries": {name: load_method(name, request.preset, request.overrides).recipe.summary for name in request.methods},
+        "seeds": list(request.seeds),
+        "budget": request.budget,
+        "size": [camera.width, camera.height],
+        "preset": request.preset or "laptop",
+        "command": request.shell(),
+        "baselines": baseline_scores(scene, protocol),
+        "noise_ceiling": scene.noise_ceiling,
+        "protocol": asdict(protocol),
+        "scene_info": {
+            "train": len(scene.train),
+            "val": len(scene.val),
+            "test": len(scene.test),
+            "colour": scene.colour,
+            "background": scene.background.tolist(),
+            "space": scene.bounds.space,
+            "notes": scene.notes,
+        },
+        "environment": environment(torch.device(request.device or "cpu")),
+    }
+
+
+def _fit_in_own_process(fit: FitRequest, root: Path) -> tuple[int, str]:
+    """Spawn a fit, so that its time and memory are its own; returns its exit status and what went wrong."""
+    jobs = root / "jobs"
+    jobs.mkdir(exist_ok=True)
+    job = jobs / f"{slug(fit.method)}-seed-{fit.seed}.json"
+    report = job.with_suffix(".error.json")
+    report.unlink(missing_ok=True)
+    write_json(job, fit.to_json())
+    process = subprocess.Popen([sys.executable, "-m", "invgraphics.experiments.run", str(job)])
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:  # the child got the same Ctrl-C and is writing its checkpoint
+        process.wait()
+        status = 130
+    if status in (0, 130):
+        return status, ""
+    try:
+        return status, json.loads(report.read_text())["error"]
+    except (OSError, json.JSONDecodeError, KeyError):
+        return status, f"The process ended with status {status} and left no message."

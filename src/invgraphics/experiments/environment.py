@@ -1,0 +1,59 @@
+"""What a run's numbers depend on: the machine, the versions, the code."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+from invgraphics import kernels
+
+
+@cache
+def code_version() -> str:
+    """Version and a hash of every source file of the package, so that an edited working copy is told from a release."""
+    root = Path(__file__).resolve().parents[1]
+    sha = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        if not {"report", "cli"} & set(path.relative_to(root).parts):  # they cannot change a number
+            sha.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return f"{version('invgraphics')}+{sha.hexdigest()[:12]}"
+
+
+def cpu_name() -> str:
+    """The processor's name as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def environment(device: torch.device) -> dict[str, object]:
+    """A record for ``environment.json``."""
+    record: dict[str, object] = {
+        "invgraphics": code_version(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "platform": platform.platform(),
+        "cpu": cpu_name(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "kernels": kernels.in_use(),
+        "device": str(device),
+        "deterministic": device.type == "cpu",
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    }
+    for package in ("numpy", "numba", "mitsuba", "pycolmap", "scikit-image"):
+        record[package] = version(package)
+    if device.type == "cuda":
+        record["gpu"] = torch.cuda.get_device_name(device)
+        record["note"] = "GPU sums are not ordered: repeating a run gives close, not equal, bits."
+    return record

@@ -1,0 +1,166 @@
+"""Evaluation of a fitted model: every test view rendered, kept and scored. A method never scores itself."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from invgraphics.core import Camera, Context, Field, Renderer, Rendering, Scene, View
+from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.errors import InputError
+from invgraphics.experiments.build import build_model, device_of
+from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.progress import Reporter
+from invgraphics.experiments.recipe import Method, resolve
+from invgraphics.metrics.cost import model_bytes, parameter_count
+from invgraphics.metrics.protocols import protocol_named, score, summarise
+from invgraphics.training import checkpoint
+
+
+def render_view(
+    field: Field, renderer: Renderer, camera: Camera, scene: Scene, device: torch.device, geometry: bool = True
+) -> Rendering:
+    """One picture for scoring: deterministic, on the CPU, outside the graph."""
+    ctx = Context(scene.bounds.to(device), training=False, geometry=geometry)
+    with torch.no_grad():
+        rendering, _ = renderer.render_image(field, camera.to(device), ctx)
+    rendering = rendering.detach()
+    normal = None if rendering.normal is None else rendering.normal.cpu()
+    return Rendering(rendering.rgb.cpu(), rendering.alpha.cpu(), rendering.depth.cpu(), normal)
+
+
+def expected_seconds(field: Field, renderer: Renderer, scene: Scene, device: torch.device) -> float:
+    """Seconds for all test views, extrapolated from one small picture with the unfitted model."""
+    camera = scene.test[0].camera
+    small = camera.resized(max(8, camera.width // 8), max(8, camera.height // 8))
+    began = time.perf_counter()
+    render_view(field, renderer, small, scene, device)
+    seconds = time.perf_counter() - began
+    return seconds * len(scene.test) * (camera.width * camera.height) / (small.width * small.height)
+
+
+def evaluate(
+    folder: RunFolder,
+    scene: Scene,
+    model: tuple[Field, Renderer],
+    protocol: str,
+    costs: dict[str, Any],
+    method: Method,
+) -> dict[str, Any]:
+    """Render, keep and score all test views of ``scene``; writes ``test/`` and the scores file, returns the scores."""
+    rules = protocol_named(protocol)
+    field, renderer = model
+    device = next(field.parameters()).device
+    (folder.root / "test").mkdir(exist_ok=True)
+    scores, seconds = [], []
+    with Reporter(f"{method.name} evaluation") as reporter:
+        render_view(field, renderer, scene.test[0].camera.resized(16, 16), scene, device)  # first use pays for allocation
+        for index, view in enumerate(scene.test):
+            # Timed as a viewer would ask for it: colour, alpha and depth. Normals are rendered apart, for the scores only.
+            began = time.perf_counter()
+            picture = render_view(field, renderer, view.camera, scene, device, geometry=False)
+            seconds.append(time.perf_counter() - began)
+            if view.normal is not None:
+                picture = render_view(field, renderer, view.camera, scene, device)
+            _save_view(folder.root / "test" / f"{index:04d}", picture, scene)
+            scores.append(score(picture, view, scene, rules))
+            reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
+    per_view = statistics.median(seconds)
+    quality, skipped = summarise(scores, rules)
+    result = {
+        "schema": 1,
+        "method": method.name,
+        "preset": method.preset,
+        "scene": scene.name,
+        "seed": folder.read_json("provenance.json")["seed"],
+        "protocol": protocol,
+        "views": [view.name for view in scene.test],
+        "cost": costs
+        | {
+            "render_seconds_per_view": per_view,
+            "render_fps": 1 / max(per_view, 1e-9),
+            "model_bytes": model_bytes(model),
+            "parameters": parameter_count(model),
+            "primitives": field.primitive_count(),
+        },
+        "quality": quality,
+        "skipped": skipped,
+    }
+    folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)
+    return result
+
+
+def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> dict[str, Any]:
+    """Score a finished run again from its checkpoint, on its own scene or on another copy of it.
+
+    Raises:
+        InputError: the folder holds no run, or its checkpoint does not fit its recipe.
+    """
+    from invgraphics.scenes.open import SceneOptions, open_scene
+
+    folder = RunFolder(run)
+    provenance = folder.read_json("provenance.json")
+    method = resolve(provenance["method"], provenance["preset"], folder.read_recipe())
+    size = provenance["options"]["size"]
+    options = SceneOptions(tuple(size) if isinstance(size, list) else size, provenance["options"]["test_views"])
+    scene = open_scene(scene_spec or provenance["scene"], options)
+    device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
+    field, renderer = build_model(method, scene, provenance["seed"], device)
+    state = checkpoint.load(folder.checkpoint, device)
+    try:
+        field.load_state_dict(state.get("field", {}))
+        renderer.load_state_dict(state.get("renderer", {}))
+    except RuntimeError as error:
+        raise InputError(f"{folder.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
+    fit = folder.read_json("fit.json")
+    costs = {"fit_seconds": fit["seconds"], "steps": fit["steps"], "peak_memory_bytes": fit.get("peak_memory_bytes")}
+    return evaluate(folder, scene, (field, renderer), protocol, costs, method)
+
+
+def _save_view(stem: Path, picture: Rendering, scene: Scene) -> None:
+    """Keep a prediction: float16 premultiplied with geometry, and an 8-bit picture over the declared background."""
+    arrays: dict[str, Any] = {
+        "rgb": picture.rgb.numpy().astype(np.float16),
+        "alpha": picture.alpha.numpy().astype(np.float16),
+        "depth": picture.depth.numpy().astype(np.float32) * np.float32(scene.scale),
+    }
+    if picture.normal is not None:
+        arrays["normal"] = picture.normal.numpy().astype(np.float16)
+    np.savez_compressed(stem.with_suffix(".npz"), **arrays)
+    Image.fromarray(display(picture.over(scene.background), scene).numpy()).save(stem.with_suffix(".png"))
+
+
+def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
+    """8-bit display colours of a composited picture."""
+    return quantise(linear_to_srgb(colour) if scene.colour == "linear" else colour)
+
+
+def save_truth(scene: Scene, root: Path) -> Path:
+    """Keep the test views' truth once per content: ``root/<sha>/0000.png`` and, where known, ``0000.npz``."""
+    folder = root / scene.digest("test")[:16]
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, view in enumerate(scene.test):
+        stem = folder / f"{index:04d}"
+        if not stem.with_suffix(".png").is_file():
+            Image.fromarray(display(view.over(scene.background), scene).numpy()).save(stem.with_suffix(".png"))
+        arrays = _truth_geometry(view, scene)
+        if arrays and not stem.with_suffix(".npz").is_file():
+            np.savez_compressed(stem.with_suffix(".npz"), **arrays)
+    return folder
+
+
+def _truth_geometry(view: View, scene: Scene) -> dict[str, Any]:
+    arrays: dict[str, Any] = {}
+    if view.depth is not None:
+        arrays["depth"] = view.depth.numpy() * np.float32(scene.scale)
+    if view.normal is not None:
+        arrays["normal"] = view.normal.numpy().astype(np.float16)
+    if view.alpha is not None:
+        arrays["alpha"] = view.opacity().numpy().astype(np.float16)
+    return arrays

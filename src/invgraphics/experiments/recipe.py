@@ -1,0 +1,130 @@
+"""Recipes: a method is data, a TOML file that names a field, a renderer, losses, hooks and settings."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from invgraphics import plugins
+from invgraphics.config import fill, merge, set_path, to_table
+from invgraphics.data import find
+from invgraphics.errors import InputError
+
+if TYPE_CHECKING:
+    from invgraphics.experiments.schema import Recipe
+
+
+@dataclass(frozen=True)
+class Method:
+    """A recipe ready to be built.
+
+    Attributes:
+        name: ``renderer/recipe``, or the path of a user's own TOML file.
+        preset: which preset was laid over the recipe; empty for none.
+        recipe: its typed settings.
+        table: the same, everything resolved, as plain values; what a run's ``recipe.toml`` holds.
+    """
+
+    name: str
+    preset: str
+    recipe: Recipe
+    table: dict[str, Any]
+
+    @property
+    def slug(self) -> str:
+        """The name as one folder name."""
+        return self.name.removesuffix(".toml").strip("/").replace("/", "-")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the resolved table."""
+        return hashlib.sha256(json.dumps(self.table, sort_keys=True).encode()).hexdigest()
+
+
+def methods() -> dict[str, str]:
+    """Name -> summary of every known method, our own first; imports no implementation."""
+    root = find("renderers")
+    found = {}
+    for path in sorted(root.glob("*/*.toml")):
+        found[f"{path.parent.name}/{path.stem}"] = str(_parse(path.read_text(), str(path)).get("summary", ""))
+    for name in plugins.names("recipes"):
+        found.setdefault(name, str(_parse(_foreign_text(name), name).get("summary", "")))
+    return found
+
+
+def presets(name: str) -> list[str]:
+    """Names of the presets of a method."""
+    return sorted(_source(name).get("presets", {}))
+
+
+def load_method(name: str, preset: str | None = None, overrides: Sequence[str] = ()) -> Method:
+    """Read a method's recipe, lay a preset and then overrides over it, and check every key.
+
+    Args:
+        name: ``renderer/recipe`` of a built-in or plugged-in method, or the path of a TOML file.
+        preset: one of the recipe's presets; ``None`` takes ``laptop`` where there is one.
+        overrides: ``dotted.path=value`` items, values as in TOML; bare words are taken as text.
+
+    Raises:
+        InputError: unknown method, preset or key, or a value of the wrong type.
+    """
+    table = _source(name)
+    known = table.pop("presets", {})
+    if preset is None:
+        preset = "laptop" if "laptop" in known else ""
+    if preset and preset not in known:
+        raise InputError(f"{name} has no preset '{preset}'.", f"Its presets: {', '.join(known) or 'none'}.")
+    table = merge(table, known.get(preset, {}))
+    for item in overrides:
+        path, equals, value = item.partition("=")
+        if not equals or not path.strip():
+            raise InputError(f"'--set {item}' is not of the form key=value.", "Example: --set batches.rays=2048.")
+        set_path(table, path.strip(), _value(value.strip()))
+    return resolve(name, preset, table)
+
+
+def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
+    """A method from a complete table, for instance from a run's ``recipe.toml``."""
+    from invgraphics.experiments.schema import Recipe
+
+    recipe = fill(Recipe, table)
+    return Method(name, preset, recipe, to_table(recipe))
+
+
+def _source(name: str) -> dict[str, Any]:
+    """The recipe's table as written, presets included."""
+    if name.endswith(".toml"):
+        path = Path(name)
+    else:
+        path = find("renderers") / f"{name}.toml"
+        if name in plugins.names("recipes") and not path.is_file():
+            return _parse(_foreign_text(name), name)
+        if not path.is_file():
+            raise InputError(f"There is no method '{name}'.", f"Known methods: {', '.join(methods())}; or the path of a .toml.")
+    try:
+        return _parse(path.read_text(), str(path))
+    except OSError as error:
+        raise InputError(f"The recipe {path} cannot be read: {error.strerror}.") from error
+
+
+def _foreign_text(name: str) -> str:
+    return str(plugins.load("recipes", name))
+
+
+def _parse(text: str, where: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"The recipe {where} is not valid TOML: {error}.") from error
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,159 @@
+"""Watches a fit: history, checkpoints, monitor views, progress and interruptions. Its own time is not the fit's."""
+
+from __future__ import annotations
+
+import math
+import re
+import signal
+import time
+from dataclasses import dataclass
+from types import FrameType
+
+import torch
+from torch import Tensor
+
+from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
+from invgraphics.errors import InputError
+from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.progress import Reporter
+from invgraphics.training import checkpoint
+from invgraphics.training.fit import Fit
+
+MARKS = (0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Points of the fit at which the monitor looks."""
+
+
+@dataclass(frozen=True)
+class Cadence:
+    """How often a checkpoint is written: every so many steps or seconds."""
+
+    steps: int | None = None
+    seconds: float | None = None
+
+    @staticmethod
+    def parse(text: str) -> Cadence:
+        """Read ``100steps`` or ``30s``."""
+        found = re.fullmatch(r"\s*([0-9]+)\s*(steps?|s)\s*", text)
+        if found is None or int(found.group(1)) == 0:
+            raise InputError(f"'{text}' says no interval for checkpoints.", "Expected something like 100steps or 30s.")
+        amount = int(found.group(1))
+        return Cadence(seconds=float(amount)) if found.group(2) == "s" else Cadence(steps=amount)
+
+
+class Monitor:
+    """PSNR on a fixed set of pixels of a few views that are not trained on, for curves over time.
+
+    Uses validation views, or test views where a data set has none; what it sees never reaches the fit.
+    """
+
+    VIEWS, PIXELS = 4, 4096
+
+    def __init__(self, scene: Scene, device: torch.device) -> None:
+        source = scene.val or scene.test
+        chosen = sorted({round(i * (len(source) - 1) / max(self.VIEWS - 1, 1)) for i in range(self.VIEWS)})
+        self._views: list[View] = [source[i] for i in chosen]
+        self._scene, self._device = scene, device
+        self._bounds = scene.bounds.to(device)
+        generator = torch.Generator().manual_seed(0)
+        per_view = self.PIXELS // len(self._views)
+        self._pixels = [
+            torch.randint(v.image.shape[0] * v.image.shape[1], (per_view,), generator=generator) for v in self._views
+        ]
+
+    @torch.no_grad()
+    def psnr(self, fit: Fit) -> float:
+        """PSNR in dB over all watched pixels, over the declared background."""
+        ctx = Context(self._bounds, progress=fit.progress)
+        background = self._scene.background.to(self._device)
+        errors = []
+        for view, flat in zip(self._views, self._pixels, strict=True):
+            prediction = self._predict(fit, view.camera, flat, ctx, background)
+            errors.append((prediction.clamp(0, 1).cpu() - view.over(self._scene.background, flat)).square().mean())
+        return -10 * math.log10(max(float(torch.stack(errors).mean()), 1e-10))
+
+    def _predict(self, fit: Fit, camera: Camera, flat: Tensor, ctx: Context, background: Tensor) -> Tensor:
+        renderer, field = fit.plan.renderer, fit.plan.field
+        if isinstance(renderer, RayRenderer):
+            pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
+            rays: Rays = camera.rays(pixels).to(self._device)
+            return torch.cat([renderer.render_rays(field, part, ctx)[0].over(background) for part in rays.chunks(4096)])
+        picture = renderer.render_image(field, camera.to(self._device), ctx)[0].over(background)
+        return picture.reshape(-1, 3)[flat.to(self._device)]
+
+
+class Recorder:
+    """Runs a fit and keeps its run folder up to date.
+
+    Args:
+        fit: what to run.
+        folder: where to write.
+        cadence: how often to write a checkpoint.
+        title: what the progress display says.
+    """
+
+    def __init__(self, fit: Fit, folder: RunFolder, cadence: Cadence, title: str) -> None:
+        self._fit, self._folder, self._cadence, self._title = fit, folder, cadence, title
+        self._monitor = Monitor(fit.plan.scene, fit.plan.device)
+        self._saved_at = (fit.steps, time.monotonic())
+        self._marks = [mark for mark in MARKS if mark > fit.progress]
+        self._asked_to_stop = False
+        self._loss = math.nan
+
+    def run(self) -> None:
+        """Fit until the budget is spent.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C or SIGTERM came; the run folder holds a checkpoint of the last whole step.
+        """
+        before = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            with Reporter(self._title) as reporter:
+                if self._fit.steps == 0:
+                    self._record()
+                self._fit.run(lambda loss: self._after_step(loss, reporter))
+            self._save()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        if self._asked_to_stop:
+            raise KeyboardInterrupt
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self._asked_to_stop = True
+
+    def _after_step(self, loss: float, reporter: Reporter) -> bool:
+        fit = self._fit
+        self._loss = loss
+        if self._marks and fit.progress >= self._marks[0]:
+            self._marks = [mark for mark in self._marks if mark > fit.progress]
+            psnr = self._record()
+            reporter.show(fit.progress, f"step {fit.steps}, {fit.seconds:.0f} s, monitor {psnr:.1f} dB")
+        else:
+            reporter.show(min(fit.progress, 0.999), f"step {fit.steps}, loss {loss:.4f}")
+        if self._due():
+            self._save()
+        return self._asked_to_stop
+
+    def _due(self) -> bool:
+        step, moment = self._saved_at
+        if self._cadence.steps is not None:
+            return self._fit.steps - step >= self._cadence.steps
+        return time.monotonic() - moment >= (self._cadence.seconds or 30.0)
+
+    def _save(self) -> None:
+        checkpoint.save(self._folder.checkpoint, self._fit.state())
+        self._folder.write_json("fit.json", {"steps": self._fit.steps, "seconds": self._fit.seconds})
+        self._saved_at = (self._fit.steps, time.monotonic())
+
+    def _record(self) -> float:
+        fit = self._fit
+        psnr = self._monitor.psnr(fit)
+        line: dict[str, object] = {"step": fit.steps, "seconds": round(fit.seconds, 4), "progress": round(fit.progress, 6)}
+        line["psnr"] = psnr
+        if math.isfinite(self._loss):
+            line["loss"] = self._loss
+        count = fit.plan.field.primitive_count()
+        if count is not None:
+            line["primitives"] = count
+        self._folder.append_history(line)
+        return psnr

@@ -1,0 +1,123 @@
+"""What a run or a comparison is asked to do: plain values, light to import, able to travel to another process as JSON."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+Existing = Literal["refuse", "resume", "reuse"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What single runs and comparisons have in common.
+
+    Attributes:
+        scene: built-in scene or path of a data set.
+        out: folder to write.
+        budget: of each fit, ``60s`` or ``5000steps``.
+        preset: preset of the recipes; ``None`` for their default.
+        overrides: ``key=value`` items laid over the recipes.
+        size: longest side in pixels, or (width, height); ``None`` for the scene's own.
+        test_views: how many test views to score; ``None`` for all.
+        device: ``cpu`` or ``cuda``; ``None`` for the CPU.
+        kernels: implementation to force; ``None`` for the best one here.
+        protocol: how to score.
+        checkpoint_every: for instance ``30s`` or ``100steps``.
+    """
+
+    scene: str
+    out: str
+    budget: str = "60s"
+    preset: str | None = None
+    overrides: tuple[str, ...] = ()
+    size: int | tuple[int, int] | None = None
+    test_views: int | None = 16
+    device: str | None = None
+    kernels: str | None = None
+    protocol: str = "default"
+    checkpoint_every: str = "30s"
+
+    def flags(self) -> list[str]:
+        """The common part of the command that reproduces this request."""
+        words = ["--budget", self.budget]
+        words += ["--preset", self.preset] if self.preset else []
+        if self.size is not None:
+            words += ["--size", str(self.size) if isinstance(self.size, int) else f"{self.size[0]}x{self.size[1]}"]
+        words += ["--test-views", "all" if self.test_views is None else str(self.test_views)]
+        words += [word for item in self.overrides for word in ("--set", item)]
+        words += ["--device", self.device] if self.device else []
+        words += ["--kernels", self.kernels] if self.kernels else []
+        words += ["--protocol", self.protocol] if self.protocol != "default" else []
+        return [*words, "--out", self.out]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitRequest(Settings):
+    """One run.
+
+    Attributes:
+        method: ``renderer/recipe`` or the path of a recipe.
+        seed: of initial values and of the fit.
+        existing: what to do with a run that is already there: ``refuse``; ``resume`` it, if it is the same; or ``reuse`` what
+            is the same and replace what is not.
+        truth: folder for truth images, shared by runs; ``None`` for ``OUT/truth``.
+    """
+
+    method: str
+    seed: int = 0
+    existing: Existing = "refuse"
+    truth: str | None = None
+
+    def shell(self) -> str:
+        """The command that makes this run."""
+        return shlex.join(["invgraphics", "fit", self.method, self.scene, "--seed", str(self.seed), *self.flags()])
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for a job file."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> FitRequest:
+        """Inverse of `to_json`; JSON knows no tuples."""
+        plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        return FitRequest(**plain)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareRequest(Settings):
+    """Several methods on one scene.
+
+    Attributes:
+        methods: in the order of the report.
+        seeds: each method is fitted once per seed.
+    """
+
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...] = (0,)
+
+    def fits(self) -> list[FitRequest]:
+        """One request per method and seed."""
+        shared: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(Settings)}
+        shared |= {"existing": "reuse", "truth": str(Path(self.out) / "truth")}
+        return [
+            FitRequest(**shared | {"method": method, "seed": seed, "out": str(self.folder(method, seed))})
+            for method in self.methods
+            for seed in self.seeds
+        ]
+
+    def folder(self, method: str, seed: int) -> Path:
+        """The run folder of one cell."""
+        return Path(self.out) / "runs" / slug(method) / f"seed-{seed}"
+
+    def shell(self) -> str:
+        """The command that makes this comparison."""
+        chosen = ["--methods", ",".join(self.methods), "--seeds", ",".join(map(str, self.seeds))]
+        return shlex.join(["invgraphics", "compare", self.scene, *chosen, *self.flags()])
+
+
+def slug(method: str) -> str:
+    """A method's name as one folder name."""
+    return method.removesuffix(".toml").strip("/").replace("/", "-")

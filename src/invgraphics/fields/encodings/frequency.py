@@ -1,0 +1,67 @@
+"""NeRF's positional encoding (Mildenhall et al. 2020, §5.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core.field import Encoding
+
+
+@dataclass(frozen=True)
+class FrequencyConfig:
+    """Sines and cosines of octaves of each coordinate.
+
+    Attributes:
+        octaves: number of frequencies L; the highest has period 2^(2 - L) of the scene's half-extent.
+        include_input: whether the coordinates themselves come first.
+    """
+
+    octaves: int = 10
+    include_input: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.octaves <= 24:
+            raise ValueError(f"octaves must be from 0 to 24 (float32 resolves no more), not {self.octaves}.")
+        if self.octaves == 0 and not self.include_input:
+            raise ValueError("with 0 octaves and include_input = false nothing is left to encode.")
+
+    def build(self) -> FrequencyEncoding:
+        """The encoding; it has no parameters."""
+        return FrequencyEncoding(self)
+
+
+class FrequencyEncoding(Encoding):
+    """Frequencies of the unit cube's coordinates, mapped to [-1, 1] first.
+
+    Attributes:
+        width: ``3 * (2 * octaves + include_input)``.
+    """
+
+    def __init__(self, config: FrequencyConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.width = frequency_width(config.octaves, config.include_input)
+
+    def forward(self, unit: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"] | None = None) -> Float[Tensor, "m f"]:
+        """Features of ``2 * unit - 1``; ``covariance`` is not used."""
+        return frequencies(2 * unit - 1, self.config.octaves, self.config.include_input)
+
+
+def frequency_width(octaves: int, include_input: bool = True) -> int:
+    """Number of features that `frequencies` makes of three coordinates."""
+    return 3 * (2 * octaves + include_input)
+
+
+def frequencies(x: Float[Tensor, "m 3"], octaves: int, include_input: bool = True) -> Float[Tensor, "m f"]:
+    """``[x, sin(2^k π x), cos(2^k π x)]`` for k = 0 .. octaves - 1 (NeRF, equation 4).
+
+    Returns:
+        The input first (if included), then all sines, then all cosines, each octave by octave and x, y, z within it.
+    """
+    scales = torch.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype)
+    phases = (x[:, None, :] * scales[:, None]).reshape(len(x), 3 * octaves)
+    return torch.cat([*([x] if include_input else []), phases.sin(), phases.cos()], dim=1)

@@ -1,0 +1,77 @@
+"""Multi-resolution hash encoding (Instant-NGP, Müller et al. 2022, §3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from invgraphics import kernels
+from invgraphics.core.field import Encoding
+from invgraphics.kernels.types import HashGrid
+
+INITIAL_RANGE = 1e-4
+"""Table entries start uniformly within +- this (Instant-NGP, §4)."""
+
+
+@dataclass(frozen=True)
+class HashConfig:
+    """A pyramid of feature grids whose finer levels share a hash table each.
+
+    Attributes:
+        levels: number of resolutions L.
+        features: features per entry F.
+        log2_size: most entries of a level T, as a power of two.
+        base: cells along an edge on the coarsest level.
+        finest: cells along an edge on the finest level.
+    """
+
+    levels: int = 16
+    features: int = 2
+    log2_size: int = 17
+    base: int = 16
+    finest: int = 2048
+
+    def __post_init__(self) -> None:
+        if self.levels < 1 or self.features < 1:
+            raise ValueError("levels and features must be at least 1.")
+        if not 1 <= self.log2_size <= 30:
+            raise ValueError(f"log2_size must be from 1 to 30, not {self.log2_size}.")
+        if not 1 <= self.base <= self.finest < 2**20:
+            raise ValueError(f"1 <= base <= finest < 2^20 must hold, not base = {self.base} and finest = {self.finest}.")
+
+    def build(self) -> HashEncoding:
+        """The encoding, its table drawn from torch's global generator."""
+        return HashEncoding(HashGrid(self.levels, self.features, self.log2_size, self.base, self.finest))
+
+
+class HashEncoding(Encoding):
+    """Trilinear look-ups on all levels.
+
+    Attributes:
+        width: levels * features.
+        table: features of all levels, one row per entry.
+    """
+
+    def __init__(self, grid: HashGrid) -> None:
+        super().__init__()
+        self.grid = grid
+        self.width = grid.levels * grid.features
+        self.table = nn.Parameter(torch.empty(grid.entries, grid.features).uniform_(-INITIAL_RANGE, INITIAL_RANGE))
+
+    def forward(self, unit: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"] | None = None) -> Float[Tensor, "m f"]:
+        """Features at ``unit``; ``covariance`` is not used.
+
+        Where a gradient with respect to ``unit`` is wanted, that gradient is itself differentiable in the table (a loss on
+        normals needs it). Its own derivative with respect to ``unit`` is taken as zero: within a cell only the mixed second
+        derivatives of a trilinear function are not zero, and the fast kernels do not offer them.
+        """
+        if not (unit.requires_grad and torch.is_grad_enabled()):
+            return kernels.hash_encode(unit, self.table, self.grid)[0]
+        fixed = unit.detach()
+        features, jacobian = kernels.hash_encode(fixed, self.table, self.grid, jacobian=True)
+        assert jacobian is not None
+        # First-order expansion about the point itself: adds zero to the value and the Jacobian to the graph.
+        return features + torch.einsum("mfa,ma->mf", jacobian, unit - fixed)

@@ -1,0 +1,240 @@
+"""Networks over an encoding of position: NeRF, Instant-NGP, and signed distance functions.
+
+A position goes through `Bounds.to_unit` and the encoding into ``geometry_net``, which says what is there (a density or a signed
+distance) and hands a feature vector to ``colour_net``, which also sees the direction. A method is a choice of settings:
+NeRF is 8 layers of 256 with a skip at 4 over 10 octaves, 256 geometry features and one colour layer of 128; Instant-NGP is one
+layer of 64 over a hash encoding, 15 geometry features, two colour layers of 64, ``exp`` density and SH directions.
+
+Densities are per local length unit, signed distances in local length units, whatever the size of the box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize, relu, softplus
+
+from invgraphics.config import Slot
+from invgraphics.core import harmonics
+from invgraphics.core.bounds import Bounds, Space
+from invgraphics.core.field import Encoding, Field, Quantity
+from invgraphics.core.samples import FieldValues, Samples
+from invgraphics.core.scene import Scene
+from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies, frequency_width
+from invgraphics.fields.mlp import Mlp, truncated_exp
+
+CPU_CHUNK = 8192
+"""Samples that go through the networks at once on a CPU: larger activations cost more in page faults than in arithmetic."""
+
+INITIAL_RADIUS = 0.5
+"""Radius of the sphere that a signed distance function starts as, in half-extents of the box (NeuS)."""
+
+_POINTWISE = {
+    "density": Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL,
+    "sdf": Quantity.SDF | Quantity.RADIANCE | Quantity.NORMAL,
+}
+
+
+@dataclass(frozen=True)
+class NeuralFieldConfig:
+    """An encoding and two networks.
+
+    Attributes:
+        encoding: position to features.
+        geometry: what the first network says: volume density, or signed distance (started as a sphere).
+        layers: hidden layers of the geometry network.
+        width: features of each.
+        skip: hidden layer after which the encoding is concatenated once more, counted from 0; -1 for none.
+        geometry_features: features that the geometry network hands to the colour network.
+        colour_layers: hidden layers of the colour network.
+        colour_width: features of each.
+        direction: how the colour network sees the viewing direction; ``none`` makes colour independent of it.
+        direction_degree: octaves for ``frequency``; bands for ``sh``, 1 to 4.
+        density_activation: ``exp`` stops growing at exp(15); not used for ``sdf``.
+        density_bias: added before that activation (mip-NeRF: softplus and -1).
+    """
+
+    encoding: Annotated[Any, Slot("encodings")] = field(default_factory=FrequencyConfig)
+    geometry: Literal["density", "sdf"] = "density"
+    layers: int = 8
+    width: int = 256
+    skip: int = 4
+    geometry_features: int = 256
+    colour_layers: int = 1
+    colour_width: int = 128
+    direction: Literal["frequency", "sh", "none"] = "frequency"
+    direction_degree: int = 4
+    density_activation: Literal["softplus", "exp", "relu"] = "softplus"
+    density_bias: float = -1.0
+
+    def __post_init__(self) -> None:
+        if self.layers < 0 or self.colour_layers < 0:
+            raise ValueError("layers and colour_layers cannot be negative.")
+        if min(self.width, self.colour_width) < 1 or self.geometry_features < 0:
+            raise ValueError("width and colour_width must be at least 1, geometry_features at least 0.")
+        if not -1 <= self.skip < self.layers:
+            raise ValueError(f"skip must name one of the {self.layers} hidden layers (from 0) or be -1, not {self.skip}.")
+        if self.direction == "sh" and not 1 <= self.direction_degree <= harmonics.MAX_DEGREE + 1:
+            raise ValueError(f"direction_degree must be 1 to {harmonics.MAX_DEGREE + 1} for 'sh', not {self.direction_degree}.")
+        if self.direction_degree < 0:
+            raise ValueError("direction_degree cannot be negative.")
+        if self.geometry_features == 0 and self.direction == "none":
+            raise ValueError("with geometry_features = 0 and direction = 'none' colour would be the same everywhere.")
+
+    @property
+    def direction_width(self) -> int:
+        """Number of features of a direction."""
+        widths = {"frequency": frequency_width(self.direction_degree), "sh": self.direction_degree**2, "none": 0}
+        return widths[self.direction]
+
+    def build(self, scene: Scene) -> NeuralField:
+        """The field of ``scene``'s region and colour space, its weights drawn from torch's global generator."""
+        return NeuralField(self, scene.bounds, scene.colour)
+
+
+@dataclass(frozen=True, eq=False)
+class _Answers:
+    """What the networks say about one chunk: the geometry network's output, its slope in the encoding, the colour."""
+
+    raw: Float[Tensor, " m"]
+    radiance: Float[Tensor, "m 3"] | None
+    slope: Float[Tensor, "m f"] | None
+
+
+class NeuralField(Field):
+    """Density or signed distance, radiance and normal by two networks over an encoding.
+
+    Args:
+        config: sizes and kinds.
+        bounds: the region; density is zero outside it.
+        colour: radiance is in [0, 1] for ``srgb``, in [0, inf) for ``linear``.
+    """
+
+    lo: Tensor
+    hi: Tensor
+
+    def __init__(self, config: NeuralFieldConfig, bounds: Bounds, colour: Literal["srgb", "linear"] = "srgb") -> None:
+        super().__init__()
+        self.config = config
+        self.provides = _POINTWISE[config.geometry]
+        self.colour = colour
+        self._space: Space = bounds.space
+        self._near = bounds.near
+        self.register_buffer("lo", bounds.lo.clone())
+        self.register_buffer("hi", bounds.hi.clone())
+        self.encoding: Encoding = config.encoding.build()
+        signed = config.geometry == "sdf"
+        self.geometry_net = Mlp(
+            # A distance function also sees the plain coordinates, which its start as a sphere is made of.
+            inputs=self.encoding.width + (3 if signed else 0),
+            layers=config.layers,
+            width=config.width,
+            outputs=1 + config.geometry_features,
+            skip=config.skip,
+            smooth=signed,
+        )
+        self.colour_net = Mlp(
+            inputs=config.geometry_features + config.direction_width,
+            layers=config.colour_layers,
+            width=config.colour_width,
+            outputs=3,
+            smooth=signed,
+        )
+        if signed:
+            self.geometry_net.initialise_as_sphere(INITIAL_RADIUS / self._reach)
+
+    @property
+    def bounds(self) -> Bounds:
+        """The region this field describes."""
+        return Bounds(self.lo, self.hi, self._space, self._near)
+
+    @property
+    def _reach(self) -> float:
+        """Half-extents of the box that the unit cube's half-edge spans."""
+        return 2.0 if self._space == "contracted" else 1.0
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        """See `Field.query`.
+
+        Normals are the normalised gradient: of the signed distance, or of minus the density (taken before its activation,
+        which is monotone, so that they are defined where the density saturates). They can be had inside ``no_grad``.
+        """
+        training = torch.is_grad_enabled()
+        with_normal = Quantity.NORMAL in want
+        with torch.set_grad_enabled(training or with_normal):
+            position = samples.position
+            if with_normal and not (training and position.requires_grad):
+                position = position.detach().requires_grad_()
+            features = self._encode(samples, position)
+            parts = [self._answer(*chunk, want, training) for chunk in self._chunks(features, samples.direction)]
+            raw = torch.cat([part.raw for part in parts])
+            normal = None
+            if with_normal:
+                slope = torch.cat([part.slope for part in parts if part.slope is not None])
+                (gradient,) = torch.autograd.grad(features, position, slope, create_graph=training)
+                normal = normalize(gradient if self.config.geometry == "sdf" else -gradient, dim=1)
+        radiances = [part.radiance for part in parts if part.radiance is not None]
+        return FieldValues(
+            density=self._density(raw, samples.position) if Quantity.DENSITY in want else None,
+            sdf=raw * self._reach * self.bounds.half.mean() if Quantity.SDF in want else None,
+            radiance=torch.cat(radiances) if Quantity.RADIANCE in want else None,
+            normal=normal,
+        )
+
+    def _encode(self, samples: Samples, position: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
+        unit = self.bounds.to_unit(position)
+        covariance = None
+        if self.encoding.needs_covariance:
+            covariance = unit_covariance(self.bounds, position, samples.covariance)
+        features = self.encoding(unit, covariance)
+        return torch.cat([2 * unit - 1, features], dim=1) if self.config.geometry == "sdf" else features
+
+    def _chunks(self, features: Tensor, direction: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        size = CPU_CHUNK if features.device.type == "cpu" else max(len(features), 1)
+        return zip(features.split(size), direction.split(size), strict=True)
+
+    def _answer(self, features: Tensor, direction: Tensor, want: Quantity, training: bool) -> _Answers:
+        """Both networks on one chunk. Its graph is dropped at once unless ``training``."""
+        with_colour = Quantity.RADIANCE in want
+        if Quantity.NORMAL in want and not training:
+            # Starting the chunk's graph here keeps it from growing over all chunks.
+            features = features.detach().requires_grad_()
+        outputs = self.geometry_net(features, None if with_colour else 1)
+        raw, slope = outputs[:, 0], None
+        if Quantity.NORMAL in want:
+            (slope,) = torch.autograd.grad(raw.sum(), features, create_graph=training)
+        if not training:
+            raw, outputs = raw.detach(), outputs.detach()
+        with torch.set_grad_enabled(training):
+            return _Answers(raw, self._radiance(outputs[:, 1:], direction) if with_colour else None, slope)
+
+    def _radiance(self, geometry: Tensor, direction: Tensor) -> Float[Tensor, "m 3"]:
+        degree = self.config.direction_degree
+        if self.config.direction == "frequency":
+            geometry = torch.cat([geometry, frequencies(direction, degree)], dim=1)
+        elif self.config.direction == "sh":
+            geometry = torch.cat([geometry, harmonics.basis(direction, degree - 1)], dim=1)
+        raw = self.colour_net(geometry)
+        return raw.sigmoid() if self.colour == "srgb" else softplus(raw)
+
+    def _density(self, raw: Float[Tensor, " m"], position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
+        activation = {"softplus": softplus, "exp": truncated_exp, "relu": relu}[self.config.density_activation]
+        density = activation(raw + self.config.density_bias)
+        return torch.where(self.bounds.contains(position), density, torch.zeros_like(density))
+
+
+def unit_covariance(
+    bounds: Bounds, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]
+) -> Float[Tensor, "m 3 3"]:
+    """Covariances carried to the unit cube by the linearised map J Σ J^T (mip-NeRF 360, equation 9)."""
+    columns = [
+        torch.func.jvp(bounds.to_unit, (position,), (axis.expand_as(position),))[1]
+        for axis in torch.eye(3, dtype=position.dtype, device=position.device)
+    ]
+    jacobian = torch.stack(columns, dim=-1)
+    return jacobian @ covariance @ jacobian.mT

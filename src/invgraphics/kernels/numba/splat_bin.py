@@ -1,0 +1,250 @@
+"""Depth sort and tile lists of footprints."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, scratch, serial, share, threads
+from invgraphics.kernels.types import ALPHA_MIN, Bins, Footprints
+
+RADIX_BITS = 11
+RADIX_PASSES = 3
+
+# A packed row: what rasterising a footprint needs, followed by its features.
+MEAN_X, MEAN_Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, WIDEST, HIGHEST, SHEAR, ASPECT, FEATURES = range(11)
+
+SLACK = np.float32(0.01)
+"""Pixels by which ellipses are widened when blocks are chosen, so that rounding never loses a visible pixel."""
+LARGEST = 1e9
+"""Coordinates and extents beyond this, in pixels, are taken for numerical failures and skipped."""
+SMALLEST = 1e-18
+"""Entries of conics below this belong to footprints wider than ``LARGEST``."""
+
+
+class Packed(NamedTuple):
+    """m visible footprints front to back, and the tiles they touch.
+
+    Attributes:
+        order: index of each in the caller's arrays (m,).
+        rows: their packed rows (m, FEATURES + c).
+        entries: positions in ``order``, tile after tile, front to back.
+        starts: first entry of each tile, and the total at the end.
+    """
+
+    order: np.ndarray
+    rows: np.ndarray
+    entries: np.ndarray
+    starts: np.ndarray
+
+
+@serial
+def _sort_by_depth(depths, radii, keys, order, keys_other, order_other):
+    """Indices of the footprints with a radius, by depth, ties by index (radix sort of the float's bits); returns their number."""
+    m = 0
+    buckets = 1 << RADIX_BITS
+    mask = np.uint32(buckets - 1)
+    counts = np.zeros((RADIX_PASSES, buckets), np.int64)
+    for i in range(len(depths)):
+        if radii[i] > 0:
+            bits = np.float32(depths[i]).view(np.uint32)
+            # Order of the floats as order of unsigned integers: negative ones count backwards.
+            key = bits ^ np.uint32(0xFFFFFFFF) if bits >> np.uint32(31) else bits ^ np.uint32(0x80000000)
+            keys[m] = key
+            order[m] = i
+            for p in range(RADIX_PASSES):
+                counts[p, (key >> np.uint32(p * RADIX_BITS)) & mask] += 1
+            m += 1
+    for p in range(RADIX_PASSES):
+        total = 0
+        for bucket in range(buckets):
+            count = counts[p, bucket]
+            counts[p, bucket] = total
+            total += count
+        for i in range(m):
+            bucket = (keys[i] >> np.uint32(p * RADIX_BITS)) & mask
+            to = counts[p, bucket]
+            counts[p, bucket] = to + 1
+            keys_other[to] = keys[i]
+            order_other[to] = order[i]
+        keys, keys_other = keys_other, keys
+        order, order_other = order_other, order
+    return m
+
+
+def depth_order(footprints: Footprints) -> np.ndarray:
+    """Indices of the footprints that are not culled, front to back, ties by index; valid until the next call."""
+    n = len(footprints)
+    keys, keys_other = scratch("sort keys", n, np.uint32), scratch("sort keys 2", n, np.uint32)
+    order, order_other = scratch("sort order", n, np.int32), scratch("sort order 2", n, np.int32)
+    m = _sort_by_depth(array(footprints.depths), array(footprints.radii), keys, order, keys_other, order_other)
+    return (order_other if RADIX_PASSES % 2 else order)[:m]
+
+
+@inlined
+def _tiles(low, high, tile, count):
+    """Tiles that the closed interval of pixel coordinates touches, clipped to ``count``; empty if first > last."""
+    first = min(max(np.floor(low / tile), np.float32(0.0)), np.float32(count))
+    last = max(min(np.floor(high / tile), np.float32(count - 1)), np.float32(-1.0))
+    return np.int32(first), np.int32(last)
+
+
+@inlined
+def half_span(row, r, y):
+    """Half the ellipse's width at height ``y`` over its centre, and the offset of that chord's middle."""
+    return row[r, ASPECT] * np.sqrt(max(row[r, HIGHEST] * row[r, HIGHEST] - y * y, np.float32(0.0))), row[r, SHEAR] * y
+
+
+@inlined
+def _drawable(x, y, xx, yy, det):
+    """Whether a footprint is finite and a proper ellipse; written so that NaN says no."""
+    inside = abs(x) < LARGEST and abs(y) < LARGEST
+    regular = xx > SMALLEST and yy > SMALLEST and max(xx, yy) < LARGEST * max(det, 0.0) * LARGEST
+    return inside and regular and max(xx, yy) < 1 / SMALLEST
+
+
+@parallel
+def _pack(order, means, conics, opacities, features, rows, jobs):
+    """Gather footprints front to back; those that cannot be drawn get an ellipse of negative height."""
+    for job in nb.prange(jobs):
+        for r in range(share(len(order), jobs, job), share(len(order), jobs, job + 1)):
+            i = index(order[r])
+            a, b, c, opacity = conics[i, 0], conics[i, 1], conics[i, 2], opacities[i]
+            rows[r, MEAN_X], rows[r, MEAN_Y] = means[i, 0], means[i, 1]
+            rows[r, CONIC_XX], rows[r, CONIC_XY], rows[r, CONIC_YY], rows[r, OPACITY] = a, b, c, opacity
+            rows[r, HIGHEST] = np.float32(-1.0)
+            # In float64: a c - b² cancels for thin footprints.
+            det = np.float64(a) * np.float64(c) - np.float64(b) * np.float64(b)
+            if _drawable(means[i, 0], means[i, 1], a, c, det) and opacity >= np.float32(ALPHA_MIN):
+                # The visible ellipse is a x² + 2 b x y + c y² = reach, around the mean; its rightmost point lies at y = WIDEST.
+                reach = 2.0 * np.log(max(np.float64(opacity) / ALPHA_MIN, 1.0))
+                rows[r, WIDEST] = -b * np.sqrt(reach / (det * c))
+                rows[r, HIGHEST] = np.sqrt(a * reach / det) * 1.00001 + SLACK
+                rows[r, SHEAR] = -b / a
+                rows[r, ASPECT] = np.sqrt(det) / a
+            rows[r, FEATURES:] = np.float32(0.0)
+            for k in range(features.shape[1]):
+                rows[r, FEATURES + k] = features[i, k]
+
+
+@inlined
+def chord(rows, r, low, high):
+    """Leftmost and rightmost point, relative to the centre, of the ellipse between two heights over its centre."""
+    right, left = min(max(rows[r, WIDEST], low), high), min(max(-rows[r, WIDEST], low), high)
+    width_right, middle_right = half_span(rows, r, right)
+    width_left, middle_left = half_span(rows, r, left)
+    return middle_left - width_left - SLACK, middle_right + width_right + SLACK
+
+
+@inlined
+def _tile_rows(rows, r, tile, count):
+    # A tile's pixel centres begin and end half a pixel inside it.
+    half = np.float32(0.5)
+    return _tiles(rows[r, MEAN_Y] - rows[r, HIGHEST] + half, rows[r, MEAN_Y] + rows[r, HIGHEST] - half, tile, count)
+
+
+@inlined
+def _tile_columns(rows, r, y, tile, count):
+    """Tiles of tile row ``y`` that the ellipse touches (between the first and the last pixel centre)."""
+    low = y * tile + np.float32(0.5) - rows[r, MEAN_Y]
+    left, right = chord(rows, r, low, low + tile - np.float32(1.0))
+    x, half = rows[r, MEAN_X], np.float32(0.5)
+    return _tiles(x + left + half, x + right - half, tile, count)
+
+
+@parallel
+def _count(rows, tile, columns, lines, counts):
+    """Per job, how many of its footprints touch each tile."""
+    jobs, m = counts.shape[0], rows.shape[0]
+    edge = np.float32(tile)
+    for job in nb.prange(jobs):
+        counts[job, :] = 0
+        for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
+            if rows[r, HIGHEST] > 0:
+                top, bottom = _tile_rows(rows, r, edge, lines)
+                for y in range(top, bottom + 1):
+                    first, last = _tile_columns(rows, r, np.float32(y), edge, columns)
+                    for x in range(first, last + 1):
+                        counts[job, index(y * columns + x)] += 1
+
+
+@serial
+def _running_totals(counts, starts):
+    """Turn counts into places: tile after tile, within a tile job after job."""
+    total = 0
+    for t in range(counts.shape[1]):
+        starts[t] = total
+        for job in range(counts.shape[0]):
+            count = counts[job, t]
+            counts[job, t] = total
+            total += count
+    starts[counts.shape[1]] = total
+    return total
+
+
+@parallel
+def _list(rows, tile, columns, lines, places, entries):
+    """Write each footprint to the tiles it touches; ``places`` says where each job's next entry of a tile goes."""
+    jobs, m = places.shape[0], rows.shape[0]
+    edge = np.float32(tile)
+    for job in nb.prange(jobs):
+        for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
+            if rows[r, HIGHEST] > 0:
+                top, bottom = _tile_rows(rows, r, edge, lines)
+                for y in range(top, bottom + 1):
+                    first, last = _tile_columns(rows, r, np.float32(y), edge, columns)
+                    for x in range(first, last + 1):
+                        place = places[job, index(y * columns + x)]
+                        places[job, index(y * columns + x)] = place + 1
+                        entries[index(place)] = r
+
+
+def pack(footprints: Footprints, features: Float[Tensor, "n c"], columns: int, lines: int, tile: int) -> Packed:
+    """Sort visible footprints by depth and list, per tile, those whose visible ellipse touches it."""
+    jobs = threads()
+    order = depth_order(footprints).copy()
+    # Features are handled three at a time.
+    rows = np.empty((len(order), FEATURES + 3 * -(-features.shape[1] // 3)), np.float32)
+    means, conics, opacities = array(footprints.means2d), array(footprints.conics), array(footprints.opacities)
+    _pack(order, means, conics, opacities, array(features), rows, jobs)
+    counts = scratch("tile counts", jobs * columns * lines, np.int64).reshape(jobs, columns * lines)
+    starts = np.empty(columns * lines + 1, np.int64)
+    _count(rows, tile, columns, lines, counts)
+    entries = np.empty(_running_totals(counts, starts), np.int32)
+    _list(rows, tile, columns, lines, counts, entries)
+    return Packed(order, rows, entries, starts)
+
+
+@serial
+def _squares(order, means, radii, tile, columns, lines, places, entries):
+    """Count (``entries`` empty) or list the tiles each footprint's square touches, front to back."""
+    edge = np.float32(tile)
+    for r in range(len(order)):
+        i = order[r]
+        x, y, radius = means[i, 0], means[i, 1], radii[i]
+        if abs(x) < LARGEST and abs(y) < LARGEST and radius < LARGEST:
+            left, right = _tiles(x - radius, x + radius, edge, columns)
+            top, bottom = _tiles(y - radius, y + radius, edge, lines)
+            for line in range(top, bottom + 1):
+                for column in range(left, right + 1):
+                    t = line * columns + column
+                    if len(entries):
+                        entries[places[0, t]] = i
+                    places[0, t] += 1
+
+
+def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bins:
+    """See `invgraphics.kernels.splat_bin`."""
+    columns, lines = -(-width // tile), -(-height // tile)
+    order, means, radii = depth_order(footprints), array(footprints.means2d), array(footprints.radii)
+    places, starts = np.zeros((1, columns * lines), np.int64), np.empty(columns * lines + 1, np.int64)
+    _squares(order, means, radii, tile, columns, lines, places, np.empty(0, np.int64))
+    entries = np.empty(_running_totals(places, starts), np.int64)
+    if len(entries):
+        _squares(order, means, radii, tile, columns, lines, places, entries)
+    return Bins(torch.from_numpy(entries), torch.from_numpy(starts), tile, columns, lines)

@@ -1,0 +1,188 @@
+"""Front-to-back compositing of footprints, forward.
+
+Tiles are walked in blocks of 4 x 4 pixels, whose 16 lanes fill one or two vector registers. A tile's state lies in one flat
+scratch array, block after block, so that it stays in the L1 cache.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel
+from invgraphics.kernels.numba.splat_bin import (
+    CONIC_XX,
+    CONIC_XY,
+    CONIC_YY,
+    FEATURES,
+    HIGHEST,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    chord,
+)
+from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+
+BLOCK = 4
+"""Edge of a block in pixels."""
+LANES = index(BLOCK * BLOCK)
+HALF_LOG2E = np.float32(-0.5 / np.log(2.0))
+"""Turns exp(-q / 2) into 2^(HALF_LOG2E q)."""
+
+_ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
+_STOP = np.float32(TRANSMITTANCE_MIN)
+_ONE, _ZERO = np.float32(1.0), np.float32(0.0)
+
+
+@inlined
+def block_rows(rows, r, y0, edge):
+    """First and last row of blocks, in the tile whose first pixel row is ``y0``, that the ellipse touches."""
+    top = (rows[r, MEAN_Y] - rows[r, HIGHEST] - y0 - np.float32(BLOCK - 0.5)) / np.float32(BLOCK)
+    bottom = (rows[r, MEAN_Y] + rows[r, HIGHEST] - y0 - np.float32(0.5)) / np.float32(BLOCK)
+    first = np.int32(np.ceil(min(max(top, _ZERO), np.float32(edge))))
+    last = np.int32(np.floor(max(min(bottom, np.float32(edge - 1)), -_ONE)))
+    return first, last
+
+
+@inlined
+def block_columns(rows, r, x0, y0, j, edge):
+    """First and last block of block row ``j`` that the ellipse touches."""
+    low = y0 + np.float32(j * BLOCK) + np.float32(0.5) - rows[r, MEAN_Y]
+    left, right = chord(rows, r, low, low + np.float32(BLOCK - 1))
+    offset = rows[r, MEAN_X] - x0
+    first = (offset + left - np.float32(BLOCK - 0.5)) / np.float32(BLOCK)
+    last = (offset + right - np.float32(0.5)) / np.float32(BLOCK)
+    first = np.int32(np.ceil(min(max(first, _ZERO), np.float32(edge))))
+    last = np.int32(np.floor(max(min(last, np.float32(edge - 1)), -_ONE)))
+    return first, last
+
+
+@inlined
+def open_tile(state, alive, x0, y0, edge, width, height, stride):
+    """Full transmittance on every pixel of the image, and none (-1 marks a finished pixel) outside; returns live blocks."""
+    live = 0
+    for j in range(edge):
+        for i in range(edge):
+            block = index(j * edge + i)
+            inside = x0 + i * BLOCK < width and y0 + j * BLOCK < height
+            alive[block] = inside
+            live += inside
+            state[block * stride : (block + index(1)) * stride] = _ZERO
+            for lane in range(BLOCK * BLOCK):
+                x, y = x0 + i * BLOCK + lane % BLOCK, y0 + j * BLOCK + lane // BLOCK
+                state[block * stride + index(lane)] = _ONE if x < width and y < height else -_ONE
+    return live
+
+
+@inlined
+def _blend(state, base, rows, r, dx0, dy0, triples):
+    """Composite one footprint onto one block; returns how many of its pixels are unfinished (as a float: it vectorises)."""
+    xx = rows[r, CONIC_XX] * HALF_LOG2E
+    xy = rows[r, CONIC_XY] * (HALF_LOG2E + HALF_LOG2E)
+    yy = rows[r, CONIC_YY] * HALF_LOG2E
+    opacity = rows[r, OPACITY]
+    red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
+    unfinished = _ZERO
+    for lane in range(LANES):
+        dx = dx0 + np.float32(lane & index(3))
+        dy = dy0 + np.float32(lane >> index(2))
+        alpha = min(opacity * exp2(xx * dx * dx + xy * dx * dy + yy * dy * dy), _ALPHA_MAX)
+        alpha = alpha if alpha >= _ALPHA_MIN else _ZERO
+        transmittance = state[base + lane]
+        weight = transmittance * alpha
+        after = transmittance - weight
+        # Finished pixels carry their final transmittance with a minus sign, so they stay below the limit.
+        goes_on = after >= _STOP
+        weight = weight if goes_on else _ZERO
+        state[base + lane] = after if goes_on else -abs(transmittance)
+        state[base + LANES + lane] = weight
+        state[base + index(2) * LANES + lane] += weight * red
+        state[base + index(3) * LANES + lane] += weight * green
+        state[base + index(4) * LANES + lane] += weight * blue
+        unfinished += _ONE if goes_on else _ZERO
+    for k in range(1, triples):
+        _blend_more(state, base, index(2 + 3 * k) * LANES, rows, r, index(FEATURES + 3 * k))
+    return unfinished
+
+
+@inlined
+def _blend_more(state, base, to, rows, r, k):
+    """Add three further channels with the weights that `_blend` left behind."""
+    first, second, third = rows[r, k], rows[r, k + index(1)], rows[r, k + index(2)]
+    for lane in range(LANES):
+        weight = state[base + LANES + lane]
+        state[base + to + lane] += weight * first
+        state[base + to + LANES + lane] += weight * second
+        state[base + to + LANES + LANES + lane] += weight * third
+
+
+@inlined
+def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, ends, live):
+    """Walk a tile's footprints front to back until all its pixels are finished; returns the number of blocks visited."""
+    stride = LANES * index(2 + 3 * triples)
+    half = np.float32(0.5)
+    ox, oy = np.float32(x0), np.float32(y0)
+    visits = 0
+    for entry in range(first, last):
+        r = index(entries[index(entry)])
+        top, bottom = block_rows(rows, r, oy, edge)
+        for j in range(top, bottom + 1):
+            left, right = block_columns(rows, r, ox, oy, j, edge)
+            for i in range(left, right + 1):
+                block = index(j * edge + i)
+                if alive[block]:
+                    visits += 1
+                    dx = ox + np.float32(i * BLOCK) + half - rows[r, MEAN_X]
+                    dy = oy + np.float32(j * BLOCK) + half - rows[r, MEAN_Y]
+                    if _blend(state, block * stride, rows, r, dx, dy, triples) == 0:
+                        alive[block] = False
+                        ends[block] = entry + 1
+                        live -= 1
+        if live == 0:
+            break
+    return visits
+
+
+@inlined
+def _write_tile(state, x0, y0, edge, stride, image, alpha):
+    """Copy a tile's sums into the picture."""
+    height, width, channels = image.shape
+    for y in range(y0, min(y0 + edge * BLOCK, height)):
+        for x in range(x0, min(x0 + edge * BLOCK, width)):
+            block = index((y - y0) // BLOCK * edge + (x - x0) // BLOCK)
+            lane = index((y - y0) % BLOCK * BLOCK + (x - x0) % BLOCK)
+            at = block * stride + lane
+            alpha[index(y), index(x)] = _ONE - abs(state[at])
+            for k in range(channels):
+                image[index(y), index(x), index(k)] = state[at + index(2 + k) * LANES]
+
+
+@parallel
+def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, ends, work):
+    """Composite every tile.
+
+    Args:
+        rows: packed footprints, front to back.
+        entries: positions in ``rows``, tile after tile.
+        starts: first entry of each tile.
+        bounds: first tile of each job, and the number of tiles at the end.
+        edge: blocks along a tile's edge.
+        columns: tiles per row.
+        image: output, sums of w * features (h, w, c).
+        alpha: output, sums of w (h, w).
+        ends: output, per tile and block, the entry at which all its pixels were finished.
+        work: output, blocks visited per tile.
+    """
+    height, width = alpha.shape
+    triples = (rows.shape[1] - FEATURES) // 3
+    stride = LANES * index(2 + 3 * triples)
+    for job in nb.prange(len(bounds) - 1):
+        state = np.empty(index(edge * edge) * stride, np.float32)
+        alive = np.empty(edge * edge, np.bool_)
+        for tile in range(bounds[job], bounds[job + 1]):
+            x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
+            live = open_tile(state, alive, x0, y0, edge, width, height, stride)
+            first, last = starts[tile], starts[tile + 1]
+            ends[tile, :] = last
+            work[tile] = _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, ends[tile], live)
+            _write_tile(state, x0, y0, edge, stride, image, alpha)

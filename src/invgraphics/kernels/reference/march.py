@@ -1,0 +1,70 @@
+"""Walking along rays through an occupancy grid."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.rays import Rays
+from invgraphics.kernels.types import March, MarchSteps
+
+BLOCK = 64
+"""Steps that are tested at once, which bounds memory to rays x BLOCK positions."""
+
+
+@torch.no_grad()
+def ray_march(
+    rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps, start: Float[Tensor, " n"]
+) -> March:
+    """See `invgraphics.kernels.ray_march`.
+
+    The walk visits t, t + dt, t + 2 dt, ... from ``start`` with ``dt = max(step, cone * t)``; the last interval is cut at
+    ``far``, which must be finite. ``resume`` is the end of the last interval looked at.
+    """
+    resume, room = start.clone(), torch.full_like(start, steps.limit, dtype=torch.int64)
+    kept: list[tuple[Tensor, Tensor, Tensor]] = []
+    walking = torch.nonzero((start < rays.far) & (room > 0))[:, 0]
+    while len(walking):
+        edges = _edges(resume[walking], rays.far[walking], steps)
+        t0, t1 = edges[:, :-1], edges[:, 1:]
+        unit = bounds.to_unit(rays[walking].at((t0 + t1) / 2))
+        keep = (t1 > t0) & _look_up(occupied, unit)
+        # A ray that has kept all it may stops where its last kept interval ends.
+        keep &= keep.cumsum(dim=1) <= room[walking, None]
+        row, column = torch.nonzero(keep, as_tuple=True)
+        kept.append((walking[row], t0[row, column], t1[row, column]))
+
+        room[walking] -= keep.sum(dim=1)
+        last = (keep * torch.arange(1, BLOCK + 1, device=keep.device)).amax(dim=1, keepdim=True)
+        resume[walking] = torch.where(room[walking] > 0, edges[:, -1], edges.gather(1, last)[:, 0])
+        walking = walking[(resume[walking] < rays.far[walking]) & (room[walking] > 0)]
+    return _packed(kept, resume)
+
+
+def _edges(t: Float[Tensor, " k"], far: Float[Tensor, " k"], steps: MarchSteps) -> Float[Tensor, "k edges"]:
+    """The next BLOCK + 1 interval ends of each ray; those beyond ``far`` fall onto it."""
+    edges = [t]
+    for _ in range(BLOCK):
+        t = t + (steps.cone * t).clamp_min(steps.step)
+        edges.append(torch.minimum(t, far))
+    return torch.stack(edges, dim=1)
+
+
+def _look_up(occupied: Bool[Tensor, "r r r"], unit: Float[Tensor, "k b 3"]) -> Bool[Tensor, "k b"]:
+    """Whether positions lie in an occupied cell; outside the cube nothing is occupied."""
+    resolution = occupied.shape[0]
+    inside = ((unit >= 0) & (unit <= 1)).all(dim=-1)
+    x, y, z = (unit * resolution).long().clamp(0, resolution - 1).unbind(dim=-1)
+    return inside & occupied[x, y, z]
+
+
+def _packed(kept: list[tuple[Tensor, Tensor, Tensor]], resume: Float[Tensor, " n"]) -> March:
+    """Join the blocks' samples, sorted by ray; a stable sort leaves each ray's samples in order of distance."""
+    if not kept:
+        none = resume.new_zeros(0)
+        return March(torch.zeros(0, dtype=torch.int64, device=resume.device), none, none, resume)
+    ray, t0, t1 = (torch.cat(parts) for parts in zip(*kept, strict=True))
+    order = torch.argsort(ray, stable=True)
+    return March(ray[order], t0[order], t1[order], resume)

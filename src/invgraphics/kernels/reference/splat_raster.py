@@ -1,0 +1,88 @@
+"""Tile-based front-to-back compositing of footprints."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Bins, Footprints
+
+TILE = 16
+"""Edge of a tile in pixels (3DGS)."""
+EDGE_ON = 1e-6
+"""Smallest denominator of a disc's homography: rays parallel to the disc see nothing of it."""
+
+
+@torch.no_grad()
+def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bins:
+    """See `invgraphics.kernels.splat_bin`."""
+    columns, rows = -(-width // tile), -(-height // tile)
+    order = torch.argsort(footprints.depths, stable=True)
+    splats = order[footprints.radii[order] > 0]
+
+    last = splats.new_tensor([columns - 1, rows - 1])
+    centre, radius = footprints.means2d[splats], footprints.radii[splats, None]
+    low = torch.minimum(((centre - radius) / tile).floor().long().clamp_min(0), last + 1)
+    high = torch.minimum(((centre + radius) / tile).floor().long(), last)
+    spans = (high - low + 1).clamp_min(0)
+
+    # One entry per splat and tile it touches, splats front to back; `nth` counts a splat's tiles row by row.
+    touched = spans.prod(dim=1)
+    entry = torch.repeat_interleave(torch.arange(len(splats), device=splats.device), touched)
+    nth = torch.arange(len(entry), device=splats.device) - (touched.cumsum(0) - touched)[entry]
+    x, y = low[entry, 0] + nth % spans[entry, 0], low[entry, 1] + nth // spans[entry, 0]
+    tile_of = y * columns + x
+
+    # Stable: within a tile the order by depth survives.
+    by_tile = torch.argsort(tile_of, stable=True)
+    counts = torch.bincount(tile_of, minlength=columns * rows)
+    starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    return Bins(splats[entry[by_tile]], starts, tile, columns, rows)
+
+
+def splat_rasterise(
+    footprints: Footprints, features: Float[Tensor, "n c"], width: int, height: int, tile: int | None = None
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """See `invgraphics.kernels.splat_rasterise`."""
+    bins = splat_bin(footprints, width, height, tile or TILE)
+    starts = bins.starts.tolist()
+    # Alpha is one more feature, the sum of w * 1.
+    columns = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
+    rows_of_tiles = []
+    for row in range(bins.rows):
+        y = torch.arange(row * bins.tile, min((row + 1) * bins.tile, height))
+        tiles = []
+        for column in range(bins.columns):
+            x = torch.arange(column * bins.tile, min((column + 1) * bins.tile, width))
+            index = row * bins.columns + column
+            splats = bins.splats[starts[index] : starts[index + 1]]
+            pixels = torch.cartesian_prod(y, x).flip(dims=(1,)).to(footprints.means2d) + 0.5
+            tiles.append(_composite(_responses(footprints, splats, pixels), columns[splats]).reshape(len(y), len(x), -1))
+        rows_of_tiles.append(torch.cat(tiles, dim=1))
+    image = torch.cat(rows_of_tiles)
+    return image[..., :-1], image[..., -1]
+
+
+def _responses(footprints: Footprints, splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p k"]:
+    """``opacity * exp(-q / 2)`` of each splat at each pixel centre."""
+    if footprints.homography is None:
+        dx, dy = (pixels[:, None] - footprints.means2d[splats]).unbind(dim=2)
+        xx, xy, yy = footprints.conics[splats].unbind(dim=1)
+        q = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
+    else:
+        homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
+        a, b, c = torch.einsum("kij,pj->ipk", footprints.homography[splats], homogeneous)
+        c = torch.where(c.abs() < EDGE_ON, EDGE_ON, c)
+        q = (a * a + b * b) / (c * c)
+    return footprints.opacities[splats] * torch.exp(-0.5 * q)
+
+
+def _composite(responses: Float[Tensor, "p k"], features: Float[Tensor, "k c"]) -> Float[Tensor, "p c"]:
+    """Blend splats front to back: sum over i of T_i alpha_i f_i, T_i = product over j < i of (1 - alpha_j)."""
+    alpha = torch.where(responses < ALPHA_MIN, 0.0, responses.clamp_max(ALPHA_MAX))
+    after = torch.cumprod(1 - alpha, dim=1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
+    # The transmittance never grows again, so once it would fall too low all later splats are left out as well.
+    weights = torch.where(after < TRANSMITTANCE_MIN, 0.0, alpha * before)
+    return weights @ features

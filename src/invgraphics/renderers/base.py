@@ -1,0 +1,40 @@
+"""What every renderer does with the sums of a pixel."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from invgraphics.core import Rendering
+
+SEEN = 0.5
+"""A pixel with less alpha than this has no depth and no normal (CONVENTIONS.md)."""
+
+
+def picture(
+    rgb: Float[Tensor, "*p 3"],
+    alpha: Float[Tensor, "*p"],
+    distance: Float[Tensor, "*p"],
+    normal: Float[Tensor, "*p 3"] | None,
+    far: Float[Tensor, "*p"],
+    directions: Float[Tensor, "*p 3"],
+) -> Rendering:
+    """Turn weighted sums into a picture.
+
+    Args:
+        rgb: sum of w * radiance.
+        alpha: sum of w.
+        distance: sum of w * t.
+        normal: sum of w * normal, if wanted.
+        far: depth of pixels that see nothing.
+        directions: unit ray directions, which tell a normal's front from its back.
+    """
+    seen = alpha >= SEEN
+    depth = torch.where(seen, distance / alpha.clamp_min(SEEN), far)
+    if normal is not None:
+        unit = normalize(normal, dim=-1)
+        unit = torch.where((unit * directions).sum(dim=-1, keepdim=True) > 0, -unit, unit)
+        normal = torch.where(seen[..., None], unit, 0.0)
+    return Rendering(rgb, alpha, depth, normal)

@@ -1,0 +1,178 @@
+"""Samplers without memory: strata along each ray, and strata refined where a coarse pass found something."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from invgraphics import kernels
+from invgraphics.config import Slot
+from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.field import Density
+from invgraphics.errors import NotComposableError
+
+PADDING = 1e-5
+"""Added to every coarse weight so that no part of a ray is ruled out (NeRF, reference code)."""
+
+
+@dataclass(frozen=True)
+class StratifiedConfig:
+    """Equal strata along each ray.
+
+    Attributes:
+        count: samples per ray.
+    """
+
+    count: int = 64
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ValueError(f"count must be at least 1, not {self.count}")
+
+    def build(self, scene: Scene) -> Stratified:
+        """The sampler; it needs nothing from the scene."""
+        return Stratified(self)
+
+
+class Stratified(Sampler):
+    """Intervals that tile each ray from near to far; their inner edges are jittered in training."""
+
+    def __init__(self, config: StratifiedConfig) -> None:
+        super().__init__()
+        self.config = config
+
+    def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        """Samples on every ray that meets the bounds; the density is not asked."""
+        hit = hitting(rays)
+        edges = from_spacing(strata(rays[hit], self.config.count, ctx), ctx.bounds)
+        return pack(rays, hit, edges), ()
+
+
+@dataclass(frozen=True)
+class HierarchicalConfig:
+    """Coarse strata, and fine samples drawn from the coarse pass's weights (NeRF, §5.2).
+
+    Attributes:
+        coarse: strata of the first pass.
+        fine: samples added by the second pass.
+        proposal: a field of its own for the first pass, trained through ``Trace.levels``; ``None`` asks the rendered
+            field's density, without a gradient.
+    """
+
+    coarse: int = 64
+    fine: int = 64
+    proposal: Annotated[Any, Slot("fields")] | None = None
+
+    def __post_init__(self) -> None:
+        if self.coarse < 1 or self.fine < 1:
+            raise ValueError(f"coarse and fine must be at least 1, not {self.coarse} and {self.fine}")
+
+    def build(self, scene: Scene) -> Hierarchical:
+        """The sampler, with its proposal field if it has one."""
+        return Hierarchical(self, None if self.proposal is None else self.proposal.build(scene))
+
+
+class Hierarchical(Sampler):
+    """Two passes; the second one's intervals tile the ray with the edges of both."""
+
+    def __init__(self, config: HierarchicalConfig, proposal: Field | None = None) -> None:
+        super().__init__()
+        if proposal is not None and Quantity.DENSITY not in proposal.provides:
+            raise NotComposableError(f"A proposal needs density, which {type(proposal).__name__} does not provide.")
+        self.config = config
+        self.proposal = proposal
+
+    def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        """Samples of the second pass, and the first pass's trace if it has a field of its own to train."""
+        hit = hitting(rays)
+        spacing = strata(rays[hit], self.config.coarse, ctx)
+        coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds))
+        trace = self._first_pass(coarse, len(rays), density)
+        assert trace.weights is not None
+        with torch.no_grad():
+            weights = trace.weights.reshape(len(hit), self.config.coarse)
+            drawn = invert(spacing, weights + PADDING, quantiles(len(hit), self.config.fine, ctx, like=spacing))
+        both = torch.cat([spacing, drawn], dim=1).sort(dim=1).values
+        return pack(rays, hit, from_spacing(both, ctx.bounds)), () if self.proposal is None else (trace,)
+
+    def _first_pass(self, coarse: Samples, rays: int, density: Density) -> Trace:
+        if self.proposal is None:
+            values, sigma = None, density(coarse)
+        else:
+            values = self.proposal.query(coarse, self.proposal.provides & (Quantity.DENSITY | Quantity.RADIANCE))
+            assert values.density is not None
+            sigma = values.density
+        weights, _, _ = kernels.composite(sigma * coarse.delta, sigma[:, None], coarse.ray, rays)
+        return Trace(coarse, values, weights, rays=rays)
+
+
+def hitting(rays: Rays) -> Int[Tensor, " k"]:
+    """Indices of the rays that have an interval to sample."""
+    return torch.nonzero(rays.far > rays.near)[:, 0]
+
+
+def to_spacing(t: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:
+    """The coordinate in which strata are equal: distance itself in a box.
+
+    In a contracted space, distance up to the box's radius and disparity beyond it (nerfacto), both scaled to run over
+    halves of [0, 1].
+    """
+    if bounds.space == "box":
+        return t
+    x = t / bounds.radius
+    return torch.where(x < 1, x / 2, 1 - 1 / (2 * x.clamp_min(1)))
+
+
+def from_spacing(s: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:
+    """Inverse of `to_spacing`."""
+    if bounds.space == "box":
+        return s
+    return torch.where(s < 0.5, 2 * s, 1 / (2 * (1 - s.clamp_min(0.5)))) * bounds.radius
+
+
+def strata(rays: Rays, count: int, ctx: Context) -> Float[Tensor, "k edges"]:
+    """``count + 1`` edges from near to far in spacing coordinates; in training the inner ones move by up to half a stratum."""
+    near, far = to_spacing(rays.near, ctx.bounds), to_spacing(rays.far, ctx.bounds)
+    fraction = torch.arange(count + 1, dtype=near.dtype, device=near.device).expand(len(near), -1)
+    if ctx.training and count > 1:
+        shift = uniform((len(near), count - 1), ctx, like=near) - 0.5
+        fraction = fraction + torch.nn.functional.pad(shift, (1, 1))
+    return torch.lerp(near[:, None], far[:, None], fraction / count)
+
+
+def quantiles(rays: int, count: int, ctx: Context, like: Tensor) -> Float[Tensor, "k count"]:
+    """One point in each of ``count`` equal parts of [0, 1]: the middle, or anywhere in training."""
+    within = uniform((rays, count), ctx, like) if ctx.training else like.new_full((rays, count), 0.5)
+    return (torch.arange(count, dtype=like.dtype, device=like.device) + within) / count
+
+
+def uniform(shape: tuple[int, ...], ctx: Context, like: Tensor) -> Tensor:
+    """Random numbers in [0, 1) from the context's generator."""
+    return torch.rand(shape, generator=ctx.generator, dtype=like.dtype, device=like.device)
+
+
+def invert(
+    edges: Float[Tensor, "k bins_plus_1"], mass: Float[Tensor, "k bins"], u: Float[Tensor, "k c"]
+) -> Float[Tensor, "k c"]:
+    """Where the cumulative distribution of a piecewise constant density reaches ``u``.
+
+    Args:
+        edges: bin edges, increasing.
+        mass: unnormalised probability of each bin, > 0.
+        u: quantiles in [0, 1].
+    """
+    cumulative = torch.nn.functional.pad((mass / mass.sum(dim=1, keepdim=True)).cumsum(dim=1), (1, 0))
+    upper = torch.searchsorted(cumulative, u.contiguous(), right=True).clamp(1, mass.shape[1])
+    c0, c1 = cumulative.gather(1, upper - 1), cumulative.gather(1, upper)
+    e0, e1 = edges.gather(1, upper - 1), edges.gather(1, upper)
+    return torch.lerp(e0, e1, ((u - c0) / (c1 - c0)).clamp(0, 1))
+
+
+def pack(rays: Rays, hit: Int[Tensor, " k"], edges: Float[Tensor, "k edges"]) -> Samples:
+    """Samples whose intervals tile the rays ``hit`` between ``edges``."""
+    ray = hit.repeat_interleave(edges.shape[1] - 1)
+    return Samples.on(rays, ray, edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1))

@@ -1,0 +1,155 @@
+"""The look of every plot: one colour and one marker per method, SVG that reads on white, on black and on paper."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Tone:
+    """A colour on a light and on a dark page, both with at least 3:1 contrast to it."""
+
+    light: str
+    dark: str
+
+
+SERIES = (
+    Tone("#0072b2", "#56b4e9"),
+    Tone("#d55e00", "#ff9a4d"),
+    Tone("#00856a", "#34cfa3"),
+    Tone("#a3387f", "#ee9ccb"),
+    Tone("#8a6d00", "#f0d44c"),
+    Tone("#5a5ad1", "#a9a8ff"),
+    Tone("#007d8a", "#5fdbe8"),
+    Tone("#7a4a2b", "#d6a37c"),
+)
+"""One per method, in order: Okabe and Ito's colour-blind-safe hues, darkened or lightened to read on either page."""
+
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
+"""Methods beyond the eighth repeat a colour with another line."""
+
+INK = Tone("#23262b", "#e4e6ea")
+MUTED = Tone("#6b7078", "#9aa0a9")
+GRID = Tone("#e3e5e8", "#2e323a")
+PAGE = Tone("#ffffff", "#17191d")
+"""Outlines of points, so that overlapping ones stay apart."""
+
+FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+POINTS = 72.0
+"""Plots are drawn at 72 units per inch, so that a size in units is a size in CSS pixels."""
+
+
+@dataclass(frozen=True)
+class SeriesStyle:
+    """How one method is drawn."""
+
+    colour: str
+    marker: str
+    dash: Any
+
+
+def series_style(index: int) -> SeriesStyle:
+    """The look of method number ``index``."""
+    turn, position = divmod(index, len(SERIES))
+    return SeriesStyle(SERIES[position].light, MARKERS[(position + turn) % len(MARKERS)], DASHES[turn % len(DASHES)])
+
+
+@contextmanager
+def canvas(width: float, height: float) -> Iterator[tuple[Figure, Axes]]:
+    """An empty plot of ``width`` x ``height`` CSS pixels in the house style; drawn and saved inside the block."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    settings: dict[str, Any] = {
+        "svg.fonttype": "none",
+        "svg.hashsalt": "invgraphics",
+        "text.parse_math": False,
+        "font.size": 12,
+        "font.family": "DejaVu Sans",
+        "axes.edgecolor": MUTED.light,
+        "axes.labelcolor": INK.light,
+        "axes.titlesize": 13,
+        "axes.titleweight": "bold",
+        "axes.titlelocation": "left",
+        "axes.titlecolor": INK.light,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.linewidth": 0.8,
+        "axes.axisbelow": True,
+        "axes.grid": True,
+        "axes.unicode_minus": True,
+        "grid.color": GRID.light,
+        "grid.linewidth": 0.8,
+        "text.color": INK.light,
+        "xtick.color": MUTED.light,
+        "ytick.color": MUTED.light,
+        "xtick.minor.visible": False,
+        "pdf.fonttype": 42,
+    }
+    with mpl.rc_context(settings):
+        figure = Figure(figsize=(width / POINTS, height / POINTS), dpi=POINTS, layout="constrained")
+        axes = figure.add_subplot()
+        yield figure, axes
+
+
+def save(figure: Figure, stem: Path) -> Path:
+    """Write ``stem.svg``, which follows the reader's light or dark setting, and ``stem.pdf`` for papers.
+
+    Returns:
+        The path of the SVG.
+    """
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    svg, pdf = stem.with_suffix(".svg"), stem.with_suffix(".pdf")
+    figure.savefig(svg, metadata={"Date": None}, transparent=True)
+    figure.savefig(pdf, metadata={"CreationDate": None}, transparent=True)
+    svg.write_text(adaptive(svg.read_text(encoding="utf-8")), encoding="utf-8")
+    return svg
+
+
+def adaptive(svg: str) -> str:
+    """Add the dark colours to an SVG drawn in light ones, and use the page's fonts.
+
+    The light colours stay in place as plain attributes, for programs that know no media queries.
+    """
+    rules = []
+    for tone in {tone.light: tone for tone in (*SERIES, INK, MUTED, GRID, PAGE)}.values():
+        for part in ("stroke", "fill"):
+            rules.append(f'[style*="{part}: {tone.light}"]{{{part}:{tone.dark} !important}}')
+    sheet = f"<style>@media screen and (prefers-color-scheme: dark){{{''.join(rules)}}}</style>"
+    svg = re.sub(r"font-family: 'DejaVu Sans'[^;\"]*", f"font-family: {FONT}", svg)
+    svg = re.sub(r"(font: [^'\"]*)'DejaVu Sans'[^;\"]*", rf"\1{FONT}", svg)
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    return svg.replace("</defs>", f"{sheet}</defs>", 1)
+
+
+def spread_labels(positions: Sequence[float], gap: float, low: float, high: float) -> list[float]:
+    """Move label positions apart so that neighbours are at least ``gap`` from each other, inside [low, high] where they fit."""
+    order = sorted(range(len(positions)), key=lambda i: positions[i])
+    placed = [positions[i] for i in order]
+    for _ in range(50):
+        moved = False
+        for i in range(len(placed) - 1):
+            overlap = gap - (placed[i + 1] - placed[i])
+            if overlap > 1e-9 * gap:
+                placed[i] -= overlap / 2
+                placed[i + 1] += overlap / 2
+                moved = True
+        if not moved:
+            break
+    if placed:
+        shift = max(low - placed[0], 0.0) or min(high - placed[-1], 0.0)
+        placed = [position + shift for position in placed]
+    result = [0.0] * len(placed)
+    for i, position in zip(order, placed, strict=True):
+        result[i] = position
+    return result

@@ -1,0 +1,255 @@
+"""From runs to a table: means over seeds, best values, Pareto fronts, times to quality."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from invgraphics.report.records import Comparison, Failure, Run, Score
+from invgraphics.report.wording import ABSENT, COSTS, Quantity, budget_words, metric_label, quality_quantity
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number of the summary.
+
+    Attributes:
+        mean: over seeds, in stored units; ``None`` where there is none.
+        std: sample standard deviation over seeds; ``None`` for a single one.
+        text: the mean as written.
+        spread: the deviation as written; empty for a single seed.
+        best: no method's written value is better.
+        note: number of the footnote that explains an absence; 0 for none.
+    """
+
+    mean: float | None
+    std: float | None
+    text: str
+    spread: str
+    best: bool = False
+    note: int = 0
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method or a trivial baseline.
+
+    Attributes:
+        label: its name.
+        kind: what it is; ``failed`` is a method without a single run.
+        series: index of its colour, the same in every plot; -1 for a baseline.
+        seeds: number of runs that succeeded.
+        failures: its failed cells.
+        cells: one per column.
+    """
+
+    label: str
+    kind: Literal["method", "baseline", "failed"]
+    series: int
+    seeds: int
+    failures: tuple[Failure, ...]
+    cells: tuple[Cell, ...]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The summary table.
+
+    Attributes:
+        columns: quality first, then cost.
+        rows: methods in order, then baselines.
+        notes: footnotes; note i is ``notes[i - 1]``.
+        skipped: metric label -> why no run has it.
+    """
+
+    columns: tuple[Quantity, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...]
+    skipped: dict[str, str]
+
+    def column(self, key: str) -> int | None:
+        """Position of a quantity, ``None`` when the table has no such column."""
+        return next((index for index, column in enumerate(self.columns) if column.key == key), None)
+
+    def cell(self, row: Row, key: str) -> Cell | None:
+        """The cell of ``row`` in the column ``key``."""
+        index = self.column(key)
+        return None if index is None else row.cells[index]
+
+    @property
+    def methods(self) -> tuple[Row, ...]:
+        """Rows of methods that have at least one run."""
+        return tuple(row for row in self.rows if row.kind == "method")
+
+    @property
+    def baselines(self) -> tuple[Row, ...]:
+        """Rows of trivial predictors."""
+        return tuple(row for row in self.rows if row.kind == "baseline")
+
+
+def summarise(comparison: Comparison) -> Summary:
+    """The summary of a comparison: means over seeds, the best of each column marked."""
+    columns = _columns(comparison)
+    notes: list[str] = []
+    rows = []
+    for series, method in enumerate(comparison.methods):
+        runs, failures = comparison.runs_of(method), comparison.failures_of(method)
+        cells = tuple(_method_cell(column, runs, notes) for column in columns)
+        rows.append(Row(method, "method" if runs else "failed", series, len(runs), failures, cells))
+    for name, quality in comparison.baselines.items():
+        cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
+        rows.append(Row(name, "baseline", -1, 1, (), cells))
+    return Summary(columns, _mark_best(columns, rows), tuple(notes), _skipped(comparison))
+
+
+def quality_columns(comparison: Comparison) -> tuple[Quantity, ...]:
+    """Every quality metric that at least one run or baseline has, in the order of the first that has it."""
+    found: dict[str, Score] = {}
+    for quality in [run.quality for run in comparison.runs] + list(comparison.baselines.values()):
+        for key, score in quality.items():
+            found.setdefault(key, score)
+    return tuple(quality_quantity(key, score) for key, score in found.items())
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points that no other point dominates, both coordinates smaller-is-better, by first coordinate.
+
+    A point dominates another when it is nowhere worse and somewhere better; equal points stand together.
+    """
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=lambda i: points[i]):
+        if not front or points[index][1] < points[front[-1]][1] or points[index] == points[front[-1]]:
+            front.append(index)
+    return front
+
+
+def seconds_to_reach(run: Run, level: float) -> float | None:
+    """Seconds of optimisation after which the monitored PSNR first was at least ``level`` dB."""
+    return next((entry.seconds for entry in run.history if entry.psnr is not None and entry.psnr >= level), None)
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Who reaches a quality when.
+
+    Attributes:
+        levels: PSNR thresholds in dB, rising.
+        rows: (method, series, one text per level).
+    """
+
+    levels: tuple[int, ...]
+    rows: tuple[tuple[str, int, tuple[str, ...]], ...]
+
+
+def time_to_quality(comparison: Comparison, count: int = 4) -> Reach | None:
+    """Median seconds over seeds to reach ``count`` round PSNR levels between the slowest start and the best end."""
+    measured = [[entry.psnr for entry in run.history if entry.psnr is not None] for run in comparison.runs]
+    measured = [values for values in measured if values]
+    if not measured:
+        return None
+    low, high = max(values[0] for values in measured), max(max(values) for values in measured)
+    first, last = math.ceil(low + 0.1), math.floor(high)
+    if last < first:
+        return None
+    step = max(1, (last - first) // max(1, count - 1))
+    levels = tuple(range(last, first - 1, -step))[:count][::-1]
+    rows = []
+    for series, method in enumerate(comparison.methods):
+        runs = comparison.runs_of(method)
+        if runs:
+            rows.append((method, series, tuple(_reach_text(runs, level) for level in levels)))
+    return Reach(levels, tuple(rows))
+
+
+def _reach_text(runs: Sequence[Run], level: float) -> str:
+    times = [time for run in runs if (time := seconds_to_reach(run, level)) is not None]
+    if 2 * len(times) <= len(runs):
+        return "not reached"
+    return f"{statistics.median(times):.1f} s"
+
+
+def _columns(comparison: Comparison) -> tuple[Quantity, ...]:
+    time_budget = budget_words(comparison.budget).endswith(" s")
+    costs = []
+    for cost in COSTS:
+        redundant = cost.key == "render_seconds_per_view"
+        if redundant or all(run.cost.get(cost.key) is None for run in comparison.runs):
+            continue
+        if cost.key == "fit_seconds" and time_budget:  # what every method was given is no merit of any
+            cost = Quantity(cost.key, cost.label, cost.unit, "none", "cost")
+        costs.append(cost)
+    return quality_columns(comparison) + tuple(costs)
+
+
+def _mean(score: Score | None) -> float | None:
+    return None if score is None else score.mean
+
+
+def _known(values: Sequence[float | None]) -> list[float]:
+    return [value for value in values if value is not None]
+
+
+def value_of(run: Run, column: Quantity) -> float | None:
+    """A run's value of a quantity, in stored units."""
+    return _mean(run.quality.get(column.key)) if column.group == "quality" else run.cost.get(column.key)
+
+
+def _method_cell(column: Quantity, runs: Sequence[Run], notes: list[str]) -> Cell:
+    values = _known([value_of(run, column) for run in runs])
+    reasons = [_absence(run, column) for run in runs if value_of(run, column) is None]
+    reasons = list(dict.fromkeys(reason for reason in reasons if reason))
+    if not reasons:
+        return _cell(column, values)
+    text = f"{column.label}: {'; '.join(reasons)}"
+    if values:
+        text += f" ({len(runs) - len(values)} of {len(runs)} seeds)"
+    if text not in notes:
+        notes.append(text)
+    return _cell(column, values, notes.index(text) + 1)
+
+
+def _absence(run: Run, column: Quantity) -> str:
+    if column.group == "cost":
+        return ""  # NeRFs have no primitives; that needs no apology
+    if column.key in run.quality:
+        return "the score is not a number"
+    return run.skipped.get(column.key, "the run does not report it")
+
+
+def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
+    if not values:
+        return Cell(None, None, "n/a" if note else ABSENT, "", note=note)
+    mean = statistics.fmean(values)
+    std = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+    return Cell(mean, std, column.text(mean), "" if std is None else f"± {column.text(std)}", note=note)
+
+
+def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Mark, among methods, every cell that reads the same as the best one; a contest needs two methods."""
+    marked = [list(row.cells) for row in rows]
+    for index, column in enumerate(columns):
+        values = {i: row.cells[index].mean for i, row in enumerate(rows) if row.kind == "method"}
+        known = {i: value for i, value in values.items() if value is not None}
+        if column.better == "none" or len(known) < 2:
+            continue
+        best = min(known.values(), key=column.sort_key)
+        for i, value in known.items():
+            if column.text(value) == column.text(best):
+                old = marked[i][index]
+                marked[i][index] = Cell(old.mean, old.std, old.text, old.spread, True, old.note)
+    return tuple(
+        Row(row.label, row.kind, row.series, row.seeds, row.failures, tuple(cells))
+        for row, cells in zip(rows, marked, strict=True)
+    )
+
+
+def _skipped(comparison: Comparison) -> dict[str, str]:
+    reasons: dict[str, list[str]] = {}
+    for run in comparison.runs:
+        for key, why in run.skipped.items():
+            reasons.setdefault(key, []).append(why)
+    present = {column.key for column in quality_columns(comparison)}
+    return {metric_label(key): "; ".join(dict.fromkeys(why)) for key, why in reasons.items() if key not in present}

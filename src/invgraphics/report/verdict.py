@@ -1,0 +1,123 @@
+"""What the numbers say, in sentences: who wins at what cost, and how sure one may be."""
+
+from __future__ import annotations
+
+import math
+
+from invgraphics.report.records import Comparison
+from invgraphics.report.summary import Row, Summary
+from invgraphics.report.wording import Quantity, budget_words, listing
+
+
+def verdict(comparison: Comparison, summary: Summary) -> list[str]:
+    """Sentences in order of importance. Each follows from the summary table alone."""
+    sentences = [*_quality(comparison, summary), *_costs(summary), *_warnings(comparison, summary)]
+    return [sentence for sentence in sentences if sentence]
+
+
+def _ranking(summary: Summary, column: Quantity) -> list[tuple[float, Row]]:
+    """(value, row) of the methods, best first."""
+    values = [(cell.mean, row) for row in summary.methods if (cell := summary.cell(row, column.key)) and cell.mean is not None]
+    return sorted(values, key=lambda entry: column.sort_key(entry[0]))
+
+
+def _quality(comparison: Comparison, summary: Summary) -> list[str]:
+    columns = [column for column in summary.columns if column.group == "quality"]
+    ranking = _ranking(summary, columns[0]) if columns else []
+    if not ranking:
+        return []
+    column, (value, winner) = columns[0], ranking[0]
+    given = f"Given {budget_words(comparison.budget)} each, " if comparison.budget else ""
+    unit = f" {column.unit}" if column.unit else ""
+    extreme = "highest" if column.better == "higher" else "lowest"
+    sentence = f"{given}{winner.label} reaches the {extreme} {column.label}, {column.text(value)}{unit}"
+    gaps = []
+    if len(ranking) > 1:
+        gaps.append((ranking[1][1].label, abs(value - ranking[1][0])))
+    reference = _best_baseline(summary, column)
+    if reference is not None:
+        gaps.append((f"the better trivial baseline ({reference[1].label})", abs(value - reference[0])))
+    if column.key == "psnr" and comparison.noise_ceiling is not None:
+        below = comparison.noise_ceiling - value
+        gaps.append((f"the truth's own noise ceiling ({column.text(comparison.noise_ceiling)}{unit})", below))
+    worded = [f"{column.text(gap)}{unit} {'from' if 'ceiling' in name else 'ahead of'} {name}" for name, gap in gaps]
+    sentence += f": {listing(worded)}." if worded and math.isfinite(value) else "."
+    return [sentence, _resolution(summary, column, ranking), _other_metrics(summary, columns[1:], winner)]
+
+
+def _best_baseline(summary: Summary, column: Quantity) -> tuple[float, Row] | None:
+    found = [(cell.mean, row) for row in summary.baselines if (cell := summary.cell(row, column.key)) and cell.mean is not None]
+    return min(found, key=lambda entry: column.sort_key(entry[0])) if found else None
+
+
+def _resolution(summary: Summary, column: Quantity, ranking: list[tuple[float, Row]]) -> str:
+    """Whether seeds resolve the lead: the gap against the standard deviation of a difference of two seeds."""
+    if len(ranking) < 2:
+        return ""
+    if max(row.seeds for _, row in ranking) < 2:
+        return "One seed per method: how much of a small difference is chance cannot be told from this page."
+    cells = [summary.cell(row, column.key) for _, row in ranking[:2]]
+    deviations = [cell.std for cell in cells if cell is not None and cell.std is not None]
+    if len(deviations) < 2:
+        return ""
+    noise, gap = math.hypot(*deviations), abs(ranking[0][0] - ranking[1][0])
+    unit = f" {column.unit}" if column.unit else ""
+    if gap > 2 * noise:
+        return (
+            f"That lead is {gap / noise:.1f} times what two seeds differ by ({column.text(noise)}{unit})." if noise > 0 else ""
+        )
+    return f"That lead is within what two seeds differ by ({column.text(noise)}{unit}): call it a draw."
+
+
+def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> str:
+    agree, others = [], []
+    for column in columns:
+        ranking = _ranking(summary, column)
+        best = [row for row in summary.methods if (cell := summary.cell(row, column.key)) and cell.best]
+        if len(ranking) < 2 or not best:
+            continue
+        if winner in best:
+            agree.append(column.label)
+        else:
+            others.append(f"{column.label} goes to {listing(row.label for row in best)}")
+    parts = [f"It also leads in {listing(agree)}" if agree else "", listing(others)]
+    text = "; ".join(part for part in parts if part)
+    return f"{text[0].upper()}{text[1:]}." if text else ""
+
+
+def _costs(summary: Summary) -> list[str]:
+    words = {
+        "render_fps": "renders fastest",
+        "model_bytes": "has the smallest model",
+        "peak_memory_bytes": "needs the least memory",
+    }
+    parts = []
+    for column in summary.columns:
+        ranking = _ranking(summary, column) if column.key in words else []
+        if len(ranking) < 2:
+            continue
+        (value, row), (second, _) = ranking[0], ranking[1]
+        ratio = second / value if column.better == "lower" and value else value / second if second else math.inf
+        if math.isfinite(ratio) and ratio >= 1.05:
+            parts.append(
+                f"{row.label} {words[column.key]} ({column.text(value)} {column.unit}, {ratio:.2g}× better than the next)"
+            )
+    text = "; ".join(parts)
+    return [f"{text}."] if text else []
+
+
+def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
+    sentences = []
+    columns = [column for column in summary.columns if column.group == "quality"]
+    reference = _best_baseline(summary, columns[0]) if columns else None
+    if reference is not None:
+        column = columns[0]
+        below = [
+            row.label for value, row in _ranking(summary, column) if column.sort_key(value) >= column.sort_key(reference[0])
+        ]
+        if below:
+            sentences.append(f"{listing(below)} did not beat the trivial baseline '{reference[1].label}' in {column.label}.")
+    if comparison.failures:
+        cells = len(comparison.runs) + len(comparison.failures)
+        sentences.append(f"{len(comparison.failures)} of {cells} cells failed; they are listed below the table.")
+    return sentences

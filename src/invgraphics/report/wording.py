@@ -1,0 +1,132 @@
+"""How quantities are called and written: labels, units, directions and digits, the same in every output."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from invgraphics.report.records import Score
+
+Direction = Literal["higher", "lower", "none"]
+
+ABSENT = "–"
+"""Shown where a method has no such quantity."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of the summary: something measured about a run.
+
+    Attributes:
+        key: its name in ``scores.json``.
+        label: what people call it.
+        unit: unit in which it is written; empty for a pure number.
+        better: which way is better; ``none`` for what is a fact, not a merit.
+        group: ``quality`` or ``cost``.
+        scale: the stored value is multiplied by this before it is written.
+        decimals: digits after the point; ``None`` means three significant digits.
+    """
+
+    key: str
+    label: str
+    unit: str
+    better: Direction
+    group: Literal["quality", "cost"]
+    scale: float = 1.0
+    decimals: int | None = None
+
+    @property
+    def arrow(self) -> str:
+        """``↑`` where higher is better, ``↓`` where lower is."""
+        return {"higher": "↑", "lower": "↓", "none": ""}[self.better]
+
+    @property
+    def heading(self) -> str:
+        """Label, unit and direction."""
+        return " ".join(part for part in (self.label, f"({self.unit})" if self.unit else "", self.arrow) if part)
+
+    def text(self, value: float | None) -> str:
+        """``value`` in this quantity's unit and digits."""
+        if value is None:
+            return ABSENT
+        if math.isinf(value):
+            return "∞" if value > 0 else "−∞"
+        scaled = value * self.scale
+        text = f"{scaled:,.{significant_decimals(scaled) if self.decimals is None else self.decimals}f}"
+        return text.replace("-", "−")
+
+    def sort_key(self, value: float) -> float:
+        """Smaller is better."""
+        return -value if self.better == "higher" else value
+
+
+_NAMES: dict[str, tuple[str, int]] = {
+    "psnr": ("PSNR", 2),
+    "ssim": ("SSIM", 3),
+    "ms_ssim": ("MS-SSIM", 3),
+    "flip": ("FLIP", 3),
+    "lpips": ("LPIPS", 3),
+    "depth_abs_rel": ("Depth abs-rel", 3),
+    "depth_rmse": ("Depth RMSE", 3),
+    "normal_deg": ("Normal error", 1),
+    "alpha_iou": ("Alpha IoU", 3),
+}
+
+_UNITS = {"deg": "°", "degrees": "°", "degree": "°", "1": "", "-": ""}
+
+COSTS = (
+    Quantity("fit_seconds", "Fit", "s", "lower", "cost"),
+    Quantity("steps", "Steps", "", "none", "cost", decimals=0),
+    Quantity("render_seconds_per_view", "Render", "s/view", "lower", "cost"),
+    Quantity("render_fps", "Render", "FPS", "higher", "cost"),
+    Quantity("peak_memory_bytes", "Peak memory", "MB", "lower", "cost", scale=1e-6),
+    Quantity("model_bytes", "Model", "MB", "lower", "cost", scale=1e-6),
+    Quantity("parameters", "Parameters", "M", "none", "cost", scale=1e-6),
+    Quantity("primitives", "Primitives", "", "none", "cost", decimals=0),
+)
+"""Costs in the order of the table; 1 MB = 10⁶ bytes."""
+
+
+def metric_label(key: str) -> str:
+    """What people call a metric; an unknown one keeps its name."""
+    return _NAMES[key][0] if key in _NAMES else key.replace("_", " ")
+
+
+def quality_quantity(key: str, score: Score) -> Quantity:
+    """The column of a quality metric, whose unit and direction come with its scores."""
+    decimals = _NAMES[key][1] if key in _NAMES else None
+    better: Direction = "higher" if score.higher_is_better else "lower"
+    return Quantity(key, metric_label(key), _UNITS.get(score.unit, score.unit), better, "quality", decimals=decimals)
+
+
+def significant_decimals(value: float, digits: int = 3) -> int:
+    """Decimals that show ``digits`` significant digits, at most six."""
+    if value == 0:
+        return 0
+    return min(6, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
+
+
+def listing(items: Iterable[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    words = list(items)
+    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
+
+
+def duration(seconds: float) -> str:
+    """A time span as people say it."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
+def budget_words(budget: str) -> str:
+    """``60s`` -> ``60 s``; ``5000steps`` -> ``5,000 steps``."""
+    for unit, words in (("steps", " steps"), ("s", " s")):
+        amount = budget.removesuffix(unit)
+        if amount != budget and amount.replace(".", "", 1).isdigit():
+            return f"{float(amount):,g}{words}" if unit == "s" else f"{int(float(amount)):,}{words}"
+    return budget

@@ -1,0 +1,44 @@
+"""NeRF's synthetic scenes: ``transforms_{train,val,test}.json`` beside folders of RGBA pictures (NeRF, §6.1)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from invgraphics.core import Bounds, Scene
+from invgraphics.scenes.frames import Frames
+from invgraphics.scenes.images import Photo
+from invgraphics.scenes.layout import Frame, SceneOptions, Split, compose, evenly, present
+
+HALF_EXTENT = 1.5
+"""The objects of NeRF-synthetic lie within ±1.5 world units (instant-ngp and TensoRF use the same box)."""
+
+_VAL_VIEWS = 4  # looked at during a fit, never scored
+
+
+class Blender:
+    """Loader of NeRF-synthetic folders: OpenGL axes, straight alpha, white background, a box of ±1.5."""
+
+    def matches(self, path: Path) -> bool:
+        """Whether ``path`` is such a folder."""
+        return (path / "transforms_train.json").is_file()
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read the folder.
+
+        Raises:
+            InputError: a file is missing or unusable.
+        """
+        notes: dict[str, str] = {"loader": "blender"}
+        train, test = self._photos(path, "train", notes), self._photos(path, "test", notes)
+        val = self._photos(path, "val", notes) if (path / "transforms_val.json").is_file() else []
+        split = Split(train, test, evenly(val, _VAL_VIEWS), "the data set's own")
+        box = torch.full((3,), HALF_EXTENT)
+        return compose(path.resolve().name, split, Frame(Bounds(-box, box)), options, notes)
+
+    def _photos(self, path: Path, split: str, notes: dict[str, str]) -> list[Photo]:
+        source = path / f"transforms_{split}.json"
+        photos, missing = present(Frames.read(source).photos(), source)
+        notes |= {f"{key}_{split}": value for key, value in missing.items()}
+        return photos

@@ -1,0 +1,90 @@
+"""COLMAP reconstructions: ``sparse/0`` beside ``images``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from invgraphics.core import Camera, Points, Scene
+from invgraphics.core.transforms import colmap_to_opencv
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import Photo
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, present
+from invgraphics.scenes.lens import Lens
+
+_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+
+
+class Colmap:
+    """Loader of a COLMAP model, binary or text, with any perspective camera model and one camera per image if need be.
+
+    The scene is unbounded, its SfM points are kept, and every eighth photograph by name is scored. Registered images whose
+    files do not exist are skipped and named in the scene's notes.
+    """
+
+    def matches(self, path: Path) -> bool:
+        """Whether ``path`` holds a COLMAP model in one of the usual places."""
+        return _model(path) is not None
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read the model and the photographs it registers.
+
+        Raises:
+            InputError: the model is unusable or its photographs are missing.
+        """
+        model = _model(path)
+        if model is None:
+            raise InputError(f"{path} has no COLMAP model.", f"Looked for cameras.bin or cameras.txt in {', '.join(_PLACES)}.")
+        reconstruction = _read(model)
+        listed = [_photo(image, path / "images") for image in reconstruction.images.values() if image.has_pose]
+        if not listed:
+            raise InputError(f"{model} registers no image.")
+        photos, notes = present(sorted(listed, key=lambda photo: photo.name), model)
+        notes |= {"loader": "colmap", "points": f"{reconstruction.num_points3D()} from SfM"}
+        poses = torch.stack([photo.camera.cam_to_world for photo in photos])
+        frame = contracted_frame(poses, _points(reconstruction))
+        return compose(path.resolve().name, every_eighth(photos), frame, options, notes)
+
+
+def _model(path: Path) -> Path | None:
+    for place in _PLACES:
+        if any((path / place / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
+            return path / place
+    return None
+
+
+def _read(model: Path) -> Any:
+    import pycolmap
+
+    try:
+        return pycolmap.Reconstruction(str(model))
+    except (ValueError, IndexError, RuntimeError, MemoryError) as error:
+        raise InputError(f"The COLMAP model {model} cannot be read: {str(error).splitlines()[0]}.") from error
+
+
+def _photo(image: Any, folder: Path) -> Photo:
+    lens = Lens(image.camera.model_name, tuple(float(v) for v in image.camera.params), image.camera.width, image.camera.height)
+    where = f"image '{image.name}'"
+    if not np.isfinite(lens.params).all() or image.camera.focal_length_x <= 0 or image.camera.focal_length_y <= 0:
+        raise InputError(f"The camera of {where} has parameters {lens.params}, which no lens has.")
+    world_to_cam = torch.from_numpy(np.array(image.cam_from_world().matrix(), dtype=np.float64))
+    camera = Camera(
+        cam_to_world=pose(colmap_to_opencv(world_to_cam), where),
+        focal=torch.tensor([image.camera.focal_length_x, image.camera.focal_length_y], dtype=torch.float64),
+        centre=torch.tensor([image.camera.principal_point_x, image.camera.principal_point_y], dtype=torch.float64),
+        width=lens.width,
+        height=lens.height,
+    )
+    return Photo(folder / image.name, camera, image.name, None if lens.is_pinhole() else lens)
+
+
+def _points(reconstruction: Any) -> Points | None:
+    points = list(reconstruction.points3D.values())
+    if not points:
+        return None
+    position = np.stack([point.xyz for point in points])
+    rgb = np.stack([point.color for point in points]).astype(np.float32) / 255
+    return Points(torch.from_numpy(position), torch.from_numpy(rgb))

@@ -1,0 +1,153 @@
+"""What the relatives of ``transforms.json`` have in common: frames with OpenGL poses, and intrinsics here or there."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from invgraphics.core import Camera
+from invgraphics.core.transforms import focal_from_fov, opengl_to_opencv
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import SUFFIXES, Photo, image_size
+from invgraphics.scenes.layout import pose
+from invgraphics.scenes.lens import Lens
+
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """A ``transforms*.json``, read and checked for its outline.
+
+    Attributes:
+        path: the file.
+        table: its top level.
+        frames: its list of frames.
+    """
+
+    path: Path
+    table: Mapping[str, Any]
+    frames: Sequence[Mapping[str, Any]]
+
+    @staticmethod
+    def read(path: Path) -> Frames:
+        """Read a file.
+
+        Raises:
+            InputError: it is missing, no JSON (line and column are given), or has no frames.
+        """
+        try:
+            table = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise InputError(f"{path} does not exist.") from None
+        except json.JSONDecodeError as error:
+            raise InputError(f"{path} is not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.") from error
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{path} cannot be read: {error}.") from error
+        frames = table.get("frames") if isinstance(table, dict) else None
+        if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+            raise InputError(
+                f"{path} has no list of 'frames'.", "Expected a transforms.json of NeRF, instant-ngp or nerfstudio."
+            )
+        return Frames(path, table, frames)
+
+    def photos(self) -> list[Photo]:
+        """One photograph per frame, in the file's order, whether its picture exists or not.
+
+        Raises:
+            InputError: a key is missing or a value unusable; the sentence names the file, the frame and the key.
+        """
+        files = [_find(self.path.parent, self._text(index)) for index in range(len(self.frames))]
+        existing = next((file for file in files if file.is_file()), None)
+        return [self._photo(index, file, existing) for index, file in enumerate(files)]
+
+    def _where(self, index: int) -> str:
+        return f"{self.path}, frame {index} ('{self.frames[index].get('file_path', '?')}')"
+
+    def _text(self, index: int) -> str:
+        value = self.frames[index].get("file_path")
+        if not isinstance(value, str) or not value:
+            raise InputError(f"{self.path}, frame {index}, has no 'file_path'.")
+        return value
+
+    def _number(self, index: int, key: str) -> float | None:
+        """A value of the frame, or else of the file."""
+        value = self.frames[index].get(key, self.table.get(key))
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError(f"'{key}' of {self._where(index)} is {value!r}, not a finite number.")
+        return float(value)
+
+    def _photo(self, index: int, file: Path, existing: Path | None) -> Photo:
+        if "transform_matrix" not in self.frames[index]:
+            raise InputError(f"{self._where(index)} has no 'transform_matrix'.")
+        cam_to_world = opengl_to_opencv(pose(self.frames[index]["transform_matrix"], self._where(index)))
+        width, height = self._size(index, existing)
+        fx, fy = self._focal(index, width, height)
+        cx, cy = self._number(index, "cx"), self._number(index, "cy")
+        focal, centre = [fx, fy], [width / 2 if cx is None else cx, height / 2 if cy is None else cy]
+        number = torch.float64
+        camera = Camera(cam_to_world, torch.tensor(focal, dtype=number), torch.tensor(centre, dtype=number), width, height)
+        name = self._text(index).replace("\\", "/").removeprefix("./")
+        return Photo(file, camera, name, self._lens(index, (*focal, *centre), (width, height)))
+
+    def _size(self, index: int, existing: Path | None) -> tuple[int, int]:
+        """Width and height that the file states, or else those of the first picture there is."""
+        w, h = self._number(index, "w"), self._number(index, "h")
+        if w is None or h is None:
+            return image_size(existing) if existing is not None else (1, 1)
+        if w < 1 or h < 1:
+            raise InputError(f"'w' and 'h' of {self._where(index)} are {w:g} and {h:g}, not a size in pixels.")
+        return round(w), round(h)
+
+    def _focal(self, index: int, width: int, height: int) -> tuple[float, float]:
+        fx, fy = self._number(index, "fl_x"), self._number(index, "fl_y")
+        angle_x, angle_y = self._number(index, "camera_angle_x"), self._number(index, "camera_angle_y")
+        if fx is None and angle_x is not None and 0 < angle_x < math.pi:
+            fx = focal_from_fov(angle_x, width)
+        if fy is None and angle_y is not None and 0 < angle_y < math.pi:
+            fy = focal_from_fov(angle_y, height)
+        fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+        if fx is None or fy is None:
+            raise InputError(f"{self._where(index)} has no focal length.", "Expected 'fl_x' in pixels or 'camera_angle_x'.")
+        if fx <= 0 or fy <= 0:
+            raise InputError(f"The focal length of {self._where(index)} is {fx:g}, {fy:g}, not positive.")
+        return fx, fy
+
+    def _lens(self, index: int, pinhole: tuple[float, ...], size: tuple[int, int]) -> Lens | None:
+        """OPENCV (k1 k2 p1 p2, with k3 and k4 its rational extension) or OPENCV_FISHEYE (k1 k2 k3 k4); None for a pinhole."""
+        k1, k2, p1, p2, k3, k4 = (self._number(index, key) or 0.0 for key in _COEFFICIENTS)
+        model = str(self.frames[index].get("camera_model", self.table.get("camera_model", "OPENCV")))
+        fisheye = model == "OPENCV_FISHEYE" or self.table.get("is_fisheye") is True
+        if fisheye:
+            lens = Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4), *size)
+        elif model in _PINHOLES:
+            return None
+        elif model in ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV"):
+            extended = bool(k3 or k4)
+            more = (k3, k4, 0.0, 0.0) if extended else ()
+            lens = Lens("FULL_OPENCV" if extended else "OPENCV", (*pinhole, k1, k2, p1, p2, *more), *size)
+        else:
+            remedy = "Known: OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL, RADIAL, FULL_OPENCV, PINHOLE, SIMPLE_PINHOLE."
+            raise InputError(f"{self.path} has the camera model '{model}', which is not supported.", remedy)
+        return None if lens.is_pinhole() else lens
+
+
+def _find(folder: Path, file_path: str) -> Path:
+    """The picture that a frame names, whose suffix may be left out."""
+    path = folder / file_path.replace("\\", "/")
+    if path.is_file():
+        return path
+    for suffix in SUFFIXES:
+        for candidate in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
+            if candidate.is_file():
+                return candidate
+    return path

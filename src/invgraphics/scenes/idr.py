@@ -1,0 +1,120 @@
+"""IDR's and NeuS's layout of DTU and BlendedMVS: ``cameras*.npz`` beside ``image`` and ``mask``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Bounds, Camera, Scene
+from invgraphics.core.transforms import colmap_to_opencv
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import Photo, image_files, image_size
+from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth, pose
+
+_NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
+
+
+class Idr:
+    """Loader of ``cameras*.npz``: projection matrices ``world_mat_i`` and the subject's sphere ``scale_mat_i``.
+
+    The local frame is the one in which the subject fills the unit sphere, bounds are ±1. With masks these are the coverage and
+    the scene is a box; without, the surroundings are part of the picture and the scene is contracted. Every eighth
+    photograph by name is scored.
+    """
+
+    def matches(self, path: Path) -> bool:
+        """Whether ``path`` is such a folder."""
+        return _source(path) is not None
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read the folder.
+
+        Raises:
+            InputError: a file or a key is missing or unusable, or there are fewer matrices or masks than pictures.
+        """
+        source = _source(path)
+        if source is None:
+            raise InputError(f"{path} has none of {', '.join(_NAMES)}.")
+        files = image_files(path / "image")
+        masks = image_files(path / "mask")
+        if not files:
+            raise InputError(f"{path} has {source.name} but no pictures in 'image'.")
+        if masks and len(masks) != len(files):
+            raise InputError(f"{path / 'mask'} has {len(masks)} masks, {path / 'image'} has {len(files)} pictures.")
+        world_from_local, cameras = _cameras(source, files)
+        photos = [
+            Photo(file, camera, file.name, alpha=masks[index] if masks else None)
+            for index, (file, camera) in enumerate(zip(files, cameras, strict=True))
+        ]
+        bounds = Bounds(-torch.ones(3), torch.ones(3), "box" if masks else "contracted", NEAR)
+        notes = {"loader": "idr", "cameras": source.name}
+        return compose(path.resolve().name, every_eighth(photos), Frame(bounds, world_from_local), options, notes)
+
+
+def _source(path: Path) -> Path | None:
+    return next((path / name for name in _NAMES if (path / name).is_file()), None)
+
+
+def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], list[Camera]]:
+    try:
+        with np.load(source, allow_pickle=False) as table:
+            arrays = {key: np.asarray(table[key], dtype=np.float64) for key in table.files if "_mat_" in key}
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{source} cannot be read: {error}.") from error
+    sphere = _matrix(arrays, "scale_mat_0", source)
+    world_from_local = torch.from_numpy(sphere)
+    # The sphere's matrix is a similarity exactly if its linear part without the scale is rigid.
+    scale = torch.linalg.det(world_from_local[:3, :3]).abs() ** (1 / 3)
+    pose(torch.cat([world_from_local[:3, :3] / scale, world_from_local[:3, 3:]], dim=1), f"{source}, scale_mat_0")
+    cameras = []
+    for index, file in enumerate(files):
+        if np.abs(_matrix(arrays, f"scale_mat_{index}", source) - sphere).max() > 1e-6 * np.abs(sphere).max():
+            raise InputError(f"{source} has a scale_mat_{index} that differs from scale_mat_0.", "One sphere is expected.")
+        camera = decompose(_matrix(arrays, f"world_mat_{index}", source)[:3], image_size(file), f"{source}, world_mat_{index}")
+        cameras.append(camera)
+    return world_from_local, cameras
+
+
+def _matrix(arrays: Mapping[str, np.ndarray], key: str, source: Path) -> Float[np.ndarray, "4 4"]:
+    if key not in arrays:
+        raise InputError(f"{source} has no '{key}'.", "One world_mat and one scale_mat per picture are expected.")
+    if arrays[key].shape != (4, 4) or not np.isfinite(arrays[key]).all():
+        raise InputError(f"'{key}' of {source} is not a finite 4x4 matrix.")
+    return arrays[key]
+
+
+def decompose(projection: Float[np.ndarray, "3 4"], size: tuple[int, int], where: str) -> Camera:
+    """Split a projection matrix into a camera by RQ decomposition (Hartley and Zisserman, §6.2.4).
+
+    DTU's pixel coordinates put the first pixel's centre at (0, 0), ours at (0.5, 0.5).
+
+    Args:
+        projection: maps homogeneous world points to homogeneous pixels; its scale and sign do not matter.
+        size: (width, height) of the picture.
+        where: file and view, for messages.
+    """
+    from scipy.linalg import rq
+
+    if abs(np.linalg.det(projection[:, :3])) < 1e-12 * np.abs(projection).max():
+        raise InputError(f"{where} is not a projection matrix: its left part is singular.")
+    projection = projection * np.sign(np.linalg.det(projection[:, :3]))
+    upper, rotation = rq(projection[:, :3])
+    signs = np.diag(np.sign(np.diag(upper)))
+    upper, rotation = upper @ signs, signs @ rotation
+    translation = np.linalg.solve(upper, projection[:, 3])
+    intrinsics = upper / upper[2, 2]
+    if abs(intrinsics[0, 1]) * size[1] / intrinsics[1, 1] > 1:
+        raise InputError(f"{where} has skewed pixels (skew {intrinsics[0, 1]:.3g}), which no camera here has.")
+    world_to_cam = torch.from_numpy(np.concatenate([rotation, translation[:, None]], axis=1))
+    return Camera(
+        cam_to_world=pose(colmap_to_opencv(world_to_cam), where),
+        focal=torch.from_numpy(np.diag(intrinsics)[:2].copy()),
+        centre=torch.from_numpy(intrinsics[:2, 2] + 0.5),
+        width=size[0],
+        height=size[1],
+    )

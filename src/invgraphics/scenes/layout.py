@@ -1,0 +1,257 @@
+"""From photographs with cameras to a scene: which views train, which are scored, and the frame in which fields live."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Bounds, Camera, Points, Scene, View
+from invgraphics.core.transforms import apply_similarity, transform_points
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import RESIZE, Photo, load_view, match_sizes
+
+T = TypeVar("T")
+
+HOLD_OUT = 8
+"""One photograph in eight is scored, the first included (LLFF's rule, which later work kept)."""
+
+NEAR = 0.05
+"""Closest sample to a camera in local units, where a data set does not say."""
+
+_RIGID = 1e-3  # a pose that is farther from a rotation than this is an error, not rounding
+_PARALLEL = 0.01  # mean squared sine of the angle between viewing directions (6°) below which they have no common focus
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """What a person chooses about any scene.
+
+    Attributes:
+        size: longest side in pixels, or (width, height); ``None`` leaves pictures as they are.
+        test_views: number of views to score, evenly spaced among those held out; ``None`` means all.
+        train_views: number of views to fit, evenly spaced; ``None`` means all.
+        seed: seed of whatever has to be rendered first.
+    """
+
+    size: int | tuple[int, int] | None = None
+    test_views: int | None = 16
+    train_views: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        sides = self.size if isinstance(self.size, tuple) else (self.size,)
+        if any(side is not None and side < 1 for side in sides):
+            raise InputError(f"The size {self.size} is not positive.")
+        for name in ("test_views", "train_views"):
+            if (count := getattr(self, name)) is not None and count < 1:
+                raise InputError(f"The number of {name.replace('_', ' ')} must be at least 1, not {count}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Photographs by their use.
+
+    Attributes:
+        train: to fit.
+        test: to score.
+        val: to look at during a fit.
+        rule: how they were told apart, for the scene's notes.
+    """
+
+    train: Sequence[Photo]
+    test: Sequence[Photo]
+    val: Sequence[Photo] = ()
+    rule: str = ""
+
+    @property
+    def photos(self) -> list[Photo]:
+        """All of them."""
+        return [*self.train, *self.val, *self.test]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The local frame and the region to describe in it.
+
+    Attributes:
+        bounds: local.
+        world_from_local: similarity, float64.
+        points: known surface points, world frame.
+    """
+
+    bounds: Bounds
+    world_from_local: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
+    points: Points | None = None
+
+
+def pose(values: object, where: str) -> Float[Tensor, "4 4"]:
+    """A rigid 4x4 in float64 from nested lists or an array with 3 or 4 rows; rounding errors are polished away.
+
+    Raises:
+        InputError: wrong shape, not finite, or not rigid; ``where`` names the file and the view.
+    """
+    try:
+        matrix = torch.as_tensor(values, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        matrix = torch.empty(0)
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise InputError(f"The pose of {where} is not a 4x4 matrix of numbers.")
+    if not bool(matrix.isfinite().all()):
+        raise InputError(f"The pose of {where} has entries that are not finite.", "Remove the view or estimate its pose again.")
+    rotation = matrix[:3, :3]
+    error = float((rotation.T @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
+    if error > _RIGID:
+        raise InputError(f"The pose of {where} is not rigid: its axes are off from orthonormal by {error:.2g}.")
+    if float(torch.linalg.det(rotation)) < 0:
+        raise InputError(f"The pose of {where} is left-handed: its rotation has determinant -1.")
+    u, _, vh = torch.linalg.svd(rotation)
+    result = torch.eye(4, dtype=torch.float64)
+    result[:3, :3], result[:3, 3] = u @ vh, matrix[:3, 3]
+    return result
+
+
+def every_eighth(photos: Sequence[Photo]) -> Split:
+    """LLFF's split: of the photographs in name order, every eighth is scored and the others are fitted."""
+    ordered = sorted(photos, key=lambda photo: photo.name)
+    test = ordered[::HOLD_OUT]
+    train = [photo for index, photo in enumerate(ordered) if index % HOLD_OUT]
+    if not train:
+        raise InputError(f"{len(ordered)} photograph is too few: at least one to fit and one to score are needed.")
+    return Split(train, test, rule=f"every {HOLD_OUT}th photograph by name")
+
+
+def evenly(items: Sequence[T], count: int | None) -> list[T]:
+    """``count`` items, evenly spaced in the middle of equal parts; all of them if there are no more."""
+    if count is None or count >= len(items):
+        return list(items)
+    return [items[int((index + 0.5) * len(items) / count)] for index in range(count)]
+
+
+def present(photos: Sequence[Photo], source: Path) -> tuple[list[Photo], dict[str, str]]:
+    """The photographs whose files exist, and a note about those that do not.
+
+    Raises:
+        InputError: none of them exists.
+    """
+    found = [photo for photo in photos if photo.path.is_file()]
+    absent = [photo.name for photo in photos if not photo.path.is_file()]
+    if not found:
+        raise InputError(
+            f"None of the {len(photos)} pictures that {source} lists exists.", f"Looked for {photos[0].path} first."
+        )
+    if not absent:
+        return found, {}
+    shown = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
+    return found, {"missing": f"{len(absent)} of {len(photos)} listed files are absent: {shown}"}
+
+
+def contracted_frame(
+    poses: Float[Tensor, "n 4 4"], points: Points | None = None, distance: float | None = None, near: float | None = None
+) -> Frame:
+    """A frame for an unbounded scene: +z is the cameras' mean up, the subject is at the origin, cameras within distance 1.
+
+    The subject is where the optical axes come closest to each other. Where they are too parallel for that it lies ``distance``
+    ahead of the cameras, and where it would be behind them (an inside-out rig) it is the middle of the cameras.
+
+    Args:
+        poses: camera-to-world, float64.
+        points: known surface points, world frame; kept, and used where ``distance`` is not given.
+        distance: how far ahead the subject is, world units.
+        near: closest thing in front of a camera, world units.
+    """
+    position, forward = poses[:, :3, 3], poses[:, :3, 2]
+    middle = position.mean(dim=0)
+    if distance is None:
+        spread = (position - middle).norm(dim=1).max()
+        known = points is not None and len(points) > 0
+        distance = float((points.position.double() - middle).norm(dim=1).median() if known and points else 2 * spread)
+    # Sum of the projections onto the planes across the axes: its solution is the point closest to all of them.
+    across = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None, :]
+    normal_matrix = across.mean(dim=0)
+    if float(torch.linalg.eigvalsh(normal_matrix)[0]) < _PARALLEL:
+        centre = middle + distance * torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
+    else:
+        focus = torch.linalg.solve(normal_matrix, (across @ position[:, :, None]).mean(dim=0)[:, 0])
+        ahead = ((focus - position) * forward).sum(dim=1).median()
+        centre = focus if float(ahead) > 0 else middle
+    radius = float((position - centre).norm(dim=1).max()) or 1.0
+    world_from_local = torch.eye(4, dtype=poses.dtype)
+    world_from_local[:3, :3] = radius * _turn_z_to(-poses[:, :3, 1].mean(dim=0))
+    world_from_local[:3, 3] = centre
+    bounds = Bounds(-torch.ones(3), torch.ones(3), "contracted", near=NEAR if near is None else near / radius)
+    return Frame(bounds, world_from_local, points)
+
+
+def _turn_z_to(up: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation that takes +z to ``up``; none where the cameras have no common up."""
+    length = float(up.norm())
+    if length < 0.1:
+        return torch.eye(3, dtype=up.dtype)
+    x, y, z = (up / length).tolist()
+    if z < -1 + 1e-9:
+        return torch.diag(up.new_tensor([1.0, -1.0, -1.0]))
+    # Rodrigues' formula for the axis z × up.
+    skew = up.new_tensor([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
+    return torch.eye(3, dtype=up.dtype) + skew + skew @ skew / (1 + z)
+
+
+def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes: dict[str, str]) -> Scene:
+    """Read the chosen photographs and put their cameras into the local frame.
+
+    Scenes with alpha are declared to be on white, others on black (which then nothing shows through to).
+    """
+    if not split.test:
+        raise InputError(f"{name} has no photographs to score.")
+    chosen = replace(split, train=evenly(split.train, options.train_views), test=evenly(split.test, options.test_views))
+    notes = notes | {
+        "split": split.rule,
+        "train_views": f"{len(chosen.train)} of {len(split.train)}, evenly spaced",
+        "test_views": f"{len(chosen.test)} of {len(split.test)}, evenly spaced",
+    }
+    photos = match_sizes(chosen.photos)
+    local_from_world = torch.linalg.inv(frame.world_from_local)
+    views = [_local_view(photo, local_from_world, options) for photo in photos]
+    lenses = sorted({photo.lens.model for photo in photos if photo.lens is not None})
+    if lenses:
+        notes["undistortion"] = f"{', '.join(lenses)} removed at full size (bilinear), zoomed in until no pixel is blank"
+    notes["resize"] = _resize_note(photos, views)
+    first_test, first_val = len(views) - len(chosen.test), len(chosen.train)
+    return Scene(
+        name=name,
+        train=tuple(views[:first_val]),
+        val=tuple(views[first_val:first_test]),
+        test=tuple(views[first_test:]),
+        background=torch.full((3,), float(any(view.alpha is not None for view in views))),
+        bounds=frame.bounds,
+        points=local_points(frame),
+        world_from_local=frame.world_from_local.float(),
+        notes=notes,
+    )
+
+
+def local_points(frame: Frame) -> Points | None:
+    """The frame's points, moved from the world into it."""
+    if frame.points is None:
+        return None
+    position = transform_points(torch.linalg.inv(frame.world_from_local), frame.points.position.double())
+    return Points(position.float(), frame.points.rgb.float())
+
+
+def _local_view(photo: Photo, local_from_world: Float[Tensor, "4 4"], options: SceneOptions) -> View:
+    camera: Camera = photo.camera.moved(apply_similarity(local_from_world, photo.camera.cam_to_world))
+    return load_view(replace(photo, camera=camera), options.size)
+
+
+def _resize_note(photos: Sequence[Photo], views: Sequence[View]) -> str:
+    changes = {
+        f"{photo.camera.width}x{photo.camera.height} to {view.camera.width}x{view.camera.height}"
+        for photo, view in zip(photos, views, strict=True)
+        if (photo.camera.width, photo.camera.height) != (view.camera.width, view.camera.height)
+    }
+    return f"{RESIZE}, {', '.join(sorted(changes))}" if changes else "none"

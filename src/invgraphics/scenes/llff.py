@@ -1,0 +1,79 @@
+"""LLFF's forward-facing photographs: ``poses_bounds.npy`` beside ``images``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from invgraphics.core import Camera, Scene
+from invgraphics.core.transforms import llff_to_opencv
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import Photo, image_files
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose
+
+
+class Llff:
+    """Loader of LLFF folders: one pinhole per photograph, near and far bounds, every eighth photograph scored.
+
+    The scene is unbounded. Where the cameras look in parallel, the subject lies where LLFF focuses: in disparity a quarter of
+    the way from the far bound to the near one.
+    """
+
+    def matches(self, path: Path) -> bool:
+        """Whether ``path`` is such a folder."""
+        return (path / "poses_bounds.npy").is_file()
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read the folder.
+
+        Raises:
+            InputError: a file is missing or unusable, or there are more or fewer pictures than poses.
+        """
+        source = path / "poses_bounds.npy"
+        table = _read(source)
+        files = _pictures(path)
+        if len(files) != len(table):
+            raise InputError(f"{files[0].parent} has {len(files)} pictures, {source} has {len(table)} poses.")
+        photos = [
+            _photo(row, file, f"{source}, row {index}") for index, (row, file) in enumerate(zip(table, files, strict=True))
+        ]
+        near, far = float(table[:, 15].min()), float(table[:, 16].max())
+        if not 0 < near < far:
+            raise InputError(f"The depth bounds of {source} are {near:g} and {far:g}, not positive and increasing.")
+        poses = torch.stack([photo.camera.cam_to_world for photo in photos])
+        # LLFF's own numbers: 10% in front of the nearest bound; focus between that and five times the farthest.
+        frame = contracted_frame(poses, distance=1 / (0.25 / (0.9 * near) + 0.75 / (5 * far)), near=0.9 * near)
+        return compose(path.resolve().name, every_eighth(photos), frame, options, {"loader": "llff"})
+
+
+def _read(source: Path) -> Float[np.ndarray, "n 17"]:
+    try:
+        table = np.load(source, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{source} cannot be read: {error}.") from error
+    if table.ndim != 2 or table.shape[1] != 17 or len(table) == 0 or table.dtype.kind != "f":
+        raise InputError(f"{source} has shape {table.shape}, expected n rows of 17 numbers.")
+    return table.astype(np.float64)
+
+
+def _pictures(path: Path) -> list[Path]:
+    """The photographs at the highest resolution there is: ``images``, or else ``images_4`` and the like."""
+    scaled = sorted((int(f.name[7:]), f) for f in path.glob("images_*") if f.is_dir() and f.name[7:].isdigit())
+    for folder in (path / "images", *(folder for _, folder in scaled)):
+        if files := image_files(folder):
+            return files
+    raise InputError(f"{path} has poses_bounds.npy but no pictures in 'images'.")
+
+
+def _photo(row: Float[np.ndarray, 17], file: Path, where: str) -> Photo:
+    values = torch.from_numpy(row[:15].reshape(3, 5))
+    height, width, focal = values[:, 4].tolist()
+    if not (height >= 1 and width >= 1 and focal > 0):
+        raise InputError(f"Height, width and focal length of {where} are {height:g}, {width:g} and {focal:g}.")
+    cam_to_world = pose(llff_to_opencv(values[:, :4]), where)
+    centre = torch.tensor([width / 2, height / 2], dtype=torch.float64)
+    camera = Camera(cam_to_world, torch.full_like(centre, focal), centre, round(width), round(height))
+    return Photo(file, camera, file.name)

@@ -1,0 +1,11 @@
+"""Procedural models, one builder per scene; plain numpy, so that nothing is downloaded and Mitsuba is not needed here."""
+
+BUILDERS = {
+    "bricks": "invgraphics.scenes.mitsuba.build.bricks:build",
+    "cloud": "invgraphics.scenes.mitsuba.build.cloud:build",
+    "fence": "invgraphics.scenes.mitsuba.build.fence:build",
+    "materials": "invgraphics.scenes.mitsuba.build.materials:build",
+    "room": "invgraphics.scenes.mitsuba.build.room:build",
+    "textured": "invgraphics.scenes.mitsuba.build.textured:build",
+}
+"""Builder name -> function that takes the scene's seed and returns a `Model`."""

@@ -1,0 +1,85 @@
+"""Where rendered scenes are kept, when one is whole, and how two processes that want the same one wait for each other."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from invgraphics.errors import InputError
+
+VARIABLE = "INVGRAPHICS_CACHE"
+TRUTH = "truth.json"
+SCHEMA = 1
+
+
+def root() -> Path:
+    """The folder of all rendered scenes, created if need be.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    base = Path(os.environ.get(VARIABLE) or Path.home() / ".cache" / "invgraphics").expanduser().resolve()
+    scenes = base / "scenes"
+    try:
+        scenes.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(scenes, error) from error
+    if not os.access(scenes, os.W_OK | os.X_OK):
+        raise unwritable(scenes, PermissionError("permission denied"))
+    return scenes
+
+
+def unwritable(folder: Path, error: OSError) -> InputError:
+    """What to tell a person whose cache cannot be written."""
+    return InputError(f"{folder} cannot be written: {error.strerror or error}.", f"Set {VARIABLE} to a folder with free space.")
+
+
+def read_truth(folder: Path) -> dict[str, Any] | None:
+    """The content of a folder's ``truth.json``; ``None`` where it is missing, broken, or a listed file has lost bytes."""
+    try:
+        content = json.loads((folder / TRUTH).read_text(encoding="utf-8"))
+        whole = content["schema"] == SCHEMA and all((folder / path).stat().st_size == n for path, n in content["files"].items())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return content if whole else None
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the right to make ``folder``; whoever comes second waits. The system frees it when a process dies."""
+    try:
+        file = folder.with_name(f"{folder.name}.lock").open("w")
+    except OSError as error:
+        raise unwritable(folder.parent, error) from error
+    with file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def copy(source: Path, target: Path) -> Path:
+    """Copy a whole scene to a folder that is new or empty, all at once; a folder that already holds it is left alone.
+
+    Raises:
+        InputError: the target holds something else, or cannot be written.
+    """
+    wanted, present = read_truth(source), read_truth(target)
+    if wanted and present and wanted["key"] == present["key"]:
+        return target
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target} already exists and holds something else.", "Choose a new or empty folder.")
+    partial = target.with_name(f".{target.name}.partial")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copytree(source, partial)
+        os.replace(partial, target)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise InputError(f"{target} cannot be written: {error.strerror or error}.") from error
+    return target

@@ -1,0 +1,68 @@
+"""What the parent process asks the rendering process for, and the hash under which the answer is kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from invgraphics.config import fill, to_table
+from invgraphics.scenes.mitsuba.spec import Counts, Samples, SceneSpec
+
+# The sources that decide pixels, relative to the package; the rest (caching, messages) does not.
+_SOURCES = (
+    "scenes/mitsuba/build/*.py", "scenes/mitsuba/rig.py", "scenes/mitsuba/stage.py", "scenes/mitsuba/gbuffer.py",
+    "scenes/mitsuba/render.py", "scenes/mitsuba/folder.py", "core/camera.py", "core/transforms.py", "core/colour.py",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Job:
+    """One rendering of a scene.
+
+    Attributes:
+        spec: the scene's description.
+        size: width and height in pixels.
+        views: how many of each split.
+        samples: per pixel, of each split.
+        seed: of the camera positions and of the renderer's noise.
+        variant: Mitsuba's.
+    """
+
+    spec: SceneSpec
+    size: tuple[int, int]
+    views: Counts
+    samples: Samples
+    seed: int
+    variant: str
+
+    def table(self) -> dict[str, Any]:
+        """As plain values."""
+        return to_table(self)
+
+    @staticmethod
+    def from_json(text: str) -> Job:
+        """Inverse of ``json.dumps(job.table())``."""
+        return fill(Job, json.loads(text))
+
+    @property
+    def total(self) -> int:
+        """Views to render."""
+        return self.views.train + self.views.val + self.views.test
+
+    def key(self) -> str:
+        """Hash of everything the pixels depend on: description, options, our sources, Mitsuba's version and variant."""
+        content = {"job": self.table(), "sources": _source_hash(), "mitsuba": version("mitsuba"), "drjit": version("drjit")}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _source_hash() -> str:
+    package = Path(__file__).resolve().parents[2]
+    sha = hashlib.sha256()
+    for pattern in _SOURCES:
+        for path in sorted(package.glob(pattern)):
+            sha.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return sha.hexdigest()

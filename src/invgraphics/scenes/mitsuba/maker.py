@@ -1,0 +1,132 @@
+"""`make`: the one door to the rendered scenes. Looks in the cache, and has what is missing rendered by a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO
+
+from invgraphics.errors import InputError
+from invgraphics.scenes.mitsuba import cache, llvm
+from invgraphics.scenes.mitsuba.job import Job
+from invgraphics.scenes.mitsuba.spec import Counts, locate, read
+
+Progress = Callable[[int, int, str], None]
+
+
+def make(
+    name: str,
+    *,
+    size: tuple[int, int] | None = None,
+    train: int | None = None,
+    test: int | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+    out: Path | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Ground truth of a scene, rendered unless it has been before.
+
+    Args:
+        name: of a built-in scene, or the path of one's own ``scene.toml``.
+        size: width and height in pixels. For this and what follows, ``None`` means what the scene's description says.
+        train: number of training views.
+        test: number of test views.
+        spp: samples per pixel of the training views; the other splits' keep their proportion to it.
+        seed: of the camera positions and of the renderer's noise.
+        out: folder to put a copy into; ``None`` leaves the scene in the cache only.
+        progress: called with (views done, views in all, what is being done).
+
+    Returns:
+        The folder of the scene, see `invgraphics.scenes.truth`.
+
+    Raises:
+        InputError: unknown scene, impossible option, unwritable folder, or the renderer failed.
+    """
+    job = _job(name, size, (train, test), spp, seed)
+    folder = cache.root() / f"{job.spec.name}-{job.key()}"
+    if cache.read_truth(folder) is None:
+        with cache.locked(folder):
+            if cache.read_truth(folder) is None:  # another process may have made it meanwhile
+                _make(job, folder, progress or (lambda done, total, what: None))
+    return folder if out is None else cache.copy(folder, Path(out))
+
+
+def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int | None], spp: int | None, seed: int) -> Job:
+    spec = read(locate(name))
+    for value, least, what in ((size and min(size), 8, "The size"), (views[0], 1, "The number of training views"),
+                               (views[1], 1, "The number of test views"), (spp, 1, "The number of samples per pixel")):  # fmt: skip
+        if value is not None and value < least:
+            raise InputError(f"{what} cannot be {value}.", f"Expected: at least {least}.")
+    if seed < 0:
+        raise InputError(f"The seed cannot be {seed}.", "Expected: 0 or a positive whole number.")
+    train, test = (
+        default if given is None else given for given, default in zip(views, (spec.views.train, spec.views.test), strict=True)
+    )
+    samples = spec.samples if spp is None else spec.samples.scaled(spp)
+    return Job(spec, size or spec.size, Counts(train, spec.views.val, test), samples, seed, llvm.status().variant)
+
+
+def _make(job: Job, folder: Path, progress: Progress) -> None:
+    """Render into a folder beside the final one, which appears only when it is whole."""
+    partial = folder.with_name(f"{folder.name}.partial")
+    request = partial / "job.json"
+    try:
+        shutil.rmtree(folder, ignore_errors=True)  # a broken one, see `cache.read_truth`
+        partial.mkdir(exist_ok=True)
+        request.write_text(json.dumps(job.table()), encoding="utf-8")
+        _run(job, partial, progress)
+        request.unlink()
+        os.replace(partial, folder)
+    except OSError as error:
+        raise cache.unwritable(partial, error) from error
+
+
+def _run(job: Job, partial: Path, progress: Progress) -> None:
+    command = [sys.executable, "-m", "invgraphics.scenes.mitsuba.render", str(partial)]
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=complaints, text=True, env=llvm.status().environment()
+        )
+        try:
+            failure = _follow(process, progress)
+            status = process.wait()
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
+        if status:
+            raise InputError(*_explain(job, status, failure, complaints))
+
+
+def _follow(process: subprocess.Popen[str], progress: Progress) -> str:
+    """Pass progress on until the process closes its output; what it said went wrong, if it did."""
+    failure = ""
+    for line in process.stdout or ():
+        word, _, rest = line.rstrip("\n").partition(" ")
+        if word == "progress":
+            done, total, what = rest.split(" ", 2)
+            progress(int(done), int(total), what)
+        elif word == "error":
+            failure = rest
+    return failure
+
+
+def _explain(job: Job, status: int, failure: str, complaints: IO[str]) -> tuple[str, str]:
+    """Sentence and remedy for a rendering process that failed."""
+    scene = f"The scene '{job.spec.name}' could not be rendered"
+    if failure:
+        return f"{scene}: {failure}", f"The cache is {cache.root()}; {cache.VARIABLE} moves it."
+    if status < 0:
+        killed = signal.Signals(-status).name
+        return f"{scene}: the rendering process died of {killed}.", "If memory ran out, make it smaller (--size, --spp)."
+    complaints.seek(0)
+    last = next((line for line in reversed(complaints.read().splitlines()) if line.strip()), f"exit status {status}")
+    return f"{scene}: {last.strip()}.", ""

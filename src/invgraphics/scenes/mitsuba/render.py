@@ -1,0 +1,129 @@
+"""The rendering process: ``python -m invgraphics.scenes.mitsuba.render FOLDER`` does what ``FOLDER/job.json`` asks for.
+
+It runs apart from the caller because a bad LLVM aborts the process that uses it. It reports on its standard output, a line per
+view: ``progress DONE TOTAL WHAT``. Views that an interrupted process has left are kept.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from invgraphics.core import Camera
+from invgraphics.errors import InputError
+from invgraphics.scenes.mitsuba import folder as folders
+from invgraphics.scenes.mitsuba import ply, stage
+from invgraphics.scenes.mitsuba.build import BUILDERS
+from invgraphics.scenes.mitsuba.build.mesh import merge, sphere
+from invgraphics.scenes.mitsuba.build.model import Model
+from invgraphics.scenes.mitsuba.gbuffer import GBuffer, sample_points, trace, trace_fog
+from invgraphics.scenes.mitsuba.job import Job
+from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
+
+POINTS = 20_000
+REQUEST = "job.json"
+
+
+def main(folder: Path) -> None:
+    """Render what is missing in ``folder``, then write what depends on all views."""
+    import mitsuba
+
+    job = Job.from_json((folder / REQUEST).read_text(encoding="utf-8"))
+    mitsuba.set_variant(job.variant)
+    rig = make_rig(job.spec.rig)
+    counts: dict[Split, int] = {"train": job.views.train, "val": job.views.val, "test": job.views.test}
+    views = {split: cameras(rig, split, counts[split], job.size, job.seed) for split in SPLITS}
+    model = build(job.spec.builder, job.spec.seed)
+    with tempfile.TemporaryDirectory() as scratch:
+        scene = stage.load(model, job.spec.depth, job.spec.background is not None, Path(scratch))
+    done = 0
+    for split in SPLITS:
+        for index, camera in enumerate(views[split]):
+            _report(done, job.total, f"{split} {index:04d}")
+            if not folders.view_paths(folder, split, index)[1].exists():
+                _render_view(job, scene, model, folder, (split, index, camera))
+            done += 1
+    _report(done, job.total, "points and mesh")
+    _finish(job, model, folder, views)
+
+
+def build(builder: str, seed: int) -> Model:
+    """Make a registered model.
+
+    Raises:
+        InputError: there is no such builder.
+    """
+    if builder not in BUILDERS:
+        raise InputError(f"There is no builder '{builder}'.", f"Known builders: {', '.join(BUILDERS)}.")
+    module, _, function = BUILDERS[builder].partition(":")
+    return getattr(importlib.import_module(module), function)(seed)
+
+
+def _render_view(job: Job, scene: Any, model: Model, folder: Path, view: tuple[Split, int, Camera]) -> None:
+    split, index, camera = view
+    samples: int = getattr(job.samples, split)
+    stream = (job.seed, SPLITS.index(split), index)
+    if split == "test":
+        halves = [stage.render(scene, camera, samples // 2, (*stream, half)) for half in (1, 2)]
+        linear, half_psnr = (halves[0] + halves[1]) / 2, folders.psnr(halves[0], halves[1], job.spec.background)
+    else:
+        linear, half_psnr = stage.render(scene, camera, samples, (*stream, 0)), float("nan")
+    gbuffer = trace_fog(model.fog, camera) if model.fog else trace(scene, camera)
+    _check_bounds(job, gbuffer)
+    folders.write_view(folder, split, index, linear, gbuffer, half_psnr)
+
+
+def _check_bounds(job: Job, gbuffer: GBuffer) -> None:
+    seen = gbuffer.position[np.isfinite(gbuffer.depth)]
+    lo, hi = np.array(job.spec.lo), np.array(job.spec.hi)
+    if len(seen) and ((seen < lo - 1e-4).any() or (seen > hi + 1e-4).any()):
+        low, high = seen.min(axis=0).round(3).tolist(), seen.max(axis=0).round(3).tolist()
+        raise InputError(f"Surfaces from {low} to {high} leave the scene's box.", "Widen 'lo' and 'hi' in its scene.toml.")
+
+
+def _finish(job: Job, model: Model, folder: Path, views: dict[Split, tuple[Camera, ...]]) -> None:
+    if not model.fog:
+        _write_points(job, folder, views["train"])
+        mesh = merge([part.mesh for part in model.parts] + [sphere(ball.centre, ball.radius) for ball in model.balls])
+        ply.write(folder / "mesh.ply", *ply.weld(mesh.vertices, mesh.faces))
+    half_psnr = []
+    for split in SPLITS:
+        if views[split]:
+            folders.write_transforms(folder, split, views[split])
+    for index in range(job.views.test):
+        with np.load(folders.view_paths(folder, "test", index)[1], allow_pickle=False) as arrays:
+            half_psnr.append(float(arrays["half_psnr"]))
+    folders.write_truth(folder, job, views, half_psnr)
+
+
+def _write_points(job: Job, folder: Path, train: tuple[Camera, ...]) -> None:
+    positions, colours = [], []
+    for index, camera in enumerate(train):
+        with np.load(folders.view_paths(folder, "train", index)[1], allow_pickle=False) as arrays:
+            depth, linear = arrays["depth"].reshape(-1), arrays["linear"]
+        rays = camera.rays()
+        hit = np.isfinite(depth)
+        positions.append((rays.origins.numpy() + np.where(hit, depth, 0)[:, None] * rays.directions.numpy())[hit])
+        colours.append(folders.straight_srgb(linear)[..., :3].numpy().reshape(-1, 3)[hit])
+    position, rgb = sample_points(positions, colours, POINTS, job.seed)
+    with (folder / "points.npz").open("wb") as file:
+        np.savez_compressed(file, position=position.astype(np.float32), rgb=rgb.astype(np.float32))
+
+
+def _report(done: int, total: int, what: str) -> None:
+    # A parent that was killed leaves a closed pipe: writing to it ends this process too.
+    print(f"progress {done} {total} {what}", flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        main(Path(sys.argv[1]))
+    except (InputError, OSError) as error:
+        print(f"error {str(error).replace(os.linesep, ' ')}", flush=True)
+        sys.exit(1)

@@ -1,0 +1,128 @@
+"""What a ``scene.toml`` says: the schema of a scene description."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from invgraphics import data
+from invgraphics.config import fill
+from invgraphics.errors import InputError
+
+FILE = "scene.toml"
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples per pixel of each split; those of ``test`` are taken in two independent halves."""
+
+    train: int = 256
+    val: int = 64
+    test: int = 1024
+
+    def __post_init__(self) -> None:
+        if min(self.train, self.val) < 1 or self.test < 2 or self.test % 2:
+            raise ValueError("samples per pixel must be positive, and even for the test views")
+
+    def scaled(self, train: int) -> Samples:
+        """The same proportions for another number of samples per training pixel."""
+        factor = train / self.train
+        return Samples(train, max(1, round(self.val * factor)), 2 * max(1, round(self.test * factor / 2)))
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Views of each split."""
+
+    train: int = 40
+    val: int = 4
+    test: int = 16
+
+    def __post_init__(self) -> None:
+        if min(self.train, self.test) < 1 or self.val < 0:
+            raise ValueError("there must be at least one training view and one test view")
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """A scene description.
+
+    Attributes:
+        name: short name, shown everywhere.
+        builder: which procedural model (`invgraphics.scenes.mitsuba.build.BUILDERS`) is rendered.
+        summary: one sentence about what is seen.
+        stresses: one sentence about what the scene is hard for.
+        lo: lowest corner of a box that holds every visible surface, world units.
+        hi: highest corner of that box.
+        rig: where the cameras stand: a ``kind`` and its parameters, see `invgraphics.scenes.mitsuba.rig`.
+        size: default width and height in pixels.
+        views: default numbers of views.
+        samples: default samples per pixel.
+        background: colour put behind the scene when it is scored, display sRGB; ``None`` where the scene is opaque.
+        depth: longest light path, in vertices.
+        seed: of the model's own randomness (textures, placement), apart from the renderer's noise.
+    """
+
+    name: str
+    builder: str
+    summary: str
+    stresses: str
+    lo: Vector
+    hi: Vector
+    rig: dict[str, Any]
+    size: tuple[int, int] = (128, 128)
+    views: Counts = Counts()
+    samples: Samples = Samples()
+    background: Vector | None = None
+    depth: int = 8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.lo, self.hi, strict=True)):
+            raise ValueError("every coordinate of 'lo' must be below that of 'hi'")
+        if min(self.size) < 8:
+            raise ValueError("images must be at least 8 pixels wide and high")
+        if self.depth < 2:
+            raise ValueError("'depth' must be at least 2, which is direct light only")
+
+
+@cache
+def names() -> tuple[str, ...]:
+    """The built-in scenes."""
+    return tuple(sorted(path.parent.name for path in data.find("scenes").glob(f"*/{FILE}")))
+
+
+def locate(name: str) -> Path:
+    """The description of a built-in scene, or of one's own: the path of a ``scene.toml`` or of its folder.
+
+    Raises:
+        InputError: there is none; the built-in scenes are listed.
+    """
+    if name in names():
+        return data.find("scenes", name) / FILE
+    for path in (Path(name), Path(name) / FILE):
+        if path.name == FILE and path.is_file():
+            return path
+    raise InputError(f"There is no scene '{name}'.", f"Built-in scenes: {', '.join(names())}; or give a path to a {FILE}.")
+
+
+def read(path: Path) -> SceneSpec:
+    """The checked description in a ``scene.toml``.
+
+    Raises:
+        InputError: not TOML, or a key is unknown, missing or wrong.
+    """
+    try:
+        table: Mapping[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}.") from error
+    try:
+        return fill(SceneSpec, table)
+    except InputError as error:
+        raise InputError(f"{path}: {error.sentence}", error.remedy) from error

@@ -1,0 +1,44 @@
+"""Photographs with a ``transforms.json``, as nerfstudio and instant-ngp write it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from invgraphics.core import Scene
+from invgraphics.scenes.frames import Frames
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, present
+
+
+class Nerfstudio:
+    """Loader of ``transforms.json``: OpenGL axes, OPENCV lenses, an unbounded scene, every eighth photograph scored.
+
+    Poses are taken as they are: an ``applied_transform`` has already been applied to them. Listed photographs that do not
+    exist are skipped and named in the scene's notes.
+    """
+
+    def matches(self, path: Path) -> bool:
+        """Whether ``path`` is a folder with a ``transforms.json``, or such a file."""
+        return _source(path).is_file()
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read the folder.
+
+        Raises:
+            InputError: a file is missing or unusable.
+        """
+        source = _source(path)
+        frames = Frames.read(source)
+        photos, notes = present(frames.photos(), source)
+        notes["loader"] = "nerfstudio"
+        if "ply_file_path" in frames.table:
+            notes["points"] = f"{frames.table['ply_file_path']} is not read"
+        if any("mask_path" in frame for frame in frames.frames):
+            notes["masks"] = "the frames' mask_path is not read"
+        poses = torch.stack([photo.camera.cam_to_world for photo in photos])
+        return compose(source.resolve().parent.name, every_eighth(photos), contracted_frame(poses), options, notes)
+
+
+def _source(path: Path) -> Path:
+    return path if path.suffix == ".json" else path / "transforms.json"

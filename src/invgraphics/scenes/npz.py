@@ -1,0 +1,186 @@
+"""A scene in one ``.npz``: the simplest thing a person can write with ``numpy.savez``.
+
+============== ============================== =====================================================================
+key            shape                          meaning
+============== ============================== =====================================================================
+images         (n, h, w, 3) or (n, h, w, 4)   bytes, or floats in [0, 1]; straight display sRGB, the 4th channel is alpha
+cam_to_world   (n, 4, 4) or (n, 3, 4)         rigid poses, OpenCV axes (+x right, +y down, +z forward)
+focal          (), (2,) or (n, 2)             focal lengths in pixels, (fx, fy)
+centre         (2,) or (n, 2), optional       principal point (cx, cy) in pixels, first pixel's centre at 0.5; default: middle
+alpha          (n, h, w), optional            coverage, bytes or floats in [0, 1]; instead of a 4th channel
+depth          (n, h, w), optional            distance along the unit ray, world units, inf where nothing is hit
+normal         (n, h, w, 3), optional         unit normals, world frame, facing the camera, zero where nothing is hit
+points         (m, 3), optional               known surface points, world frame
+points_rgb     (m, 3), optional               their colours, as ``images``; default: grey
+test           (n,) booleans, optional        which views are scored; default: every 8th
+bounds         (2, 3), optional               lowest and highest corner of a box that holds all there is; default: unbounded
+============== ============================== =====================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from invgraphics.core import Bounds, Camera, Points, Scene, View
+from invgraphics.core.transforms import apply_similarity
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import RESIZE, make_view, wanted_size
+from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
+
+Arrays = Mapping[str, np.ndarray]
+
+_REQUIRED = ("images", "cam_to_world", "focal")
+
+
+class Npz:
+    """Loader of the convention in this module's docstring."""
+
+    def matches(self, path: Path) -> bool:
+        """Whether ``path`` is an ``.npz`` file."""
+        return path.is_file() and path.suffix == ".npz"
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read the file.
+
+        Raises:
+            InputError: it is damaged, or a key is missing or has another shape.
+        """
+        arrays = _read(path)
+        n, height, width = arrays["images"].shape[:3]
+        poses = torch.stack([_pose(path, arrays, i) for i in range(n)])
+        frame = _frame(arrays, poses, path)
+        held_out = _held_out(arrays, n, path)
+        train, test = np.flatnonzero(~held_out).tolist(), np.flatnonzero(held_out).tolist()
+        if not train or not test:
+            raise InputError(f"{path} has {len(train)} views to fit and {len(test)} to score; it needs at least one of each.")
+        final = wanted_size(width, height, options.size)
+        chosen = (evenly(train, options.train_views), evenly(test, options.test_views))
+        notes = {
+            "loader": "npz",
+            "train_views": f"{len(chosen[0])} of {len(train)}, evenly spaced",
+            "test_views": f"{len(chosen[1])} of {len(test)}, evenly spaced",
+            "resize": "none" if final == (width, height) else f"{RESIZE}, {width}x{height} to {final[0]}x{final[1]}",
+        }
+        if final != (width, height) and ("depth" in arrays or "normal" in arrays):
+            notes["geometry"] = "depth and normals are dropped: they are one ray per pixel and cannot be averaged"
+        views = {i: _view(path, arrays, i, frame, final) for part in chosen for i in part}
+        return Scene(
+            name=path.stem,
+            train=tuple(views[i] for i in chosen[0]),
+            test=tuple(views[i] for i in chosen[1]),
+            background=torch.full((3,), float(any(view.alpha is not None for view in views.values()))),
+            bounds=frame.bounds,
+            points=local_points(frame),
+            world_from_local=frame.world_from_local.float(),
+            notes=notes,
+        )
+
+
+def _read(path: Path) -> Arrays:
+    """All arrays, with the shapes that the convention asks for."""
+    try:
+        with np.load(path, allow_pickle=False) as table:
+            arrays = {key: table[key] for key in table.files}
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise InputError(f"{path} cannot be read: {error}.") from error
+    except Exception as error:  # zipfile and zlib have errors of their own for a damaged archive
+        raise InputError(f"{path} is damaged: {error}.", "Write or copy the file again.") from error
+    missing = [key for key in _REQUIRED if key not in arrays]
+    if missing:
+        raise InputError(f"{path} has no {' and no '.join(map(repr, missing))}.", f"It has: {', '.join(arrays) or 'nothing'}.")
+    images = arrays["images"]
+    n, h, w = images.shape[:3] if images.ndim == 4 else (0, 0, 0)
+    if n == 0 or images.shape[3] not in (3, 4):
+        raise InputError(f"'images' of {path} has shape {images.shape}, expected (n, h, w, 3) or (n, h, w, 4).")
+    allowed = {
+        "cam_to_world": [(n, 4, 4), (n, 3, 4)],
+        "focal": [(), (2,), (n, 2)],
+        "centre": [(2,), (n, 2)],
+        "alpha": [(n, h, w)],
+        "depth": [(n, h, w)],
+        "normal": [(n, h, w, 3)],
+        "bounds": [(2, 3)],
+        "test": [(n,)],
+    }
+    for key, shapes in allowed.items():
+        if key in arrays and arrays[key].shape not in shapes:
+            expected = " or ".join(map(str, shapes))
+            raise InputError(f"'{key}' of {path} has shape {arrays[key].shape}, expected {expected}.")
+        if key in arrays and arrays[key].dtype.kind not in "fiub":
+            raise InputError(f"'{key}' of {path} holds {arrays[key].dtype}, not numbers.")
+    return arrays
+
+
+def _pose(path: Path, arrays: Arrays, i: int) -> Float[Tensor, "4 4"]:
+    return pose(arrays["cam_to_world"][i], f"{path}, view {i}")
+
+
+def _frame(arrays: Arrays, poses: Float[Tensor, "n 4 4"], path: Path) -> Frame:
+    points = None
+    if "points" in arrays:
+        position = arrays["points"]
+        rgb = arrays.get("points_rgb", np.full(position.shape, 0.5))
+        if position.ndim != 2 or position.shape[1] != 3 or rgb.shape != position.shape:
+            raise InputError(f"'points' of {path} has shape {position.shape}, its colours {rgb.shape}; expected (m, 3) twice.")
+        if not np.isfinite(position).all():
+            raise InputError(f"'points' of {path} has entries that are not finite.")
+        points = Points(
+            torch.from_numpy(position.astype(np.float64)), torch.from_numpy(_bytes(rgb, "points_rgb", path)).float() / 255
+        )
+    if "bounds" not in arrays:
+        return contracted_frame(poses, points)
+    lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32))
+    if not bool((lo < hi).all()):
+        raise InputError(f"'bounds' of {path} is {arrays['bounds'].tolist()}: the first corner must be below the second.")
+    return Frame(Bounds(lo, hi), points=points)
+
+
+def _held_out(arrays: Arrays, n: int, path: Path) -> np.ndarray:
+    if "test" not in arrays:
+        return np.arange(n) % HOLD_OUT == 0
+    if arrays["test"].dtype != np.bool_:
+        raise InputError(f"'test' of {path} holds {arrays['test'].dtype}, expected one boolean per view.")
+    return arrays["test"]
+
+
+def _view(path: Path, arrays: Arrays, i: int, frame: Frame, final: tuple[int, int]) -> View:
+    pixels = _bytes(arrays["images"][i], "images", path)
+    if "alpha" in arrays:
+        pixels = np.concatenate([pixels[:, :, :3], _bytes(arrays["alpha"][i], "alpha", path)[:, :, None]], axis=2)
+    height, width = pixels.shape[:2]
+    local = apply_similarity(torch.linalg.inv(frame.world_from_local), _pose(path, arrays, i))
+    focal = np.broadcast_to(arrays["focal"][i] if arrays["focal"].ndim == 2 else arrays["focal"], 2)
+    centre = arrays.get("centre", np.array([width / 2, height / 2]))
+    centre = centre[i] if centre.ndim == 2 else centre
+    focal, centre = (torch.from_numpy(np.array(values, dtype=np.float64)) for values in (focal, centre))
+    view = make_view(Camera(local, focal, centre, width, height), pixels, str(i), final)
+    if final != (width, height):
+        return view
+    depth, normal = arrays.get("depth"), arrays.get("normal")
+    scale, rotation = _parts(frame.world_from_local)
+    return replace(
+        view,
+        depth=None if depth is None else torch.from_numpy(depth[i].astype(np.float32)) / scale,
+        normal=None if normal is None else torch.from_numpy(normal[i].astype(np.float32)) @ rotation.float(),
+    )
+
+
+def _parts(similarity: Float[Tensor, "4 4"]) -> tuple[float, Float[Tensor, "3 3"]]:
+    """Scale and rotation."""
+    scale = float(torch.linalg.det(similarity[:3, :3]) ** (1 / 3))
+    return scale, similarity[:3, :3] / scale
+
+
+def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shape"]:
+    if values.dtype == np.uint8:
+        return values
+    if values.dtype.kind == "f" and np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1:
+        return (values * 255 + 0.5).astype(np.uint8)
+    raise InputError(f"'{key}' of {path} holds neither bytes nor finite floats in [0, 1].")

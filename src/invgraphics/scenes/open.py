@@ -1,0 +1,153 @@
+"""The one way to open a scene: a built-in scene's name, or a path to a data set in any known format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from invgraphics import plugins
+from invgraphics.core import Scene, View
+from invgraphics.errors import InputError
+from invgraphics.scenes.layout import SceneOptions, pose
+
+__all__ = ["Loader", "SceneOptions", "find_loader", "open_scene", "validate"]
+
+_SAME_POSE = 1e-6  # entries of two poses that are closer than this are one camera
+
+
+class Loader(Protocol):
+    """A format of data sets on disk."""
+
+    def matches(self, path: Path) -> bool:
+        """Whether ``path`` is in this format."""
+        ...
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read the data set; bad input raises `InputError`."""
+        ...
+
+
+def open_scene(spec: str, options: SceneOptions | None = None, progress: Callable[..., Any] | None = None) -> Scene:
+    """Open a scene and check it.
+
+    Args:
+        spec: a built-in scene's name, which is rendered first unless its truth is in the cache; the path of one's own
+            ``scene.toml``; or the path of a data set.
+        options: size and number of views.
+        progress: told about rendering, see `invgraphics.scenes.mitsuba.make`.
+
+    Raises:
+        InputError: nothing is known by this name, no format fits, or the data cannot be used.
+    """
+    options = options or SceneOptions()
+    described = _description(spec)
+    if described is not None:
+        path = _render(spec, described, options, progress)
+        return validate(plugins.load("scenes", "truth")().load(path, options))
+    path = Path(spec).expanduser()
+    if not path.exists():
+        raise InputError(
+            f"'{spec}' is neither a built-in scene nor an existing path.", f"Built-in scenes: {', '.join(_built_in())}."
+        )
+    return validate(find_loader(path).load(path, options))
+
+
+def find_loader(path: Path) -> Loader:
+    """The first format that fits ``path``, in the registry's order.
+
+    Raises:
+        InputError: none fits; the sentence says what was looked for.
+    """
+    formats = plugins.names("scenes")
+    for name in formats:
+        loader: Loader = plugins.load("scenes", name)()
+        if loader.matches(path):
+            return loader
+    what = "is an empty folder" if path.is_dir() and not any(path.iterdir()) else "is not a data set of a known format"
+    raise InputError(
+        f"{path} {what}.",
+        "Looked for truth.json, transforms_train.json, transforms.json, poses_bounds.npy, sparse/0/cameras.bin, cameras*.npz "
+        f"and .npz (formats: {', '.join(formats)}).",
+    )
+
+
+def _built_in() -> tuple[str, ...]:
+    from invgraphics.scenes.mitsuba import spec
+
+    return spec.names()
+
+
+def _description(spec: str) -> Path | None:
+    """The ``scene.toml`` that ``spec`` stands for, if any."""
+    from invgraphics.scenes.mitsuba.spec import FILE, locate
+
+    path = Path(spec).expanduser()
+    own = path if path.name == FILE else path / FILE
+    return locate(spec) if spec in _built_in() or own.is_file() else None
+
+
+def _render(spec: str, description: Path, options: SceneOptions, progress: Callable[..., Any] | None) -> Path:
+    from invgraphics.scenes.mitsuba import make
+    from invgraphics.scenes.mitsuba.spec import read
+
+    size = options.size
+    if isinstance(size, int):
+        width, height = read(description).size
+        size = (round(size * width / max(width, height)), round(size * height / max(width, height)))
+    return make(
+        spec,
+        size=size,
+        train=options.train_views,
+        test=options.test_views,
+        spp=None,
+        seed=options.seed,
+        progress=progress,
+    )
+
+
+def validate(scene: Scene) -> Scene:
+    """Check what everything later relies on; returns the scene.
+
+    Raises:
+        InputError: a pose is not finite or not rigid, a focal length is not positive, pixels are not finite or not of the
+            camera's size, a split is empty, or a test camera is also a training camera. The sentence names the view.
+    """
+    for split in ("train", "test"):
+        if not getattr(scene, split):
+            raise InputError(
+                f"The scene '{scene.name}' has no {split} views.", "At least one to fit and one to score is needed."
+            )
+    for split in ("train", "val", "test"):
+        for view in getattr(scene, split):
+            _validate_view(view, f"{split} view '{view.name}' of '{scene.name}'")
+    tested = torch.stack([_flat(view) for view in scene.test])
+    for split in ("train", "val"):
+        for view in getattr(scene, split):
+            same = ((tested - _flat(view)).abs().amax(dim=1) < _SAME_POSE).nonzero()
+            if len(same):
+                twin = scene.test[int(same[0])].name
+                raise InputError(f"The {split} view '{view.name}' and the test view '{twin}' of '{scene.name}' share a camera.")
+    return scene
+
+
+def _flat(view: View) -> torch.Tensor:
+    return view.camera.cam_to_world[:3].reshape(-1)
+
+
+def _validate_view(view: View, what: str) -> None:
+    camera = view.camera
+    pose(camera.cam_to_world, what)
+    intrinsics = torch.cat([camera.focal, camera.centre])
+    if not bool(intrinsics.isfinite().all()) or float(camera.focal.min()) <= 0:
+        raise InputError(f"The {what} has focal length {camera.focal.tolist()} and centre {camera.centre.tolist()} pixels.")
+    for name, values in (("image", view.image), ("alpha", view.alpha), ("depth", view.depth), ("normal", view.normal)):
+        if values is None:
+            continue
+        if tuple(values.shape[:2]) != (camera.height, camera.width):
+            height, width = values.shape[:2]
+            raise InputError(f"The {name} of {what} has {width}x{height} pixels, its camera {camera.width}x{camera.height}.")
+        if bool(values.isnan().any()) or (name != "depth" and not bool(values.isfinite().all())):
+            raise InputError(f"The {name} of {what} has pixels that are not finite.")

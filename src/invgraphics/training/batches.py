@@ -1,0 +1,126 @@
+"""What a step looks at: random rays of several views, or one whole view, in front of the step's background."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Batch, Camera, Rays, Scene, View
+
+
+@dataclass(frozen=True)
+class BatchConfig:
+    """Size of a step.
+
+    Attributes:
+        rays: rays of a step, for ray renderers. With ``samples`` set it is only the start.
+        views: most views that one step's rays come from.
+        samples: target number of samples per step: the ray count follows what is kept (Instant-NGP); 0 keeps ``rays``.
+        resolution: image scale of each phase of the fit, for image renderers; the last should be 1.
+        until: progress at which each phase but the last ends; one fewer than ``resolution``.
+    """
+
+    rays: int = 1024
+    views: int = 32
+    samples: int = 0
+    resolution: tuple[float, ...] = (1.0,)
+    until: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.rays < 1 or self.views < 1 or self.samples < 0:
+            raise ValueError("'rays' and 'views' must be at least 1, 'samples' at least 0.")
+        if len(self.until) != len(self.resolution) - 1 or list(self.until) != sorted(self.until):
+            raise ValueError("'until' must hold one rising progress value fewer than 'resolution' has entries.")
+        if not all(0 < scale <= 1 for scale in self.resolution):
+            raise ValueError("'resolution' must hold scales in (0, 1].")
+
+    def scale_at(self, progress: float) -> float:
+        """Image scale at a point of the fit."""
+        return self.resolution[sum(progress >= end for end in self.until)]
+
+
+class Batches:
+    """Draws what each step compares; all randomness comes from the generator it is given."""
+
+    MAX_RAYS = 1 << 16
+
+    def __init__(self, config: BatchConfig, scene: Scene, generator: torch.Generator, device: torch.device) -> None:
+        self._config, self._scene, self._generator, self._device = config, scene, generator, device
+        self._order = torch.zeros(0, dtype=torch.int64)
+        self._rays = config.rays
+        self._small: dict[tuple[int, float], View] = {}
+
+    def background(self) -> Float[Tensor, 3]:
+        """Random where photographs are transparent, so that emptiness must be learnt; declared otherwise. All methods alike."""
+        if self._scene.has_alpha:
+            return torch.rand(3, generator=self._generator)
+        return self._scene.background
+
+    def rays(self) -> tuple[Rays, Batch]:
+        """Random rays of up to ``views`` random training views."""
+        background = self.background()
+        train, config = self._scene.train, self._config
+        count = min(config.views, len(train), self._rays)
+        chosen = torch.randperm(len(train), generator=self._generator)[:count]
+        shares = [self._rays // count + (i < self._rays % count) for i in range(count)]
+        parts = [self._rays_of(int(view), share, background) for view, share in zip(chosen, shares, strict=True)]
+        rays, targets, alphas = zip(*parts, strict=True)
+        batch = Batch(torch.cat(targets), torch.cat(alphas), background)
+        return Rays.cat(rays).to(self._device), batch.to(self._device)
+
+    def _rays_of(self, index: int, count: int, background: Tensor) -> tuple[Rays, Tensor, Tensor]:
+        view = self._scene.train[index]
+        camera = view.camera
+        if view.mask is None:
+            flat = torch.randint(camera.width * camera.height, (count,), generator=self._generator)
+        else:
+            valid = view.mask.reshape(-1).nonzero()[:, 0]
+            flat = valid[torch.randint(len(valid), (count,), generator=self._generator)]
+        pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
+        return camera.rays(pixels, view=index), view.over(background, flat), view.opacity(flat)
+
+    def observe(self, rays: int, samples: int) -> None:
+        """Let the ray count follow the samples that ``rays`` rays led to."""
+        if self._config.samples and samples:
+            wanted = self._rays * self._config.samples / samples
+            self._rays = int(min(max(0.5 * self._rays + 0.5 * wanted, 128), self.MAX_RAYS))
+
+    def image(self, progress: float) -> tuple[Camera, Batch]:
+        """One whole training view; every view comes once before any comes again."""
+        background = self.background()
+        if len(self._order) == 0:
+            self._order = torch.randperm(len(self._scene.train), generator=self._generator)
+        index, self._order = int(self._order[0]), self._order[1:]
+        view = self._scaled(index, self._config.scale_at(progress))
+        batch = Batch(view.over(background), view.opacity(), background, index)
+        return view.camera.to(self._device), batch.to(self._device)
+
+    def _scaled(self, index: int, scale: float) -> View:
+        """A training view at a fraction of its size, area-averaged; kept for the phase, as bytes."""
+        view = self._scene.train[index]
+        if scale == 1:
+            self._small.clear()
+            return view
+        key = (index, scale)
+        if key not in self._small:
+            width, height = (max(1, round(edge * scale)) for edge in (view.camera.width, view.camera.height))
+            alpha = view.opacity()[..., None]
+            stacked = torch.cat([view.colour() * alpha, alpha], dim=-1).permute(2, 0, 1)[None]
+            shrunk = torch.nn.functional.interpolate(stacked, (height, width), mode="area")[0].permute(1, 2, 0)
+            straight = shrunk[..., :3] / shrunk[..., 3:].clamp_min(1e-6)
+            image = (straight.clamp(0, 1) * 255).round().to(torch.uint8) if view.image.dtype == torch.uint8 else straight
+            small_alpha = None if view.alpha is None else shrunk[..., 3]
+            camera = view.camera.resized(width, height)
+            self._small[key] = replace(view, camera=camera, image=image, alpha=small_alpha, depth=None, normal=None, mask=None)
+        return self._small[key]
+
+    def state(self) -> dict[str, Tensor]:
+        """What a resumed fit needs."""
+        return {"order": self._order, "rays": torch.tensor(self._rays)}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Inverse of `state`."""
+        self._order, self._rays = state["order"], int(state["rays"])

@@ -1,0 +1,55 @@
+"""One file that holds a whole fit: safetensors, written to the side and renamed, never a pickle, no clock readings."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from invgraphics.errors import InputError
+
+NAME = "checkpoint.safetensors"
+
+
+def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
+    """Write ``parts`` (section -> name -> tensor) so that an interruption leaves either the old file or the new one."""
+    flat = {
+        f"{section}|{name}": value.detach().cpu().contiguous().clone()
+        for section, part in parts.items()
+        for name, value in part.items()
+    }
+    temporary = path.with_suffix(".tmp")
+    try:
+        save_file(flat, temporary)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except SafetensorError as error:  # safetensors wraps a full disk in its own exception
+        raise OSError(f"{path}: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, Tensor]]:
+    """Inverse of `save`.
+
+    Raises:
+        InputError: the file is missing or is not a whole checkpoint.
+    """
+    try:
+        flat = load_file(path, device=str(device or "cpu"))
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist.", "The run has not reached its first checkpoint.") from None
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path} is not a readable checkpoint: {error}.") from error
+    parts: dict[str, dict[str, Tensor]] = {}
+    for key, value in flat.items():
+        section, bar, name = key.partition("|")
+        if not bar:
+            raise InputError(f"{path} was not written by invgraphics: it holds '{key}'.")
+        parts.setdefault(section, {})[name] = value
+    return parts

@@ -1,0 +1,181 @@
+"""Adaptive density control of Gaussians (3DGS, §5.2): clone and split where images pull, prune what nobody sees."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, cast
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from typing_extensions import override
+
+from invgraphics.core import Field, Quantity, Renderer
+from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.errors import InputError
+from invgraphics.training.hooks import FitState, Hook
+
+
+@dataclass(frozen=True)
+class DensityControlConfig:
+    """The 3DGS rules, on a schedule of progress so that they fit any budget.
+
+    Attributes:
+        start: progress at which growing begins (paper: 500 of 30,000 steps).
+        stop: progress at which it ends (paper: 15,000 of 30,000).
+        every: steps between two rounds.
+        threshold: mean norm of dL/d(NDC xy) above which a Gaussian grows.
+        dense: share of the scene's extent that divides cloning (smaller) from splitting (larger).
+        prune_opacity: opacity below which a Gaussian goes.
+        prune_extent: share of the scene's extent above which a Gaussian goes, after the first reset.
+        prune_pixels: radius in pixels above which a Gaussian goes, after the first reset; 0 never.
+        resets: progress values at which opacities are pulled down to at most twice ``prune_opacity``.
+        max_primitives: growth stops here; those with the largest gradients come first.
+        clone: whether small Gaussians are cloned.
+        split: whether large Gaussians are split.
+    """
+
+    start: float = 1 / 60
+    stop: float = 0.5
+    every: int = 100
+    threshold: float = 2e-4
+    dense: float = 0.01
+    prune_opacity: float = 0.005
+    prune_extent: float = 0.1
+    prune_pixels: float = 0.0
+    resets: tuple[float, ...] = ()
+    max_primitives: int = 1_000_000
+    clone: bool = True
+    split: bool = True
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or self.max_primitives < 1:
+            raise ValueError("'every' and 'max_primitives' must be at least 1.")
+
+    def build(self) -> Hook:
+        """The hook."""
+        return DensityControl(self)
+
+
+class _Splats(Protocol):
+    """The part of a Gaussian field that density control edits."""
+
+    means: Float[Tensor, "n 3"]
+    log_scales: Float[Tensor, "n 3"]
+    quaternions: Float[Tensor, "n 4"]
+    opacity_logits: Float[Tensor, " n"]
+
+    def replace(self, tensors: dict[str, Tensor]) -> None: ...
+
+
+class DensityControl(Hook):
+    """Gathers screen-space gradients and regrows the Gaussians at intervals.
+
+    The gradient is 3DGS's: dL/d(NDC xy), the pixel gradient times (W/2, H/2), averaged over the views that see the Gaussian.
+    """
+
+    SPLIT_INTO = 2
+    SPLIT_SHRINK = 1.6
+
+    def __init__(self, config: DensityControlConfig) -> None:
+        self._config = config
+        self._pull = torch.zeros(0)
+        self._seen = torch.zeros(0)
+        self._radius = torch.zeros(0)
+        self._resets_done = 0
+
+    @override
+    def check(self, field: Field, renderer: Renderer) -> None:
+        if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "replace"):
+            raise InputError(f"The hook 'density_control' needs Gaussians, which {type(field).__name__} does not have.")
+
+    @override
+    def after_backward(self, state: FitState) -> None:
+        screen = state.trace.screen if state.trace is not None else None
+        if screen is None or screen.means2d.grad is None or state.ctx.progress >= self._config.stop:
+            return
+        if len(self._pull) != len(screen.radii):
+            self._restart(len(screen.radii), screen.radii)
+        ndc = screen.means2d.grad * screen.means2d.new_tensor([screen.width / 2, screen.height / 2])
+        visible = screen.radii > 0
+        self._pull += torch.where(visible, ndc.norm(dim=1), 0)
+        self._seen += visible
+        self._radius = torch.maximum(self._radius, screen.radii.detach())
+
+    @override
+    def after_step(self, state: FitState) -> None:
+        config, progress = self._config, state.ctx.progress
+        field = cast(_Splats, state.field)
+        due = (state.step + 1) % config.every == 0 and len(self._pull) == len(field.means)
+        if due and config.start <= progress < config.stop:
+            self._regrow(state)
+        if self._resets_done < len(config.resets) and progress >= config.resets[self._resets_done]:
+            self._resets_done += 1
+            ceiling = math.log(2 * config.prune_opacity / (1 - 2 * config.prune_opacity))
+            with torch.no_grad():
+                field.opacity_logits.clamp_(max=ceiling)
+            state.optimiser.forget("field.opacity_logits")
+
+    @torch.no_grad()
+    def _regrow(self, state: FitState) -> None:
+        config, field = self._config, cast(_Splats, state.field)
+        pull = self._pull / self._seen.clamp_min(1)
+        largest = field.log_scales.exp().amax(dim=1)
+        keep = ~self._to_prune(field, largest, state.scene.extent)
+        grows = keep & self._to_grow(pull, config.max_primitives - int(keep.sum()))
+        small = largest <= config.dense * state.scene.extent
+        cloned = (grows & small).nonzero()[:, 0] if config.clone else torch.zeros(0, dtype=torch.int64)
+        split = (grows & ~small).nonzero()[:, 0] if config.split else torch.zeros(0, dtype=torch.int64)
+        keep[split] = False
+        if not bool(keep.any()) and len(split) == 0:
+            keep[torch.argmax(field.opacity_logits)] = True  # a field of nothing could never grow again
+        self._apply(state, keep.nonzero()[:, 0], cloned, split)
+
+    def _to_grow(self, pull: Float[Tensor, " n"], room: int) -> Bool[Tensor, " n"]:
+        """Above the threshold; where room is short, the strongest only."""
+        grows = pull > self._config.threshold
+        if int(grows.sum()) > max(room, 0):
+            ranked = torch.argsort(pull, descending=True, stable=True)
+            grows = torch.zeros_like(grows)
+            grows[ranked[: max(room, 0)]] = True
+            grows &= pull > self._config.threshold
+        return grows
+
+    def _to_prune(self, field: _Splats, largest: Float[Tensor, " n"], extent: float) -> Bool[Tensor, " n"]:
+        config = self._config
+        prune = torch.sigmoid(field.opacity_logits) < config.prune_opacity
+        if self._resets_done:
+            prune |= largest > config.prune_extent * extent
+            if config.prune_pixels:
+                prune |= self._radius > config.prune_pixels
+        return prune
+
+    def _apply(self, state: FitState, keep: Int[Tensor, " k"], cloned: Int[Tensor, " c"], split: Int[Tensor, " s"]) -> None:
+        field = state.field
+        old = {name: parameter.detach() for name, parameter in field.named_parameters()}
+        parts = split.repeat(self.SPLIT_INTO)
+        rows = torch.cat([keep, cloned, parts])
+        new = {name: values[rows].clone() for name, values in old.items()}
+        first = len(keep) + len(cloned)
+        offset = torch.randn(len(parts), 3, generator=state.ctx.generator).to(rows.device) * old["log_scales"][parts].exp()
+        rotation = quaternion_to_matrix(old["quaternions"][parts])
+        new["means"][first:] += (rotation @ offset[:, :, None])[:, :, 0]
+        new["log_scales"][first:] -= math.log(self.SPLIT_SHRINK)
+        cast(_Splats, field).replace(new)
+        for name, parameter in field.named_parameters():
+            state.optimiser.rechoose(f"field.{name}", cast(nn.Parameter, parameter), keep, len(rows) - len(keep))
+        self._restart(len(rows), new["means"])
+
+    def _restart(self, count: int, like: Tensor) -> None:
+        self._pull, self._seen, self._radius = (torch.zeros(count, device=like.device) for _ in range(3))
+
+    @override
+    def state_dict(self) -> dict[str, Tensor]:
+        gathered = {"pull": self._pull, "seen": self._seen, "radius": self._radius}
+        return gathered | {"resets_done": torch.tensor(self._resets_done)}
+
+    @override
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self._pull, self._seen, self._radius = state["pull"], state["seen"], state["radius"]
+        self._resets_done = int(state["resets_done"])

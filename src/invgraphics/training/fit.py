@@ -1,0 +1,167 @@
+"""The one fitting loop: any field through any renderer, within a budget."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from dataclasses import field as default
+
+import torch
+from torch import Tensor
+
+from invgraphics.core import Batch, Context, Field, RayRenderer, Renderer, Rendering, Scene, Trace, check
+from invgraphics.errors import NumericalError
+from invgraphics.training.batches import BatchConfig, Batches
+from invgraphics.training.budget import Budget
+from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
+from invgraphics.training.losses import Loss
+from invgraphics.training.optimiser import Optimiser, OptimiserConfig
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything a fit is made of.
+
+    Attributes:
+        field: what is fitted.
+        renderer: what it is seen through.
+        scene: what it is compared with.
+        losses: their sum is minimised.
+        hooks: called around each step, in order.
+        optimiser: parameter groups and Adam's settings.
+        batches: size of a step.
+        budget: when to stop.
+        seed: of all randomness during the fit.
+        device: where tensors live.
+    """
+
+    field: Field
+    renderer: Renderer
+    scene: Scene
+    losses: Sequence[Loss]
+    hooks: Sequence[Hook]
+    optimiser: OptimiserConfig
+    batches: BatchConfig
+    budget: Budget
+    seed: int = 0
+    device: torch.device = default(default_factory=lambda: torch.device("cpu"))
+
+
+class Fit:
+    """A fit in progress. `step` advances it; `state` and `load` carry it over an interruption, bit by bit on a CPU."""
+
+    def __init__(self, plan: Plan) -> None:
+        check(plan.field, plan.renderer)
+        for hook in plan.hooks:
+            hook.check(plan.field, plan.renderer)
+        self.plan = plan
+        self.steps = 0
+        self.seconds = 0.0
+        self._bounds = plan.scene.bounds.to(plan.device)
+        self._generator = torch.Generator().manual_seed(plan.seed)
+        self._batches = Batches(plan.batches, plan.scene, self._generator, plan.device)
+        self._optimiser = self._make_optimiser()
+
+    def _make_optimiser(self) -> Optimiser:
+        parameters = {
+            f"{owner}.{name}": parameter
+            for owner, module in (("field", self.plan.field), ("renderer", self.plan.renderer))
+            for name, parameter in module.named_parameters()
+            if parameter.requires_grad
+        }
+        return Optimiser(self.plan.optimiser, parameters, self.plan.scene.extent)
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget that is spent."""
+        return self.plan.budget.progress(self.seconds, self.steps)
+
+    def context(self) -> Context:
+        """Context of the next training step."""
+        return Context(self._bounds, training=True, progress=self.progress, generator=self._generator)
+
+    def step(self) -> float:
+        """One step: draw, render, compare, differentiate, move. Returns the loss.
+
+        Raises:
+            NumericalError: the loss is not finite; names the step and the first tensor that is not.
+        """
+        began = time.perf_counter()
+        plan, ctx = self.plan, self.context()
+        state = FitState(plan.field, plan.renderer, self._optimiser, plan.scene, ctx, self.steps)
+        self._optimiser.set_progress(ctx.progress)
+        for hook in plan.hooks:
+            hook.before_step(state)
+        rendering, trace, batch = self._render(ctx)
+        loss = torch.stack([loss(rendering, trace, batch, ctx) for loss in plan.losses]).sum()
+        value = loss.item()
+        if not torch.isfinite(loss):
+            raise NumericalError(self._blame(rendering))
+        self._optimiser.zero_grad()
+        if loss.requires_grad:
+            loss.backward()
+        state.rendering, state.trace, state.batch = rendering, trace, batch
+        for hook in plan.hooks:
+            hook.after_backward(state)
+        self._optimiser.step()
+        for hook in plan.hooks:
+            hook.after_step(state)
+        plan.renderer.update(plan.field, ctx)
+        self.steps += 1
+        if plan.device.type == "cuda":
+            torch.cuda.synchronize(plan.device)
+        self.seconds += time.perf_counter() - began
+        return value
+
+    def _render(self, ctx: Context) -> tuple[Rendering, Trace, Batch]:
+        renderer, fitted = self.plan.renderer, self.plan.field
+        if isinstance(renderer, RayRenderer):
+            rays, batch = self._batches.rays()
+            rendering, trace = renderer.render_rays(fitted, rays, ctx)
+            self._batches.observe(len(rays), 0 if trace.samples is None else len(trace.samples))
+        else:
+            camera, batch = self._batches.image(ctx.progress)
+            rendering, trace = renderer.render_image(fitted, camera, ctx)
+        return rendering, trace, batch
+
+    def _blame(self, rendering: Rendering) -> str:
+        """The first tensor that is not finite, in the order in which a reader would look."""
+        candidates: dict[str, Tensor] = {
+            f"{owner}.{name}": parameter
+            for owner, module in (("field", self.plan.field), ("renderer", self.plan.renderer))
+            for name, parameter in module.named_parameters()
+        }
+        candidates |= {"rendering.rgb": rendering.rgb, "rendering.alpha": rendering.alpha}
+        broken = [name for name, value in candidates.items() if not bool(torch.isfinite(value).all())]
+        where = broken[0] if broken else "the loss"
+        return f"Step {self.steps}: {where} is not finite; the fit stops here."
+
+    def run(self, after_step: Callable[[float], bool]) -> None:
+        """Step until the budget is spent or ``after_step(loss)`` says stop (by returning True)."""
+        while self.progress < 1 and not after_step(self.step()):
+            pass
+
+    def state(self) -> dict[str, dict[str, Tensor]]:
+        """Every tensor of the fit, by section. Contains no clock reading."""
+        return {
+            "field": dict(self.plan.field.state_dict()),
+            "renderer": dict(self.plan.renderer.state_dict()),
+            "optimiser": self._optimiser.state(),
+            "hooks": prefixed(self.plan.hooks),
+            "batches": self._batches.state(),
+            "random": generator_state(self._generator),
+            "fit": {"steps": torch.tensor(self.steps)},
+        }
+
+    def load(self, state: dict[str, dict[str, Tensor]], seconds: float) -> None:
+        """Go on from a `state`; ``seconds`` is the optimisation time already spent."""
+        self.plan.field.load_state_dict(state.get("field", {}))
+        self.plan.renderer.load_state_dict(state.get("renderer", {}))
+        self._optimiser = self._make_optimiser()
+        self._optimiser.load(state.get("optimiser", {}))
+        load_prefixed(self.plan.hooks, state.get("hooks", {}))
+        self._batches.load(state["batches"])
+        self._generator.set_state(state["random"]["fit"].cpu())
+        torch.set_rng_state(state["random"]["global"].cpu())
+        self.steps, self.seconds = int(state["fit"]["steps"]), seconds

@@ -1,0 +1,81 @@
+"""The region of a scene: its map to the unit cube and the interval it leaves of a ray."""
+
+import pytest
+import torch
+
+from invgraphics.core import Bounds, Rays
+from invgraphics.core.bounds import FAR, contract, uncontract
+
+F64 = torch.float64
+
+
+def bounds(space: str = "box", near: float = 0.1) -> Bounds:
+    return Bounds(torch.tensor([-1.0, -2.0, 0.5], dtype=F64), torch.tensor([3.0, 1.0, 1.5], dtype=F64), space, near)
+
+
+@pytest.mark.parametrize("space", ["box", "contracted"])
+def test_unit_cube_and_back(space: str) -> None:
+    region = bounds(space)
+    points = torch.randn(200, 3, dtype=F64) * (20 if space == "contracted" else 2)
+    unit = region.to_unit(points)
+    torch.testing.assert_close(region.from_unit(unit), points)
+    if space == "contracted":
+        assert bool(((unit > 0) & (unit < 1)).all())
+        assert bool(region.contains(points).all())
+    else:
+        inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
+        assert torch.equal(region.contains(points), inside)
+        assert 0 < int(inside.sum()) < 200
+
+
+def test_corners_of_the_box() -> None:
+    region = bounds()
+    torch.testing.assert_close(region.to_unit(region.lo), torch.zeros(3, dtype=F64))
+    torch.testing.assert_close(region.to_unit(region.hi), torch.ones(3, dtype=F64))
+    torch.testing.assert_close(bounds("contracted").to_unit(region.centre), torch.full((3,), 0.5, dtype=F64))
+
+
+def test_contraction_is_equation_10_of_mipnerf360() -> None:
+    inside, outside = torch.tensor([[0.3, -0.2, 0.1]], dtype=F64), torch.tensor([[0.0, 3.0, 4.0]], dtype=F64)
+    assert torch.equal(contract(inside), inside)
+    torch.testing.assert_close(contract(outside), (2 - 1 / 5) * outside / 5)
+    assert float(contract(outside * 1e6).norm()) == pytest.approx(2.0)
+    points = torch.randn(100, 3, dtype=F64) * 3
+    torch.testing.assert_close(uncontract(contract(points)), points)
+
+
+def test_contraction_has_gradients_everywhere() -> None:
+    points = torch.cat([torch.zeros(1, 3), torch.randn(20, 3), torch.randn(5, 3) * 100]).double().requires_grad_()
+    assert torch.autograd.gradcheck(contract, (points,))
+
+
+def test_clip_finds_the_part_inside() -> None:
+    region = bounds()
+    origins = torch.randn(300, 3, dtype=F64) * 3
+    rays = Rays.make(origins, torch.nn.functional.normalize(region.centre - origins + torch.randn(300, 3, dtype=F64), dim=1))
+    clipped = region.clip(rays)
+    t = torch.linspace(0, 20, 4001, dtype=F64).expand(300, -1)
+    inside = region.contains(rays.at(t)) & (t >= region.near)
+    within = (t >= clipped.near[:, None]) & (t <= clipped.far[:, None])
+    assert int(inside.any(dim=1).sum()) > 50
+    assert int((~inside.any(dim=1)).sum()) > 20
+    # The clipped interval and the brute-force one may differ by a grid point at either end.
+    assert int((inside != within).sum(dim=1).max()) <= 2
+    assert bool((clipped.far >= clipped.near).all())
+
+
+def test_clip_axis_parallel_rays() -> None:
+    region = bounds()
+    directions = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], dtype=F64)
+    origins = torch.tensor([[-5.0, 0, 1.0], [0, 0, 9.0], [9.0, -5.0, 1.0]], dtype=F64)
+    clipped = region.clip(Rays.make(origins, directions))
+    torch.testing.assert_close(clipped.near[:2], torch.tensor([4.0, 7.5], dtype=F64))
+    torch.testing.assert_close(clipped.far[:2], torch.tensor([8.0, 8.5], dtype=F64))
+    assert clipped.far[2] == clipped.near[2]
+
+
+def test_contracted_rays_end_far_away() -> None:
+    region = bounds("contracted", near=0.3)
+    clipped = region.clip(Rays.make(torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0, 1.0]], dtype=F64)))
+    assert float(clipped.near) == 0.3
+    assert float(clipped.far) == FAR * 2.0

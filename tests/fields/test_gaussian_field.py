@@ -1,0 +1,200 @@
+"""Gaussian fields: where they start, resizing, checkpoints of another size, and motion."""
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from invgraphics.core import Context, Points, Quantity, Samples, harmonics
+from invgraphics.core.colour import srgb_to_linear
+from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.errors import InputError, NotComposableError
+from invgraphics.fields.gaussian import PARAMETERS, GaussianField, GaussianFieldConfig
+
+
+def _points(n: int = 30) -> Points:
+    return Points(torch.rand(n, 3), torch.rand(n, 3))
+
+
+def _gaussians(field: GaussianField, scene):
+    return field.primitives(Quantity.GAUSSIANS, Context(scene.bounds))
+
+
+def _scrambled(scene, degree: int = 3, dtype: torch.dtype = torch.float64) -> GaussianField:
+    field = GaussianFieldConfig(sh_degree=degree).build(scene).to(dtype)
+    with torch.no_grad():
+        for name in PARAMETERS:
+            getattr(field, name).copy_(torch.randn_like(getattr(field, name)))
+    return field
+
+
+def test_starts_from_the_points(make_scene):
+    points = _points()
+    scene = make_scene(points=points)
+    field = GaussianFieldConfig(opacity=0.2, scale_factor=0.5).build(scene)
+    gaussians = _gaussians(field, scene)
+    torch.testing.assert_close(gaussians.means, points.position)
+    torch.testing.assert_close(gaussians.opacities, torch.full((30,), 0.2))
+    torch.testing.assert_close(harmonics.evaluate(gaussians.sh, torch.eye(3)[:1].expand(30, 3)) + 0.5, points.rgb)
+    distances = torch.cdist(points.position.double(), points.position.double())
+    nearest = distances.sort(dim=1).values[:, 1:4].mean(dim=1).float()
+    torch.testing.assert_close(gaussians.scales, 0.5 * nearest[:, None].expand(30, 3))
+    assert field.primitive_count() == len(gaussians) == 30
+    assert {name: tuple(p.shape) for name, p in field.named_parameters()} == {
+        "means": (30, 3),
+        "quaternions": (30, 4),
+        "log_scales": (30, 3),
+        "opacity_logits": (30,),
+        "sh_dc": (30, 1, 3),
+        "sh_rest": (30, 15, 3),
+    }
+
+
+def test_linear_scenes_get_linear_colours(make_scene):
+    points = _points()
+    field = GaussianFieldConfig(sh_degree=0).build(make_scene(points=points, colour="linear"))
+    torch.testing.assert_close(field.sh_dc[:, 0] * harmonics.BAND_0 + 0.5, srgb_to_linear(points.rgb))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_few_or_coincident_points_still_have_a_size(make_scene, n):
+    scene = make_scene(points=Points(torch.zeros(n, 3), torch.zeros(n, 3)))
+    scales = _gaussians(GaussianFieldConfig().build(scene), scene).scales
+    assert torch.isfinite(scales).all()
+    assert (scales > 0).all()
+
+
+def test_an_outlier_does_not_cover_the_scene(make_scene):
+    points = Points(torch.cat([torch.rand(50, 3), torch.tensor([[100.0, 0, 0]])]), torch.rand(51, 3))
+    scene = make_scene(points=points)
+    assert float(_gaussians(GaussianFieldConfig().build(scene), scene).scales[-1].max()) <= 51
+
+
+def test_random_start_fills_the_box(make_scene):
+    scene = make_scene(points=_points())
+    field = GaussianFieldConfig(init="random", count=2000).build(scene)
+    unit = scene.bounds.to_unit(field.means.detach())
+    assert field.primitive_count() == 2000
+    assert ((unit >= 0) & (unit <= 1)).all()
+    torch.testing.assert_close(unit.mean(0), torch.full((3,), 0.5), atol=0.03, rtol=0)
+    torch.testing.assert_close(unit.std(0), torch.full((3,), 12**-0.5), atol=0.02, rtol=0)
+
+
+def test_random_start_in_contracted_space_reaches_far(make_scene):
+    scene = make_scene("contracted")
+    distance = ((GaussianFieldConfig(count=2000).build(scene).means - scene.bounds.centre) / scene.bounds.half).norm(dim=1)
+    # 400 points go outwards; of the others only the box's corners lie beyond distance 1, and none beyond sqrt(3).
+    beyond = 400 * (1 - math.log(3**0.5) / math.log(30))
+    assert int((distance > 3**0.5).sum()) == pytest.approx(beyond, rel=0.1)
+    assert float(distance.max()) <= 30.001
+
+
+def test_too_many_points_are_thinned_by_the_seed(make_scene):
+    scene = make_scene(points=_points(100))
+    starts = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        starts.append(GaussianFieldConfig(max_init=20).build(scene).means)
+    assert len(starts[0]) == 20
+    assert torch.equal(starts[0], starts[1])
+    assert not torch.equal(starts[0], starts[2])
+
+
+@pytest.mark.parametrize(("points", "says"), [(Points(torch.zeros(0, 3), torch.zeros(0, 3)), "empty"), (None, "not finite")])
+def test_bad_point_clouds_are_refused_in_a_sentence(make_scene, points, says):
+    if points is None:
+        points = _points()
+        points.position[3, 1] = math.nan
+    with pytest.raises(InputError, match=says):
+        GaussianFieldConfig().build(make_scene(points=points))
+    assert GaussianFieldConfig(init="random", count=5).build(make_scene(points=points)).primitive_count() == 5
+
+
+@pytest.mark.parametrize("bad", [{"sh_degree": 4}, {"opacity": 1.0}, {"count": 0}, {"scale_factor": 0.0}])
+def test_nonsense_is_refused(bad):
+    with pytest.raises(ValueError, match="must be"):
+        GaussianFieldConfig(**bad)
+
+
+def test_only_active_bands_are_given_and_remembered(make_scene):
+    scene = make_scene(points=_points())
+    field = _scrambled(scene)
+    field.active_degree = 1
+    assert _gaussians(field, scene).sh.shape == (30, 4, 3)
+    other = GaussianFieldConfig().build(scene)
+    other.load_state_dict(field.state_dict())
+    assert other.active_degree == 1
+    with pytest.raises(ValueError, match="0 to 3"):
+        field.active_degree = 4
+
+
+def test_isotropic_gaussians_stay_round_and_keep_gradients(make_scene):
+    scene = make_scene(points=_points())
+    field = GaussianFieldConfig(isotropic=True).build(scene)
+    with torch.no_grad():
+        field.log_scales += torch.randn_like(field.log_scales)
+    scales = _gaussians(field, scene).scales
+    assert (scales == scales[:, :1]).all()
+    (gradient,) = torch.autograd.grad(scales[:, 0].sum(), field.log_scales)
+    assert (gradient != 0).all()
+
+
+def test_replace_changes_the_number(make_scene):
+    field = GaussianFieldConfig().build(make_scene(points=_points()))
+    halved = {name: getattr(field, name)[::2] for name in PARAMETERS}
+    field.replace(halved)
+    assert field.primitive_count() == 15
+    assert len(list(field.parameters())) == 6
+    assert all(parameter.is_leaf and parameter.requires_grad for parameter in field.parameters())
+    for bad in ({"means": field.means}, halved | {"means": torch.zeros(4, 3)}, halved | {"sh_rest": torch.zeros(15, 3, 3)}):
+        with pytest.raises(ValueError, match=r"replace needs|rows of"):
+            field.replace(bad)
+
+
+def test_a_checkpoint_of_another_size_loads(make_scene):
+    scene = make_scene(points=_points())
+    big, small = _scrambled(scene, dtype=torch.float32), GaussianFieldConfig(init="random", count=7).build(scene)
+    held = small.means
+    torch.nn.ModuleDict({"field": small}).load_state_dict(torch.nn.ModuleDict({"field": big}).state_dict())
+    assert small.means is held
+    for name in PARAMETERS:
+        assert torch.equal(getattr(small, name), getattr(big, name))
+    _gaussians(small, scene).means.sum().backward()
+    assert small.means.grad is not None
+    assert small.means.grad.shape == (30, 3)
+    with pytest.raises(RuntimeError, match="sh_rest"):
+        GaussianFieldConfig(sh_degree=1).build(scene).load_state_dict(big.state_dict())
+
+
+def test_transformed_moves_covariances_and_colours_and_comes_back(make_scene):
+    scene = make_scene(points=_points())
+    field = _scrambled(scene)
+    rotation = torch.from_numpy(Rotation.random(random_state=1).as_matrix())
+    similarity = torch.eye(4, dtype=torch.float64)
+    similarity[:3, :3], similarity[:3, 3] = 2.5 * rotation, torch.tensor([1.0, -2.0, 0.5])
+    before, after = _gaussians(field, scene), _gaussians(field.transformed(similarity), scene)
+    torch.testing.assert_close(after.means, 2.5 * before.means @ rotation.T + similarity[:3, 3])
+
+    def covariance(gaussians):
+        axes = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
+        return axes @ axes.mT
+
+    torch.testing.assert_close(covariance(after), 2.5**2 * rotation @ covariance(before) @ rotation.T)
+    direction = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1)
+    seen = harmonics.evaluate(after.sh, direction @ rotation.T)
+    torch.testing.assert_close(seen, harmonics.evaluate(before.sh, direction))
+    back = _gaussians(field.transformed(similarity).transformed(torch.linalg.inv(similarity)), scene)
+    torch.testing.assert_close(back.means, before.means)
+    torch.testing.assert_close(covariance(back), covariance(before))
+    torch.testing.assert_close(back.sh, before.sh)
+    with pytest.raises(InputError, match="mirror"):
+        field.transformed(torch.diag(torch.tensor([1.0, 1, -1, 1])))
+
+
+def test_points_cannot_be_asked(make_scene):
+    field = GaussianFieldConfig().build(make_scene(points=_points()))
+    with pytest.raises(NotComposableError, match="density"):
+        field.query(Samples.at(torch.zeros(1, 3)), Quantity.DENSITY)
+    with pytest.raises(NotComposableError, match="planes"):
+        field.primitives(Quantity.PLANES, Context(make_scene().bounds))

@@ -1,0 +1,59 @@
+"""Cost measurements against work whose cost is known."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from invgraphics.metrics import cost
+
+MB = 1 << 20
+
+
+def test_peak_memory_sees_what_was_freed_again() -> None:
+    with cost.PeakMemory() as memory:
+        block = np.ones(96 * MB, dtype=np.uint8)  # ones, so that the pages are really touched
+        time.sleep(4 * cost.SAMPLING_SECONDS)
+        del block
+    assert 90 * MB < memory.peak_bytes < 130 * MB
+
+
+def test_peak_memory_leaves_out_what_was_there_before() -> None:
+    block = np.ones(96 * MB, dtype=np.uint8)
+    with cost.PeakMemory() as memory:
+        time.sleep(2 * cost.SAMPLING_SECONDS)
+    assert memory.peak_bytes < 16 * MB < block.nbytes
+
+
+def test_memory_without_proc(monkeypatch, tmp_path) -> None:
+    now = cost.resident_bytes()
+    monkeypatch.setattr(cost, "STATM", tmp_path / "absent")
+    assert cost.resident_bytes() >= now * 0.9 > 10 * MB
+
+
+def test_median_ignores_warm_up_and_outliers() -> None:
+    pauses = iter([0.2, 0.01, 0.01, 0.2, 0.01, 0.01])
+    seconds = cost.median_seconds(lambda: time.sleep(next(pauses)), "cpu", repeats=5, warm_up=1)
+    assert 0.01 <= seconds < 0.1
+    assert next(pauses, None) is None
+
+
+def test_sizes_count_shared_tensors_once_and_buffers_as_bytes() -> None:
+    a, b = nn.Linear(3, 5), nn.BatchNorm1d(5)
+    b.weight.requires_grad_(False)
+    shared = nn.Linear(3, 5)
+    shared.weight = a.weight
+    modules = [a, b, shared]
+    assert cost.parameter_count(modules) == 15 + 5 + 5 + 5  # weight once, two biases, the norm's bias
+    # the norm's frozen weight and its running mean, variance (float32) and counter (int64) are stored as well
+    assert cost.model_bytes(modules) == 4 * (30 + 5) + 4 * 10 + 8
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_peak_memory_on_cuda() -> None:
+    with cost.PeakMemory("cuda") as memory:
+        block = torch.ones(64 * MB, dtype=torch.uint8, device="cuda")
+        del block
+    assert memory.peak_bytes == pytest.approx(64 * MB, rel=0.05)
