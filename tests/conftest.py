@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
+pytest_plugins = ["training_fixtures"]
+
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:

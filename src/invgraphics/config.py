@@ -74,7 +74,10 @@ def to_table(config: Any) -> dict[str, Any]:
 
 
 def set_path(table: dict[str, Any], path: str, value: Any) -> None:
-    """Set ``table[a][b][c] = value`` for ``path = "a.b.c"``; list entries are addressed by number."""
+    """Set ``table[a][b][c] = value`` for ``path = "a.b.c"``; list entries are addressed by number.
+
+    Setting a part's ``type`` to another one drops the settings of the old.
+    """
     *parents, last = path.split(".")
     node: Any = table
     for depth, key in enumerate(parents):
@@ -87,6 +90,8 @@ def set_path(table: dict[str, Any], path: str, value: Any) -> None:
             raise InputError(f"Unknown key '{path}': '{'.'.join(parents)}' has entries 0 to {len(node) - 1}.")
         node[int(last)] = value
     elif isinstance(node, dict):
+        if last == "type" and node.get("type") != value:
+            node.clear()  # another type has other settings
         node[last] = value
     else:
         raise InputError(f"Unknown key '{path}': '{'.'.join(parents)}' is a value, not a table.")

@@ -39,7 +39,7 @@ def test_axes_are_right_down_forward() -> None:
     x, y, z = view.cam_to_world[:3, :3].unbind(dim=1)
     middle, depth = view.project((view.position + 2 * z)[None])
     torch.testing.assert_close(middle[0], view.centre)
-    assert float(depth) == 2.0
+    torch.testing.assert_close(depth, torch.tensor([2.0], dtype=F64))
     right, _ = view.project((view.position + 2 * z + x)[None])
     below, _ = view.project((view.position + 2 * z + y)[None])
     torch.testing.assert_close(right[0] - middle[0], torch.tensor([10.5, 0.0], dtype=F64))

@@ -22,7 +22,7 @@ def _rays(n: int = 12) -> Rays:
     origins = -2.5 * directions + 0.4 * torch.randn(n, 3, dtype=torch.float64)
     # Some rays start or end inside.
     near = torch.linspace(0.0, 3.0, n, dtype=torch.float64)
-    return Rays.make(origins, directions).within(near, torch.full_like(near, 6.0))
+    return Rays.make(origins, directions).within(near, near + 1 + 3 * torch.rand(n, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -30,9 +30,9 @@ def test_optical_depth_is_the_integral_of_the_density(name):
     field = FIELDS[name]().double()
     rays = _rays()
     depths = field.optical_depth(rays).detach()
-    assert float(depths.max()) > 0.5
+    assert float(depths.max()) > 0.3
     for i, depth in enumerate(depths.tolist()):
-        t = torch.linspace(float(rays.near[i]), 6.0, 200_001, dtype=torch.float64)
+        t = torch.linspace(float(rays.near[i]), float(rays.far[i]), 200_001, dtype=torch.float64)
         values = field.density_at(rays.origins[i] + t[:, None] * rays.directions[i])
         # A hard edge costs the trapezoid rule up to half a step of density.
         assert depth == pytest.approx(torch.trapezoid(values, t).item(), abs=1e-6 if "blob" in name else 2e-4)

@@ -33,9 +33,9 @@ KINDS = {
 
 def _field(config: NeuralFieldConfig, scene) -> NeuralField:
     field = config.build(scene).double()
+    # Away from the start: tables are almost zero there, and a distance function does not see its encoding.
     for name, parameter in field.named_parameters():
-        if "table" in name:
-            torch.nn.init.normal_(parameter)
+        torch.nn.init.normal_(parameter, std=1.0 if "table" in name else 0.4)
     return field
 
 
@@ -202,7 +202,7 @@ def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, space):
     assert sdf is not None
     inside = offset.norm(dim=1) < scene.bounds.half[0]  # contracted space bends distances beyond the unit ball
     error = (sdf - (offset.norm(dim=1) - 0.5 * scene.bounds.half[0]))[inside]
-    assert float(error.abs().mean()) < 0.1 * float(scene.bounds.half[0])
+    assert float(error.abs().mean()) < 0.05 * float(scene.bounds.half[0])
 
 
 def test_nerf_and_instant_ngp_have_their_published_sizes(make_scene):

@@ -100,6 +100,17 @@ def test_clamped_positions_do_not_move_features():
     torch.testing.assert_close(jacobian.sum(dim=1), gradient)
 
 
+def test_slopes_on_the_far_faces_are_those_of_the_last_cell():
+    _, table = _inputs()
+    faces, step = torch.ones(1, 3, dtype=torch.float64), 1e-6
+    _, jacobian = hash_encode(faces, table, TINY, jacobian=True)
+    assert jacobian is not None
+    for axis in range(3):
+        behind = faces - step * torch.eye(3, dtype=torch.float64)[axis]
+        difference = (hash_encode(faces, table, TINY)[0] - hash_encode(behind, table, TINY)[0]) / step
+        torch.testing.assert_close(jacobian[..., axis], difference, atol=1e-6, rtol=1e-6)
+
+
 def test_a_dense_level_is_a_grid():
     r = 6
     grid = HashGrid(levels=1, features=4, log2_size=10, base=r, finest=r)

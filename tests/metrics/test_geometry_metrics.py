@@ -55,6 +55,8 @@ def test_smooth_variants_leave_out_the_truths_discontinuities() -> None:
     expected = torch.ones(8, 12, dtype=torch.bool)
     expected[:, 5:7] = False
     expected[:2, :2] = False
+    true[5:, :4] = torch.inf  # wide enough for a pixel whose whole neighbourhood is missed
+    expected[4:, :5] = False
     assert torch.equal(geometry.smooth_depth(true), expected)
     predicted = true.clone()
     predicted[:, 5:7] = 10.0

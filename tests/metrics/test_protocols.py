@@ -173,6 +173,7 @@ def stumble(pair: Pair) -> float:
 
 
 BIAS = Metric("bias", "", False, mean_difference, "mean signed error")
+NOTHING = Metric("nothing", "", False, lambda pair: float("nan"), "no number")
 FAULTY = Metric("faulty", "", False, stumble, "always fails")
 
 
@@ -187,12 +188,14 @@ class Point:
 
 def test_a_strangers_metric_is_scored_and_cannot_spoil_the_others(monkeypatch) -> None:
     points = [Point("bias", "BIAS"), Point("faulty", "FAULTY"), Point("gone", "ABSENT"), Point("odd", "HEIGHT")]
+    points.append(Point("nothing", "NOTHING"))
     monkeypatch.setattr(plugins, "entry_points", lambda group: points if group == "invgraphics.metrics" else [])
     view = view_of(0.25)
     result = score(rendering_of(0.5), view, scene_of(view), PLAIN)
     assert result.values["bias"] == pytest.approx(0.25)
     assert result.skipped["faulty"] == "their-package: RuntimeError: no licence"
     assert "cannot be imported" in result.skipped["gone"]
+    assert result.skipped["nothing"] == "the value is not finite (nan)"
     assert "not an invgraphics Metric" in result.skipped["odd"]
     assert result.values["psnr"] == pytest.approx(20 * math.log10(4), abs=1e-4)
     assert summarise([result])[0]["bias"]["mean"] == pytest.approx(0.25)

@@ -58,3 +58,9 @@ def use_kernels(name: str | None) -> None:
     """Choose kernels by name, and compile what needs compiling before any clock runs."""
     kernels.use(name)
     kernels.warm_up()
+
+
+def repeatable(device: torch.device) -> None:
+    """Ask torch for sums in a fixed order; on a CPU that makes the same seed and threads give the same bits."""
+    torch.use_deterministic_algorithms(device.type == "cpu", warn_only=True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # a debugging aid that costs a pass over every new tensor

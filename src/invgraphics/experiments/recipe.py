@@ -59,7 +59,7 @@ def methods() -> dict[str, str]:
 
 def presets(name: str) -> list[str]:
     """Names of the presets of a method."""
-    return sorted(_source(name).get("presets", {}))
+    return sorted(source(name).get("presets", {}))
 
 
 def load_method(name: str, preset: str | None = None, overrides: Sequence[str] = ()) -> Method:
@@ -73,7 +73,7 @@ def load_method(name: str, preset: str | None = None, overrides: Sequence[str] =
     Raises:
         InputError: unknown method, preset or key, or a value of the wrong type.
     """
-    table = _source(name)
+    table = source(name)
     known = table.pop("presets", {})
     if preset is None:
         preset = "laptop" if "laptop" in known else ""
@@ -96,7 +96,7 @@ def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
     return Method(name, preset, recipe, to_table(recipe))
 
 
-def _source(name: str) -> dict[str, Any]:
+def source(name: str) -> dict[str, Any]:
     """The recipe's table as written, presets included."""
     if name.endswith(".toml"):
         path = Path(name)

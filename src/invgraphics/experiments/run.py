@@ -15,7 +15,7 @@ import torch
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import recipe
-from invgraphics.experiments.build import build_plan, device_of, use_kernels
+from invgraphics.experiments.build import build_plan, device_of, repeatable, use_kernels
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
 from invgraphics.experiments.folder import RunFolder, write_json
@@ -41,6 +41,7 @@ def fit_run(request: FitRequest) -> Path:
     device = device_of(request.device)
     folder = RunFolder(Path(request.out))
     _check_existing(folder, request)
+    repeatable(device)
     use_kernels(request.kernels)
     scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
     identity = _identity(request, method, scene)

@@ -16,7 +16,7 @@ EXP_LIMIT = 15.0
 
 SPHERE_POINTS = 4096
 """Points on which `Mlp.initialise_as_sphere` corrects its output layer."""
-SPHERE_RIDGE = 1e-6
+SPHERE_RIDGE = 1e-4
 """Penalty on that correction, per point."""
 
 
@@ -61,13 +61,13 @@ class Mlp(nn.Module):
         averages. Inputs beyond the first three, and those that come in by the skip, start with weight zero, as in IDR.
         Layers of a practical width are some 15% off, so the averaging weights are then corrected by ridge regression.
         """
-        for index, layer in enumerate(self.hidden):
-            assert isinstance(layer, nn.Linear)
+        hidden = [layer for layer in self.hidden if isinstance(layer, nn.Linear)]
+        for index, layer in enumerate(hidden):
             layer.weight.normal_(0.0, sqrt(2 / layer.out_features))
             layer.bias.zero_()
             layer.weight[:, 3 if index == 0 else layer.out_features :] = 0
         # Whatever the skip appends after the last layer must not count either.
-        width = self.hidden[-1].weight.shape[0] if len(self.hidden) else 3
+        width = hidden[-1].out_features if hidden else 3
         x = torch.zeros(SPHERE_POINTS, self.inputs)
         x[:, :3].uniform_(-1, 1)
         h = self._last_hidden(x)[:, :width].double()

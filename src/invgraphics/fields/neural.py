@@ -146,17 +146,12 @@ class NeuralField(Field):
             smooth=signed,
         )
         if signed:
-            self.geometry_net.initialise_as_sphere(INITIAL_RADIUS / self._reach)
+            self.geometry_net.initialise_as_sphere(INITIAL_RADIUS)
 
     @property
     def bounds(self) -> Bounds:
         """The region this field describes."""
         return Bounds(self.lo, self.hi, self._space, self._near)
-
-    @property
-    def _reach(self) -> float:
-        """Half-extents of the box that the unit cube's half-edge spans."""
-        return 2.0 if self._space == "contracted" else 1.0
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
         """See `Field.query`.
@@ -181,7 +176,7 @@ class NeuralField(Field):
         radiances = [part.radiance for part in parts if part.radiance is not None]
         return FieldValues(
             density=self._density(raw, samples.position) if Quantity.DENSITY in want else None,
-            sdf=raw * self._reach * self.bounds.half.mean() if Quantity.SDF in want else None,
+            sdf=raw * self.bounds.half.mean() if Quantity.SDF in want else None,
             radiance=torch.cat(radiances) if Quantity.RADIANCE in want else None,
             normal=normal,
         )
@@ -192,7 +187,11 @@ class NeuralField(Field):
         if self.encoding.needs_covariance:
             covariance = unit_covariance(self.bounds, position, samples.covariance)
         features = self.encoding(unit, covariance)
-        return torch.cat([2 * unit - 1, features], dim=1) if self.config.geometry == "sdf" else features
+        if self.config.geometry == "density":
+            return features
+        # In half-extents of the box, which is half as long as the unit cube in a contracted space.
+        reach = 2 if self._space == "contracted" else 1
+        return torch.cat([reach * (2 * unit - 1), features], dim=1)
 
     def _chunks(self, features: Tensor, direction: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         size = CPU_CHUNK if features.device.type == "cpu" else max(len(features), 1)
@@ -232,9 +231,13 @@ def unit_covariance(
     bounds: Bounds, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]
 ) -> Float[Tensor, "m 3 3"]:
     """Covariances carried to the unit cube by the linearised map J Σ J^T (mip-NeRF 360, equation 9)."""
-    columns = [
-        torch.func.jvp(bounds.to_unit, (position,), (axis.expand_as(position),))[1]
-        for axis in torch.eye(3, dtype=position.dtype, device=position.device)
-    ]
-    jacobian = torch.stack(columns, dim=-1)
+    differentiable = torch.is_grad_enabled()
+    with torch.enable_grad():
+        if not (differentiable and position.requires_grad):
+            position = position.detach().requires_grad_()
+        unit = bounds.to_unit(position)
+        rows = [
+            torch.autograd.grad(u.sum(), position, create_graph=differentiable, retain_graph=True)[0] for u in unit.unbind(1)
+        ]
+    jacobian = torch.stack(rows, dim=1)
     return jacobian @ covariance @ jacobian.mT

@@ -24,7 +24,9 @@ def read_comparison(folder: Path) -> Comparison:
     """
     source = folder / "compare.json"
     table = read_table(source)
-    runs = tuple(read_run(folder / str(path)) for path in need(table, "runs", list, source))
+    protocol = optional(table, "protocol", dict, source, {})
+    name = str(protocol.get("name", "default"))
+    runs = tuple(read_run(folder / str(path), name) for path in need(table, "runs", list, source))
     failures = tuple(
         Failure(need(entry, "method", str, source), need(entry, "seed", int, source), need(entry, "error", str, source))
         for entry in optional(table, "failures", list, source, [])
@@ -45,25 +47,26 @@ def read_comparison(folder: Path) -> Comparison:
         budget=optional(table, "budget", str, source, ""),
         preset=optional(table, "preset", str, source, ""),
         size=(int(size[0]), int(size[1])) if len(size) == 2 else None,
+        summaries={str(k): str(v) for k, v in optional(table, "summaries", dict, source, {}).items()},
         command=optional(table, "command", str, source, ""),
         baselines={name: read_quality(quality, source) for name, quality in baselines.items()},
         noise_ceiling=number(table.get("noise_ceiling"), "noise_ceiling", source),
-        protocol=optional(table, "protocol", dict, source, {}),
+        protocol=protocol,
         scene_info=optional(table, "scene_info", dict, source, {}),
         environment=optional(table, "environment", dict, source, {}),
         wall_seconds=number(table.get("wall_seconds"), "wall_seconds", source),
     )
 
 
-def read_run(folder: Path) -> Run:
-    """Read one run folder.
+def read_run(folder: Path, protocol: str = "default") -> Run:
+    """Read one run folder, with its scores under ``protocol``.
 
     Raises:
         InputError: the folder is no run, or a file of it is missing or broken; the sentence names it.
     """
     if not folder.is_dir():
         raise InputError(f"There is no run at '{folder}'.", "Give the folder that `invgraphics fit` wrote.")
-    source = folder / "scores.json"
+    source = folder / ("scores.json" if protocol == "default" else f"scores.{protocol}.json")
     scores = read_table(source)
     provenance = read_table(folder / "provenance.json")
     for key in ("truth_sha256", "truth"):

@@ -103,6 +103,7 @@ class Comparison:
         budget: what every fit was given, ``60s`` or ``5000steps``; empty where fits had different budgets.
         preset: ``laptop`` or ``paper``; empty where fits differ.
         size: width and height of the test pictures, px.
+        summaries: method -> what it is, one line.
         command: reproduces the whole comparison; empty where there is none.
         baselines: trivial predictor -> metric -> score.
         noise_ceiling: PSNR between two half-sample renders of the truth, dB.
@@ -120,6 +121,7 @@ class Comparison:
     budget: str = ""
     preset: str = ""
     size: tuple[int, int] | None = None
+    summaries: dict[str, str] = field(default_factory=dict)
     command: str = ""
     baselines: dict[str, dict[str, Score]] = field(default_factory=dict)
     noise_ceiling: float | None = None

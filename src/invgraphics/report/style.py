@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,27 @@ POINTS = 72.0
 """Plots are drawn at 72 units per inch, so that a size in units is a size in CSS pixels."""
 
 
+PANEL = (460.0, 330.0)
+"""Width and height of a small plot, CSS pixels."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A plot on disk.
+
+    Attributes:
+        path: its SVG.
+        narrow: the same plot drawn for a phone; ``None`` where the plot is small anyway.
+        title: what it shows.
+        alt: what a reader who cannot see it should know.
+    """
+
+    path: Path
+    narrow: Path | None
+    title: str
+    alt: str
+
+
 @dataclass(frozen=True)
 class SeriesStyle:
     """How one method is drawn."""
@@ -65,12 +86,12 @@ def series_style(index: int) -> SeriesStyle:
 
 
 @contextmanager
-def canvas(width: float, height: float) -> Iterator[tuple[Figure, Axes]]:
+def canvas(width: float, height: float) -> Iterator[tuple[Canvas, Axes]]:
     """An empty plot of ``width`` x ``height`` CSS pixels in the house style; drawn and saved inside the block."""
     import matplotlib as mpl
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
-    settings: dict[str, Any] = {
+    settings: dict[Any, Any] = {
         "svg.fonttype": "none",
         "svg.hashsalt": "invgraphics",
         "text.parse_math": False,
@@ -94,24 +115,18 @@ def canvas(width: float, height: float) -> Iterator[tuple[Figure, Axes]]:
         "xtick.color": MUTED.light,
         "ytick.color": MUTED.light,
         "xtick.minor.visible": False,
-        "pdf.fonttype": 42,
     }
     with mpl.rc_context(settings):
-        figure = Figure(figsize=(width / POINTS, height / POINTS), dpi=POINTS, layout="constrained")
+        figure = Canvas(figsize=(width / POINTS, height / POINTS), dpi=POINTS, layout="constrained")
         axes = figure.add_subplot()
         yield figure, axes
 
 
-def save(figure: Figure, stem: Path) -> Path:
-    """Write ``stem.svg``, which follows the reader's light or dark setting, and ``stem.pdf`` for papers.
-
-    Returns:
-        The path of the SVG.
-    """
+def save(figure: Canvas, stem: Path) -> Path:
+    """Write ``stem.svg``, which follows the reader's light or dark setting, and return its path."""
     stem.parent.mkdir(parents=True, exist_ok=True)
-    svg, pdf = stem.with_suffix(".svg"), stem.with_suffix(".pdf")
+    svg = stem.with_suffix(".svg")
     figure.savefig(svg, metadata={"Date": None}, transparent=True)
-    figure.savefig(pdf, metadata={"CreationDate": None}, transparent=True)
     svg.write_text(adaptive(svg.read_text(encoding="utf-8")), encoding="utf-8")
     return svg
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from invgraphics.report.records import Comparison, Failure, Run, Score
@@ -62,13 +62,13 @@ class Summary:
         columns: quality first, then cost.
         rows: methods in order, then baselines.
         notes: footnotes; note i is ``notes[i - 1]``.
-        skipped: metric label -> why no run has it.
+        skipped: why -> labels of the metrics that no run has for that reason.
     """
 
     columns: tuple[Quantity, ...]
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
-    skipped: dict[str, str]
+    skipped: dict[str, list[str]]
 
     def column(self, key: str) -> int | None:
         """Position of a quantity, ``None`` when the table has no such column."""
@@ -146,11 +146,16 @@ class Reach:
 
 def time_to_quality(comparison: Comparison, count: int = 4) -> Reach | None:
     """Median seconds over seeds to reach ``count`` round PSNR levels between the slowest start and the best end."""
-    measured = [[entry.psnr for entry in run.history if entry.psnr is not None] for run in comparison.runs]
-    measured = [values for values in measured if values]
-    if not measured:
+    starts, peaks = [], []
+    for method in comparison.methods:
+        curves = [[entry.psnr for entry in run.history if entry.psnr is not None] for run in comparison.runs_of(method)]
+        curves = [curve for curve in curves if curve]
+        if curves:
+            starts.append(statistics.median(curve[0] for curve in curves))
+            peaks.append(statistics.median_low(max(curve) for curve in curves))
+    if not starts:
         return None
-    low, high = max(values[0] for values in measured), max(max(values) for values in measured)
+    low, high = max(starts), max(peaks)
     first, last = math.ceil(low + 0.1), math.floor(high)
     if last < first:
         return None
@@ -178,9 +183,8 @@ def _columns(comparison: Comparison) -> tuple[Quantity, ...]:
         redundant = cost.key == "render_seconds_per_view"
         if redundant or all(run.cost.get(cost.key) is None for run in comparison.runs):
             continue
-        if cost.key == "fit_seconds" and time_budget:  # what every method was given is no merit of any
-            cost = Quantity(cost.key, cost.label, cost.unit, "none", "cost")
-        costs.append(cost)
+        given = cost.key == "fit_seconds" and time_budget  # what every method was given is no merit of any
+        costs.append(replace(cost, better="none") if given else cost)
     return quality_columns(comparison) + tuple(costs)
 
 
@@ -194,7 +198,7 @@ def _known(values: Sequence[float | None]) -> list[float]:
 
 def value_of(run: Run, column: Quantity) -> float | None:
     """A run's value of a quantity, in stored units."""
-    return _mean(run.quality.get(column.key)) if column.group == "quality" else run.cost.get(column.key)
+    return _mean(run.quality.get(column.key)) if column.group != "cost" else run.cost.get(column.key)
 
 
 def _method_cell(column: Quantity, runs: Sequence[Run], notes: list[str]) -> Cell:
@@ -224,7 +228,7 @@ def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
         return Cell(None, None, "n/a" if note else ABSENT, "", note=note)
     mean = statistics.fmean(values)
     std = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
-    return Cell(mean, std, column.text(mean), "" if std is None else f"± {column.text(std)}", note=note)
+    return Cell(mean, std, column.text(mean), "" if std is None else column.spread(mean, std), note=note)
 
 
 def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -238,18 +242,18 @@ def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, .
         best = min(known.values(), key=column.sort_key)
         for i, value in known.items():
             if column.text(value) == column.text(best):
-                old = marked[i][index]
-                marked[i][index] = Cell(old.mean, old.std, old.text, old.spread, True, old.note)
-    return tuple(
-        Row(row.label, row.kind, row.series, row.seeds, row.failures, tuple(cells))
-        for row, cells in zip(rows, marked, strict=True)
-    )
+                marked[i][index] = replace(marked[i][index], best=True)
+    return tuple(replace(row, cells=tuple(cells)) for row, cells in zip(rows, marked, strict=True))
 
 
-def _skipped(comparison: Comparison) -> dict[str, str]:
+def _skipped(comparison: Comparison) -> dict[str, list[str]]:
     reasons: dict[str, list[str]] = {}
     for run in comparison.runs:
         for key, why in run.skipped.items():
             reasons.setdefault(key, []).append(why)
     present = {column.key for column in quality_columns(comparison)}
-    return {metric_label(key): "; ".join(dict.fromkeys(why)) for key, why in reasons.items() if key not in present}
+    labels: dict[str, list[str]] = {}
+    for key, why in reasons.items():
+        if key not in present:
+            labels.setdefault("; ".join(dict.fromkeys(why)), []).append(metric_label(key))
+    return labels

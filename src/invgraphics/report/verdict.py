@@ -22,7 +22,7 @@ def _ranking(summary: Summary, column: Quantity) -> list[tuple[float, Row]]:
 
 
 def _quality(comparison: Comparison, summary: Summary) -> list[str]:
-    columns = [column for column in summary.columns if column.group == "quality"]
+    columns = [column for column in summary.columns if column.group != "cost"]
     ranking = _ranking(summary, columns[0]) if columns else []
     if not ranking:
         return []
@@ -62,15 +62,15 @@ def _resolution(summary: Summary, column: Quantity, ranking: list[tuple[float, R
         return ""
     noise, gap = math.hypot(*deviations), abs(ranking[0][0] - ranking[1][0])
     unit = f" {column.unit}" if column.unit else ""
+    spread = f"Seeds of a method differ by about {column.text(noise)}{unit}"
     if gap > 2 * noise:
-        return (
-            f"That lead is {gap / noise:.1f} times what two seeds differ by ({column.text(noise)}{unit})." if noise > 0 else ""
-        )
-    return f"That lead is within what two seeds differ by ({column.text(noise)}{unit}): call it a draw."
+        return f"{spread}, {gap / noise:.1f} times less than that lead." if noise > 0 else ""
+    return f"{spread}: that lead may be chance."
 
 
 def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> str:
-    agree, others = [], []
+    agree: list[str] = []
+    others: dict[str, list[str]] = {}
     for column in columns:
         ranking = _ranking(summary, column)
         best = [row for row in summary.methods if (cell := summary.cell(row, column.key)) and cell.best]
@@ -79,10 +79,11 @@ def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> st
         if winner in best:
             agree.append(column.label)
         else:
-            others.append(f"{column.label} goes to {listing(row.label for row in best)}")
-    parts = [f"It also leads in {listing(agree)}" if agree else "", listing(others)]
+            others.setdefault(listing(row.label for row in best), []).append(column.label)
+    parts = [f"It also leads in {listing(agree)}" if agree else ""]
+    parts += [f"{who} {'lead' if ' and ' in who else 'leads'} in {listing(labels)}" for who, labels in others.items()]
     text = "; ".join(part for part in parts if part)
-    return f"{text[0].upper()}{text[1:]}." if text else ""
+    return f"{text}." if text else ""
 
 
 def _costs(summary: Summary) -> list[str]:
@@ -108,7 +109,7 @@ def _costs(summary: Summary) -> list[str]:
 
 def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
     sentences = []
-    columns = [column for column in summary.columns if column.group == "quality"]
+    columns = [column for column in summary.columns if column.group != "cost"]
     reference = _best_baseline(summary, columns[0]) if columns else None
     if reference is not None:
         column = columns[0]

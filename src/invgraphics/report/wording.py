@@ -10,6 +10,7 @@ from typing import Literal
 from invgraphics.report.records import Score
 
 Direction = Literal["higher", "lower", "none"]
+Group = Literal["image", "geometry", "cost"]
 
 ABSENT = "–"
 """Shown where a method has no such quantity."""
@@ -24,7 +25,7 @@ class Quantity:
         label: what people call it.
         unit: unit in which it is written; empty for a pure number.
         better: which way is better; ``none`` for what is a fact, not a merit.
-        group: ``quality`` or ``cost``.
+        group: what it judges: ``image``, ``geometry`` or ``cost``; the first two are quality.
         scale: the stored value is multiplied by this before it is written.
         decimals: digits after the point; ``None`` means three significant digits.
     """
@@ -33,7 +34,7 @@ class Quantity:
     label: str
     unit: str
     better: Direction
-    group: Literal["quality", "cost"]
+    group: Group
     scale: float = 1.0
     decimals: int | None = None
 
@@ -53,13 +54,19 @@ class Quantity:
             return ABSENT
         if math.isinf(value):
             return "∞" if value > 0 else "−∞"
-        scaled = value * self.scale
-        text = f"{scaled:,.{significant_decimals(scaled) if self.decimals is None else self.decimals}f}"
-        return text.replace("-", "−")
+        return f"{value * self.scale:,.{self._digits(value)}f}".replace("-", "−")
+
+    def spread(self, mean: float, deviation: float) -> str:
+        """``± deviation`` with the digits of its mean; empty for a cost that is the same for all seeds."""
+        text = f"{deviation * self.scale:,.{self._digits(mean)}f}"
+        return "" if self.group == "cost" and float(text.replace(",", "")) == 0 else f"± {text}"
 
     def sort_key(self, value: float) -> float:
         """Smaller is better."""
         return -value if self.better == "higher" else value
+
+    def _digits(self, value: float) -> int:
+        return significant_decimals(value * self.scale) if self.decimals is None else self.decimals
 
 
 _NAMES: dict[str, tuple[str, int]] = {
@@ -70,20 +77,24 @@ _NAMES: dict[str, tuple[str, int]] = {
     "lpips": ("LPIPS", 3),
     "depth_abs_rel": ("Depth abs-rel", 3),
     "depth_rmse": ("Depth RMSE", 3),
+    "depth_abs_rel_smooth": ("Depth abs-rel off edges", 3),
+    "depth_rmse_smooth": ("Depth RMSE off edges", 3),
     "normal_deg": ("Normal error", 1),
     "alpha_iou": ("Alpha IoU", 3),
 }
 
-_UNITS = {"deg": "°", "degrees": "°", "degree": "°", "1": "", "-": ""}
+_GEOMETRY = ("depth_", "normal_", "alpha_")
+
+_UNITS = {"deg": "°", "degrees": "°", "degree": "°", "world units": "units"}
 
 COSTS = (
     Quantity("fit_seconds", "Fit", "s", "lower", "cost"),
     Quantity("steps", "Steps", "", "none", "cost", decimals=0),
     Quantity("render_seconds_per_view", "Render", "s/view", "lower", "cost"),
     Quantity("render_fps", "Render", "FPS", "higher", "cost"),
-    Quantity("peak_memory_bytes", "Peak memory", "MB", "lower", "cost", scale=1e-6),
+    Quantity("peak_memory_bytes", "Memory", "MB", "lower", "cost", scale=1e-6),
     Quantity("model_bytes", "Model", "MB", "lower", "cost", scale=1e-6),
-    Quantity("parameters", "Parameters", "M", "none", "cost", scale=1e-6),
+    Quantity("parameters", "Params", "M", "none", "cost", scale=1e-6),
     Quantity("primitives", "Primitives", "", "none", "cost", decimals=0),
 )
 """Costs in the order of the table; 1 MB = 10⁶ bytes."""
@@ -98,7 +109,8 @@ def quality_quantity(key: str, score: Score) -> Quantity:
     """The column of a quality metric, whose unit and direction come with its scores."""
     decimals = _NAMES[key][1] if key in _NAMES else None
     better: Direction = "higher" if score.higher_is_better else "lower"
-    return Quantity(key, metric_label(key), _UNITS.get(score.unit, score.unit), better, "quality", decimals=decimals)
+    group: Group = "geometry" if key.startswith(_GEOMETRY) else "image"
+    return Quantity(key, metric_label(key), _UNITS.get(score.unit, score.unit), better, group, decimals=decimals)
 
 
 def significant_decimals(value: float, digits: int = 3) -> int:

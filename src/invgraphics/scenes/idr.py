@@ -15,6 +15,7 @@ from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files, image_size
 from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth, pose
+from invgraphics.scenes.npz import DAMAGED
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 
@@ -64,7 +65,7 @@ def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], lis
     try:
         with np.load(source, allow_pickle=False) as table:
             arrays = {key: np.asarray(table[key], dtype=np.float64) for key in table.files if "_mat_" in key}
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED as error:
         raise InputError(f"{source} cannot be read: {error}.") from error
     sphere = _matrix(arrays, "scale_mat_0", source)
     world_from_local = torch.from_numpy(sphere)
@@ -100,7 +101,7 @@ def decompose(projection: Float[np.ndarray, "3 4"], size: tuple[int, int], where
     """
     from scipy.linalg import rq
 
-    if abs(np.linalg.det(projection[:, :3])) < 1e-12 * np.abs(projection).max():
+    if np.linalg.matrix_rank(projection[:, :3]) < 3:
         raise InputError(f"{where} is not a projection matrix: its left part is singular.")
     projection = projection * np.sign(np.linalg.det(projection[:, :3]))
     upper, rotation = rq(projection[:, :3])

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core import Bounds, Camera, Points, Scene, View
+from invgraphics.core import Bounds, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity, transform_points
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import RESIZE, Photo, load_view, match_sizes
+from invgraphics.scenes.images import RESIZE, Photo, load_view, match_sizes, wanted_size
 
 T = TypeVar("T")
 
@@ -215,8 +215,7 @@ def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes:
         "test_views": f"{len(chosen.test)} of {len(split.test)}, evenly spaced",
     }
     photos = match_sizes(chosen.photos)
-    local_from_world = torch.linalg.inv(frame.world_from_local)
-    views = [_local_view(photo, local_from_world, options) for photo in photos]
+    views = _read(photos, torch.linalg.inv(frame.world_from_local), options.size)
     lenses = sorted({photo.lens.model for photo in photos if photo.lens is not None})
     if lenses:
         notes["undistortion"] = f"{', '.join(lenses)} removed at full size (bilinear), zoomed in until no pixel is blank"
@@ -243,9 +242,21 @@ def local_points(frame: Frame) -> Points | None:
     return Points(position.float(), frame.points.rgb.float())
 
 
-def _local_view(photo: Photo, local_from_world: Float[Tensor, "4 4"], options: SceneOptions) -> View:
-    camera: Camera = photo.camera.moved(apply_similarity(local_from_world, photo.camera.cam_to_world))
-    return load_view(replace(photo, camera=camera), options.size)
+def _read(photos: Sequence[Photo], local_from_world: Float[Tensor, "4 4"], size: int | tuple[int, int] | None) -> list[View]:
+    """Read photographs one at a time; only their final pixels are kept.
+
+    Those have their place before the first picture is read: allocated in between, they would be scattered among the large
+    work arrays and keep the C library from using that space again (1 GB for a hundred photographs of 1 MP).
+    """
+    sizes = [wanted_size(photo.camera.width, photo.camera.height, size) for photo in photos]
+    places = [(torch.empty(h, w, 3, dtype=torch.uint8), torch.empty(h, w, dtype=torch.uint8)) for w, h in sizes]
+    views = []
+    for photo, (image, alpha) in zip(photos, places, strict=True):
+        camera = photo.camera.moved(apply_similarity(local_from_world, photo.camera.cam_to_world))
+        view = load_view(replace(photo, camera=camera), size)
+        coverage = None if view.alpha is None else alpha.copy_(view.alpha)
+        views.append(replace(view, image=image.copy_(view.image), alpha=coverage))
+    return views
 
 
 def _resize_note(photos: Sequence[Photo], views: Sequence[View]) -> str:

@@ -13,6 +13,7 @@ from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files
 from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose
+from invgraphics.scenes.npz import DAMAGED
 
 
 class Llff:
@@ -52,8 +53,10 @@ class Llff:
 def _read(source: Path) -> Float[np.ndarray, "n 17"]:
     try:
         table = np.load(source, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED as error:
         raise InputError(f"{source} cannot be read: {error}.") from error
+    if not isinstance(table, np.ndarray):
+        raise InputError(f"{source} is an archive, not one array.")
     if table.ndim != 2 or table.shape[1] != 17 or len(table) == 0 or table.dtype.kind != "f":
         raise InputError(f"{source} has shape {table.shape}, expected n rows of 17 numbers.")
     return table.astype(np.float64)

@@ -19,6 +19,8 @@ bounds         (2, 3), optional               lowest and highest corner of a box
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +37,9 @@ from invgraphics.scenes.images import RESIZE, make_view, wanted_size
 from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
 
 Arrays = Mapping[str, np.ndarray]
+
+DAMAGED = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What `numpy.load` raises about a file that is damaged or holds pickled objects."""
 
 _REQUIRED = ("images", "cam_to_world", "focal")
 
@@ -88,10 +93,8 @@ def _read(path: Path) -> Arrays:
     try:
         with np.load(path, allow_pickle=False) as table:
             arrays = {key: table[key] for key in table.files}
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise InputError(f"{path} cannot be read: {error}.") from error
-    except Exception as error:  # zipfile and zlib have errors of their own for a damaged archive
-        raise InputError(f"{path} is damaged: {error}.", "Write or copy the file again.") from error
+    except DAMAGED as error:
+        raise InputError(f"{path} cannot be read: {error}.", "Write or copy the file again.") from error
     missing = [key for key in _REQUIRED if key not in arrays]
     if missing:
         raise InputError(f"{path} has no {' and no '.join(map(repr, missing))}.", f"It has: {', '.join(arrays) or 'nothing'}.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 
@@ -30,22 +30,24 @@ class Loader(Protocol):
         ...
 
 
-def open_scene(spec: str, options: SceneOptions | None = None, progress: Callable[..., Any] | None = None) -> Scene:
+def open_scene(
+    spec: str, options: SceneOptions | None = None, progress: Callable[[int, int, str], None] | None = None
+) -> Scene:
     """Open a scene and check it.
 
     Args:
         spec: a built-in scene's name, which is rendered first unless its truth is in the cache; the path of one's own
             ``scene.toml``; or the path of a data set.
         options: size and number of views.
-        progress: told about rendering, see `invgraphics.scenes.mitsuba.make`.
+        progress: called while a scene is rendered with (views done, views in all, what is being done).
 
     Raises:
         InputError: nothing is known by this name, no format fits, or the data cannot be used.
     """
     options = options or SceneOptions()
-    described = _description(spec)
-    if described is not None:
-        path = _render(spec, described, options, progress)
+    description = _description(spec)
+    if description is not None:
+        path = _render(description, options, progress)
         return validate(plugins.load("scenes", "truth")().load(path, options))
     path = Path(spec).expanduser()
     if not path.exists():
@@ -80,31 +82,25 @@ def _built_in() -> tuple[str, ...]:
     return spec.names()
 
 
-def _description(spec: str) -> Path | None:
-    """The ``scene.toml`` that ``spec`` stands for, if any."""
-    from invgraphics.scenes.mitsuba.spec import FILE, locate
+def _description(spec: str) -> str | None:
+    """What `make` calls the scene: a built-in scene's name or the path of a ``scene.toml``; ``None`` for a data set."""
+    from invgraphics.scenes.mitsuba.spec import FILE
 
     path = Path(spec).expanduser()
     own = path if path.name == FILE else path / FILE
-    return locate(spec) if spec in _built_in() or own.is_file() else None
+    return spec if spec in _built_in() else str(own) if own.is_file() else None
 
 
-def _render(spec: str, description: Path, options: SceneOptions, progress: Callable[..., Any] | None) -> Path:
+def _render(description: str, options: SceneOptions, progress: Callable[[int, int, str], None] | None) -> Path:
     from invgraphics.scenes.mitsuba import make
-    from invgraphics.scenes.mitsuba.spec import read
+    from invgraphics.scenes.mitsuba.spec import locate, read
 
     size = options.size
     if isinstance(size, int):
-        width, height = read(description).size
+        width, height = read(locate(description)).size
         size = (round(size * width / max(width, height)), round(size * height / max(width, height)))
     return make(
-        spec,
-        size=size,
-        train=options.train_views,
-        test=options.test_views,
-        spp=None,
-        seed=options.seed,
-        progress=progress,
+        description, size=size, train=options.train_views, test=options.test_views, seed=options.seed, progress=progress
     )
 
 

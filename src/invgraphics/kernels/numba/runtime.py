@@ -27,8 +27,16 @@ parallel = partial(nb.njit, parallel=True, fastmath=FASTMATH, **_OPTIONS)
 """Decorator of kernels that loop over jobs with ``nb.prange``, one job per thread."""
 serial = partial(nb.njit, fastmath=FASTMATH, **_OPTIONS)
 """Decorator of functions that one thread runs."""
+exact_parallel = partial(nb.njit, parallel=True, **_OPTIONS)
+exact = partial(nb.njit, forceinline=True, **_OPTIONS)
+"""`parallel` and `inlined` in plain IEEE arithmetic."""
 inlined = partial(nb.njit, fastmath=FASTMATH, forceinline=True, **_OPTIONS)
 """Decorator of small functions inside hot loops."""
+
+# Starting Numba's threads sets OpenMP's thread count for the whole process, torch's too: put it back.
+_torch_threads = torch.get_num_threads()
+nb.set_num_threads(nb.get_num_threads())
+torch.set_num_threads(_torch_threads)
 
 # A signed index carries a test for wrap-around that keeps LLVM from vectorising: hot loops index with this type.
 index = np.uintp
@@ -113,16 +121,25 @@ def split_by_work(work: np.ndarray, jobs: int, first: np.ndarray) -> None:
 
 
 @inlined
-def exp2(x):
-    """``2**x`` to 1e-7 relative for x in [-126, 127], clamped below: a polynomial, because LLVM vectorises no library call."""
+def power_minus_one(x):
+    """``2**f - 1`` and ``2**n`` with x = f + n, n whole and f in [-1/2, 1/2], for x in [-126, 127], clamped below.
+
+    Polynomials, because LLVM vectorises no library call; ``2**x`` is `exp2`, to 1e-7 relative.
+    """
     x = max(x, np.float32(-126.0))
     whole = np.floor(x + np.float32(0.5))
     f = x - whole
-    # Minimax polynomial of 2^f on [-1/2, 1/2], exact at 0; relative error 9.1e-8.
+    # Minimax polynomial, relative error of 2^f 9.1e-8.
     p = np.float32(0.00132647272)
     p = p * f + np.float32(0.00967151281)
     p = p * f + np.float32(0.0555073374)
     p = p * f + np.float32(0.240222421)
     p = p * f + np.float32(0.693146978)
-    p = p * f + np.float32(1.0)
-    return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
+    return p * f, np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@inlined
+def exp2(x):
+    """``2**x`` for x in [-126, 127], clamped below."""
+    fraction, scale = power_minus_one(x)
+    return (fraction + np.float32(1.0)) * scale

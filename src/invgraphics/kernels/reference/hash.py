@@ -12,7 +12,6 @@ from invgraphics.kernels.types import HashGrid
 
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the spatial hash, one per axis (Instant-NGP, equation 4)."""
-_WORD = 0xFFFFFFFF
 
 
 def entry_index(vertices: Int[Tensor, "*m 3"], resolution: int, log2_size: int) -> Int[Tensor, "*m"]:
@@ -30,8 +29,8 @@ def entry_index(vertices: Int[Tensor, "*m 3"], resolution: int, log2_size: int) 
     edge = resolution + 1
     if edge**3 <= 2**log2_size:
         return x + edge * (y + edge * z)
-    # The products stay below 2^63 for any resolution below 2^31; masking them gives the 32-bit wrap-around.
-    hashed = ((x * PRIMES[0]) & _WORD) ^ ((y * PRIMES[1]) & _WORD) ^ ((z * PRIMES[2]) & _WORD)
+    # Only the low bits count, and they do not depend on where the words wrap around: 64-bit products serve as well.
+    hashed = (x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])
     return hashed & (2**log2_size - 1)
 
 
@@ -41,11 +40,11 @@ def hash_encode(
     """See `invgraphics.kernels.hash_encode`. Positions outside [0, 1] are clamped, and their Jacobian is zero there."""
     inside = ((unit >= 0) & (unit <= 1)).to(unit.dtype)
     features, slopes = [], []
-    for resolution, offset in zip(grid.resolutions, grid.offsets, strict=False):
+    for resolution, level in zip(grid.resolutions, table.split(list(grid.sizes)), strict=True):
         cell = locate(unit, torch.tensor([resolution] * 3, device=unit.device))
-        index = offset + entry_index(cell.vertices, resolution, grid.log2_size)
+        index = entry_index(cell.vertices, resolution, grid.log2_size)
         # `embedding` rather than indexing: its backward sums in a fixed order, whatever the number of threads.
-        entries = embedding(index, table)
+        entries = embedding(index, level)
         features.append(torch.einsum("mk,mkf->mf", cell.weights, entries))
         if jacobian:
             slope = torch.einsum("mka,mkf->mfa", cell.slopes, entries)

@@ -15,6 +15,7 @@ from invgraphics.errors import InputError
 
 VARIABLE = "INVGRAPHICS_CACHE"
 TRUTH = "truth.json"
+REQUEST = "job.json"
 SCHEMA = 1
 
 
@@ -78,7 +79,7 @@ def copy(source: Path, target: Path) -> Path:
         shutil.rmtree(partial, ignore_errors=True)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copytree(source, partial)
-        os.replace(partial, target)
+        partial.replace(target)
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
         raise InputError(f"{target} cannot be written: {error.strerror or error}.") from error

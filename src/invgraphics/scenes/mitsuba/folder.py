@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from jaxtyping import Float
 from invgraphics.core import Camera
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.core.transforms import opencv_to_opengl
-from invgraphics.scenes.mitsuba.cache import SCHEMA, TRUTH
+from invgraphics.scenes.mitsuba.cache import REQUEST, SCHEMA, TRUTH
 from invgraphics.scenes.mitsuba.gbuffer import GBuffer
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.rig import Split
@@ -61,7 +60,7 @@ def write_view(
             alpha=gbuffer.alpha,
             half_psnr=np.float64(half_psnr),
         )
-    os.replace(partial, arrays)
+    partial.replace(arrays)
 
 
 def write_transforms(folder: Path, split: Split, cameras: tuple[Camera, ...]) -> None:
@@ -82,7 +81,7 @@ def write_truth(folder: Path, job: Job, cameras: dict[Split, tuple[Camera, ...]]
     files = {
         path.relative_to(folder).as_posix(): path.stat().st_size
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and (path.parent != folder or path.suffix in (".json", ".npz", ".ply")) and path.name != TRUTH
+        if path.is_file() and path.name not in (TRUTH, REQUEST)
     }
     content: dict[str, Any] = {
         "schema": SCHEMA,
@@ -104,7 +103,7 @@ def write_truth(folder: Path, job: Job, cameras: dict[Split, tuple[Camera, ...]]
     }
     partial = folder / f"{TRUTH}.partial"
     partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    os.replace(partial, folder / TRUTH)
+    partial.replace(folder / TRUTH)
 
 
 def _camera_table(camera: Camera) -> dict[str, Any]:

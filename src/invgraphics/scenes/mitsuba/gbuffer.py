@@ -82,8 +82,11 @@ def first_hits(
     """Distance (inf where there is none) and geometric normal of each ray's first hit."""
     import mitsuba
 
-    if mitsuba.variant().startswith("scalar"):
-        hits = [scene.ray_intersect(mitsuba.Ray3f(list(o), list(d))) for o, d in zip(origins, directions, strict=True)]
+    if str(mitsuba.variant()).startswith("scalar"):
+        hits = [
+            scene.ray_intersect(mitsuba.Ray3f(mitsuba.Point3f(o), mitsuba.Vector3f(d)))
+            for o, d in zip(origins, directions, strict=True)
+        ]
         distance = np.array([hit.t if hit.is_valid() else np.inf for hit in hits])
         return distance, np.array([np.array(hit.n).reshape(3) for hit in hits])
     hit = scene.ray_intersect(mitsuba.Ray3f(mitsuba.Point3f(origins.T), mitsuba.Vector3f(directions.T)))

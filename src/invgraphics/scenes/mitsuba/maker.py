@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -61,12 +60,16 @@ def make(
 
 def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int | None], spp: int | None, seed: int) -> Job:
     spec = read(locate(name))
-    for value, least, what in ((size and min(size), 8, "The size"), (views[0], 1, "The number of training views"),
-                               (views[1], 1, "The number of test views"), (spp, 1, "The number of samples per pixel")):  # fmt: skip
+    limits = (
+        ("The size", size and min(size), 8),
+        ("The number of training views", views[0], 1),
+        ("The number of test views", views[1], 1),
+        ("The number of samples per pixel", spp, 1),
+        ("The seed", seed, 0),
+    )
+    for what, value, least in limits:
         if value is not None and value < least:
             raise InputError(f"{what} cannot be {value}.", f"Expected: at least {least}.")
-    if seed < 0:
-        raise InputError(f"The seed cannot be {seed}.", "Expected: 0 or a positive whole number.")
     train, test = (
         default if given is None else given for given, default in zip(views, (spec.views.train, spec.views.test), strict=True)
     )
@@ -77,14 +80,14 @@ def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int |
 def _make(job: Job, folder: Path, progress: Progress) -> None:
     """Render into a folder beside the final one, which appears only when it is whole."""
     partial = folder.with_name(f"{folder.name}.partial")
-    request = partial / "job.json"
+    request = partial / cache.REQUEST
     try:
         shutil.rmtree(folder, ignore_errors=True)  # a broken one, see `cache.read_truth`
         partial.mkdir(exist_ok=True)
         request.write_text(json.dumps(job.table()), encoding="utf-8")
         _run(job, partial, progress)
         request.unlink()
-        os.replace(partial, folder)
+        partial.replace(folder)
     except OSError as error:
         raise cache.unwritable(partial, error) from error
 
@@ -103,30 +106,28 @@ def _run(job: Job, partial: Path, progress: Progress) -> None:
                 process.terminate()
                 process.wait()
         if status:
-            raise InputError(*_explain(job, status, failure, complaints))
+            raise failure or _explain(job, status, complaints)
 
 
-def _follow(process: subprocess.Popen[str], progress: Progress) -> str:
+def _follow(process: subprocess.Popen[str], progress: Progress) -> InputError | None:
     """Pass progress on until the process closes its output; what it said went wrong, if it did."""
-    failure = ""
+    failure = None
     for line in process.stdout or ():
         word, _, rest = line.rstrip("\n").partition(" ")
         if word == "progress":
             done, total, what = rest.split(" ", 2)
             progress(int(done), int(total), what)
         elif word == "error":
-            failure = rest
+            failure = InputError(*json.loads(rest))
     return failure
 
 
-def _explain(job: Job, status: int, failure: str, complaints: IO[str]) -> tuple[str, str]:
-    """Sentence and remedy for a rendering process that failed."""
+def _explain(job: Job, status: int, complaints: IO[str]) -> InputError:
+    """Why a rendering process failed that could not say so itself."""
     scene = f"The scene '{job.spec.name}' could not be rendered"
-    if failure:
-        return f"{scene}: {failure}", f"The cache is {cache.root()}; {cache.VARIABLE} moves it."
     if status < 0:
         killed = signal.Signals(-status).name
-        return f"{scene}: the rendering process died of {killed}.", "If memory ran out, make it smaller (--size, --spp)."
+        return InputError(f"{scene}: its process died of {killed}.", "If memory ran out, make it smaller (--size, --spp).")
     complaints.seek(0)
-    last = next((line for line in reversed(complaints.read().splitlines()) if line.strip()), f"exit status {status}")
-    return f"{scene}: {last.strip()}.", ""
+    last = next((line.strip() for line in reversed(complaints.read().splitlines()) if line.strip()), f"exit status {status}")
+    return InputError(f"{scene}: {last}")

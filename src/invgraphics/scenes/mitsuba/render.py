@@ -7,7 +7,7 @@ view: ``progress DONE TOTAL WHAT``. Views that an interrupted process has left a
 from __future__ import annotations
 
 import importlib
-import os
+import json
 import sys
 import tempfile
 from pathlib import Path
@@ -22,12 +22,12 @@ from invgraphics.scenes.mitsuba import ply, stage
 from invgraphics.scenes.mitsuba.build import BUILDERS
 from invgraphics.scenes.mitsuba.build.mesh import merge, sphere
 from invgraphics.scenes.mitsuba.build.model import Model
+from invgraphics.scenes.mitsuba.cache import REQUEST, unwritable
 from invgraphics.scenes.mitsuba.gbuffer import GBuffer, sample_points, trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
 
 POINTS = 20_000
-REQUEST = "job.json"
 
 
 def main(folder: Path) -> None:
@@ -38,7 +38,7 @@ def main(folder: Path) -> None:
     mitsuba.set_variant(job.variant)
     rig = make_rig(job.spec.rig)
     counts: dict[Split, int] = {"train": job.views.train, "val": job.views.val, "test": job.views.test}
-    views = {split: cameras(rig, split, counts[split], job.size, job.seed) for split in SPLITS}
+    views: dict[Split, tuple[Camera, ...]] = {split: cameras(rig, split, counts[split], job.size, job.seed) for split in SPLITS}
     model = build(job.spec.builder, job.spec.seed)
     with tempfile.TemporaryDirectory() as scratch:
         scene = stage.load(model, job.spec.depth, job.spec.background is not None, Path(scratch))
@@ -124,6 +124,10 @@ def _report(done: int, total: int, what: str) -> None:
 if __name__ == "__main__":
     try:
         main(Path(sys.argv[1]))
-    except (InputError, OSError) as error:
-        print(f"error {str(error).replace(os.linesep, ' ')}", flush=True)
+    except InputError as error:
+        print("error", json.dumps([error.sentence, error.remedy]), flush=True)
+        sys.exit(1)
+    except OSError as error:
+        refused = unwritable(Path(sys.argv[1]), error)
+        print("error", json.dumps([refused.sentence, refused.remedy]), flush=True)
         sys.exit(1)

@@ -98,6 +98,7 @@ class InsideOut:
         fov: field of view across the image's shorter side, degrees.
         elevation: lowest and highest viewing angle above the horizon, degrees.
         azimuth: first and last viewing direction from +x, degrees.
+        setback: how far each camera steps back, horizontally, from what it looks at.
     """
 
     extent: Vector
@@ -105,13 +106,15 @@ class InsideOut:
     target: Vector = (0.0, 0.0, 0.0)
     elevation: tuple[float, float] = (-25.0, 10.0)
     azimuth: tuple[float, float] = (0.0, 360.0)
+    setback: float = 0.0
 
     dimensions: ClassVar[int] = 5
 
     def pose(self, unit: Float[Tensor, " d"]) -> Float[Tensor, "4 4"]:
         """The camera of a point of the unit cube: viewing angles, then position."""
-        forward = _direction(_between(self.azimuth, unit[0]), _between(self.elevation, unit[1]))
-        eye = _tensor(self.target) + _tensor(self.extent) * (2 * unit[2:] - 1)
+        azimuth = _between(self.azimuth, unit[0])
+        forward = _direction(azimuth, _between(self.elevation, unit[1]))
+        eye = _tensor(self.target) + _tensor(self.extent) * (2 * unit[2:] - 1) - self.setback * _direction(azimuth, 0.0)
         return look_at(eye, eye + forward, _tensor(UP))
 
 
@@ -155,7 +158,7 @@ def cameras(rig: Rig, split: Split, count: int, size: tuple[int, int], seed: int
 
 
 def _low_discrepancy(count: int, shift: Float[Tensor, " d"]) -> Float[Tensor, "n d"]:
-    """Points of the unit cube by the additive recurrence R_d (Roberts 2018), a Kronecker sequence: its prefixes are even too."""
+    """Points of the unit cube by the additive recurrence R_d (Roberts 2018), whose prefixes are even too."""
     dimensions = len(shift)
     root = 2.0
     for _ in range(64):  # fixed point of x = (1 + x)^(1 / (d + 1)), the generalised golden ratio

@@ -41,6 +41,9 @@ def load(model: Model, depth: int, hide_emitters: bool, folder: Path) -> Any:
         path = folder / f"part{index}.ply"
         ply.write(path, part.mesh.vertices, part.mesh.faces, part.mesh.normals, part.mesh.uv)
         scene[f"part{index}"] = {"type": "ply", "filename": str(path), "bsdf": _objects(part.material)}
+        if part.radiance is not None:
+            emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(part.radiance)}}
+            scene[f"part{index}"]["emitter"] = emitter
     for index, ball in enumerate(model.balls):
         sphere = {"type": "sphere", "center": list(ball.centre), "radius": ball.radius}
         scene[f"ball{index}"] = {**sphere, "bsdf": _objects(ball.material)}
@@ -103,7 +106,8 @@ def render(scene: Any, camera: Camera, samples: int, seed: tuple[int, ...]) -> F
     for number, start in enumerate(range(0, samples, most)):
         count = min(most, samples - start)
         stream = int(np.random.SeedSequence((*seed, number)).generate_state(1)[0])
-        total += count * np.asarray(mitsuba.render(scene, sensor=film_sensor, spp=count, seed=stream), dtype=np.float64)
+        image = mitsuba.render(scene, sensor=film_sensor, spp=count, seed=stream)  # pyright: ignore[reportArgumentType]
+        total += count * np.asarray(image, dtype=np.float64)
     return (total / samples).astype(np.float32)
 
 

@@ -22,7 +22,7 @@ SCALE = 1.76 / BASE
 """World units per stud: the baseplate is 1.76 wide."""
 
 PALETTE = {
-    "red": "#c4281c", "crimson": "#a01d14", "blue": "#1a5fb4", "azure": "#58b7dd", "navy": "#16324f", "yellow": "#f5c430",
+    "red": "#d3301f", "crimson": "#ad2015", "blue": "#1a5fb4", "azure": "#58b7dd", "navy": "#16324f", "yellow": "#f5c430",
     "amber": "#ee9b27", "green": "#4aa64a", "lime": "#a3cf3b", "forest": "#1f7a3d", "white": "#f2f2ef", "grey": "#9ba19d",
     "slate": "#5a6066", "black": "#20262b", "brown": "#6d4024", "tan": "#dcc48e", "pink": "#ee8fb5", "violet": "#8a4fa3",
 }  # fmt: skip
@@ -72,7 +72,7 @@ class Bricks:
         for x, y, z, colour in self.studs:
             if (x, y, z) not in self.filled:
                 self.add(colour, stud.moved((x + 0.5, y + 0.5, z * PLATE - GAP)))
-        middle = (-BASE / 2, -BASE / 2, -5.6)
+        middle = (-BASE / 2, -BASE / 2, -6.7)
         return [
             Part(merge(meshes).moved(middle).scaled(SCALE), plastic(rgb(PALETTE[colour])))
             for colour, meshes in sorted(self.meshes.items())
@@ -195,6 +195,7 @@ def _fill(bricks: Bricks, axis: str, fixed: int, opening: Opening) -> None:
 
 def _roof(bricks: Bricks, rng: np.random.Generator) -> None:
     top = 3 * COURSES
+    _core(bricks, top * PLATE)
     for step in range(4):
         z = top + 3 * step
         for y, down in ((Y0 - 1 + step, -1), (Y1 - step, 1)):
@@ -207,6 +208,16 @@ def _roof(bricks: Bricks, rng: np.random.Generator) -> None:
     for course in range(4):
         bricks.brick("slate" if course % 2 else "grey", (10, 9, top + 6 + 3 * course), (2, 2, 3))
     bricks.brick("black", (10, 9, top + 18), (2, 2, 1))
+
+
+def _core(bricks: Bricks, eaves: float) -> None:
+    """Dark filling behind walls and roof, so that no ray slips through the seams into an empty house."""
+    x0, x1, y0, y1, inset = X0 + 0.7, X1 - 0.7, Y0 + 0.7, Y1 - 0.7, 0.3
+    bricks.add("black", box((x0, y0, 0.05), (x1, y1, eaves)))
+    ridge = eaves + 3 * PLATE * (y1 - y0) / 2
+    gable = [(y0, eaves), (y1, eaves), ((y0 + y1) / 2, ridge)]
+    points = np.array([(x, y, z) for x in (X0 + inset, X1 - inset) for y, z in gable])
+    bricks.add("black", solid(points, [(0, 1, 2), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)]))
 
 
 def _tree(bricks: Bricks) -> None:

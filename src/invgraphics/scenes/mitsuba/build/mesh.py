@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -100,6 +101,8 @@ def box(lo: Point, hi: Point, chamfer: float = 0.0) -> Mesh:
 def lathe(profile: Sequence[tuple[float, float]], sides: int = 32) -> Mesh:
     """A surface of revolution about +z, round in one direction and with the profile's corners kept.
 
+    Texture coordinates follow the angle and the length along the profile.
+
     Args:
         profile: (radius, height), from the lower axis around the outside to the upper axis.
         sides: corners of the circle.
@@ -107,11 +110,13 @@ def lathe(profile: Sequence[tuple[float, float]], sides: int = 32) -> Mesh:
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     bands = []
-    for (r0, z0), (r1, z1) in zip(profile, profile[1:], strict=False):
+    lengths = np.hypot(*np.diff(np.array(profile), axis=0).T)
+    ends = np.concatenate([[0], np.cumsum(lengths)]) / lengths.sum()
+    for (r0, z0), (r1, z1), heights in zip(profile, profile[1:], pairwise(ends), strict=False):
         slope = np.array([z1 - z0, r0 - r1]) / np.hypot(z1 - z0, r1 - r0)  # outward normal of the profile: (radial, up)
         rows = [np.column_stack([r * ring, np.full(sides + 1, z)]) for r, z in ((r0, z0), (r1, z1))]
         normals = np.column_stack([slope[0] * ring, np.full(sides + 1, slope[1])])
-        uv = [np.column_stack([angle / (2 * np.pi), np.full(sides + 1, v)]) for v in (0.0, 1.0)]
+        uv = [np.column_stack([angle / (2 * np.pi), np.full(sides + 1, v)]) for v in heights]
         quads = _quads(2, sides + 1)
         keep = np.concatenate([np.full(sides, r0 > 0), np.full(sides, r1 > 0)])
         bands.append(Mesh(np.concatenate(rows), quads[keep], np.tile(normals, (2, 1)), np.concatenate(uv)))
@@ -143,8 +148,8 @@ def sheet(points: Float[np.ndarray, "a b 3"], normals: Float[np.ndarray, "a b 3"
     """A smooth surface over a grid of points; its front is towards (d points / d b) x (d points / d a)."""
     rows, columns = points.shape[:2]
     if normals is None:
-        normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
-        normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+        crossed = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+        normals = np.asarray(crossed / np.linalg.norm(crossed, axis=-1, keepdims=True))
     u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
     return Mesh(points.reshape(-1, 3), _quads(rows, columns), normals.reshape(-1, 3), np.stack([u, v], -1).reshape(-1, 2))
 

@@ -19,10 +19,11 @@ Material = dict[str, Any]
 
 @dataclass(frozen=True)
 class Part:
-    """A mesh and what it is made of."""
+    """A mesh, what it is made of, and the linear radiance that it emits (if it is a lamp)."""
 
     mesh: Mesh
     material: Material
+    radiance: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Model:
     Attributes:
         parts: meshes.
         balls: spheres.
-        lights: Mitsuba emitters, or shapes that carry one.
+        lights: Mitsuba emitters at infinity.
         fog: the medium, where there is one.
     """
 

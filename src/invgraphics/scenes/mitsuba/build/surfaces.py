@@ -72,22 +72,26 @@ class Softbox:
 
 
 THREE_POINT = (
-    Softbox(-60, 50, 24, (4.6, 4.4, 4.1)),
-    Softbox(70, 35, 30, (0.9, 1.0, 1.15)),
-    Softbox(175, 40, 22, (1.7, 1.75, 1.9)),
+    Softbox(-60, 50, 24, (6.0, 5.7, 5.3)),
+    Softbox(70, 35, 30, (1.3, 1.4, 1.6)),
+    Softbox(175, 40, 22, (2.2, 2.3, 2.5)),
 )
 """Key, fill and rim."""
 
 
 def studio(
-    boxes: tuple[Softbox, ...] = THREE_POINT, sky: Colour = (0.42, 0.44, 0.47), floor: Colour = (0.3, 0.29, 0.28)
-) -> Any:
+    boxes: tuple[Softbox, ...] = THREE_POINT,
+    sky: Colour = (0.5, 0.52, 0.55),
+    floor: Colour = (0.36, 0.35, 0.34),
+    exposure: float = 1.0,
+) -> dict[str, Any]:
     """Lights of a photo studio, painted into an environment: seen in reflections, hidden from the camera.
 
     Args:
         boxes: the lamps.
         sky: radiance from straight above.
         floor: radiance from straight below.
+        exposure: factor on all of it.
     """
     rows, columns = ENVIRONMENT_SIZE
     theta = (np.arange(rows) + 0.5)[:, None] / rows * np.pi
@@ -103,4 +107,4 @@ def studio(
         rim = np.clip((1.15 * lamp.width - angle) / (0.3 * lamp.width), 0, 1)
         image = image + (rim * rim * (3 - 2 * rim))[..., None] * np.array(lamp.radiance)
     turn = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    return {"type": "envmap", "bitmap": image.astype(np.float32), "to_world": turn}
+    return {"type": "envmap", "bitmap": (exposure * image).astype(np.float32), "to_world": turn}

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel
-from invgraphics.kernels.numba.splat_bin import (
+from invgraphics.kernels.numba.binning import (
     CONIC_XX,
     CONIC_XY,
     CONIC_YY,

@@ -1,0 +1,31 @@
+# Everything a newcomer needs: each target sets up what it needs first.
+PYTHON ?= python3
+BIN := .venv/bin
+METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
+
+.PHONY: env compare test slow check clean
+
+env: .venv/.ready  ## create .venv and install invgraphics with all it needs
+
+.venv/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev,llvm]"
+	touch $@
+
+compare: env  ## the main job: three families on one scene under one budget, and a report
+	$(BIN)/invgraphics compare bricks --methods $(METHODS) --budget 60s --out reports/compare-bricks
+
+test: env  ## the test suite (under 10 minutes on 2 cores)
+	$(BIN)/python -m pytest
+
+slow: env  ## the longer checks
+	$(BIN)/python -m pytest -m slow
+
+check: env  ## lint, format, types, import contract
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+clean:  ## remove the environment and what the tools cached
+	rm -rf .venv .pytest_cache .ruff_cache .import_linter_cache

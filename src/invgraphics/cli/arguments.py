@@ -1,0 +1,149 @@
+"""Reading arguments: tyro's parser with errors of at most four lines, the options that commands share, and their texts."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeVar
+
+from tyro.conf import UseAppendAction, arg
+
+from invgraphics.errors import InputError
+from invgraphics.training.budget import Budget
+
+T = TypeVar("T")
+
+SMALLEST = 8
+"""Pixels along the shorter side of the smallest pictures that are worth fitting."""
+
+_BOX = "│╭╮╰╯"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shared:
+    """What ``fit`` and ``compare`` have in common."""
+
+    budget: Annotated[str, arg(metavar="60s|5000steps")] = "60s"
+    """How long each fit may optimise: seconds (60s, 2m, 1h), or steps (5000steps)."""
+    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: laptop)")] = None
+    """Size of the method: laptop shows its character in a minute, paper holds the published values."""
+    overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
+    """Change one value of the recipe, for instance --set batches.rays=2048."""
+    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
+    """Size of the pictures; one number is the longest side."""
+    test_views: Annotated[str, arg(metavar="N|all")] = "16"
+    """How many test views are scored, evenly spaced."""
+    device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
+    """Where to compute."""
+    kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
+    """Force an implementation of the hot operations: numba, or reference (plain torch)."""
+    protocol: Annotated[str, arg(metavar="NAME")] = "default"
+    """How pictures are scored: default (rounded to 8 bits), or float."""
+    checkpoint_every: Annotated[str, arg(metavar="30s|100steps")] = "30s"
+    """How much work an interruption may cost."""
+
+    def settings(self) -> dict[str, Any]:
+        """These options as keyword arguments of a request, checked.
+
+        Raises:
+            InputError: one of them cannot be read.
+        """
+        Budget.parse(self.budget)
+        return {
+            "budget": self.budget,
+            "preset": self.preset,
+            "overrides": tuple(self.overrides),
+            "size": None if self.size is None else parse_size(self.size),
+            "test_views": parse_views(self.test_views),
+            "device": self.device,
+            "kernels": self.kernels,
+            "protocol": self.protocol,
+            "checkpoint_every": self.checkpoint_every,
+        }
+
+
+def parse(command: type[T], program: str, arguments: Sequence[str]) -> T:
+    """Make a command from its arguments; ``--help`` prints its help and exits.
+
+    Raises:
+        InputError: an argument is missing, unknown or of the wrong type.
+    """
+    import tyro
+
+    complaints = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaints):
+            return tyro.cli(command, prog=program, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise InputError(*condense(complaints.getvalue())) from None
+
+
+def condense(box: str) -> tuple[str, str]:
+    """Tyro's framed message as a sentence (of one or two lines) and a remedy."""
+    lines = [line.strip(_BOX + " ") for line in box.splitlines()]
+    # Inside the frame, horizontal rules part the message from suggestions, the argument's help and the pointer to --help.
+    parts = [" ".join(part.split()) for part in re.split(r"─{4,}", "\n".join(lines[1:]))]
+    parts = [part for part in parts if part and not part.startswith(("Argument helptext", "Available subcommands"))]
+    if not parts:
+        return "The arguments cannot be read.", ""
+    sentence = re.sub(r"invalid literal for int\(\) with base 10: ('.*')", r"\1 is not a whole number", parts[0])
+    hints = [part for part in parts[1:-1] if part.startswith("Perhaps")]
+    return "\n".join([sentence, *hints[:1]]), parts[-1] if len(parts) > 1 else ""
+
+
+def parse_size(text: str) -> int | tuple[int, int]:
+    """Read ``480`` (longest side) or ``640x480``.
+
+    Raises:
+        InputError: anything else, or less than `SMALLEST` pixels.
+    """
+    found = re.fullmatch(r"(\d+)(?:[xX×](\d+))?", text.strip())
+    sides = [int(side) for side in found.groups() if side is not None] if found else [0]
+    if min(sides) < SMALLEST:
+        expected = (
+            f"Expected WIDTHxHEIGHT, for instance 320x240, or one number for the longest side; at least {SMALLEST} pixels."
+        )
+        raise InputError(f"--size cannot be '{text}'.", expected)
+    return sides[0] if len(sides) == 1 else (sides[0], sides[1])
+
+
+def parse_views(text: str) -> int | None:
+    """Read a number of views, ``None`` for ``all``.
+
+    Raises:
+        InputError: anything else.
+    """
+    if text.strip() == "all":
+        return None
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise InputError(f"--test-views cannot be '{text}'.", "Expected a number of views, 1 or more, or 'all'.")
+    return int(text)
+
+
+def parse_list(text: str, option: str) -> tuple[str, ...]:
+    """Read a comma-separated list.
+
+    Raises:
+        InputError: nothing in it.
+    """
+    items = tuple(item.strip() for item in text.split(",") if item.strip())
+    if not items:
+        raise InputError(f"{option} is empty.", "Expected one name or several, with commas between them.")
+    return items
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Read comma-separated seeds.
+
+    Raises:
+        InputError: one of them is not a whole number, 0 or more.
+    """
+    items = parse_list(text, "--seeds")
+    if not all(item.isdecimal() for item in items):
+        raise InputError(f"--seeds cannot be '{text}'.", "Expected whole numbers, 0 or more, with commas between them: 0,1,2.")
+    return tuple(int(item) for item in items)

@@ -1,0 +1,58 @@
+"""``invgraphics compare``: the main job. Fit, evaluate, report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.arguments import Shared, parse_list, parse_seeds
+from invgraphics.cli.report import write_report
+from invgraphics.experiments.recipe import presets
+from invgraphics.experiments.request import CompareRequest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(Shared):
+    """Fit several methods to one scene under one budget, each in its own process; score them; write a report.
+
+    The same command again keeps what is finished and goes on with what is not. Exit status 1 means that some fits failed.
+    """
+
+    scene: Annotated[Positional[str], arg(metavar="SCENE")]
+    """A built-in scene (see `invgraphics list scenes`), or the path of a data set."""
+    methods: Annotated[str, arg(metavar="A,B,C")]
+    """Methods with commas between them (see `invgraphics list methods`)."""
+    seeds: Annotated[str, arg(metavar="0,1,2")] = "0"
+    """Each method is fitted once per seed."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/compare-SCENE)")] = None
+    """Folder of the report and its runs."""
+
+    def run(self) -> int:
+        """Compare; print the table and the page's path."""
+        request = self.request()
+        for method in request.methods:
+            presets(method)  # refuses an unknown method before torch is imported
+
+        from invgraphics.experiments.compare import compare
+
+        try:
+            folder, failures = compare(request)
+        except KeyboardInterrupt:
+            _report_what_is_finished(Path(request.out))
+            raise
+        write_report(folder)
+        return 1 if failures else 0
+
+    def request(self) -> CompareRequest:
+        """The same as plain values, checked as far as that needs no data."""
+        out = Path("reports") / f"compare-{Path(self.scene).resolve().name}" if self.out is None else self.out
+        methods, seeds = parse_list(self.methods, "--methods"), parse_seeds(self.seeds)
+        return CompareRequest(scene=self.scene, methods=methods, seeds=seeds, out=str(out), **self.settings())
+
+
+def _report_what_is_finished(folder: Path) -> None:
+    if any(folder.glob("runs/*/*/scores.json")):
+        write_report(folder)

@@ -1,0 +1,124 @@
+"""``invgraphics doctor``: what this machine offers, and what to do about what is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from invgraphics.cli.output import show_table
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's report.
+
+    Attributes:
+        subject: what was looked at.
+        found: what there is.
+        remedy: what to do; empty if all is well.
+    """
+
+    subject: str
+    found: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Tell what this machine offers (processor, kernels, LLVM for Mitsuba, CUDA, extras), and how to get what is missing."""
+
+    warm_up: bool = False
+    """Compile the kernels now, so that no later command waits for it."""
+
+    def run(self) -> int:
+        """Print the findings."""
+        findings = list(examine(self.warm_up))
+        rows = [("!" if finding.remedy else "ok", finding.subject, finding.found) for finding in findings]
+        show_table("This machine", ("", "subject", "found"), rows)
+        for finding in findings:
+            if finding.remedy:
+                print(f"{finding.subject}: {finding.remedy}")
+        missing = [finding for finding in findings if finding.remedy]
+        print("Nothing is missing." if not missing else "Everything works without what is marked !, only slower or with less.")
+        return 0
+
+
+def examine(warm_up: bool) -> Iterator[Finding]:
+    """Look at the machine, part by part."""
+    yield Finding("invgraphics", f"{version('invgraphics')}, Python {platform.python_version()}, {platform.platform()}")
+    yield from _processor()
+    yield _kernels(warm_up)
+    yield _llvm()
+    yield _cuda()
+    yield _lpips()
+    yield _data()
+
+
+def _processor() -> Iterator[Finding]:
+    import torch
+
+    from invgraphics.experiments.environment import cpu_name
+
+    cores, threads = os.cpu_count() or 1, torch.get_num_threads()
+    yield Finding("processor", f"{cpu_name()}, {cores} cores, {torch.backends.cpu.get_cpu_capability()} instructions")
+    remedy = (
+        "" if threads >= cores else "unset OMP_NUM_THREADS, or accept slower fits; scores are compared at equal threads only"
+    )
+    yield Finding("torch", f"{torch.__version__}, {threads} threads", remedy)
+
+
+def _kernels(warm_up: bool) -> Finding:
+    from invgraphics import kernels
+    from invgraphics.kernels.dispatch import why_not
+
+    reason = why_not("numba")
+    if reason:
+        return Finding("Numba kernels", f"not usable: {reason}", "reinstall with `pip install --force-reinstall numba`")
+    compiled = f", compiled in {kernels.warm_up():.1f} s" if warm_up else ", compiled at first use (--warm-up does it now)"
+    return Finding("Numba kernels", f"Numba {version('numba')}{compiled}")
+
+
+def _llvm() -> Finding:
+    from invgraphics.scenes.mitsuba import llvm
+
+    try:
+        found = f"{version('mitsuba')}, Dr.Jit {version('drjit')}"
+    except PackageNotFoundError as error:
+        return Finding("Mitsuba", f"{error.name} is not installed", "reinstall with `pip install invgraphics`")
+    status = llvm.status()
+    return Finding("Mitsuba", f"{found}, variant {status.variant}: {status.reason}", status.remedy)
+
+
+def _cuda() -> Finding:
+    import torch
+
+    if torch.cuda.is_available():
+        name, memory = torch.cuda.get_device_name(0), torch.cuda.get_device_properties(0).total_memory
+        return Finding("CUDA", f"{torch.version.cuda}, {name}, {memory / 2**30:.0f} GiB")
+    if torch.version.cuda is None:
+        return Finding("CUDA", "this torch is built for the CPU", "with an NVIDIA GPU: install torch from https://pytorch.org")
+    return Finding("CUDA", f"torch is built for CUDA {torch.version.cuda}, but finds no device", "check `nvidia-smi`")
+
+
+def _lpips() -> Finding:
+    from invgraphics.metrics.perceptual import why_no_lpips
+
+    reason = why_no_lpips()
+    if not reason:
+        return Finding("LPIPS", f"lpips {version('lpips')} with its weights")
+    if importlib.util.find_spec("lpips") is None:
+        return Finding("LPIPS", "not installed", "an extra: `pip install 'invgraphics[lpips]'`, and weights of your own")
+    return Finding("LPIPS", "installed without weights", reason)
+
+
+def _data() -> Finding:
+    root = os.environ.get("INVGRAPHICS_DATA")
+    if root and Path(root).is_dir():
+        return Finding("INVGRAPHICS_DATA", root)
+    found = "not set" if not root else f"{root} is no folder"
+    return Finding("INVGRAPHICS_DATA", found, "set it to a folder of data sets to run the tests that need real photographs")

@@ -1,0 +1,36 @@
+"""``invgraphics evaluate``: score a run again from its model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.output import show_scores
+from invgraphics.errors import InputError
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Render the test views of a finished run again from its model, and score them."""
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a run."""
+    scene: Annotated[Positional[str | None], arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    """Another copy of the scene, for instance where the data set has moved."""
+    protocol: Annotated[str, arg(metavar="NAME")] = "default"
+    """How pictures are scored: default (rounded to 8 bits), or float."""
+
+    def run(self) -> int:
+        """Score; print the scores."""
+        if not (self.folder / "recipe.toml").is_file():
+            raise InputError(
+                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
+            )
+
+        from invgraphics.experiments.evaluate import evaluate_run
+
+        show_scores(evaluate_run(self.folder, self.scene, self.protocol))
+        return 0

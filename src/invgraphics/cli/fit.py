@@ -1,0 +1,57 @@
+"""``invgraphics fit``: one run, which ends with its evaluation."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.arguments import Shared
+from invgraphics.cli.output import show_scores
+from invgraphics.experiments.recipe import presets
+from invgraphics.experiments.request import FitRequest, slug
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Shared):
+    """Fit one method to one scene, then render and score its test views."""
+
+    method: Annotated[Positional[str], arg(metavar="METHOD")]
+    """renderer/recipe (see `invgraphics list methods`), or the path of a recipe."""
+    scene: Annotated[Positional[str], arg(metavar="SCENE")]
+    """A built-in scene (see `invgraphics list scenes`), or the path of a data set."""
+    seed: int = 0
+    """Seed of the initial values and of the fit."""
+    out: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="(default: runs/SCENE-METHOD-seed-N)")] = None
+    """Folder of the run."""
+    resume: bool = False
+    """Go on with the run that --out holds, from its last checkpoint."""
+
+    def run(self) -> int:
+        """Make the run; print its scores and its folder."""
+        request = self.request()
+        presets(self.method)  # refuses an unknown method before torch is imported
+
+        from invgraphics.experiments.run import fit_run
+
+        try:
+            folder = fit_run(request)
+        except KeyboardInterrupt:
+            if (Path(request.out) / "checkpoint.safetensors").is_file():
+                print(f"{request.out} holds what was done; --resume goes on from there.", file=sys.stderr)
+            raise
+        show_scores(json.loads((folder / "scores.json").read_text()))
+        print(folder)
+        return 0
+
+    def request(self) -> FitRequest:
+        """The same as plain values, checked as far as that needs no data."""
+        name = f"{Path(self.scene).resolve().name}-{slug(self.method)}-seed-{self.seed}"
+        out = Path("runs") / name if self.out is None else self.out
+        existing = "resume" if self.resume else "refuse"
+        settings = self.settings()
+        return FitRequest(method=self.method, scene=self.scene, seed=self.seed, out=str(out), existing=existing, **settings)

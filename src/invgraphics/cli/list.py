@@ -1,0 +1,79 @@
+"""``invgraphics list``: what there is, and where each comes from. Imports no implementation."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics import plugins
+from invgraphics.cli.output import show_table
+from invgraphics.data import find
+from invgraphics.errors import InputError
+
+COMPONENTS = {
+    "fields": "fields",
+    "encodings": "encodings",
+    "renderers": "renderers",
+    "samplers": "samplers",
+    "losses": "losses",
+    "hooks": "hooks",
+    "metrics": "metrics",
+    "formats": "scenes",
+}
+"""Title -> registry; the registry of scenes holds the formats of data sets that can be opened."""
+
+KINDS = ("methods", "scenes", *COMPONENTS)
+
+
+@dataclass(frozen=True)
+class List:
+    """List methods, scenes and the components that recipes are made of, and where each comes from."""
+
+    kinds: Annotated[Positional[tuple[str, ...]], arg(metavar="KIND", help_behavior_hint="(default: everything)")] = ()
+    """What to list: methods, scenes, fields, encodings, renderers, samplers, losses, hooks, metrics, formats."""
+
+    def run(self) -> int:
+        """Print the tables."""
+        for kind in self.kinds:
+            if kind not in KINDS:
+                raise InputError(f"There is no list of '{kind}'.", f"Lists: {', '.join(KINDS)}.")
+        for kind in self.kinds or KINDS:
+            if kind == "methods":
+                _list_methods()
+            elif kind == "scenes":
+                _list_scenes()
+            else:
+                _list_components(kind)
+        return 0
+
+
+def _list_methods() -> None:
+    from invgraphics.experiments.recipe import methods
+
+    ours = find("renderers")
+    rows = [
+        (name, summary, "built in" if (ours / f"{name}.toml").is_file() else plugins.origin("recipes", name))
+        for name, summary in methods().items()
+    ]
+    show_table("Methods (field x renderer recipes)", ("name", "summary", "from"), rows)
+
+
+def _list_scenes() -> None:
+    rows = []
+    for path in sorted(find("scenes").glob("*/scene.toml")):
+        try:
+            table = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise InputError(f"{path} is not valid TOML: {error}.") from error
+        rows.append((path.parent.name, str(table.get("summary", "")), str(table.get("stresses", ""))))
+    show_table("Scenes (rendered by Mitsuba; a path to a data set serves as well)", ("name", "what it shows", "stresses"), rows)
+
+
+def _list_components(kind: str) -> None:
+    registry = COMPONENTS[kind]
+    rows = [(name, plugins.origin(registry, name), target) for name, target in plugins.names(registry).items()]
+    title = "Formats of data sets" if kind == "formats" else kind.capitalize()
+    show_table(title, ("name", "from", "implementation"), rows)

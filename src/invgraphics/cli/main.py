@@ -1,0 +1,130 @@
+"""The console script: finds the command, reads its arguments, and turns what goes wrong into a sentence and an exit status.
+
+Exit status: 0 done, 1 some cells failed, 2 bad input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Any
+
+from invgraphics.cli.arguments import parse
+from invgraphics.errors import InputError, NumericalError
+
+COMMANDS = {
+    "list": (
+        "invgraphics.cli.list:List",
+        "what there is: methods, scenes, fields, renderers, metrics, and where each comes from",
+    ),
+    "doctor": ("invgraphics.cli.doctor:Doctor", "what this machine offers, and what to do about what is missing"),
+    "make-scene": ("invgraphics.cli.make_scene:MakeScene", "render a scene's ground truth with Mitsuba"),
+    "fit": ("invgraphics.cli.fit:Fit", "fit one method to one scene, and evaluate it"),
+    "evaluate": ("invgraphics.cli.evaluate:Evaluate", "score a run again from its model"),
+    "compare": ("invgraphics.cli.compare:Compare", "fit several methods to one scene under one budget, and report who wins"),
+    "report": ("invgraphics.cli.report:Report", "write page, tables and figures from finished runs"),
+}
+"""Name -> (``module:class`` of its arguments, summary). A class is imported when its command is given."""
+
+DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+MOST_LINES = 4
+
+USER_ERRNOS = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EACCES: "permission denied",
+    errno.EPERM: "permission denied",
+    errno.EROFS: "the file system is read-only",
+    errno.ENOENT: "no such file or folder",
+    errno.ENOTDIR: "a part of the path is a file, not a folder",
+    errno.EISDIR: "it is a folder",
+    errno.EEXIST: "it exists, and is not a folder",
+    errno.ENAMETOOLONG: "the name is too long",
+}
+"""Failures of the file system that a person can mend, in words."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run one command and exit with its status.
+
+    Args:
+        argv: arguments without the program's name; ``None`` for those of the process.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    sys.exit(run([word for word in arguments if word != "--debug"], debug))
+
+
+def run(arguments: Sequence[str], debug: bool = False) -> int:
+    """Run one command and return its exit status; with ``debug``, the traceback of what went wrong is shown."""
+    try:
+        if not arguments or arguments[0] in ("-h", "--help", "help"):
+            print(overview())
+            return DONE
+        if arguments[0] == "--version":
+            print(version("invgraphics"))
+            return DONE
+        status: int = parse(_command(arguments[0]), f"invgraphics {arguments[0]}", arguments[1:]).run()
+        return status
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of our output has gone, as in `invgraphics list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        status, lines = explain(error)
+        for line in lines[:MOST_LINES]:
+            print(line, file=sys.stderr)
+        return status
+
+
+def overview() -> str:
+    """The text of ``invgraphics --help``."""
+    width = max(map(len, COMMANDS))
+    commands = "\n".join(f"  {name:{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
+    return f"""usage: invgraphics COMMAND ...   (invgraphics COMMAND --help tells more; --debug shows tracebacks)
+
+Compare differentiable renderers: neural radiance fields, hash grids and Gaussian splats on one ruler.
+
+{commands}
+
+Start with:  invgraphics compare bricks --methods volumetric/hash,splatting/gaussians --budget 60s"""
+
+
+def explain(error: Exception) -> tuple[int, list[str]]:
+    """Exit status and lines for a person."""
+    if isinstance(error, InputError):
+        return BAD_INPUT, str(error).splitlines()
+    if isinstance(error, NumericalError):
+        return FAILED, str(error).splitlines()
+    if isinstance(error, OSError) and error.errno in USER_ERRNOS:
+        where = f"'{error.filename}'" if error.filename else "a file"
+        return BAD_INPUT, [f"{where} cannot be used: {USER_ERRNOS[error.errno]}."]
+    if "No space left on device" in str(error) or "StorageFull" in str(error):  # from libraries that wrap the system's error
+        return BAD_INPUT, [f"Writing failed: {USER_ERRNOS[errno.ENOSPC]}."]
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error):
+        return FAILED, ["There is not enough memory.", "Try a smaller --size, or smaller settings of the method (--set)."]
+    first = (str(error).splitlines() or [""])[0]
+    return FAILED, [
+        f"Unexpected {type(error).__name__}: {first}",
+        "This is a fault of invgraphics, not of your input; --debug shows where it happened.",
+    ]
+
+
+def _command(name: str) -> Any:
+    """The class of a command's arguments."""
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        guess = f" Did you mean '{close[0]}'?" if close else ""
+        raise InputError(f"There is no command '{name}'.{guess}", f"Commands: {', '.join(COMMANDS)}.")
+    module, _, attribute = COMMANDS[name][0].partition(":")
+    return getattr(importlib.import_module(module), attribute)

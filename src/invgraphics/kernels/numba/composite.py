@@ -1,0 +1,122 @@
+"""Emission-absorption along packed rays. Each job takes whole rays, so every sum has one writer and a fixed order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, power_minus_one, share, threads
+from invgraphics.kernels.reference.composite import OPAQUE
+
+_OPAQUE, _LOG2E = np.float32(OPAQUE), np.float32(1 / np.log(2.0))
+_ZERO = np.float32(0.0)
+
+
+@inlined
+def _absorb(optical_depth):
+    """Transmittance of one interval (float64, so that products of many stay exact) and its complement."""
+    loss, scale = power_minus_one(-min(optical_depth, _OPAQUE) * _LOG2E)
+    if scale == np.float32(1.0):
+        # Nearly transparent: 1 - exp(-tau) without cancellation.
+        return 1.0 + np.float64(loss), -loss
+    passed = (loss + np.float32(1.0)) * scale
+    return np.float64(passed), np.float32(1.0) - passed
+
+
+@inlined
+def _first_sample(ray, jobs, job):
+    """First sample of a job: an even share, moved on to the beginning of a ray."""
+    first = share(len(ray), jobs, job)
+    while 0 < first < len(ray) and ray[first] == ray[first - 1]:
+        first += 1
+    return first
+
+
+@parallel
+def accumulate(optical_depth, channels, ray, jobs, weights, after, sums, alpha):
+    """Weights, transmittance behind each sample, and the sums per ray (which hold zeros)."""
+    width = channels.shape[1]
+    for job in nb.prange(jobs):
+        transmittance, current = 1.0, np.int64(-1)
+        for number in range(_first_sample(ray, jobs, job), _first_sample(ray, jobs, job + 1)):
+            i = index(number)
+            if ray[i] != current:
+                transmittance, current = 1.0, ray[i]
+            r = index(current)
+            passed, opacity = _absorb(optical_depth[i])
+            weight = np.float32(transmittance) * opacity
+            transmittance *= passed
+            weights[i], after[i] = weight, np.float32(transmittance)
+            alpha[r] += weight
+            for k in range(width):
+                sums[r, index(k)] += weight * channels[i, index(k)]
+
+
+@parallel
+def accumulate_back(channels, ray, weights, after, jobs, to_weights, to_sums, to_alpha, to_depth, to_channels):
+    """Gradients along optical depths and channels, from the far end of each ray to its near end."""
+    width = channels.shape[1]
+    for job in nb.prange(jobs):
+        first, end = _first_sample(ray, jobs, job), _first_sample(ray, jobs, job + 1)
+        behind, current = 0.0, np.int64(-1)
+        for step in range(end - first):
+            i = index(end - 1 - step)
+            if ray[i] != current:
+                behind, current = 0.0, ray[i]
+            r = index(current)
+            weight = weights[i]
+            gain = to_weights[i] + to_alpha[r]
+            for number in range(width):
+                k = index(number)
+                gain += to_sums[r, k] * channels[i, k]
+                to_channels[i, k] = weight * to_sums[r, k]
+            # A denser sample takes from the light that passes it and hides what is behind.
+            to_depth[i] = after[i] * gain - np.float32(behind)
+            behind += weight * gain
+
+
+class _Composite(torch.autograd.Function):
+    """Differentiable in optical depths and channels."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, optical_depth: Tensor, channels: Tensor, ray: Tensor, rays: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        weights, after = torch.empty(optical_depth.shape), torch.empty(optical_depth.shape)
+        sums, alpha = torch.zeros(rays, channels.shape[1]), torch.zeros(rays)
+        outputs = (x.numpy() for x in (weights, after, sums, alpha))
+        accumulate(array(optical_depth), array(channels), array(ray.long()), threads(), *outputs)
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(channels, ray, weights, after)
+        ctx.rays = rays
+        return weights, sums, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, to_weights: Tensor | None, to_sums: Tensor | None, to_alpha: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        channels, ray, weights, after = ctx.saved_tensors
+        shapes = (weights.shape, (ctx.rays, channels.shape[1]), (ctx.rays,))
+        given = (to_weights, to_sums, to_alpha)
+        # A gradient that nobody asked for counts as zero.
+        received = [array(torch.zeros(shape) if g is None else g) for shape, g in zip(shapes, given, strict=True)]
+        to_depth, to_channels = torch.empty(weights.shape), torch.empty(channels.shape)
+        kept = (array(x) for x in (channels, ray.long(), weights, after))
+        accumulate_back(*kept, threads(), *received, to_depth.numpy(), to_channels.numpy())
+        return to_depth, to_channels, None, None
+
+
+def composite(
+    optical_depth: Float[Tensor, " m"], channels: Float[Tensor, "m c"], ray: Int[Tensor, " m"], rays: int
+) -> tuple[Float[Tensor, " m"], Float[Tensor, "n c"], Float[Tensor, " n"]]:
+    """See `invgraphics.kernels.composite`."""
+    if len(ray) and not 0 <= int(ray[0]) <= int(ray[-1]) < rays:
+        raise IndexError(f"Samples belong to rays {int(ray[0])} to {int(ray[-1])}, but there are {rays} rays.")
+    return _Composite.apply(optical_depth, channels, ray, rays)

@@ -1,0 +1,106 @@
+"""`splat_project` as torch sees it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from invgraphics.core.camera import Camera
+from invgraphics.core.field import Gaussians
+from invgraphics.kernels import reference
+from invgraphics.kernels.numba.runtime import array, threads
+from invgraphics.kernels.numba.ewa import CENTRE, FOCAL, POSITION, SIZE, VIEW, project
+from invgraphics.kernels.numba.ewa_backward import project_back
+from invgraphics.kernels.types import Footprints
+
+
+class _Project(torch.autograd.Function):
+    """Differentiable in means, quaternions, scales, sh and the camera's pose."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, pose: Tensor, *constants: Any
+    ) -> tuple[Tensor, ...]:
+        opacities, camera, dilation = constants
+        n = len(means)
+        view = _flat(camera)
+        means2d, conics, rgb = means.new_empty(n, 2), means.new_empty(n, 3), means.new_empty(n, 3)
+        depths, planes, radii = means.new_empty(n), means.new_empty(n, 3), means.new_empty(n)
+        outputs = (means2d, conics, depths, planes, radii, rgb)
+        inputs = (array(x) for x in (means, quaternions, scales, opacities, sh))
+        project(view, np.float32(dilation), *inputs, threads(), *(output.numpy() for output in outputs))
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(radii)
+        ctx.save_for_backward(means, quaternions, scales, sh, opacities, conics, radii, rgb, pose)
+        ctx.view, ctx.camera, ctx.dilation = view, camera, dilation
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        means, quaternions, scales, sh, opacities, conics, radii, rgb, pose = ctx.saved_tensors
+        to_means2d, to_conics, to_depths, to_planes, _, to_rgb = gradients
+        likes = (means[:, :2], conics, radii, rgb)
+        given = (to_means2d, to_conics, to_depths, to_rgb)
+        # A gradient that nobody asked for counts as zero.
+        received = [torch.zeros(x.shape) if g is None else g for x, g in zip(likes, given, strict=True)]
+        results = [torch.empty(x.shape) for x in (means, quaternions, scales, sh)]
+        poses = np.empty((threads(), 12))
+        inputs = (array(x) for x in (means, quaternions, scales, sh, radii, conics, rgb))
+        project_back(ctx.view, *inputs, *(array(g) for g in received), *(r.numpy() for r in results), poses)
+        results.append(_pose_gradient(poses, pose))
+        if to_planes is not None:
+            gaussians = Gaussians(means, quaternions, scales, opacities, sh)
+            for result, extra in zip(results, _through_planes(gaussians, ctx.camera, ctx.dilation, to_planes, radii), strict=True):
+                if extra is not None:
+                    result += extra
+        return (*results, None, None, None)
+
+
+def _flat(camera: Camera) -> np.ndarray:
+    """The camera as `project` reads it."""
+    view = np.empty(VIEW, np.float32)
+    pose = array(camera.cam_to_world)
+    view[:POSITION], view[POSITION:FOCAL] = pose[:3, :3].reshape(-1), pose[:3, 3]
+    view[FOCAL:CENTRE], view[CENTRE:SIZE] = array(camera.focal), array(camera.centre)
+    view[SIZE:] = camera.width, camera.height
+    return view
+
+
+def _pose_gradient(jobs: np.ndarray, pose: Tensor) -> Tensor:
+    """Gradient along ``cam_to_world`` from each job's share."""
+    total = jobs.sum(axis=0)
+    gradient = np.zeros((4, 4))
+    gradient[:3, :3], gradient[:3, 3] = total[:9].reshape(3, 3), total[9:]
+    return torch.from_numpy(gradient).to(pose)
+
+
+def _through_planes(
+    gaussians: Gaussians, camera: Camera, dilation: float, to_planes: Tensor, radii: Tensor
+) -> tuple[Tensor | None, ...]:
+    """Gradients that arrive by the planes, which only depth losses use: left to the reference."""
+    with torch.enable_grad():
+        leaves = [x.detach().requires_grad_() for x in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.sh)]
+        pose = camera.cam_to_world.detach().requires_grad_()
+        again = Gaussians(*leaves[:3], gaussians.opacities.detach(), leaves[3])
+        footprints, _ = reference.splat_project(again, camera.moved(pose), dilation)
+        visible = torch.where(radii[:, None] > 0, to_planes, 0.0)
+        return torch.autograd.grad(footprints.planes, [*leaves, pose], visible, allow_unused=True)
+
+
+def splat_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.3) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+    """See `invgraphics.kernels.splat_project`; a camera whose lens is being optimised is left to the reference."""
+    if camera.focal.requires_grad or camera.centre.requires_grad:
+        return reference.splat_project(gaussians, camera, dilation)
+    g = gaussians
+    constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation)
+    means2d, conics, depths, planes, radii, rgb = _Project.apply(
+        g.means, g.quaternions, g.scales, g.sh, camera.cam_to_world, *constants
+    )
+    return Footprints(means2d, conics, g.opacities, depths, planes, radii), rgb

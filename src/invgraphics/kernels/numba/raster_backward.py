@@ -1,0 +1,189 @@
+"""Front-to-back compositing of footprints, backward.
+
+The walk of the forward pass is repeated, front to back. What lies behind a footprint, which its alpha hides, is the pixel's
+final sum minus what has been composited so far; so nothing but the picture itself needs to be kept per pixel.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, share
+from invgraphics.kernels.numba.binning import CONIC_XX, CONIC_XY, CONIC_YY, FEATURES, MEAN_X, MEAN_Y, OPACITY
+from invgraphics.kernels.numba.raster import BLOCK, HALF_LOG2E, LANES, block_columns, block_rows
+from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+
+# What a block holds for each of its pixels, LANES values each: transmittance, weight of the current footprint, the loss's
+# derivative along what is still to be composited, gradient of alpha, gradient along the current footprint's features beyond
+# the first three, gradients of the picture's channels.
+_T, _WEIGHT, _BEHIND, _ALPHA, _ALONG, _PICTURE = (index(slot) * LANES for slot in range(6))
+
+# What is summed per footprint, before the features: v = dL/dalpha alpha times 1, x, y, x², x y, y².
+MOMENTS = 6
+
+_ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
+_STOP = np.float32(TRANSMITTANCE_MIN)
+_ONE, _ZERO = np.float32(1.0), np.float32(0.0)
+
+
+@inlined
+def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient):
+    """Load a tile's gradients, and the derivative along the whole of each pixel."""
+    height, width, channels = image.shape
+    state[: index(edge * edge) * stride] = _ZERO
+    for block in range(edge * edge):
+        left, top = x0 + block % edge * BLOCK, y0 + block // edge * BLOCK
+        for lane in range(BLOCK * BLOCK):
+            x, y = index(left + lane % BLOCK), index(top + lane // BLOCK)
+            at = index(block) * stride + index(lane)
+            # Pixels outside the image count as finished.
+            state[at] = -_ONE
+            if x < width and y < height:
+                gradient = alpha_gradient[y, x]
+                behind = gradient * alpha[y, x]
+                for k in range(channels):
+                    behind += image_gradient[y, x, index(k)] * image[y, x, index(k)]
+                    state[at + _PICTURE + index(k) * LANES] = image_gradient[y, x, index(k)]
+                state[at + _T], state[at + _BEHIND] = _ONE, behind
+                state[at + _ALPHA], state[at + _ALONG] = gradient, gradient
+
+
+@inlined
+def _unblend(state, base, rows, r, dx0, dy0):
+    """Repeat one footprint's blending onto one block; returns its sums over the block's pixels."""
+    xx = rows[r, CONIC_XX] * HALF_LOG2E
+    xy = rows[r, CONIC_XY] * (HALF_LOG2E + HALF_LOG2E)
+    yy = rows[r, CONIC_YY] * HALF_LOG2E
+    opacity = rows[r, OPACITY]
+    red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
+    v0 = vx = vy = vxx = vxy = vyy = _ZERO
+    to_red = to_green = to_blue = _ZERO
+    for lane in range(LANES):
+        dx = dx0 + np.float32(lane & index(3))
+        dy = dy0 + np.float32(lane >> index(2))
+        response = opacity * exp2(xx * dx * dx + xy * dx * dy + yy * dy * dy)
+        alpha = min(response, _ALPHA_MAX)
+        alpha = alpha if alpha >= _ALPHA_MIN else _ZERO
+        transmittance = state[base + lane]
+        weight = transmittance * alpha
+        after = transmittance - weight
+        goes_on = after >= _STOP
+        weight = weight if goes_on else _ZERO
+        g_red = state[base + _PICTURE + lane]
+        g_green = state[base + _PICTURE + LANES + lane]
+        g_blue = state[base + _PICTURE + LANES + LANES + lane]
+        along = state[base + _ALONG + lane] + g_red * red + g_green * green + g_blue * blue
+        behind = state[base + _BEHIND + lane] - weight * along
+        state[base + _BEHIND + lane] = behind
+        state[base + lane] = after if goes_on else -abs(transmittance)
+        state[base + _WEIGHT + lane] = weight
+        # alpha raises its own contribution and hides what is behind; where it is clamped or skipped it does not change.
+        v = response * (transmittance * along - behind / (_ONE - alpha))
+        v = v if goes_on and alpha > _ZERO and alpha < _ALPHA_MAX else _ZERO
+        v0 += v
+        vx += v * dx
+        vy += v * dy
+        vxx += v * dx * dx
+        vxy += v * dx * dy
+        vyy += v * dy * dy
+        to_red += weight * g_red
+        to_green += weight * g_green
+        to_blue += weight * g_blue
+    return v0, vx, vy, vxx, vxy, vyy, to_red, to_green, to_blue
+
+
+@inlined
+def _look_along(state, base, rows, r, triples):
+    """Gradient of alpha plus the dot product of the picture's gradients and the features beyond the first three."""
+    for lane in range(LANES):
+        state[base + _ALONG + lane] = state[base + _ALPHA + lane]
+    for k in range(3, 3 * triples):
+        value = rows[r, index(FEATURES + k)]
+        channel = _PICTURE + index(k) * LANES
+        for lane in range(LANES):
+            state[base + _ALONG + lane] += state[base + channel + lane] * value
+
+
+@inlined
+def _sum_further(state, base, sums, r, triples):
+    """Gradients of the features beyond the first three."""
+    for k in range(3, 3 * triples):
+        channel = _PICTURE + index(k) * LANES
+        total = _ZERO
+        for lane in range(LANES):
+            total += state[base + _WEIGHT + lane] * state[base + channel + lane]
+        sums[r, index(MOMENTS + k)] += total
+
+
+@inlined
+def _walk_tile(rows, entries, first, last, x0, y0, edge, triples, state, stride, ends, sums):
+    """Walk a tile's footprints front to back and add what each of them receives to ``sums``."""
+    ox, oy, half = np.float32(x0), np.float32(y0), np.float32(0.5)
+    for entry in range(first, last):
+        r = index(entries[index(entry)])
+        v0 = vx = vy = vxx = vxy = vyy = to_red = to_green = to_blue = _ZERO
+        top, bottom = block_rows(rows, r, oy, edge)
+        for j in range(top, bottom + 1):
+            left, right = block_columns(rows, r, ox, oy, j, edge)
+            for i in range(left, right + 1):
+                block = index(j * edge + i)
+                if entry < ends[block]:
+                    base = block * stride
+                    dx = ox + np.float32(i * BLOCK) + half - rows[r, MEAN_X]
+                    dy = oy + np.float32(j * BLOCK) + half - rows[r, MEAN_Y]
+                    if triples > 1:
+                        _look_along(state, base, rows, r, triples)
+                    s = _unblend(state, base, rows, r, dx, dy)
+                    v0, vx, vy = v0 + s[0], vx + s[1], vy + s[2]
+                    vxx, vxy, vyy = vxx + s[3], vxy + s[4], vyy + s[5]
+                    to_red, to_green, to_blue = to_red + s[6], to_green + s[7], to_blue + s[8]
+                    if triples > 1:
+                        _sum_further(state, base, sums, r, triples)
+        sums[r, 0] += v0
+        sums[r, 1] += vx
+        sums[r, 2] += vy
+        sums[r, 3] += vxx
+        sums[r, 4] += vxy
+        sums[r, 5] += vyy
+        sums[r, MOMENTS] += to_red
+        sums[r, MOMENTS + 1] += to_green
+        sums[r, MOMENTS + 2] += to_blue
+
+
+@parallel
+def walk_back(rows, entries, starts, bounds, edge, columns, ends, image, alpha, image_gradient, alpha_gradient, sums):
+    """Per job and packed footprint, the sums from which `gather` makes gradients (arguments as in `rasterise`)."""
+    triples = (rows.shape[1] - FEATURES) // 3
+    stride = _PICTURE + LANES * index(3 * triples)
+    for job in nb.prange(len(bounds) - 1):
+        state = np.empty(index(edge * edge) * stride, np.float32)
+        own = sums[job]
+        own[:] = _ZERO
+        for tile in range(bounds[job], bounds[job + 1]):
+            if starts[tile] < starts[tile + 1]:
+                x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
+                _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient)
+                _walk_tile(
+                    rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, triples, state, stride, ends[tile], own
+                )
+
+
+@parallel
+def gather(order, rows, sums, means, conics, opacities, features):
+    """Add up the jobs in a fixed order and write gradients to the caller's arrays, which hold zeros for culled footprints."""
+    jobs, m = sums.shape[0], len(order)
+    for job in nb.prange(jobs):
+        for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
+            i = index(order[r])
+            for other in range(1, jobs):
+                for k in range(sums.shape[2]):
+                    sums[0, r, k] += sums[other, r, k]
+            s = sums[0, r]
+            xx, xy, yy = rows[r, CONIC_XX], rows[r, CONIC_XY], rows[r, CONIC_YY]
+            # response = opacity exp(-q / 2), q = xx dx² + 2 xy dx dy + yy dy², (dx, dy) = pixel - mean.
+            means[i, 0], means[i, 1] = xx * s[1] + xy * s[2], xy * s[1] + yy * s[2]
+            conics[i, 0], conics[i, 1], conics[i, 2] = np.float32(-0.5) * s[3], -s[4], np.float32(-0.5) * s[5]
+            opacities[i] = s[0] / rows[r, OPACITY] if s[0] != _ZERO else _ZERO
+            for k in range(features.shape[1]):
+                features[i, k] = s[MOMENTS + k]

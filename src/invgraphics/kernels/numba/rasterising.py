@@ -1,0 +1,96 @@
+"""`splat_rasterise` as torch sees it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from invgraphics.kernels import reference
+from invgraphics.kernels.numba.runtime import array, scratch, split_by_work, threads
+from invgraphics.kernels.numba.raster_backward import MOMENTS, gather, walk_back
+from invgraphics.kernels.numba.binning import FEATURES, Packed, pack
+from invgraphics.kernels.numba.raster import BLOCK, rasterise
+from invgraphics.kernels.types import Footprints
+
+TILE = 32
+"""Edge of a tile in pixels: the measured best on CPUs (a tile's state fits into the L1 cache)."""
+
+
+class _Walk(NamedTuple):
+    """What the backward pass needs of the forward pass."""
+
+    packed: Packed
+    edge: int
+    columns: int
+    ends: np.ndarray
+    work: np.ndarray
+
+
+class _Rasterise(torch.autograd.Function):
+    """Differentiable in means2d, conics, opacities and features."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means2d: Tensor,
+        conics: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        footprints: Footprints,
+        size: tuple[int, int],
+        tile: int,
+    ) -> tuple[Tensor, Tensor]:
+        width, height = size
+        edge = max(1, -(-tile // BLOCK))
+        columns, lines = -(-width // (edge * BLOCK)), -(-height // (edge * BLOCK))
+        packed = pack(footprints, features, columns, lines, edge * BLOCK)
+        image, alpha = means2d.new_empty(height, width, features.shape[1]), means2d.new_empty(height, width)
+        ends = np.empty((columns * lines, edge * edge), np.int32)
+        work = np.empty(columns * lines, np.int64)
+        bounds = _bounds(np.diff(packed.starts))
+        rasterise(packed.rows, packed.entries, packed.starts, bounds, edge, columns, image.numpy(), alpha.numpy(), ends, work)
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(means2d, conics, opacities, features, image, alpha)
+        ctx.walk = _Walk(packed, edge, columns, ends, work)
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, image_gradient: Tensor | None, alpha_gradient: Tensor | None) -> tuple[Tensor | None, ...]:
+        means2d, conics, opacities, features, image, alpha = ctx.saved_tensors
+        packed, edge, columns, ends, work = ctx.walk
+        to_image = array(torch.zeros_like(image) if image_gradient is None else image_gradient)
+        to_alpha = array(torch.zeros_like(alpha) if alpha_gradient is None else alpha_gradient)
+        bounds = _bounds(work)
+        rows, width = packed.rows, MOMENTS + packed.rows.shape[1] - FEATURES
+        shape = (len(bounds) - 1, len(rows), width)
+        sums = scratch("splat sums", int(np.prod(shape))).reshape(shape)
+        walk_back(
+            rows, packed.entries, packed.starts, bounds, edge, columns, ends, array(image), array(alpha), to_image, to_alpha, sums
+        )
+        gradients = tuple(torch.zeros_like(x, memory_format=torch.contiguous_format) for x in (means2d, conics, opacities, features))
+        gather(packed.order, rows, sums, *(gradient.numpy() for gradient in gradients))
+        return (*gradients, None, None, None)
+
+
+def _bounds(work: np.ndarray) -> np.ndarray:
+    """First tile of each job, such that all have about equal work."""
+    jobs = threads()
+    bounds = np.empty(jobs + 1, np.int64)
+    split_by_work(work, jobs, bounds)
+    return bounds
+
+
+def splat_rasterise(
+    footprints: Footprints, features: Float[Tensor, "n c"], width: int, height: int, tile: int | None = None
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+    """See `invgraphics.kernels.splat_rasterise`; discs are left to the reference."""
+    if footprints.homography is not None:
+        return reference.splat_rasterise(footprints, features, width, height, tile)
+    f = footprints
+    return _Rasterise.apply(f.means2d, f.conics, f.opacities, features, footprints, (width, height), tile or TILE)

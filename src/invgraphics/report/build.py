@@ -1,0 +1,118 @@
+"""From a comparison or from single runs to a report: page, Markdown, CSV, LaTeX and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from invgraphics.errors import InputError
+from invgraphics.report.assets import Folder, read_picture
+from invgraphics.report.curves import draw_curves
+from invgraphics.report.distributions import draw_distributions
+from invgraphics.report.page import Drawn, write_html, write_markdown
+from invgraphics.report.pictures import draw_views
+from invgraphics.report.reading import check_comparable, read_comparison, read_run
+from invgraphics.report.records import Comparison, Run
+from invgraphics.report.summary import summarise, time_to_quality
+from invgraphics.report.tables import write_csv, write_latex
+from invgraphics.report.tradeoffs import draw_tradeoffs
+from invgraphics.report.verdict import verdict
+from invgraphics.report.wording import listing
+
+
+def build_report(folder: Path) -> Path:
+    """Write the report of a comparison into its own folder.
+
+    Args:
+        folder: what ``compare`` wrote: ``compare.json``, ``truth/`` and ``runs/``.
+
+    Returns:
+        The page, ``folder/index.html``; beside it lie ``index.md``, ``results.csv``, ``table.tex`` and ``figures/``.
+
+    Raises:
+        InputError: a file is missing or broken, or the folder cannot be written.
+    """
+    return _write(read_comparison(folder), folder)
+
+
+def build_from_runs(runs: Sequence[Path], out: Path) -> Path:
+    """Write a report of runs from anywhere; what the page shows is copied into ``out`` unless it lies there already.
+
+    Args:
+        runs: run folders.
+        out: folder to write; created where absent.
+
+    Returns:
+        The page, ``out/index.html``.
+
+    Raises:
+        InputError: no runs, a file is missing or broken, or the runs were scored against different ground truth.
+    """
+    if not runs:
+        raise InputError("There are no runs to report.", "Give at least one run folder.")
+    folders = list({path.resolve(): path for path in runs}.values())
+    read = [read_run(path) for path in folders]
+    check_comparable(tuple(read))
+    labelled = _tell_apart(read)
+    methods = tuple(dict.fromkeys(run.method for run in labelled))
+    first = labelled[0]
+    picture = read_picture(first.truth / "0000.png")
+    comparison = Comparison(
+        scene=_common([run.scene for run in labelled]),
+        question=f"How {'does' if len(methods) == 1 else 'do'} {listing(methods)} show new views, and at what cost?",
+        methods=methods,
+        runs=tuple(labelled),
+        budget=_common([str(run.provenance.get("budget", "")) for run in labelled]),
+        preset=_common([run.preset for run in labelled]),
+        size=(picture.shape[1], picture.shape[0]),
+        protocol={"name": first.protocol},
+    )
+    return _write(comparison, out)
+
+
+def _write(comparison: Comparison, out: Path) -> Path:
+    figures = out / "figures"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        summary = summarise(comparison)
+        drawn = Drawn(
+            curves=draw_curves(comparison, summary, figures),
+            tradeoffs=draw_tradeoffs(summary, figures),
+            distributions=draw_distributions(comparison, summary, figures),
+            views=draw_views(comparison, Folder(out)),
+        )
+        told = verdict(comparison, summary)
+        write_csv(comparison, out / "results.csv")
+        write_latex(comparison, summary, out / "table.tex")
+        write_markdown(comparison, summary, told, drawn, out)
+        write_html(comparison, summary, told, time_to_quality(comparison), drawn, out)
+    except OSError as error:
+        raise InputError(f"The report cannot be written to '{out}': {error}.", "Choose another --out.") from error
+    return out / "index.html"
+
+
+def _common(values: Sequence[str]) -> str:
+    """What all agree on; empty where they do not."""
+    return values[0] if len(set(values)) == 1 else ""
+
+
+def _tell_apart(runs: Sequence[Run]) -> list[Run]:
+    """Give runs that share method and seed different names: by preset, by budget, else by folder."""
+    cells = [(run.method, run.seed) for run in runs]
+    if len(set(cells)) == len(cells):
+        return list(runs)
+    for detail in ("preset", "budget"):
+        details = [run.preset if detail == "preset" else str(run.provenance.get("budget", "")) for run in runs]
+        named = [(f"{run.method} ({what})", run.seed) for run, what in zip(runs, details, strict=True)]
+        if len(set(named)) == len(named):
+            return [replace(run, method=name) for run, (name, _) in zip(runs, named, strict=True)]
+    return [replace(run, method=f"{run.method} ({_folder_name(run, runs)})") for run in runs]
+
+
+def _folder_name(run: Run, runs: Sequence[Run]) -> str:
+    """The shortest end of a run's path that no other run's path has."""
+    paths = [other.folder.resolve().parts for other in runs]
+    own = run.folder.resolve().parts
+    length = next(n for n in range(1, len(own) + 1) if sum(path[-n:] == own[-n:] for path in paths) == 1)
+    return "/".join(own[-length:]).lstrip("/")

@@ -1,0 +1,109 @@
+"""Loader of a rendered scene: the folder that `invgraphics.scenes.mitsuba.make` fills and ``truth.json`` describes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import RESIZE, Photo, load_view
+from invgraphics.scenes.layout import SceneOptions, evenly, pose
+from invgraphics.scenes.mitsuba import cache, ply
+
+_DAMAGED = "Make the scene again: `invgraphics make-scene`."
+
+
+class Truth:
+    """Loader of rendered scenes; the local frame is the renderer's world, +z up."""
+
+    def matches(self, path: Path) -> bool:
+        """Whether ``path`` is such a folder."""
+        return (path / cache.TRUTH).is_file()
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read the folder.
+
+        Another size than the rendered one is area-averaged; depth and normals, which belong to pixel centres, are then left out.
+
+        Raises:
+            InputError: a file is missing, cut short or inconsistent.
+        """
+        truth = cache.read_truth(path)
+        if truth is None:
+            raise InputError(f"{path} is not a whole rendered scene: truth.json or a file it lists is damaged.", _DAMAGED)
+        try:
+            return self._scene(path, truth, options)
+        except (KeyError, TypeError, ValueError, OSError) as error:
+            raise InputError(f"{path} is damaged: {type(error).__name__} {error}.", _DAMAGED) from error
+
+    def _scene(self, path: Path, truth: Mapping[str, Any], options: SceneOptions) -> Scene:
+        wanted = {"train": options.train_views, "val": None, "test": options.test_views}
+        views = {
+            split: tuple(
+                _view(path, split, index, truth["cameras"][split][index], options)
+                for index in evenly(range(len(truth["cameras"][split])), count)
+            )
+            for split, count in wanted.items()
+        }
+        bounds = Bounds(torch.tensor(truth["bounds"]["lo"]), torch.tensor(truth["bounds"]["hi"]))
+        return Scene(
+            name=truth["name"],
+            train=views["train"],
+            val=views["val"],
+            test=views["test"],
+            background=torch.tensor(truth["background"] or [0.0, 0.0, 0.0]),
+            bounds=bounds,
+            points=_points(path / "points.npz"),
+            mesh=_mesh(path / "mesh.ply"),
+            noise_ceiling=truth["noise_ceiling"],
+            notes=_notes(truth, views["train"][0]),
+        )
+
+
+def _view(path: Path, split: str, index: int, table: Mapping[str, Any], options: SceneOptions) -> View:
+    name = f"{index:04d}"
+    picture = path / split / f"{name}.png"
+    focal, centre = (torch.tensor(table[key], dtype=torch.float64) for key in ("focal", "centre"))
+    camera = Camera(pose(table["cam_to_world"], f"{picture}"), focal, centre, table["width"], table["height"])
+    view = load_view(Photo(picture, camera, name), options.size)
+    if (view.camera.width, view.camera.height) != (camera.width, camera.height):
+        return view
+    with np.load(picture.with_suffix(".npz"), allow_pickle=False) as arrays:
+        depth, normal = (torch.from_numpy(arrays[key]) for key in ("depth", "normal"))
+    # Fog has no surface: its truth is in the pictures only.
+    return replace(view, depth=depth, normal=normal) if bool(depth.isfinite().any()) else view
+
+
+def _points(path: Path) -> Points | None:
+    if not path.is_file():
+        return None
+    with np.load(path, allow_pickle=False) as arrays:
+        return Points(torch.from_numpy(arrays["position"]), torch.from_numpy(arrays["rgb"]))
+
+
+def _mesh(path: Path) -> Mesh | None:
+    if not path.is_file():
+        return None
+    vertices, faces = ply.read(path)
+    return Mesh(torch.from_numpy(vertices), torch.from_numpy(faces))
+
+
+def _notes(truth: Mapping[str, Any], view: View) -> dict[str, str]:
+    width, height = truth["size"]
+    final = (view.camera.width, view.camera.height)
+    samples = ", ".join(f"{split} {count}" for split, count in truth["samples_per_pixel"].items())
+    return {
+        "loader": "truth",
+        "summary": truth["summary"],
+        "stresses": truth["stresses"],
+        "renderer": f"Mitsuba {truth['versions']['mitsuba']} ({truth['variant']}), seed {truth['seed']}",
+        "samples_per_pixel": samples,
+        "rig": truth["rig"]["kind"],
+        "resize": "none" if final == (width, height) else f"{RESIZE}, {width}x{height} to {final[0]}x{final[1]}",
+    }

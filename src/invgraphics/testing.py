@@ -1,0 +1,142 @@
+"""For tests, ours and strangers': a small scene with known truth, and conformance suites for fields and renderers.
+
+A plug-in's test needs three lines::
+
+    from invgraphics.testing import check_field, toy_scene
+    scene = toy_scene()
+    check_field(MyFieldConfig().build(scene), scene)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from invgraphics.core import (
+    Bounds,
+    Camera,
+    Context,
+    Field,
+    FieldValues,
+    Points,
+    Quantity,
+    Renderer,
+    Samples,
+    Scene,
+    View,
+    check,
+)
+from invgraphics.core.colour import quantise
+from invgraphics.core.transforms import look_at
+from invgraphics.renderers.samplers import StratifiedConfig
+from invgraphics.renderers.volumetric import VolumetricConfig
+
+_POINTWISE = {
+    Quantity.DENSITY: "density",
+    Quantity.SDF: "sdf",
+    Quantity.RADIANCE: "radiance",
+    Quantity.NORMAL: "normal",
+    Quantity.FEATURES: "features",
+}
+
+
+class TwoBalls(Field):
+    """A red and a blue ball of dense fog, shaded by height: enough structure for poses and colours to matter."""
+
+    provides = Quantity.DENSITY | Quantity.RADIANCE
+    centres: Tensor
+    radii: Tensor
+    colours: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("centres", torch.tensor([[-0.35, 0.1, -0.1], [0.4, -0.15, 0.25]]))
+        self.register_buffer("radii", torch.tensor([0.45, 0.3]))
+        self.register_buffer("colours", torch.tensor([[0.9, 0.25, 0.15], [0.15, 0.35, 0.9]]))
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        """Constant density in each ball; colour of the nearer ball, darker below."""
+        distance = (samples.position[:, None] - self.centres).norm(dim=-1) - self.radii
+        nearest = distance.argmin(dim=1)
+        shade = 0.7 + 0.3 * samples.position[:, 2:].clamp(-1, 1)
+        return FieldValues(density=30.0 * (distance.amin(dim=1) < 0), radiance=self.colours[nearest] * shade)
+
+
+def toy_cameras(count: int, size: int, turn: float = 0.0) -> list[Camera]:
+    """Cameras on a spiral around the origin at distance 3, seeing all of it."""
+    cameras = []
+    for i in range(count):
+        azimuth = 2 * math.pi * (i * 0.618034 + turn)
+        height = -0.5 + 1.4 * (i + 0.5) / count
+        eye = 3 * torch.tensor([math.cos(azimuth) * math.cos(height), math.sin(azimuth) * math.cos(height), math.sin(height)])
+        pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+        cameras.append(Camera(pose, torch.full((2,), 1.3 * size), torch.full((2,), size / 2), size, size))
+    return cameras
+
+
+def toy_scene(views: int = 12, size: int = 24, space: Literal["box", "contracted"] = "box") -> Scene:
+    """Two balls of fog seen from all around, with alpha, points and a white background; fits in well under a second."""
+    bounds = Bounds(-torch.ones(3), torch.ones(3), space)
+    truth, field = VolumetricConfig(StratifiedConfig(count=128)), TwoBalls()
+    box = Context(Bounds(-torch.ones(3), torch.ones(3)))
+
+    def view(camera: Camera, name: str) -> View:
+        with torch.no_grad():
+            picture, _ = truth.build(scene).render_image(field, camera, box)
+        straight = picture.rgb / picture.alpha[..., None].clamp_min(1e-3)
+        depth = torch.where(picture.alpha >= 0.5, picture.depth, torch.inf)
+        return View(camera, quantise(straight), name, alpha=quantise(picture.alpha), depth=depth)
+
+    directions = torch.nn.functional.normalize(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    which = torch.arange(400) % 2
+    points = Points(field.centres[which] + field.radii[which][:, None] * directions, field.colours[which])
+    scene = Scene("toy", (), (), torch.ones(3), bounds, points=points)
+    train = tuple(view(camera, f"train{i}") for i, camera in enumerate(toy_cameras(views, size)))
+    test = tuple(view(camera, f"test{i}") for i, camera in enumerate(toy_cameras(max(2, views // 4), size, turn=0.3)))
+    return scene.with_views(train=train, test=test)
+
+
+def check_field(field: Field, scene: Scene) -> None:
+    """Assert what the contract promises of a field: shapes, finiteness, nothing unasked, gradients, a state that reloads."""
+    pointwise = [quantity for quantity in _POINTWISE if quantity in field.provides]
+    position = scene.bounds.from_unit(torch.rand(37, 3)).requires_grad_(True)
+    direction = torch.nn.functional.normalize(torch.randn(37, 3), dim=1)
+    for quantity in pointwise:
+        values = field.query(Samples.at(position, direction), quantity)
+        value = getattr(values, _POINTWISE[quantity])
+        assert value is not None, f"asked for {quantity.words()}, got nothing"
+        assert len(value) == 37 and bool(value.isfinite().all()), f"{quantity.words()} is not finite"
+        if quantity is Quantity.DENSITY:
+            assert bool((value >= 0).all()), "a density is negative"
+        if quantity is Quantity.NORMAL:
+            assert torch.allclose(value.norm(dim=1), torch.ones(37), atol=1e-3), "a normal is not of unit length"
+        empty = field.query(Samples.at(position[:0], direction[:0]), quantity)
+        assert len(getattr(empty, _POINTWISE[quantity])) == 0, "no samples must give no values"
+    assert pointwise or field.provides, "a field must provide something"
+    state = {name: value.clone() for name, value in field.state_dict().items()}
+    field.load_state_dict(state)
+
+
+def check_renderer(renderer: Renderer, field: Field, scene: Scene) -> None:
+    """Assert what the contract promises of a renderer: shapes, ranges, repeatability, gradients to the field and the pose."""
+    check(field, renderer)
+    camera = scene.test[0].camera.resized(12, 9)
+    ctx = Context(scene.bounds, geometry=True)
+    first, _ = renderer.render_image(field, camera, ctx)
+    again, _ = renderer.render_image(field, camera, ctx)
+    assert first.rgb.shape == (9, 12, 3) and first.alpha.shape == (9, 12) and first.depth.shape == (9, 12)
+    assert torch.equal(first.rgb, again.rgb), "evaluation must be deterministic"
+    assert bool(first.rgb.isfinite().all()) and bool((first.alpha >= 0).all()) and bool((first.alpha <= 1 + 1e-4).all())
+    assert bool((first.depth[first.alpha >= 0.5] > 0).all()), "depth must be positive where something is"
+    pose = camera.cam_to_world.clone().requires_grad_(True)
+    training = Context(scene.bounds, training=True, generator=torch.Generator().manual_seed(0))
+    picture, _ = renderer.render_image(field, camera.moved(pose), training)
+    picture.over(torch.ones(3)).square().mean().backward()
+    assert pose.grad is not None and bool(pose.grad.isfinite().all()), "no gradient reaches the pose"
+    gradients = [parameter.grad for parameter in field.parameters() if parameter.requires_grad]
+    assert not gradients or any(grad is not None and bool((grad != 0).any()) for grad in gradients), (
+        "no gradient reaches the field"
+    )

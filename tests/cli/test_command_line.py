@@ -1,0 +1,135 @@
+"""The command line as a person meets it: in a process of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def invgraphics(*arguments: str, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "invgraphics", *arguments]
+    env = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=cwd, env=env)
+
+
+def refused(*arguments: str, cwd: Path | None = None) -> str:
+    """The message of a command that must be refused for bad input: exit status 2, at most four lines, no traceback."""
+    done = invgraphics(*arguments, cwd=cwd)
+    assert done.returncode == 2, done
+    lines = done.stderr.strip().splitlines()
+    assert 1 <= len(lines) <= 4, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    return done.stderr
+
+
+def test_unknown_command_is_refused_with_a_guess() -> None:
+    message = refused("compere", "bricks")
+    assert "no command 'compere'. Did you mean 'compare'?" in message
+    assert "doctor" in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["fit"], "Missing from invgraphics fit: METHOD"),
+        (["fit", "volumetric/hash"], "SCENE"),
+        (["fit", "volumetric/hash", "bricks", "--budgte", "3s"], "--budget"),
+        (["fit", "volumetric/hash", "bricks", "--seed", "one"], "'one' is not a whole number"),
+        (["fit", "volumetric/hash", "bricks", "--budget", "-5s"], "'-5s' is not a budget"),
+        (["fit", "volumetric/hash", "bricks", "--size", "big"], "--size cannot be 'big'"),
+        (["fit", "volumetric/hash", "bricks", "--test-views", "-1"], "--test-views cannot be '-1'"),
+        (["compare", "bricks", "--methods", ","], "--methods is empty"),
+        (["compare", "bricks", "--methods", "a", "--seeds", "x"], "--seeds cannot be 'x'"),
+        (["evaluate", "no/such/run"], "is not a run"),
+        (["report", "no/such/run"], "no/such/run"),
+        (["list", "animals"], "no list of 'animals'"),
+        (["make-scene", "atlantis"], "no scene 'atlantis'"),
+    ],
+)
+def test_bad_arguments_are_refused_in_a_few_lines(arguments: list[str], expected: str) -> None:
+    assert expected in refused(*arguments)
+
+
+def test_unknown_method_is_refused_with_the_known_ones(tmp_path) -> None:
+    message = refused("fit", "volumetric/nrf", "bricks", "--out", "run", cwd=tmp_path)
+    assert "no method 'volumetric/nrf'" in message
+    assert "volumetric/nerf" in message
+    assert list(tmp_path.iterdir()) == []  # nothing is left behind
+
+
+def test_unknown_scene_is_refused_with_the_known_ones(tmp_path) -> None:
+    message = refused("compare", "atlantis", "--methods", "volumetric/hash", "--out", str(tmp_path / "out"))
+    assert "'atlantis' is neither a built-in scene nor an existing path" in message
+    assert "bricks" in message
+
+
+def test_unwritable_output_is_refused_before_anything_is_rendered(tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    message = refused("make-scene", "bricks", "--out", str(tmp_path / "file" / "out"), "--spp", "1000000")
+    assert str(tmp_path / "file") in message
+
+
+def test_report_on_an_empty_folder_is_refused(tmp_path) -> None:
+    assert str(tmp_path) in refused("report", str(tmp_path))
+
+
+def test_debug_shows_the_traceback() -> None:
+    done = invgraphics("list", "animals", "--debug")
+    assert done.returncode == 2
+    assert "Traceback" in done.stderr
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["list"], ["compare", "--help"], ["fit", "--help"]])
+def test_looking_around_imports_nothing_heavy(arguments: list[str]) -> None:
+    script = (
+        "import sys\n"
+        "from invgraphics.cli.main import main\n"
+        "try:\n    main(sys.argv[1:])\n"
+        "finally:\n    print(sorted({'torch', 'numba', 'mitsuba', 'scipy', 'matplotlib'} & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.strip() == "[]"
+
+
+def test_list_answers_at_once() -> None:
+    """Processor time, which a busy machine does not stretch; Python itself takes a part of it."""
+    before = os.times()
+    assert invgraphics("list").returncode == 0
+    after = os.times()
+    assert after.children_user + after.children_system - before.children_user - before.children_system < 0.5
+
+
+def test_list_names_everything_that_is_registered() -> None:
+    from invgraphics import plugins
+    from invgraphics.cli.list import COMPONENTS
+
+    text = invgraphics("list").stdout
+    assert set(COMPONENTS.values()) | {"recipes"} == set(plugins.REGISTRIES)
+    for registry in COMPONENTS.values():
+        for name, target in plugins.names(registry).items():
+            assert any(line.split()[:1] == [name] and target in line for line in text.splitlines()), name
+    assert "splatting/gaussians" in text
+    assert "bricks" in text
+
+
+def test_a_strangers_package_shows_in_the_list(tmp_path) -> None:
+    """A distribution made by hand, found through its entry points alone: its module does not even exist."""
+    info = tmp_path / "their_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-package\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[invgraphics.fields]\ntheirs = their_package:TheirConfig\n")
+    done = invgraphics("list", "fields", PYTHONPATH=str(tmp_path))
+    line = next(line for line in done.stdout.splitlines() if line.strip().startswith("theirs"))
+    assert "their-package" in line
+    assert "built in" in done.stdout
+
+
+def test_a_closed_pipe_is_no_accident() -> None:
+    command = f"{sys.executable} -m invgraphics list | head -1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.startswith("Methods")
+    assert done.stderr == ""

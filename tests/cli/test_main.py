@@ -1,0 +1,194 @@
+"""Exit statuses and messages, and the reading of arguments, without processes."""
+
+import errno
+import sys
+from pathlib import Path
+
+import pytest
+
+from invgraphics.cli import arguments, main
+from invgraphics.cli.compare import Compare
+from invgraphics.cli.evaluate import Evaluate
+from invgraphics.cli.fit import Fit
+from invgraphics.errors import InputError, NumericalError
+
+
+class Failing:
+    """A command that raises what it is given."""
+
+    error: BaseException
+
+    def run(self) -> int:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "expected"),
+    [
+        (InputError("wrong", "do this"), 2, "wrong\ndo this\n"),
+        (InputError("1\n2\n3", "4\n5"), 2, "1\n2\n3\n4\n"),
+        (NumericalError("step 7: density is not finite"), 1, "step 7: density is not finite\n"),
+        (KeyboardInterrupt(), 130, "Interrupted.\n"),
+        (OSError(errno.ENOSPC, "No space left on device", "/x/y"), 2, "'/x/y' cannot be used: the disk is full.\n"),
+        (PermissionError(errno.EACCES, "Permission denied", "/x"), 2, "'/x' cannot be used: permission denied.\n"),
+        (OSError(errno.EROFS, "Read-only", "/x"), 2, "'/x' cannot be used: the file system is read-only.\n"),
+        (RuntimeError("I/O error: No space left on device (os error 28)"), 2, "Writing failed: the disk is full.\n"),
+        (MemoryError(), 1, "There is not enough memory.\nTry a smaller --size, or smaller settings of the method (--set).\n"),
+    ],
+)
+def test_what_goes_wrong_becomes_a_sentence_and_a_status(error, status, expected, monkeypatch, capsys) -> None:
+    command = Failing()
+    command.error = error
+    monkeypatch.setattr(main, "_command", lambda name: None)
+    monkeypatch.setattr(main, "parse", lambda *_: command)
+    with pytest.raises(SystemExit) as stop:
+        main.main(["fit"])
+    assert stop.value.code == status
+    assert capsys.readouterr().err == expected
+
+
+def test_an_unexpected_error_owns_up(monkeypatch, capsys) -> None:
+    command = Failing()
+    command.error = KeyError("tensor")
+    monkeypatch.setattr(main, "_command", lambda name: None)
+    monkeypatch.setattr(main, "parse", lambda *_: command)
+    assert main.run(["fit"]) == 1
+    message = capsys.readouterr().err
+    assert message.startswith("Unexpected KeyError: 'tensor'\n")
+    assert "--debug" in message
+
+
+def test_the_status_of_a_command_is_passed_on(monkeypatch) -> None:
+    monkeypatch.setattr(main, "parse", lambda *_: type("Partly", (), {"run": lambda self: 1})())
+    assert main.run(["fit"]) == main.FAILED
+
+
+@pytest.mark.parametrize("name", main.COMMANDS)
+def test_every_command_has_help(name: str, capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main.main([name, "--help"])
+    assert not stop.value.code
+    text = capsys.readouterr().out
+    assert f"usage: invgraphics {name}" in text
+    assert name in main.overview()
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("480", 480), ("640x480", (640, 480)), ("64X32", (64, 32)), ("16×8", (16, 8)), (" 9 ", 9)]
+)
+def test_sizes(text: str, size) -> None:
+    assert arguments.parse_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "0", "-480", "640x", "x480", "640x480x3", "4.5", "1e3", "640x7", "7", "big"])
+def test_bad_sizes(text: str) -> None:
+    with pytest.raises(InputError, match="--size"):
+        arguments.parse_size(text)
+
+
+def test_numbers_of_views() -> None:
+    assert arguments.parse_views("all") is None
+    assert arguments.parse_views("16") == 16
+    for text in ("0", "-3", "", "few", "1.5"):
+        with pytest.raises(InputError, match="--test-views"):
+            arguments.parse_views(text)
+
+
+def test_fit_becomes_a_request() -> None:
+    words = ["splatting/gaussians", "data/fox/", "--budget", "2m", "--set", "batches.rays=-2", "--set", "a.b=c d"]
+    words += ["--size", "480", "--test-views", "all", "--seed", "3"]
+    request = arguments.parse(Fit, "invgraphics fit", words).request()
+    assert (request.method, request.scene, request.budget, request.seed) == ("splatting/gaussians", "data/fox/", "2m", 3)
+    assert request.overrides == ("batches.rays=-2", "a.b=c d")
+    assert (request.size, request.test_views, request.existing) == (480, None, "refuse")
+    assert Path(request.out) == Path("runs/fox-splatting-gaussians-seed-3")
+
+
+def test_the_recorded_command_gives_the_same_request(tmp_path) -> None:
+    """What a run writes down to be reproduced by is read back as itself."""
+    import shlex
+
+    words = ["volumetric/hash", "bricks", "--preset", "paper", "--size", "64x48", "--set", "x=[1, 2]", "--device", "cpu"]
+    words += ["--kernels", "reference", "--protocol", "float", "--out", str(tmp_path)]
+    request = arguments.parse(Fit, "invgraphics fit", words).request()
+    again = arguments.parse(Fit, "invgraphics fit", shlex.split(request.shell())[2:]).request()
+    assert again == request
+    comparison = arguments.parse(
+        Compare, "invgraphics compare", ["bricks", "--methods", "a/b, c/d", "--seeds", "0,2", "--out", str(tmp_path)]
+    ).request()
+    assert (comparison.methods, comparison.seeds) == (("a/b", "c/d"), (0, 2))
+    assert arguments.parse(Compare, "invgraphics compare", shlex.split(comparison.shell())[2:]).request() == comparison
+
+
+def test_resume_is_asked_for() -> None:
+    command = arguments.parse(Fit, "invgraphics fit", ["a/b", "bricks", "--out", "r", "--resume"])
+    assert command.request().existing == "resume"
+
+
+def test_compare_names_its_folder_after_the_scene() -> None:
+    request = arguments.parse(Compare, "invgraphics compare", ["bricks", "--methods", "a/b"]).request()
+    assert Path(request.out) == Path("reports/compare-bricks")
+
+
+def test_evaluate_takes_another_copy_of_the_scene() -> None:
+    command = arguments.parse(Evaluate, "invgraphics evaluate", ["run", "elsewhere/fox"])
+    assert (command.folder, command.scene, command.protocol) == (Path("run"), "elsewhere/fox", "default")
+
+
+def test_a_strange_complaint_is_still_a_sentence() -> None:
+    assert arguments.condense("") == ("The arguments cannot be read.", "")
+    assert arguments.condense("╭─ X ────╮\n│ no rules │\n╰────────╯") == ("no rules", "")
+
+
+@pytest.fixture
+def refused(capsys):
+    """Run a command that must be refused for bad input, in this process, which has imported torch already."""
+
+    def run(*arguments: str) -> str:
+        assert main.run(arguments) == main.BAD_INPUT
+        message = capsys.readouterr().err
+        assert 1 <= len(message.strip().splitlines()) <= main.MOST_LINES
+        return message
+
+    return run
+
+
+def test_unknown_setting_is_refused_with_the_known_ones(refused, tmp_path) -> None:
+    message = refused("fit", "volumetric/hash", "bricks", "--set", "batches.rayz=7", "--out", str(tmp_path / "run"))
+    assert "'batches.rayz'" in message
+    assert "rays" in message
+
+
+def test_unknown_preset_is_refused_with_the_known_ones(refused, tmp_path) -> None:
+    message = refused("fit", "volumetric/hash", "bricks", "--preset", "huge", "--out", str(tmp_path / "run"))
+    assert "'huge'" in message
+    assert "laptop" in message
+
+
+def test_folder_that_is_no_data_set_is_refused(refused, tmp_path) -> None:
+    (tmp_path / "empty").mkdir()
+    message = refused("fit", "volumetric/hash", str(tmp_path / "empty"), "--out", str(tmp_path / "run"))
+    assert "empty folder" in message
+
+
+@pytest.mark.parametrize("command", [["fit", "volumetric/hash"], ["compare", "--methods", "volumetric/hash"]])
+def test_unwritable_output_is_refused(command: list[str], refused, tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    assert str(tmp_path / "file") in refused(*command, "bricks", "--out", str(tmp_path / "file" / "out"))
+
+
+def test_doctor_looks_at_everything(capsys, monkeypatch) -> None:
+    monkeypatch.setenv("INVGRAPHICS_DATA", "/no/such/folder")
+    assert main.run(["doctor"]) == main.DONE
+    text = capsys.readouterr().out
+    for subject in ("processor", "torch", "Numba kernels", "Mitsuba", "CUDA", "LPIPS", "INVGRAPHICS_DATA"):
+        assert subject in text
+    assert "/no/such/folder is no folder" in text
+
+
+def test_arguments_default_to_those_of_the_process(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["invgraphics", "--version"])
+    with pytest.raises(SystemExit) as stop:
+        main.main()
+    assert stop.value.code == 0
+    assert capsys.readouterr().out.strip()

@@ -1,0 +1,166 @@
+"""The occupancy grid: what it forgets, when it looks, and that skipping and stopping leave the picture alone."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from invgraphics.core import Context, Field, Quantity, Samples, Scene, no_grad_density
+from invgraphics.fields.analytic import GaussianBlob, Sphere
+from invgraphics.renderers.occupancy import Occupancy, OccupancyConfig, running_sums
+from invgraphics.renderers.volumetric import Volumetric
+
+SMALL = OccupancyConfig(resolution=16, steps_per_diagonal=256, warmup=32, every=4, cells=512)
+
+
+def context(scene: Scene, training: bool = True) -> Context:
+    return Context(scene.bounds, training=training, generator=torch.Generator().manual_seed(1))
+
+
+def learnt(config: OccupancyConfig, scene: Scene, field: Field, updates: int = 33) -> Occupancy:
+    sampler, ctx = config.build(scene), context(scene)
+    for _ in range(updates):
+        sampler.update(no_grad_density(field), ctx)
+    return sampler
+
+
+def test_starts_full_and_finds_the_ball(make_scene: Callable[..., Scene]) -> None:
+    scene, ball = make_scene(), Sphere(40.0, 0.6)
+    sampler = SMALL.build(scene)
+    assert bool(sampler.occupied.all())
+    sampler = learnt(SMALL, scene, ball)
+    centres = (torch.stack(torch.meshgrid(*[torch.arange(16)] * 3, indexing="ij"), dim=-1) + 0.5) / 16
+    radius = scene.bounds.from_unit(centres).norm(dim=-1)
+    cell = 3.0 / 16
+    assert bool(sampler.occupied[radius < 0.6 - cell].all())
+    assert not bool(sampler.occupied[radius > 0.6 + cell].any())
+    assert int(sampler.step) == 33
+
+
+def test_an_even_fog_stays(make_scene: Callable[..., Scene]) -> None:
+    """A density below the threshold everywhere is all there is to see: the mean takes the threshold's place."""
+    scene = make_scene()
+    sampler = learnt(SMALL, scene, Sphere(0.1, 100.0))
+    assert float(sampler.ema.max()) < SMALL.threshold
+    assert bool(sampler.occupied.all())
+
+
+@pytest.mark.parametrize("stop", ["always", "never"])
+def test_picture_equals_the_one_without_a_grid(make_scene: Callable[..., Scene], stop: str) -> None:
+    """Smooth, so that a cell whose random points are empty has little else in it."""
+    scene, blob = make_scene(), GaussianBlob(30.0, 0.02, colour=(0.2, 0.5, 0.9))
+    config = replace(SMALL, stop=stop, threshold=1e-5)
+    rays, ctx = scene.train[0].camera.rays(), context(scene, training=False)
+    full = Volumetric(OccupancyConfig(resolution=4, steps_per_diagonal=256, stop="never").build(scene))
+    expected, everything = full.render_rays(blob, rays, ctx)
+    got, kept = Volumetric(learnt(config, scene, blob)).render_rays(blob, rays, ctx)
+    assert everything.samples is not None
+    assert kept.samples is not None
+    assert len(kept.samples) < 0.5 * len(everything.samples)
+    assert float(expected.alpha.detach().max()) > 0.99
+    torch.testing.assert_close(got.rgb, expected.rgb, atol=2 * config.transmittance, rtol=0)
+    torch.testing.assert_close(got.alpha, expected.alpha, atol=2 * config.transmittance, rtol=0)
+
+
+def test_samples_behind_opaque_surfaces_are_left_out(make_scene: Callable[..., Scene]) -> None:
+    scene, ball = make_scene(), Sphere(200.0, 0.8)
+    rays = scene.bounds.clip(scene.train[0].camera.rays())
+    ctx = context(scene, training=False)
+    density = no_grad_density(ball)
+    for wave in (1, 7, 32):
+        sampler = learnt(replace(SMALL, wave=wave, transmittance=0.01), scene, ball)
+        samples, _ = sampler.sample(rays, density, ctx)
+        tau = density(samples) * samples.delta
+        before, _ = running_sums(tau, samples.ray, len(rays), 1000)
+        assert bool((before <= -torch.log(torch.tensor(0.01)) + 1e-4).all())
+        # The same as marching everything and cutting afterwards, whatever the wave.
+        whole, _ = learnt(replace(SMALL, stop="never"), scene, ball).sample(rays, density, ctx)
+        before, _ = running_sums(density(whole) * whole.delta, whole.ray, len(rays), 1000)
+        visible = before <= -torch.log(torch.tensor(0.01))
+        assert len(samples) < 0.7 * len(whole)
+        assert torch.equal(samples.ray, whole.ray[visible])
+        torch.testing.assert_close(samples.t0, whole.t0[visible])
+
+
+def test_stopping_in_evaluation_only(make_scene: Callable[..., Scene]) -> None:
+    scene, ball = make_scene(), Sphere(200.0, 0.8)
+    rays, asked = scene.bounds.clip(scene.train[0].camera.rays()), 0
+
+    def density(samples: Samples) -> Tensor:
+        nonlocal asked
+        asked += len(samples)
+        return no_grad_density(ball)(samples)
+
+    sampler = replace(SMALL, stop="evaluation").build(scene)
+    sampler.sample(rays, density, context(scene, training=True))
+    assert asked == 0
+    sampler.sample(rays, density, context(scene, training=False))
+    assert asked > 0
+
+
+def test_jitter_shifts_the_whole_lattice(make_scene: Callable[..., Scene]) -> None:
+    scene = make_scene()
+    rays, sampler = scene.bounds.clip(scene.train[0].camera.rays()), replace(SMALL, stop="never").build(scene)
+    still, _ = sampler.sample(rays, None, context(scene, training=False))  # type: ignore[arg-type]
+    moved, _ = sampler.sample(rays, None, context(scene))  # type: ignore[arg-type]
+    for ray in range(0, len(rays), 17):
+        offset = moved.t0[moved.ray == ray][:20] - still.t0[still.ray == ray][:20]
+        assert float(offset.std()) < 1e-5
+        assert -1e-6 < float(offset[0]) < sampler.length
+
+
+def test_looks_on_schedule_at_as_many_cells_as_allowed(make_scene: Callable[..., Scene]) -> None:
+    scene, looks = make_scene(), []
+
+    def density(samples: Samples) -> Tensor:
+        looks.append(len(samples))
+        return torch.ones(len(samples))
+
+    sampler, ctx = SMALL.build(scene), context(scene)
+    for _ in range(48):
+        sampler.update(density, ctx)
+    assert looks == [16**3] * 8 + [512] * 4
+
+
+def test_memory_fades_where_it_looked(make_scene: Callable[..., Scene]) -> None:
+    scene, ball = make_scene(), Sphere(40.0, 0.6)
+    sampler, ctx = learnt(replace(SMALL, warmup=1000), scene, ball), context(scene)
+    before = sampler.ema.clone()
+    for _ in range(4 * 5):
+        sampler.update(lambda samples: torch.zeros(len(samples)), ctx)
+    torch.testing.assert_close(sampler.ema, before * SMALL.decay**5)
+
+
+def test_steps_grow_in_a_contracted_space(make_scene: Callable[..., Scene]) -> None:
+    scene = make_scene("contracted")
+    sampler, rays = SMALL.build(scene), scene.bounds.clip(scene.train[0].camera.rays())
+    samples, _ = sampler.sample(rays, lambda s: torch.zeros(len(s)), context(scene, training=False))
+    first = samples[samples.ray == 0]
+    assert float(first.t1[-1]) == pytest.approx(float(rays.far[0]))
+    grown = first.t0 > 256 * sampler.length
+    torch.testing.assert_close(first.delta[grown][:-1], first.t0[grown][:-1] / 256, rtol=1e-3, atol=0)
+    # An even fog is worth as much per step as it is long: far cells must not be forgotten.
+    sampler = learnt(SMALL, scene, Sphere(0.05, 1e6))
+    far = sampler.ema[0, 8, 8] / sampler.ema[8, 8, 8]
+    assert float(far) > 2
+
+
+def test_refusals() -> None:
+    with pytest.raises(ValueError, match="resolution must be at least 1"):
+        OccupancyConfig(resolution=0)
+    with pytest.raises(ValueError, match="transmittance"):
+        OccupancyConfig(transmittance=1.0)
+
+
+def test_fields_are_asked_for_density_only(make_scene: Callable[..., Scene]) -> None:
+    scene, wanted = make_scene(), []
+
+    class Spy(Sphere):
+        def query(self, samples: Samples, want: Quantity):
+            wanted.append(want)
+            return super().query(samples, want)
+
+    learnt(SMALL, scene, Spy(1.0, 1.0), updates=1)
+    assert set(wanted) == {Quantity.DENSITY}

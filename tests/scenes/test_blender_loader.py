@@ -1,0 +1,112 @@
+"""NeRF-synthetic folders."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from dots import GL, Eye, assert_dots_are_found, ring, save
+
+from invgraphics.errors import InputError
+from invgraphics.scenes.blender import Blender
+from invgraphics.scenes.layout import SceneOptions
+from invgraphics.scenes.open import validate
+
+FOCAL = 170.0
+
+
+def write(path: Path, splits: dict[str, list[Eye]]) -> None:
+    for split, eyes in splits.items():
+        frames = []
+        for index, eye in enumerate(eyes):
+            save(eye.picture(with_alpha=True), path / split / f"r_{index}.png")
+            frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": (eye.cam_to_world @ GL).tolist()})
+        table = {"camera_angle_x": 2 * math.atan(80 / FOCAL), "frames": frames}
+        (path / f"transforms_{split}.json").write_text(json.dumps(table))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    eyes = ring(14, focal=(FOCAL, FOCAL), centre=(80.0, 60.0))
+    write(tmp_path, {"train": eyes[:4], "val": eyes[4:10], "test": eyes[10:]})
+    return tmp_path
+
+
+def test_dots_are_where_the_cameras_say(folder: Path) -> None:
+    scene = validate(Blender().load(folder, SceneOptions()))
+    assert [len(scene.train), len(scene.val), len(scene.test)] == [4, 4, 4]
+    assert_dots_are_found(scene)
+    assert scene.background.tolist() == [1, 1, 1]
+    assert scene.has_alpha
+    assert scene.bounds.space == "box"
+    assert scene.bounds.hi.tolist() == [1.5, 1.5, 1.5]
+    assert torch.equal(scene.world_from_local, torch.eye(4))
+    assert scene.train[2].name == "train/r_2"
+
+
+def test_dots_are_found_after_resizing(folder: Path) -> None:
+    scene = Blender().load(folder, SceneOptions(size=80, test_views=2, train_views=3))
+    assert scene.train[0].image.shape == (60, 80, 3)
+    assert [len(scene.train), len(scene.test)] == [3, 2]
+    assert_dots_are_found(scene)
+    assert "160x120 to 80x60" in scene.notes["resize"]
+    assert scene.notes["test_views"] == "2 of 4, evenly spaced"
+
+
+def test_digest_follows_the_pixels(folder: Path) -> None:
+    before = Blender().load(folder, SceneOptions())
+    assert before.digest("test") == Blender().load(folder, SceneOptions()).digest("test")
+    picture = ring(14, focal=(FOCAL, FOCAL), centre=(80.0, 60.0))[10].picture(with_alpha=True)
+    picture[5, 5] = (1, 0, 0, 255)
+    save(picture, folder / "test" / "r_0.png")
+    after = Blender().load(folder, SceneOptions())
+    assert before.digest("test") != after.digest("test")
+    assert before.digest("train") == after.digest("train")
+
+
+def test_no_test_split_is_a_sentence(folder: Path) -> None:
+    (folder / "transforms_test.json").unlink()
+    with pytest.raises(InputError, match=r"transforms_test\.json does not exist"):
+        Blender().load(folder, SceneOptions())
+
+
+def test_unequal_sizes_are_a_sentence(folder: Path) -> None:
+    save(np.zeros((60, 80, 4), np.uint8), folder / "train" / "r_1.png")
+    with pytest.raises(InputError, match=r"r_1\.png has 80x60 pixels, which is scaled unlike r_0\.png"):
+        Blender().load(folder, SceneOptions())
+
+
+@pytest.mark.data
+def test_mic(data) -> None:
+    scene = validate(Blender().load(data("nerf_synthetic_mic"), SceneOptions(size=200, train_views=12)))
+    assert [len(scene.train), len(scene.test)] == [12, 16]
+    assert scene.notes["train_views"].startswith("12 of 100")
+    assert scene.notes["test_views"].startswith("16 of 200")
+    assert scene.train[0].image.shape == (200, 200, 3)
+    assert inside_silhouettes(scene.train) > 0.9, "the microphone stands on its foot, within the box"
+
+
+def inside_silhouettes(views) -> float:
+    """How much of the silhouettes the visual hull, carved within the scene's box, fills again: 1 if all of it is inside."""
+    line = torch.linspace(-1.5, 1.5, 51)
+    cells = torch.cartesian_prod(line, line, line)
+    kept = torch.ones(len(cells), dtype=torch.bool)
+    for view in views:
+        opaque = torch.nn.functional.max_pool2d(view.opacity()[None, None], 5, 1, 2)[0, 0] > 0
+        pixels, z = view.camera.project(cells)
+        inside = (z > 0) & (pixels >= 0).all(1) & (pixels < 200).all(1)
+        x, y = pixels[inside].long().T
+        kept[inside.nonzero()[:, 0]] &= opaque[y, x]
+    filled = []
+    for view in views:
+        pixels, z = view.camera.project(cells[kept])
+        inside = (z > 0) & (pixels >= 0).all(1) & (pixels < 200).all(1)
+        x, y = pixels[inside].long().T
+        hull = torch.zeros(200, 200)
+        hull[y, x] = 1
+        hull = torch.nn.functional.max_pool2d(hull[None, None], 5, 1, 2)[0, 0]
+        opaque = view.opacity() > 0.5
+        filled.append(float(hull[opaque].mean()))
+    return float(np.mean(filled))

@@ -1,0 +1,136 @@
+"""COLMAP models, written as text by hand and read back by the loader."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from dots import COLOURS, POINTS, Eye, assert_dots_are_found, ring, save
+from scipy.spatial.transform import Rotation
+
+from invgraphics.errors import InputError
+from invgraphics.scenes.colmap import Colmap
+from invgraphics.scenes.layout import SceneOptions
+from invgraphics.scenes.open import validate
+
+
+def radial(k: float):
+    """COLMAP's SIMPLE_RADIAL."""
+
+    def distort(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        scale = 1 + k * (x * x + y * y)
+        return x * scale, y * scale
+
+    return distort
+
+
+def write(path: Path, eyes: list[Eye], models: list[str], place: str = "sparse/0") -> Path:
+    """One camera per image."""
+    folder = path / place
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras, images = [], []
+    for index, (eye, model) in enumerate(zip(eyes, models, strict=True)):
+        save(eye.picture(), path / "images" / f"{index:02}.png")
+        cameras.append(f"{index + 1} {model}")
+        x, y, z, w = Rotation.from_matrix(eye.R).as_quat()
+        images.append(f"{index + 1} {w} {x} {y} {z} {' '.join(map(str, eye.t))} {index + 1} {index:02}.png\n")
+    (folder / "cameras.txt").write_text("\n".join(cameras) + "\n")
+    (folder / "images.txt").write_text("\n".join(images) + "\n")
+    points = [
+        f"{i + 1} {' '.join(map(str, point))} {' '.join(str(round(255 * c)) for c in colour)} 0.1"
+        for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True))
+    ]
+    (folder / "points3D.txt").write_text("\n".join(points) + "\n")
+    return path
+
+
+def mixed(path: Path, place: str = "sparse/0") -> Path:
+    """Every photograph through a lens of its own, of three models."""
+    eyes, models = [], []
+    for index, eye in enumerate(ring(9)):
+        k = (-0.4, 0.0, 0.4)[index % 3] * (1 + index / 10)
+        if index % 3 == 1:
+            lens, model = eye, "PINHOLE 160 120 150 155 83 58"
+        else:
+            lens = Eye(eye.R, eye.t, (150.0, 150.0), (83.0, 58.0), distortion=radial(k))
+            model = f"SIMPLE_RADIAL 160 120 150 83 58 {k}" if index % 3 == 0 else f"RADIAL 160 120 150 83 58 {k} 0"
+        eyes.append(lens)
+        models.append(model)
+    return write(path, eyes, models, place)
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_dots_are_where_the_cameras_say(tmp_path: Path, place: str) -> None:
+    path = mixed(tmp_path, place)
+    assert Colmap().matches(path)
+    scene = validate(Colmap().load(path, SceneOptions()))
+    assert [view.name for view in scene.test] == ["00.png", "08.png"]
+    assert_dots_are_found(scene)
+    assert "RADIAL, SIMPLE_RADIAL" in scene.notes["undistortion"]
+
+
+def test_points_are_kept_in_the_local_frame(tmp_path: Path) -> None:
+    scene = Colmap().load(mixed(tmp_path), SceneOptions())
+    assert scene.points is not None
+    world = scene.points.position @ scene.world_from_local[:3, :3].T + scene.world_from_local[:3, 3]
+    order = [int((world - torch.from_numpy(point)).norm(dim=1).argmin()) for point in POINTS]
+    np.testing.assert_allclose(world[order].numpy(), POINTS, atol=1e-5)
+    np.testing.assert_allclose(scene.points.rgb[order].numpy(), COLOURS, atol=0.01)
+
+
+def test_missing_photographs_are_reported(tmp_path: Path) -> None:
+    mixed(tmp_path)
+    (tmp_path / "images" / "03.png").unlink()
+    scene = Colmap().load(tmp_path, SceneOptions())
+    assert scene.notes["missing"] == "1 of 9 listed files are absent: 03.png"
+    assert len(scene.train) + len(scene.test) == 8
+
+
+def test_bad_models_are_sentences(tmp_path: Path) -> None:
+    path = write(tmp_path, ring(2), ["PINHOLE 160 120 150 155 83 58", "PINHOLE 160 120 -150 155 83 58"])
+    with pytest.raises(InputError, match=r"camera of image '01\.png' has parameters"):
+        Colmap().load(path, SceneOptions())
+    (path / "sparse/0/points3D.txt").unlink()
+    with pytest.raises(InputError, match=r"COLMAP model .* cannot be read"):
+        Colmap().load(path, SceneOptions())
+    (path / "sparse/0/cameras.txt").unlink()
+    with pytest.raises(InputError, match="has no COLMAP model"):
+        Colmap().load(path, SceneOptions())
+
+
+def test_no_photographs_is_a_sentence(tmp_path: Path) -> None:
+    mixed(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "pictures")
+    with pytest.raises(InputError, match="None of the 9 pictures"):
+        Colmap().load(tmp_path, SceneOptions())
+
+
+@pytest.mark.data
+def test_beer_points_project_onto_their_observations(data) -> None:
+    """SfM's own measurements, straightened by COLMAP's lens, against our local cameras and points; and the colours there."""
+    import pycolmap
+
+    path = data("colmap_beer")
+    scene = validate(Colmap().load(path, SceneOptions(train_views=4, test_views=2)))
+    assert scene.points is not None
+    model = pycolmap.Reconstruction(str(path / "sparse/0"))
+    local = np.linalg.inv(scene.world_from_local.double().numpy())
+    by_name = {image.name: image for image in model.images.values()}
+    distances, differences, shuffled = [], [], []
+    for view in scene.train + scene.test:
+        image = by_name[view.name]
+        observed = [point for point in image.points2D if point.has_point3D()]
+        world = np.array([model.points3D[point.point3D_id].xyz for point in observed])
+        rgb = np.array([model.points3D[point.point3D_id].color for point in observed]) / 255
+        projected, _ = view.camera.project(torch.from_numpy(world @ local[:3, :3].T + local[:3, 3]).float())
+        plane = image.camera.cam_from_img(np.array([point.xy for point in observed]))
+        straight = plane * view.camera.focal.numpy() + view.camera.centre.numpy()
+        distances.append(np.linalg.norm(projected.numpy() - straight, axis=1))
+        x, y = projected.long().T
+        inside = (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)
+        assert float(inside.float().mean()) > 0.9
+        picture = view.colour()[y[inside], x[inside]].numpy()
+        differences.append(np.abs(picture - rgb[inside]).mean(1))
+        shuffled.append(np.abs(picture - rgb[inside][::-1]).mean(1))
+    assert np.median(np.concatenate(distances)) < 1.5
+    assert np.median(np.concatenate(differences)) < 0.5 * np.median(np.concatenate(shuffled))

@@ -1,0 +1,209 @@
+"""Reading, resizing and undistorting photographs."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from invgraphics.core import Camera
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import Photo, area_resize, image_size, load_view, match_sizes, read_pixels, wanted_size
+from invgraphics.scenes.lens import Lens, straighten, undistort
+
+
+def camera(width: int, height: int) -> Camera:
+    double = torch.float64
+    focal = torch.tensor([100.0, 110.0], dtype=double)
+    return Camera(torch.eye(4, dtype=double), focal, torch.tensor([width / 2, height / 2], dtype=double), width, height)
+
+
+@pytest.mark.parametrize("size", [(7, 5), (20, 9), (3, 1), (19, 13)])
+def test_area_resize_is_the_exact_integral(size: tuple[int, int]) -> None:
+    """Against brute force: repeat every pixel until old and new edges fall on one lattice, then average whole blocks."""
+    width, height = size
+    values = np.random.default_rng(0).random((13, 20, 3))
+    fine = values.repeat(height, axis=0).repeat(width, axis=1)
+    expected = fine.reshape(height, 13, width, 20, 3).mean((1, 3))
+    np.testing.assert_allclose(area_resize(values, width, height), expected, atol=1e-12)
+    np.testing.assert_allclose(area_resize(values.astype(np.float32), width, height), expected, atol=1e-6)
+
+
+def test_transparent_pixels_do_not_bleed(tmp_path: Path) -> None:
+    """Averaging red with an invisible green neighbour gives half-transparent red, not brown."""
+    pixels = np.zeros((4, 4, 4), np.uint8)
+    pixels[:, 0::2] = (200, 0, 0, 255)
+    pixels[:, 1::2] = (0, 255, 0, 0)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    view = load_view(Photo(tmp_path / "a.png", camera(4, 4), "a"), 2)
+    assert view.alpha is not None
+    assert view.image.tolist() == [[[200, 0, 0]] * 2] * 2
+    assert view.alpha.tolist() == [[128] * 2] * 2
+    assert view.camera.focal.tolist() == [50.0, 55.0]
+
+
+def test_unchanged_size_keeps_every_byte(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(1).integers(0, 256, (6, 5, 4), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    view = load_view(Photo(tmp_path / "a.png", camera(5, 6), "a"))
+    assert view.alpha is not None
+    np.testing.assert_array_equal(np.dstack([view.image.numpy(), view.alpha.numpy()]), pixels)
+
+
+def test_opaque_alpha_channel_is_no_alpha(tmp_path: Path) -> None:
+    Image.new("RGBA", (4, 4), (9, 8, 7, 255)).save(tmp_path / "a.png")
+    assert load_view(Photo(tmp_path / "a.png", camera(4, 4), "a")).alpha is None
+
+
+@pytest.mark.parametrize(("mode", "value", "expected"), [("L", 77, 77), ("I;16", 257 * 77, 77), ("P", 5, None), ("1", 1, 255)])
+def test_kinds_of_pixels(tmp_path: Path, mode: str, value: int, expected: int | None) -> None:
+    image = Image.new(mode, (3, 2), value)
+    if mode == "P":
+        image.putpalette([0] * 15 + [10, 20, 30])
+    image.save(tmp_path / "a.png")
+    pixels = read_pixels(tmp_path / "a.png")
+    assert pixels.shape == (2, 3, 3)
+    assert pixels[0, 0].tolist() == ([10, 20, 30] if expected is None else [expected] * 3)
+
+
+def test_exif_orientation_is_applied_unless_the_camera_contradicts(tmp_path: Path) -> None:
+    picture = Image.fromarray(np.arange(6, dtype=np.uint8).reshape(2, 3) * 40)
+    exif = picture.getexif()
+    exif[0x0112] = 6  # the camera was held upright: rotate by 90 degrees clockwise
+    path = tmp_path / "a.png"
+    picture.save(path, exif=exif)
+    assert image_size(path) == (2, 3)
+    assert read_pixels(path)[:, :, 0].tolist() == [[120, 0], [160, 40], [200, 80]]
+    assert image_size(path, like=(300, 200)) == (3, 2), "calibrated on the pixels as they are stored"
+    assert read_pixels(path, like=(300, 200)).shape == (2, 3, 3)
+    assert image_size(path, like=(200, 300)) == (2, 3)
+
+
+def test_truncated_png_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "cut.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)).save(path)
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(InputError, match=r"cut\.png is damaged"):
+        read_pixels(path)
+    path.write_bytes(b"not a picture")
+    with pytest.raises(InputError, match=r"cut\.png cannot be read as a picture"):
+        read_pixels(path)
+    with pytest.raises(InputError, match=r"gone\.png does not exist"):
+        read_pixels(tmp_path / "gone.png")
+
+
+def test_wanted_size() -> None:
+    assert wanted_size(1080, 1920, 480) == (270, 480)
+    assert wanted_size(100, 50, 480) == (100, 50), "never enlarged"
+    assert wanted_size(1080, 1920, (270, 480)) == (270, 480)
+    assert wanted_size(1080, 1920, None) == (1080, 1920)
+    with pytest.raises(InputError, match="squash"):
+        wanted_size(1080, 1920, (480, 270))
+    with pytest.raises(InputError, match="larger"):
+        wanted_size(100, 50, (200, 100))
+
+
+def test_scaled_copies_keep_their_calibration(tmp_path: Path) -> None:
+    lens = Lens("OPENCV", (100.0, 110.0, 40.0, 30.0, 0.1, 0.0, 0.0, 0.0), 80, 60)
+    photos = []
+    for name in "ab":
+        Image.new("RGB", (40, 30)).save(tmp_path / f"{name}.png")
+        photos.append(Photo(tmp_path / f"{name}.png", camera(80, 60), name, lens))
+    small = match_sizes(photos)[0]
+    assert (small.camera.width, small.camera.height) == (40, 30)
+    assert small.camera.focal.tolist() == [50.0, 55.0]
+    assert small.lens == Lens("OPENCV", (50.0, 55.0, 20.0, 15.0, 0.1, 0.0, 0.0, 0.0), 40, 30)
+    Image.new("RGB", (80, 60)).save(tmp_path / "b.png")
+    with pytest.raises(InputError, match=r"b\.png has 80x60 pixels, which is scaled unlike a\.png"):
+        match_sizes(photos)
+    Image.new("RGB", (50, 30)).save(tmp_path / "b.png")
+    with pytest.raises(InputError, match=r"b\.png has 50x30 pixels, its camera says 80x60"):
+        match_sizes(photos)
+
+
+def test_images_of_different_cameras_may_differ_in_size(tmp_path: Path) -> None:
+    photos = []
+    for name, size in (("a", (40, 30)), ("b", (32, 32))):
+        Image.new("RGB", size).save(tmp_path / f"{name}.png")
+        photos.append(Photo(tmp_path / f"{name}.png", camera(*size), name))
+    assert [photo.camera.width for photo in match_sizes(photos)] == [40, 32]
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens("OPENCV", (120.0, 125.0, 83.0, 58.0, 0.1, -0.05, 0.004, -0.003), 160, 120),
+        Lens("OPENCV", (120.0, 125.0, 75.0, 63.0, -0.2, 0.05, 0.0, 0.0), 160, 120),
+        Lens("OPENCV_FISHEYE", (60.0, 60.0, 80.0, 60.0, 0.02, 0.0, 0.0, 0.0), 160, 120),
+        Lens("OPENCV_FISHEYE", (30.0, 30.0, 80.0, 60.0, 0.0, 0.0, 0.0, 0.0), 160, 120),  # beyond 180 degrees
+    ],
+)
+def test_no_blank_pixel_and_little_lost(lens: Lens) -> None:
+    straight = straighten(lens)
+    assert float(straight.grid.abs().max()) <= 1.0
+    assert straight.focal[0] / straight.focal[1] == pytest.approx(lens.params[0] / lens.params[1])
+    if lens.model == "OPENCV":
+        assert float(straight.grid.abs().max()) > 0.98, "the viewport touches the photograph's border"
+
+
+def test_identity_lens_changes_nothing() -> None:
+    picture = np.random.default_rng(0).random((60, 80, 3)).astype(np.float32)
+    straight = straighten(Lens("FULL_OPENCV", (90.0, 90.0, 41.0, 29.0, *[0.0] * 8), 80, 60))
+    # The viewport leaves out half a pixel of border, hence a zoom of 1/80.
+    assert straight.focal[0] == pytest.approx(90 * 60 / 59, rel=1e-6)
+    flat = np.full_like(picture, 0.25)
+    np.testing.assert_allclose(undistort(flat, straight), flat, atol=1e-6)
+
+
+def test_unknown_lens_is_refused() -> None:
+    with pytest.raises(InputError, match="'GLASS' is not a known camera model"):
+        Lens("GLASS", (1.0,), 8, 8).colmap()
+    with pytest.raises(InputError, match="3 parameters"):
+        Lens("OPENCV", (1.0, 2.0, 3.0), 8, 8).colmap()
+
+
+def test_mask_file_of_another_size_is_refused(tmp_path: Path) -> None:
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    Image.new("L", (8, 4)).save(tmp_path / "m.png")
+    photo = Photo(tmp_path / "a.png", camera(8, 8), "a")
+    with pytest.raises(InputError, match=r"m\.png has 8x4 pixels, its photograph has 8x8"):
+        load_view(replace(photo, alpha=tmp_path / "m.png"))
+
+
+MEMORY = """
+import resource, sys
+from pathlib import Path
+import torch, pycolmap, PIL.Image, PIL.ImageOps
+from invgraphics.scenes.layout import SceneOptions
+from invgraphics.scenes.nerfstudio import Nerfstudio
+torch.set_num_threads(1)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for size in (250, None):
+    scene = Nerfstudio().load(Path(sys.argv[1]), SceneOptions(test_views=None, size=size))
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+"""
+
+
+def test_only_final_pixels_are_kept_in_memory(tmp_path: Path) -> None:
+    """30 distorted photographs of 1 MP: 6 MB of bytes at a quarter, 90 MB at full size, and one picture's work space."""
+    noise = np.random.default_rng(0).integers(0, 255, (1000, 1000, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "0.jpg", quality=50)
+    frames = []
+    for index in range(30):
+        if index:
+            (tmp_path / f"{index}.jpg").symlink_to(tmp_path / "0.jpg")
+        pose = np.eye(4)
+        pose[0, 3] = index
+        frames.append({"file_path": f"{index}.jpg", "transform_matrix": pose.tolist()})
+    table = {"fl_x": 900.0, "k1": 0.05, "w": 1000, "h": 1000, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    done = subprocess.run([sys.executable, "-c", MEMORY, str(tmp_path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    small, full = (float(megabytes) for megabytes in done.stdout.split())
+    assert small < 150
+    assert full < 240

@@ -1,0 +1,227 @@
+"""``transforms.json`` of nerfstudio and instant-ngp, distorted lenses included."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from dots import GL, POINTS, assert_dots_are_found, ring, save
+
+from invgraphics.errors import InputError
+from invgraphics.scenes.layout import SceneOptions
+from invgraphics.scenes.nerfstudio import Nerfstudio
+from invgraphics.scenes.open import validate
+
+K1, K2, P1, P2, K3 = 0.6, -0.3, 0.01, -0.008, 0.2
+
+
+def opencv(x: np.ndarray, y: np.ndarray, k3: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Brown and Conrady's model, as OpenCV's documentation writes it."""
+    r2 = x * x + y * y
+    radial = 1 + K1 * r2 + K2 * r2**2 + k3 * r2**3
+    return x * radial + 2 * P1 * x * y + P2 * (r2 + 2 * x * x), y * radial + P1 * (r2 + 2 * y * y) + 2 * P2 * x * y
+
+
+def opencv_k3(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return opencv(x, y, K3)
+
+
+def fisheye(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Kannala and Brandt's equidistant model with one coefficient."""
+    r = np.sqrt(x * x + y * y).clip(1e-9)
+    theta = np.arctan(r)
+    scale = theta * (1 + 0.05 * theta**2) / r
+    return x * scale, y * scale
+
+
+def write(path: Path, eyes, top: dict, listed_only: int = 0, suffix: str = ".png") -> Path:
+    frames = []
+    for index, eye in enumerate(eyes):
+        if index >= listed_only:
+            save(eye.picture(), path / "images" / f"{index:04}.png")
+        pose = (eye.cam_to_world @ GL).tolist()
+        frames.append({"file_path": f"images/{index:04}{suffix}", "transform_matrix": pose})
+    eye = eyes[0]
+    intrinsics = {"fl_x": eye.focal[0], "fl_y": eye.focal[1], "cx": eye.centre[0], "cy": eye.centre[1], "w": 160, "h": 120}
+    (path / "transforms.json").write_text(json.dumps({**intrinsics, **top, "frames": frames[::-1]}))
+    return path
+
+
+def edit(path: Path, change) -> None:
+    table = json.loads((path / "transforms.json").read_text())
+    change(table)
+    (path / "transforms.json").write_text(json.dumps(table))
+
+
+DISTORTED = {"k1": K1, "k2": K2, "p1": P1, "p2": P2}
+
+
+@pytest.mark.parametrize(
+    ("distortion", "top"),
+    [
+        (None, {}),
+        (opencv, DISTORTED),
+        (opencv_k3, {**DISTORTED, "k3": K3}),
+        (fisheye, {"camera_model": "OPENCV_FISHEYE", "k1": 0.05}),
+        (fisheye, {"is_fisheye": True, "k1": 0.05}),
+        (None, {"camera_model": "PINHOLE", "k1": 0.3}),
+    ],
+)
+def test_dots_are_where_the_cameras_say(tmp_path: Path, distortion, top: dict) -> None:
+    write(tmp_path, ring(distortion=distortion), top)
+    scene = validate(Nerfstudio().load(tmp_path, SceneOptions()))
+    assert_dots_are_found(scene)
+    assert ("undistortion" in scene.notes) == (distortion in (opencv, opencv_k3, fisheye))
+
+
+def test_distortion_matters(tmp_path: Path) -> None:
+    """The check above can fail: the same pictures without their coefficients put the dots elsewhere."""
+    write(tmp_path, ring(distortion=opencv), {})
+    with pytest.raises(AssertionError, match="px"):
+        assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
+
+
+def test_dots_are_found_after_resizing(tmp_path: Path) -> None:
+    write(tmp_path, ring(distortion=opencv), DISTORTED)
+    scene = Nerfstudio().load(tmp_path, SceneOptions(size=100))
+    assert scene.train[0].image.shape == (75, 100, 3)
+    assert_dots_are_found(scene)
+
+
+def test_split_absent_files_and_missing_suffix(tmp_path: Path) -> None:
+    write(tmp_path, ring(20), {}, listed_only=3, suffix="")
+    scene = Nerfstudio().load(tmp_path / "transforms.json", SceneOptions())
+    assert [view.name for view in scene.test] == ["images/0003", "images/0011", "images/0019"]
+    assert len(scene.train) == 14
+    assert scene.notes["missing"] == "3 of 20 listed files are absent: images/0002, images/0001, images/0000"
+    assert scene.name == tmp_path.name
+
+
+def test_local_frame(tmp_path: Path) -> None:
+    """The subject is at the origin, cameras reach distance 1, their up is +z, and the similarity leads back to the world."""
+    write(tmp_path, ring(12), {})
+    scene = Nerfstudio().load(tmp_path, SceneOptions(test_views=None))
+    views = scene.train + scene.test
+    distances = torch.stack([view.camera.position.norm() for view in views])
+    assert float(distances.max()) == pytest.approx(1.0, abs=1e-5)
+    assert float(distances.min()) == pytest.approx(1.0, abs=1e-5), "all axes meet in one point, which is the origin"
+    up = -torch.stack([view.camera.cam_to_world[:3, 1] for view in views]).mean(0)
+    assert float(up[2] / up.norm()) == pytest.approx(1.0, abs=1e-5)
+    assert scene.scale == pytest.approx(np.linalg.norm(ring(12)[0].cam_to_world[:3, 3]), rel=1e-5)
+    by_name = {view.name: view for view in views}
+    for index, eye in enumerate(ring(12)):
+        local = by_name[f"images/{index:04}.png"].camera.position
+        world = scene.world_from_local[:3, :3] @ local + scene.world_from_local[:3, 3]
+        np.testing.assert_allclose(world.numpy(), eye.cam_to_world[:3, 3], atol=1e-5)
+    assert scene.bounds.space == "contracted"
+
+
+def test_intrinsics_per_frame(tmp_path: Path) -> None:
+    eyes = ring(8)
+    write(tmp_path, eyes, {"fl_x": 1.0, "cx": 5.0})
+
+    def own(table: dict) -> None:
+        for frame in table["frames"]:
+            frame |= {"fl_x": 150.0, "cx": 83.0}
+
+    edit(tmp_path, own)
+    assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
+
+
+def test_scaled_copies_of_the_photographs(tmp_path: Path) -> None:
+    """Intrinsics for twice the size of the files on disk."""
+    double = {"w": 320, "h": 240, "fl_x": 300.0, "fl_y": 310.0, "cx": 166.0, "cy": 116.0}
+    write(tmp_path, ring(8, distortion=opencv), {**DISTORTED, **double})
+    assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
+
+
+def _set_matrix(entry: tuple[int, int], value: object):
+    def change(table: dict) -> None:
+        table["frames"][2]["transform_matrix"][entry[0]][entry[1]] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda table: table.pop("frames"), "has no list of 'frames'"),
+        (lambda table: table["frames"][2].pop("transform_matrix"), r"frame 2 \('images/0006.png'\) has no 'transform_matrix'"),
+        (lambda table: table["frames"][2].pop("file_path"), "frame 2, has no 'file_path'"),
+        (lambda table: (table.pop("fl_x"), table.pop("fl_y")), "has no focal length"),
+        (lambda table: table.update(fl_x=-3), r"frame 0 .* is -3, 155, not positive"),
+        (lambda table: table.update(k1="lots"), "'k1' of .* is 'lots', not a finite number"),
+        (lambda table: table.update(w=0), "not a size in pixels"),
+        (lambda table: table.update(camera_model="EQUIRECTANGULAR"), "camera model 'EQUIRECTANGULAR'"),
+        (_set_matrix((0, 3), float("nan")), r"pose of .*frame 2 \('images/0006.png'\) has entries that are not finite"),
+        (_set_matrix((0, 0), 7.0), "frame 2 .* is not rigid"),
+        (_set_matrix((0, 0), "x"), "frame 2 .* is not a 4x4 matrix of numbers"),
+        (lambda table: [f.update(file_path="no/" + f["file_path"]) for f in table["frames"]], "None of the 9 pictures"),
+        (lambda table: table.update(frames=table["frames"][:1]), "1 photograph is too few"),
+    ],
+)
+def test_bad_input_is_a_sentence(tmp_path: Path, change, sentence: str) -> None:
+    write(tmp_path, ring(9), {})
+    edit(tmp_path, change)
+    with pytest.raises(InputError, match=sentence):
+        Nerfstudio().load(tmp_path, SceneOptions())
+
+
+def test_mirrored_pose_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, ring(9), {})
+    edit(tmp_path, lambda t: [row.__setitem__(0, -row[0]) for row in t["frames"][1]["transform_matrix"]])
+    with pytest.raises(InputError, match=r"frame 1 .* is left-handed"):
+        Nerfstudio().load(tmp_path, SceneOptions())
+
+
+def test_broken_json_names_line_and_column(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text('{\n  "w": 3,\n  "h" 4\n}')
+    with pytest.raises(InputError, match=r"transforms\.json is not valid JSON: .* at line 3, column 7"):
+        Nerfstudio().load(tmp_path, SceneOptions())
+
+
+@pytest.mark.data
+def test_fox_reports_what_is_absent(data) -> None:
+    scene = validate(Nerfstudio().load(data("fox"), SceneOptions(size=480, train_views=12)))
+    assert scene.notes["missing"].startswith("17 of 67 listed files are absent: images/0005.jpg")
+    assert scene.notes["train_views"].startswith("12 of 43")
+    assert scene.notes["test_views"].startswith("7 of 7")
+    assert scene.train[0].image.shape == (480, 270, 3)
+    assert scene.has_alpha is False
+    assert sampson_distance(scene.train[4], scene.train[5]) < 1.0
+
+
+def sampson_distance(first, second) -> float:
+    """Median distance in pixels of matched features from the epipolar lines of our cameras."""
+    from skimage.feature import ORB, match_descriptors
+
+    found = []
+    for view in (first, second):
+        orb = ORB(n_keypoints=500, fast_threshold=0.05)
+        orb.detect_and_extract(view.colour().mean(-1).numpy())
+        found.append((orb.keypoints[:, ::-1] + 0.5, orb.descriptors))
+    pairs = match_descriptors(found[0][1], found[1][1], cross_check=True, max_ratio=0.8)
+    assert len(pairs) > 40
+    inverse = [np.linalg.inv(intrinsics(view)) for view in (first, second)]
+    motion = second.camera.world_to_cam.double().numpy() @ first.camera.cam_to_world.double().numpy()
+    x, y, z = motion[:3, 3]
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ motion[:3, :3]
+    fundamental = inverse[1].T @ essential @ inverse[0]
+    a, b = (np.concatenate([points[pairs[:, i]], np.ones((len(pairs), 1))], axis=1) for i, (points, _) in enumerate(found))
+    lines_b, lines_a = a @ fundamental.T, b @ fundamental
+    gradient = (lines_b[:, :2] ** 2).sum(1) + (lines_a[:, :2] ** 2).sum(1)
+    return float(np.median(np.abs((b * lines_b).sum(1)) / np.sqrt(gradient)))
+
+
+def intrinsics(view) -> np.ndarray:
+    (fx, fy), (cx, cy) = view.camera.focal.tolist(), view.camera.centre.tolist()
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def test_the_dots_are_well_placed() -> None:
+    """The helper itself: all dots are inside all pictures and apart from each other."""
+    for eye in ring(20):
+        pixels = eye.pixels(POINTS)
+        assert (pixels > 8).all()
+        assert (pixels < np.array(eye.size) - 8).all()

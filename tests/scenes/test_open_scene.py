@@ -1,0 +1,178 @@
+"""Finding the right loader, and the checks that every scene passes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from invgraphics import plugins
+from invgraphics.core import Bounds, Camera, Scene, View
+from invgraphics.errors import InputError
+from invgraphics.scenes import mitsuba
+from invgraphics.scenes.layout import contracted_frame, evenly
+from invgraphics.scenes.open import SceneOptions, find_loader, open_scene, validate
+
+
+def view(index: int) -> View:
+    pose = torch.eye(4)
+    pose[0, 3] = index
+    camera = Camera(pose, torch.tensor([10.0, 10.0]), torch.tensor([4.0, 3.0]), 8, 6)
+    return View(camera, torch.zeros(6, 8, 3, dtype=torch.uint8), f"v{index}")
+
+
+def scene() -> Scene:
+    one = torch.ones(3)
+    return Scene("toy", (view(0), view(1)), (view(2),), one, Bounds(-one, one), val=(view(3),))
+
+
+def test_good_scene_passes() -> None:
+    good = scene()
+    assert validate(good) is good
+
+
+def _posed(change) -> View:
+    bad = view(1)
+    pose = bad.camera.cam_to_world.clone()
+    change(pose)
+    return replace(bad, camera=bad.camera.moved(pose))
+
+
+def _lens(**values: object) -> View:
+    return replace(view(1), camera=replace(view(1).camera, **values))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"train": ()}, "has no train views"),
+        ({"test": ()}, "has no test views"),
+        (
+            {"train": (view(0), _posed(lambda p: p[0].fill_(torch.nan)))},
+            "train view 'v1' of 'toy' has entries that are not finite",
+        ),
+        ({"train": (view(0), _posed(lambda p: p[:3, :3].mul_(2)))}, "train view 'v1' of 'toy' is not rigid"),
+        ({"test": (_posed(lambda p: p[2, 2].fill_(-1)),)}, "test view 'v1' of 'toy' is left-handed"),
+        ({"train": (_lens(focal=torch.tensor([0.0, 1.0])),)}, "train view 'v1' .* has focal length"),
+        ({"train": (_lens(centre=torch.tensor([torch.inf, 1.0])),)}, "train view 'v1' .* centre"),
+        ({"train": (_lens(width=9),)}, "image of train view 'v1' of 'toy' has 8x6 pixels, its camera 9x6"),
+        ({"val": (replace(view(4), image=torch.full((6, 8, 3), torch.nan)),)}, "image of val view 'v4' .* not finite"),
+        ({"val": (replace(view(4), depth=torch.full((6, 8), torch.nan)),)}, "depth of val view 'v4' .* not finite"),
+        ({"test": (view(2), view(1))}, "train view 'v1' and the test view 'v1' of 'toy' share a camera"),
+        ({"test": (view(2), view(3))}, "val view 'v3' and the test view 'v3' of 'toy' share a camera"),
+    ],
+)
+def test_bad_scenes_are_refused(change: dict, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        validate(scene().with_views(**change))
+
+
+def test_infinite_depth_is_allowed() -> None:
+    validate(scene().with_views(val=(replace(view(4), depth=torch.full((6, 8), torch.inf)),)))
+
+
+@pytest.mark.parametrize(
+    ("file", "loader"),
+    [
+        ("transforms_train.json", "blender"),
+        ("transforms.json", "nerfstudio"),
+        ("poses_bounds.npy", "llff"),
+        ("sparse/0/cameras.bin", "colmap"),
+        ("cameras_sphere.npz", "idr"),
+    ],
+)
+def test_format_is_recognised(tmp_path: Path, file: str, loader: str) -> None:
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).touch()
+    assert type(find_loader(tmp_path)).__name__.lower() == loader
+
+
+def test_unknown_formats_are_sentences(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"is an empty folder\.\nLooked for .*transforms_train\.json.*formats: truth, blender"):
+        open_scene(str(tmp_path))
+    (tmp_path / "readme.txt").touch()
+    with pytest.raises(InputError, match="is not a data set of a known format"):
+        open_scene(str(tmp_path))
+    with pytest.raises(InputError, match="is not a data set of a known format"):
+        open_scene(str(tmp_path / "readme.txt"))
+
+
+def test_unknown_name_lists_the_built_in_scenes() -> None:
+    with pytest.raises(InputError, match=r"'brick' is neither a built-in scene nor an existing path\.\n.*bricks"):
+        open_scene("brick")
+
+
+@pytest.mark.parametrize(("size", "expected"), [(None, None), ((32, 16), (32, 16)), (48, (48, 48))])
+def test_built_in_scenes_are_rendered_then_loaded(tmp_path: Path, monkeypatch, size, expected) -> None:
+    calls = {}
+
+    def make(name: str, **options: object) -> Path:
+        calls[name] = options
+        return tmp_path
+
+    class Truth:
+        def load(self, path: Path, options: SceneOptions) -> Scene:
+            calls["loaded"] = (path, options)
+            return scene()
+
+    monkeypatch.setattr(mitsuba, "make", make)
+    monkeypatch.setattr(plugins, "load", lambda registry, name: Truth)
+    options = SceneOptions(size=size, test_views=3, seed=5)
+    opened = open_scene("bricks", options, progress=print)
+    assert opened.name == "toy"
+    assert calls["bricks"] == {"size": expected, "train": None, "test": 3, "seed": 5, "progress": print}
+    assert calls["loaded"] == (tmp_path, options)
+
+
+def test_evenly_spaced_choice() -> None:
+    assert evenly(list(range(200)), 4) == [25, 75, 125, 175]
+    assert evenly(list(range(3)), 16) == [0, 1, 2]
+    assert evenly(list(range(3)), None) == [0, 1, 2]
+    assert len(set(evenly(list(range(17)), 16))) == 16
+
+
+@pytest.mark.parametrize("bad", [{"size": 0}, {"size": (4, -1)}, {"test_views": 0}, {"train_views": -2}])
+def test_bad_options_are_refused(bad: dict) -> None:
+    with pytest.raises(InputError):
+        SceneOptions(**bad)
+
+
+def test_inside_out_rig_is_centred_on_its_cameras() -> None:
+    """Axes that diverge meet behind the cameras: the middle of the cameras is the better origin."""
+    poses = []
+    for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+        forward = np.array([np.cos(angle), np.sin(angle), 0])
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([np.cross(forward, [0, 0, 1]), [0, 0, -1], forward], axis=1)
+        pose[:3, 3] = 0.5 * forward + [3, 0, 1]
+        poses.append(pose)
+    frame = contracted_frame(torch.from_numpy(np.stack(poses)))
+    np.testing.assert_allclose(
+        frame.world_from_local.numpy(), [[0.5, 0, 0, 3], [0, 0.5, 0, 0], [0, 0, 0.5, 1], [0, 0, 0, 1]], atol=1e-9
+    )
+
+
+def test_upside_down_world_is_righted() -> None:
+    pose = torch.diag(torch.tensor([1.0, 1, 1, 1], dtype=torch.float64))
+    pose[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # image down is world +z
+    frame = contracted_frame(pose[None])
+    up = frame.world_from_local[:3, 2] / frame.world_from_local[:3, 2].norm()
+    np.testing.assert_allclose(up.numpy(), [0, 0, -1], atol=1e-9)
+    assert float(torch.linalg.det(frame.world_from_local[:3, :3])) > 0
+
+
+def test_plug_in_formats_are_asked_too(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "mine.json").write_text(json.dumps({}))
+
+    class Mine:
+        def matches(self, path: Path) -> bool:
+            return (path / "mine.json").is_file()
+
+        def load(self, path: Path, options: SceneOptions) -> Scene:
+            return scene()
+
+    monkeypatch.setattr(plugins, "names", lambda registry: {"mine": "somewhere:Mine"})
+    monkeypatch.setattr(plugins, "load", lambda registry, name: Mine)
+    assert open_scene(str(tmp_path)).name == "toy"

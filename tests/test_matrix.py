@@ -1,0 +1,91 @@
+"""The table field x renderer: every registered pair composes and renders, or refuses with a sentence that says why."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import pytest
+import torch
+
+from invgraphics import plugins
+from invgraphics.core import Context, Quantity, Scene, check
+from invgraphics.errors import NotComposableError
+from invgraphics.testing import toy_scene
+
+FIELDS, RENDERERS, SAMPLERS = (sorted(plugins.names(registry)) for registry in ("fields", "renderers", "samplers"))
+
+
+@pytest.fixture(params=["box", "contracted"])
+def scene(request: pytest.FixtureRequest) -> Scene:
+    return toy_scene(views=2, size=8, space=request.param)
+
+
+def build(registry: str, name: str, scene: Scene, **settings: Any) -> Any:
+    return replace(plugins.load(registry, name)(), **settings).build(scene)
+
+
+def registered(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
+    """Every registered field with every registered renderer, as their defaults are."""
+    for field in FIELDS:
+        for renderer in RENDERERS:
+            yield field, build("fields", field, scene), renderer, build("renderers", renderer, scene)
+
+
+def variants(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
+    """A small neural field of every encoding and geometry, with a volumetric renderer of every sampler."""
+    small = {"layers": 1, "width": 16, "skip": -1, "colour_layers": 1, "colour_width": 16, "geometry_features": 7}
+    for encoding, geometry, sampler in product(plugins.names("encodings"), ("density", "sdf"), SAMPLERS):
+        encode, look = plugins.load("encodings", encoding)(), plugins.load("samplers", sampler)()
+        if sampler == "occupancy":
+            look = replace(look, steps_per_diagonal=64, cone=0.1)
+        field = build("fields", "neural", scene, encoding=encode, geometry=geometry, **small)
+        renderer = build("renderers", "volumetric", scene, sampler=look)
+        yield f"neural/{encoding}/{geometry}", field, f"volumetric/{sampler}", renderer
+
+
+def assert_draws(field: Any, renderer: Any, scene: Scene) -> None:
+    """An 8x8 picture with finite numbers, and a gradient for something in the field."""
+    ctx = Context(scene.bounds, training=True, geometry=True, generator=torch.Generator().manual_seed(0))
+    rendering, _ = renderer.render_image(field, scene.train[0].camera, ctx)
+    assert rendering.rgb.shape == (8, 8, 3)
+    assert bool(torch.isfinite(rendering.rgb).all())
+    assert bool(((rendering.alpha >= 0) & (rendering.alpha <= 1 + 1e-5)).all())
+    assert bool((rendering.depth > 0).all())
+    assert rendering.normal is not None
+    norm = rendering.normal.norm(dim=-1)
+    assert bool((((norm - 1).abs() < 1e-4) == (rendering.alpha >= 0.5)).all())
+    rendering.over(scene.background).sum().backward()
+    gradients = [parameter.grad for parameter in field.parameters() if parameter.grad is not None]
+    assert any(bool(gradient.any()) for gradient in gradients)
+    assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
+
+
+def test_every_pair_draws_or_refuses_with_a_sentence(scene: Scene) -> None:
+    drawn, refused = set(), set()
+    for field_name, field, renderer_name, renderer in (*registered(scene), *variants(scene)):
+        missing = renderer.requires & ~field.provides
+        if missing:
+            with pytest.raises(NotComposableError) as refusal:
+                check(field, renderer)
+            words = (missing.words(), type(field).__name__, type(renderer).__name__)
+            assert all(word in refusal.value.sentence for word in words)
+            refused.add((field_name, renderer_name))
+        else:
+            check(field, renderer)
+            assert_draws(field, renderer, scene)
+            drawn.add((field_name, renderer_name))
+    assert {name for name, _ in drawn} >= set(FIELDS)
+    assert {name for _, name in drawn} >= set(RENDERERS)
+    assert ("neural/hash/density", "volumetric/occupancy") in drawn
+    assert ("gaussians", "splatting") in drawn
+    assert {("neural", "splatting"), ("gaussians", "volumetric"), ("neural/hash/sdf", "volumetric/stratified")} <= refused
+
+
+def test_the_sentence() -> None:
+    scene = toy_scene(views=2, size=8)
+    field, renderer = build("fields", "neural", scene), build("renderers", "splatting", scene)
+    with pytest.raises(NotComposableError, match=r"Splatting needs gaussians, which NeuralField does not provide\."):
+        check(field, renderer)
+    with pytest.raises(NotComposableError, match="gaussians"):
+        field.primitives(Quantity.GAUSSIANS, Context(scene.bounds))

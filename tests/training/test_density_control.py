@@ -1,0 +1,143 @@
+"""Density control against hand-made situations: what must grow grows, what must go goes, Adam's memory follows."""
+
+import math
+
+import pytest
+import torch
+
+from invgraphics.core import Bounds, Camera, Context, Scene, Screen, Trace, View
+from invgraphics.core.transforms import look_at
+from invgraphics.fields.gaussian import GaussianFieldConfig
+from invgraphics.renderers.splatting import SplattingConfig
+from invgraphics.training.density_control import DensityControlConfig
+from invgraphics.training.hooks import FitState
+from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
+
+
+def _scene() -> Scene:
+    eye = torch.tensor([0.0, -4.0, 0.0])
+    pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    camera = Camera(pose, torch.tensor([40.0, 40.0]), torch.tensor([16.0, 16.0]), 32, 32)
+    other = camera.moved(look_at(-eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])))
+    image = torch.zeros(32, 32, 3, dtype=torch.uint8)
+    views = (View(camera, image, "a"), View(other, image, "b"))
+    return Scene("toy", views, (views[0],), torch.ones(3), Bounds(-torch.ones(3), torch.ones(3)))
+
+
+def _state(count: int = 6) -> FitState:
+    scene = _scene()
+    field = GaussianFieldConfig(sh_degree=1, count=count, init="random").build(scene)
+    with torch.no_grad():
+        field.log_scales.fill_(math.log(1e-3))
+        field.opacity_logits.fill_(0.0)
+    parameters = {f"field.{name}": parameter for name, parameter in field.named_parameters()}
+    optimiser = Optimiser(OptimiserConfig({"all": GroupConfig("field", 1e-9)}), parameters, scene.extent)
+    for row, parameter in enumerate(parameters.values()):
+        parameter.grad = torch.full_like(parameter, float(row + 1))
+    optimiser.step()
+    ctx = Context(scene.bounds, training=True, progress=0.3, generator=torch.Generator().manual_seed(1))
+    return FitState(field, SplattingConfig().build(scene), optimiser, scene, ctx, step=9)
+
+
+def _pull(state: FitState, hook, pixels: list[float], visible: list[bool] | None = None) -> None:
+    """Pretend that the loss pulled each Gaussian by so many (loss per pixel) on a 32 x 32 image."""
+    means2d = torch.zeros(len(pixels), 2, requires_grad=True)
+    means2d.grad = torch.stack([torch.tensor(pixels), torch.zeros(len(pixels))], dim=1)
+    radii = torch.tensor([1.0 if seen else 0.0 for seen in (visible or [True] * len(pixels))])
+    state.trace = Trace(screen=Screen(means2d, radii, 32, 32))
+    hook.after_backward(state)
+
+
+def test_small_gaussians_with_large_gradients_are_cloned() -> None:
+    state = _state()
+    hook = DensityControlConfig(every=10, threshold=1.0).build()
+    # 1.0 per unit of NDC is 1/16 per pixel on an image 32 pixels wide.
+    _pull(state, hook, [0.99 / 16, 1.01 / 16, 0.0, 0.0, 0.0, 2.0])
+    before = state.field.means.detach().clone()
+    hook.after_step(state)
+    assert state.field.primitive_count() == 8
+    assert torch.equal(state.field.means[:6], before)
+    assert torch.equal(state.field.means[6:], before[[1, 5]])
+
+
+def test_gradient_is_averaged_over_the_views_that_see_a_gaussian() -> None:
+    state = _state(2)
+    hook = DensityControlConfig(every=10, threshold=1.0).build()
+    for _ in range(3):
+        _pull(state, hook, [0.0, 0.0], visible=[False, True])
+    _pull(state, hook, [1.5 / 16, 1.5 / 16])
+    hook.after_step(state)
+    assert state.field.primitive_count() == 3  # the first was seen once: 1.5; the second four times: 0.375
+
+
+def test_large_gaussians_split_into_two_smaller_ones_nearby() -> None:
+    state = _state(3)
+    with torch.no_grad():
+        state.field.log_scales[1] = math.log(0.5)
+    hook = DensityControlConfig(every=10, threshold=1.0).build()
+    _pull(state, hook, [0.0, 1.0, 0.0])
+    parent = state.field.means[1].detach().clone()
+    hook.after_step(state)
+    assert state.field.primitive_count() == 4
+    children = slice(2, 4)
+    assert torch.allclose(state.field.log_scales[children].exp(), torch.tensor(0.5 / 1.6))
+    offsets = (state.field.means[children] - parent).norm(dim=1)
+    assert bool((offsets > 0).all()) and bool((offsets < 0.5 * 5).all())
+
+
+def test_transparent_gaussians_go_and_one_always_stays() -> None:
+    state = _state(4)
+    with torch.no_grad():
+        state.field.opacity_logits[:] = torch.tensor([-9.0, 0.0, -9.0, 3.0])
+    hook = DensityControlConfig(every=10).build()
+    _pull(state, hook, [0.0] * 4)
+    hook.after_step(state)
+    assert state.field.primitive_count() == 2
+    with torch.no_grad():
+        state.field.opacity_logits.fill_(-9.0)
+    _pull(state, hook, [0.0] * 2)
+    hook.after_step(state)
+    assert state.field.primitive_count() == 1
+
+
+def test_cap_keeps_the_strongest() -> None:
+    state = _state(6)
+    hook = DensityControlConfig(every=10, threshold=0.1, max_primitives=8).build()
+    _pull(state, hook, [1.0, 6.0, 2.0, 5.0, 3.0, 4.0])
+    before = state.field.means.detach().clone()
+    hook.after_step(state)
+    assert state.field.primitive_count() == 8
+    assert torch.equal(state.field.means[6:], before[[1, 3]])
+
+
+def test_adam_forgets_the_new_and_remembers_the_old() -> None:
+    state = _state(3)
+    hook = DensityControlConfig(every=10, threshold=1.0).build()
+    _pull(state, hook, [0.0, 1.0, 0.0])
+    hook.after_step(state)
+    moments = state.optimiser.state()
+    for row, name in enumerate(dict(state.field.named_parameters())):
+        first = moments[f"field.{name}/exp_avg"]
+        assert torch.allclose(first[:3], torch.tensor(0.1 * (row + 1)))
+        assert bool((first[3:] == 0).all())
+
+
+def test_reset_lowers_opacities_and_arms_pruning_by_size() -> None:
+    state = _state(3)
+    hook = DensityControlConfig(every=10, resets=(0.25,), prune_opacity=0.005, prune_pixels=0.5).build()
+    _pull(state, hook, [0.0] * 3)
+    hook.after_step(state)
+    assert float(torch.sigmoid(state.field.opacity_logits).max()) == pytest.approx(0.01, abs=1e-6)
+    with torch.no_grad():
+        state.field.opacity_logits.fill_(0.0)
+    _pull(state, hook, [0.0] * 3, visible=[True, False, False])
+    hook.after_step(state)
+    assert state.field.primitive_count() == 2
+
+
+def test_nothing_grows_after_the_end() -> None:
+    state = _state(3)
+    hook = DensityControlConfig(every=10, threshold=1e-9, stop=0.2).build()
+    _pull(state, hook, [1.0] * 3)
+    hook.after_step(state)
+    assert state.field.primitive_count() == 3

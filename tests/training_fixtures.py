@@ -1,0 +1,90 @@
+"""Small plans that fit the toy scene in a moment."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from invgraphics.core import Scene
+from invgraphics.core.transforms import opencv_to_opengl
+from invgraphics.experiments.build import build_plan
+from invgraphics.experiments.recipe import Method, load_method
+from invgraphics.testing import toy_scene
+from invgraphics.training.budget import Budget
+from invgraphics.training.fit import Fit
+
+SMALL = {
+    "volumetric/nerf": [
+        "field.width=32",
+        "field.layers=2",
+        "field.geometry_features=8",
+        "batches.rays=256",
+        "renderer.sampler.coarse=16",
+        "renderer.sampler.fine=16",
+    ],
+    "volumetric/hash": [
+        "field.encoding.levels=6",
+        "field.encoding.log2_size=12",
+        "field.encoding.finest=48",
+        "renderer.sampler.resolution=24",
+        "renderer.sampler.steps_per_diagonal=96",
+        "renderer.sampler.warmup=16",
+        "batches.rays=128",
+        "batches.samples=4096",
+    ],
+    "splatting/gaussians": [
+        "field.count=150",
+        "field.max_init=150",
+        "field.sh_degree=1",
+        "hooks.1.every=10",
+        "hooks.1.start=0.1",
+    ],
+}
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    return toy_scene()
+
+
+@pytest.fixture
+def small() -> Callable[..., Method]:
+    """A built-in method, shrunk for the toy scene."""
+    return lambda name, *more: load_method(name, None, [*SMALL[name], *more])
+
+
+@pytest.fixture
+def make_fit(small: Callable[..., Method]) -> Callable[..., Fit]:
+    """A fit of a shrunk method."""
+
+    def make(name: str, scene: Scene, steps: int, seed: int = 0, *more: str) -> Fit:
+        return Fit(build_plan(small(name, *more), scene, Budget(steps=steps), seed, torch.device("cpu")))
+
+    return make
+
+
+def write_blender(scene: Scene, folder: Path) -> Path:
+    """Write a scene's views as a Blender data set, the way NeRF's authors do."""
+    for split, views in (("train", scene.train), ("test", scene.test)):
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for index, view in enumerate(views):
+            assert view.alpha is not None
+            rgba = torch.cat([view.image, view.alpha[..., None]], dim=2)
+            Image.fromarray(rgba.numpy()).save(folder / split / f"r_{index}.png")
+            pose = opencv_to_opengl(view.camera.cam_to_world).tolist()
+            frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": pose})
+        camera = views[0].camera
+        angle = 2 * math.atan(camera.width / 2 / float(camera.focal[0]))
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy scene on disk."""
+    return write_blender(toy_scene(), tmp_path_factory.mktemp("toy"))
