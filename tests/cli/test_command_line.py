@@ -96,11 +96,17 @@ def test_looking_around_imports_nothing_heavy(arguments: list[str]) -> None:
 
 
 def test_list_answers_at_once() -> None:
-    """Processor time, which a busy machine does not stretch; Python itself takes a part of it."""
-    before = os.times()
-    assert invgraphics("list").returncode == 0
-    after = os.times()
-    assert after.children_user + after.children_system - before.children_user - before.children_system < 0.5
+    """Processor time, the best of three, since a busy machine stretches it; Python itself takes a part of it."""
+
+    def spent() -> float:
+        return os.times().children_user + os.times().children_system
+
+    seconds = []
+    for _ in range(3):
+        before = spent()
+        assert invgraphics("list").returncode == 0
+        seconds.append(spent() - before)
+    assert min(seconds) < 0.5
 
 
 def test_list_names_everything_that_is_registered() -> None:
@@ -128,8 +134,12 @@ def test_a_strangers_package_shows_in_the_list(tmp_path) -> None:
     assert "built in" in done.stdout
 
 
-def test_a_closed_pipe_is_no_accident() -> None:
-    command = f"{sys.executable} -m invgraphics list | head -1"
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=60, check=False)
-    assert done.stdout.startswith("Methods")
-    assert done.stderr == ""
+@pytest.mark.parametrize("argument", ["list", "--help"])
+def test_a_closed_pipe_is_no_accident(argument: str) -> None:
+    command = [sys.executable, "-m", "invgraphics", argument]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()  # before the command writes its first line
+        assert process.stderr.read() == ""
+    assert process.returncode == 1

@@ -167,7 +167,7 @@ def test_unknown_preset_is_refused_with_the_known_ones(refused, tmp_path) -> Non
 
 def test_folder_that_is_no_data_set_is_refused(refused, tmp_path) -> None:
     (tmp_path / "empty").mkdir()
-    message = refused("fit", "volumetric/hash", str(tmp_path / "empty"), "--out", str(tmp_path / "run"))
+    message = refused("fit", "volumetric/hash", str(tmp_path / "empty"), "--kernels", "reference", "--out", str(tmp_path / "r"))
     assert "empty folder" in message
 
 

@@ -101,7 +101,7 @@ def view_scores(truth: Frame, prediction: Frame) -> dict[str, float]:
         "psnr": psnr(a, b),
         "ssim": float(structural_similarity(a, b, channel_axis=-1, data_range=255, **options)),
         "flip": float(flip),
-        "depth_abs_rel": float((np.abs(truth.depth - prediction.depth)[both] / truth.depth[both]).mean()),
+        "depth_abs_rel": float(np.abs(1 - prediction.depth[both] / truth.depth[both]).mean()),
         "normal_deg": float(np.degrees(np.arccos(cosine)).mean()),
         "alpha_iou": float((solid_a & solid_b).sum() / (solid_a | solid_b).sum()),
     }

@@ -64,13 +64,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str], debug: bool = False) -> int:
     """Run one command and return its exit status; with ``debug``, the traceback of what went wrong is shown."""
     try:
-        if not arguments or arguments[0] in ("-h", "--help", "help"):
-            print(overview())
-            return DONE
-        if arguments[0] == "--version":
-            print(version("invgraphics"))
-            return DONE
-        status: int = parse(_command(arguments[0]), f"invgraphics {arguments[0]}", arguments[1:]).run()
+        status = _dispatch(arguments)
+        sys.stdout.flush()  # here, where a reader that has gone is no accident
         return status
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
@@ -85,6 +80,17 @@ def run(arguments: Sequence[str], debug: bool = False) -> int:
         for line in lines[:MOST_LINES]:
             print(line, file=sys.stderr)
         return status
+
+
+def _dispatch(arguments: Sequence[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(overview())
+        return DONE
+    if arguments[0] == "--version":
+        print(version("invgraphics"))
+        return DONE
+    name, *rest = arguments
+    return parse(_command(name), f"invgraphics {name}", rest).run()
 
 
 def overview() -> str:

@@ -42,7 +42,6 @@ def fit_run(request: FitRequest) -> Path:
     folder = RunFolder(Path(request.out))
     _check_existing(folder, request)
     repeatable(device)
-    use_kernels(request.kernels)
     scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
     identity = _identity(request, method, scene)
     known = folder.read_json("provenance.json") if (folder.root / "provenance.json").is_file() else {}
@@ -53,7 +52,7 @@ def fit_run(request: FitRequest) -> Path:
         )
     if same and folder.finished:
         return folder.root
-    folder.create()
+    use_kernels(request.kernels)
     fit = Fit(build_plan(method, scene, budget, request.seed, device))
     if same and folder.checkpoint.is_file():
         fit.load(checkpoint.load(folder.checkpoint, device), float(folder.read_json("fit.json")["seconds"]))
@@ -61,6 +60,7 @@ def fit_run(request: FitRequest) -> Path:
     else:
         folder.clear()
     _describe(folder, request, method, scene, identity, device)
+    fit.rehearse()
     print(_prediction(request, fit), file=sys.stderr)
     with PeakMemory(device) as memory:
         Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}").run()

@@ -76,11 +76,12 @@ def _write(comparison: Comparison, out: Path) -> Path:
     try:
         out.mkdir(parents=True, exist_ok=True)
         summary = summarise(comparison)
+        views = draw_views(comparison, Folder(out))  # first, because it reads the files that may be broken
         drawn = Drawn(
             curves=draw_curves(comparison, summary, figures),
             tradeoffs=draw_tradeoffs(summary, figures),
             distributions=draw_distributions(comparison, summary, figures),
-            views=draw_views(comparison, Folder(out)),
+            views=views,
         )
         told = verdict(comparison, summary)
         write_csv(comparison, out / "results.csv")

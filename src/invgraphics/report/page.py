@@ -76,7 +76,7 @@ def write_html(
         "cells": facts.reproduction(comparison, folder),
         "palette": SERIES,
         "tiny": bool(drawn.views) and drawn.views[0].width < TINY,
-        "seed_count": len({run.seed for run in comparison.runs}),
+        "several_seeds": any(row.seeds > 1 for row in summary.rows if row.kind == "method"),
         "has_flip": has_flip(),
         "has_values": lambda row, columns: any(row.cells[index].mean is not None for index in columns),
     }
@@ -91,7 +91,7 @@ def _groups(summary: Summary) -> list[tuple[str, str, list[int]]]:
     geometry = [index for index, column in columns if column.group == "geometry"]
     groups = [("", "", pictures)]
     if geometry:
-        groups.append(("Geometry", "Scored where truth and prediction are both opaque.", geometry))
+        groups.append(("Geometry", "Depth and normals are scored where truth and prediction are both opaque.", geometry))
     return groups
 
 

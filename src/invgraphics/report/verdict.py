@@ -30,17 +30,25 @@ def _quality(comparison: Comparison, summary: Summary) -> list[str]:
     given = f"Given {budget_words(comparison.budget)} each, " if comparison.budget else ""
     unit = f" {column.unit}" if column.unit else ""
     extreme = "highest" if column.better == "higher" else "lowest"
-    sentence = f"{given}{winner.label} reaches the {extreme} {column.label}, {column.text(value)}{unit}"
+    record = f"the {extreme} {column.label}," if len(ranking) > 1 else f"a {column.label} of"
+    sentence = f"{given}{winner.label} reaches {record} {column.text(value)}{unit}"
     gaps = []
     if len(ranking) > 1:
-        gaps.append((ranking[1][1].label, abs(value - ranking[1][0])))
+        gaps.append((abs(value - ranking[1][0]), f"ahead of {ranking[1][1].label}"))
     reference = _best_baseline(summary, column)
     if reference is not None:
-        gaps.append((f"the better trivial baseline ({reference[1].label})", abs(value - reference[0])))
+        ahead = column.sort_key(value) < column.sort_key(reference[0])
+        gaps.append(
+            (
+                abs(value - reference[0]),
+                f"{'ahead of' if ahead else 'behind'} the better trivial baseline ({reference[1].label})",
+            )
+        )
     if column.key == "psnr" and comparison.noise_ceiling is not None:
-        below = comparison.noise_ceiling - value
-        gaps.append((f"the truth's own noise ceiling ({column.text(comparison.noise_ceiling)}{unit})", below))
-    worded = [f"{column.text(gap)}{unit} {'from' if 'ceiling' in name else 'ahead of'} {name}" for name, gap in gaps]
+        side = "below" if value < comparison.noise_ceiling else "above"
+        name = f"{side} the truth's own noise ceiling ({column.text(comparison.noise_ceiling)}{unit})"
+        gaps.append((abs(comparison.noise_ceiling - value), name))
+    worded = [f"{column.text(gap)}{unit} {where}" for gap, where in gaps]
     sentence += f": {listing(worded)}." if worded and math.isfinite(value) else "."
     return [sentence, _resolution(summary, column, ranking), _other_metrics(summary, columns[1:], winner)]
 
@@ -76,9 +84,9 @@ def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> st
         best = [row for row in summary.methods if (cell := summary.cell(row, column.key)) and cell.best]
         if len(ranking) < 2 or not best:
             continue
-        if winner in best:
+        if best == [winner]:
             agree.append(column.label)
-        else:
+        elif winner not in best:
             others.setdefault(listing(row.label for row in best), []).append(column.label)
     parts = [f"It also leads in {listing(agree)}" if agree else ""]
     parts += [f"{who} {'lead' if ' and ' in who else 'leads'} in {listing(labels)}" for who, labels in others.items()]

@@ -29,7 +29,7 @@ class Truth:
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Read the folder.
 
-        Another size than the rendered one is area-averaged; depth and normals, which belong to pixel centres, are then left out.
+        Another size than the rendered is area-averaged; depth and normals, which belong to pixel centres, are then left out.
 
         Raises:
             InputError: a file is missing, cut short or inconsistent.

@@ -137,6 +137,13 @@ class Fit:
         where = broken[0] if broken else "the loss"
         return f"Step {self.steps}: {where} is not finite; the fit stops here."
 
+    def rehearse(self) -> None:
+        """Take one step and undo it, so that compiling and allocating at first use is on no clock."""
+        before = {part: {name: value.clone() for name, value in tensors.items()} for part, tensors in self.state().items()}
+        seconds = self.seconds
+        self.step()
+        self.load(before, seconds)
+
     def run(self, after_step: Callable[[float], bool]) -> None:
         """Step until the budget is spent or ``after_step(loss)`` says stop (by returning True)."""
         while self.progress < 1 and not after_step(self.step()):

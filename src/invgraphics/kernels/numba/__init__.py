@@ -1,5 +1,15 @@
-"""Float32 kernels for the CPU, compiled by Numba at first use and cached on disk."""
+"""Float32 kernels for the CPU, compiled by Numba at first use and cached on disk.
 
-from invgraphics.kernels.numba.projecting import splat_project as splat_project
+`runtime` holds the compiler settings; the operations are those of `invgraphics.kernels`. What a kernel does not cover goes to
+the reference: discs, lenses that are being optimised, gradients through `Footprints.planes`, the Jacobian of the hash encoding.
+"""
+
 from invgraphics.kernels.numba.binning import splat_bin as splat_bin
+from invgraphics.kernels.numba.composite import composite as composite
+from invgraphics.kernels.numba.grid import grid_sample as grid_sample
+from invgraphics.kernels.numba.hash import hash_encode as hash_encode
+from invgraphics.kernels.numba.march import ray_march as ray_march
+from invgraphics.kernels.numba.projecting import splat_project as splat_project
 from invgraphics.kernels.numba.rasterising import splat_rasterise as splat_rasterise
+from invgraphics.kernels.numba.ssim import ssim as ssim
+from invgraphics.kernels.numba.warming import warm_up as warm_up

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, scratch, serial, share, threads
+from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, prange, scratch, serial, share, threads
 from invgraphics.kernels.types import ALPHA_MIN, Bins, Footprints
 
 RADIX_BITS = 11
@@ -45,7 +44,7 @@ class Packed(NamedTuple):
 
 @serial
 def _sort_by_depth(depths, radii, keys, order, keys_other, order_other):
-    """Indices of the footprints with a radius, by depth, ties by index (radix sort of the float's bits); returns their number."""
+    """Indices of footprints with a radius, by depth, ties by index (radix sort of the floats' bits); returns their number."""
     m = 0
     buckets = 1 << RADIX_BITS
     mask = np.uint32(buckets - 1)
@@ -111,7 +110,7 @@ def _drawable(x, y, xx, yy, det):
 @parallel
 def _pack(order, means, conics, opacities, features, rows, jobs):
     """Gather footprints front to back; those that cannot be drawn get an ellipse of negative height."""
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         for r in range(share(len(order), jobs, job), share(len(order), jobs, job + 1)):
             i = index(order[r])
             a, b, c, opacity = conics[i, 0], conics[i, 1], conics[i, 2], opacities[i]
@@ -162,7 +161,7 @@ def _count(rows, tile, columns, lines, counts):
     """Per job, how many of its footprints touch each tile."""
     jobs, m = counts.shape[0], rows.shape[0]
     edge = np.float32(tile)
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         counts[job, :] = 0
         for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
             if rows[r, HIGHEST] > 0:
@@ -192,7 +191,7 @@ def _list(rows, tile, columns, lines, places, entries):
     """Write each footprint to the tiles it touches; ``places`` says where each job's next entry of a tile goes."""
     jobs, m = places.shape[0], rows.shape[0]
     edge = np.float32(tile)
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
             if rows[r, HIGHEST] > 0:
                 top, bottom = _tile_rows(rows, r, edge, lines)

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, power_minus_one, share, threads
+from invgraphics.kernels.numba.runtime import (
+    array,
+    index,
+    inlined,
+    once_differentiable,
+    parallel,
+    power_minus_one,
+    prange,
+    share,
+    threads,
+)
 from invgraphics.kernels.reference.composite import OPAQUE
 
 _OPAQUE, _LOG2E = np.float32(OPAQUE), np.float32(1 / np.log(2.0))
@@ -42,7 +50,7 @@ def _first_sample(ray, jobs, job):
 def accumulate(optical_depth, channels, ray, jobs, weights, after, sums, alpha):
     """Weights, transmittance behind each sample, and the sums per ray (which hold zeros)."""
     width = channels.shape[1]
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         transmittance, current = 1.0, np.int64(-1)
         for number in range(_first_sample(ray, jobs, job), _first_sample(ray, jobs, job + 1)):
             i = index(number)
@@ -62,7 +70,7 @@ def accumulate(optical_depth, channels, ray, jobs, weights, after, sums, alpha):
 def accumulate_back(channels, ray, weights, after, jobs, to_weights, to_sums, to_alpha, to_depth, to_channels):
     """Gradients along optical depths and channels, from the far end of each ray to its near end."""
     width = channels.shape[1]
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         first, end = _first_sample(ray, jobs, job), _first_sample(ray, jobs, job + 1)
         behind, current = 0.0, np.int64(-1)
         for step in range(end - first):
@@ -85,9 +93,7 @@ class _Composite(torch.autograd.Function):
     """Differentiable in optical depths and channels."""
 
     @staticmethod
-    def forward(
-        ctx: Any, optical_depth: Tensor, channels: Tensor, ray: Tensor, rays: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, optical_depth: Tensor, channels: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor, Tensor]:
         weights, after = torch.empty(optical_depth.shape), torch.empty(optical_depth.shape)
         sums, alpha = torch.zeros(rays, channels.shape[1]), torch.zeros(rays)
         outputs = (x.numpy() for x in (weights, after, sums, alpha))
@@ -99,9 +105,8 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, to_weights: Tensor | None, to_sums: Tensor | None, to_alpha: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        to_weights, to_sums, to_alpha = grad_outputs
         channels, ray, weights, after = ctx.saved_tensors
         shapes = (weights.shape, (ctx.rays, channels.shape[1]), (ctx.rays,))
         given = (to_weights, to_sums, to_alpha)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from invgraphics.kernels.numba.harmonics import harmonics
-from invgraphics.kernels.numba.runtime import index, inlined, parallel, share
+from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, share
 from invgraphics.kernels.reference.splat_project import ILL_CONDITIONED, MARGIN, NEAR
 from invgraphics.kernels.types import ALPHA_MIN
 
@@ -149,36 +148,52 @@ def _radius(view, u, v, xx, xy, yy, opacity):
     return reach * np.sqrt(largest) if meets_x and meets_y else _ZERO
 
 
+@inlined
+def _write_footprint(view, dilation, mean, q, scales, opacity, mean2d, conic, plane):
+    """Write the footprint of a primitive in front of the camera, unless it is culled; returns its radius."""
+    _, root = scaled_axes(view, q, scales)
+    x, y, _, _ = screen_axes(view, mean, root)
+    xx, xy, yy, det = covariance(x, y, dilation)
+    u = view[CENTRE] + view[FOCAL] * mean[0] / mean[2]
+    v = view[CENTRE + 1] + view[FOCAL + 1] * mean[1] / mean[2]
+    radius = _radius(view, u, v, xx, xy, yy, opacity)
+    if radius > _ZERO:
+        mean2d[0], mean2d[1] = u, v
+        conic[0], conic[1], conic[2] = yy / det, -xy / det, xx / det
+        plane[0], plane[1], plane[2] = _plane(mean, x, y, root, dilation)
+    return radius
+
+
+@inlined
+def _write_colour(offset, distance, sh, weights, rgb):
+    """Write the colour towards the camera, from which the primitive is ``offset`` away."""
+    distance = max(distance, _NORM_MIN)
+    harmonics((offset[0] / distance, offset[1] / distance, offset[2] / distance), sh.shape[0], weights)
+    for channel in range(3):
+        c = index(channel)
+        colour = _HALF
+        for number in range(sh.shape[0]):
+            colour += weights[index(number)] * sh[index(number), c]
+        rgb[c] = max(colour, _ZERO)
+
+
 @parallel
 def project(view, dilation, means, quaternions, scales, opacities, sh, jobs, means2d, conics, depths, planes, radii, rgb):
     """Footprints and colours; those of culled primitives are set to something harmless."""
-    n, count = sh.shape[0], sh.shape[1]
-    for job in nb.prange(jobs):
+    n = len(means)
+    for job in prange(jobs):
         weights = np.empty(16, np.float32)
         for number in range(share(n, jobs, job), share(n, jobs, job + 1)):
             i = index(number)
             offset, mean = camera_point(view, means[i])
-            depths[i], radii[i] = mean[2], _ZERO
+            depths[i] = mean[2]
+            radius = _ZERO
             if mean[2] > _NEAR:
                 q, _ = normalised(quaternions[i])
-                _, root = scaled_axes(view, q, scales[i])
-                x, y, _, _ = screen_axes(view, mean, root)
-                xx, xy, yy, det = covariance(x, y, dilation)
-                u = view[CENTRE] + view[FOCAL] * mean[0] / mean[2]
-                v = view[CENTRE + 1] + view[FOCAL + 1] * mean[1] / mean[2]
-                radii[i] = _radius(view, u, v, xx, xy, yy, opacities[i])
-            if radii[i] > _ZERO:
-                means2d[i, 0], means2d[i, 1] = u, v
-                conics[i, 0], conics[i, 1], conics[i, 2] = yy / det, -xy / det, xx / det
-                planes[i, 0], planes[i, 1], planes[i, 2] = _plane(mean, x, y, root, dilation)
-                distance = max(planes[i, 0], _NORM_MIN)
-                towards = (offset[0] / distance, offset[1] / distance, offset[2] / distance)
-                harmonics(towards, count, weights)
-                for c in range(3):
-                    colour = _HALF
-                    for k in range(count):
-                        colour += weights[index(k)] * sh[i, index(k), index(c)]
-                    rgb[i, index(c)] = max(colour, _ZERO)
+                radius = _write_footprint(view, dilation, mean, q, scales[i], opacities[i], means2d[i], conics[i], planes[i])
+            radii[i] = radius
+            if radius > _ZERO:
+                _write_colour(offset, planes[i, 0], sh[i], weights, rgb[i])
             else:
                 means2d[i, :], planes[i, :], rgb[i, :] = _ZERO, _ZERO, _ZERO
                 conics[i, 0], conics[i, 1], conics[i, 2] = _ONE, _ZERO, _ONE

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
-from invgraphics.kernels.numba.harmonics import harmonics, harmonics_gradient
-from invgraphics.kernels.numba.runtime import index, inlined, parallel, share
 from invgraphics.kernels.numba.ewa import (
     FOCAL,
     camera_point,
@@ -19,6 +16,8 @@ from invgraphics.kernels.numba.ewa import (
     scaled_columns,
     screen_axes,
 )
+from invgraphics.kernels.numba.harmonics import harmonics, harmonics_gradient
+from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, share
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 
@@ -118,7 +117,7 @@ def project_back(
 ):  # fmt: skip
     """Write the gradients along the primitives and, per job, along the camera's pose."""
     n, jobs = sh.shape[0], pose.shape[0]
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         weights, along = np.empty(16, np.float32), np.empty(16, np.float32)
         own = pose[job]
         own[:] = 0.0

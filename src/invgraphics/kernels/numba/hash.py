@@ -5,15 +5,13 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-import numba as nb
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, share, threads
+from invgraphics.kernels.numba.runtime import array, index, inlined, once_differentiable, parallel, prange, share, threads
 from invgraphics.kernels.reference.hash import PRIMES
 from invgraphics.kernels.types import HashGrid
 
@@ -31,8 +29,8 @@ def axis(coordinate, cells):
     position = np.float64(coordinate) * np.float64(cells)
     position = position if position > 0.0 else 0.0
     position = min(position, np.float64(cells))
-    # Through signed 32-bit integers: processors convert nothing else quickly.
-    lower = min(np.int32(position), np.int32(cells - 1))
+    # Through signed 32-bit integers: processors convert nothing else quickly. The last vertex belongs to the last cell.
+    lower = max(min(np.int32(position), np.int32(cells - 1)), np.int32(0))
     return np.uint64(lower), np.float32(position - np.float64(lower))
 
 
@@ -102,7 +100,7 @@ def _spread(to_table, r, w, k, g):
 @parallel
 def encode(unit, table, width, cells, offsets, masks, jobs, out):
     """Features of all levels at each point; ``table`` is flat. Features go in pairs, which keeps the usual two unrolled."""
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         begin, end = share(len(unit), jobs, job), share(len(unit), jobs, job + 1)
         for chunk in range(begin, end, CHUNK):
             for level in range(len(cells)):
@@ -123,7 +121,7 @@ def encode(unit, table, width, cells, offsets, masks, jobs, out):
 @parallel
 def encode_back(unit, gradient, width, cells, offsets, masks, jobs, to_table):
     """Gradient along the table. Each job owns every ``jobs``-th level, so no entry is written by two of them."""
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         for level in range(job, len(cells), jobs):
             offset, mask, edge = index(offsets[level]), masks[level], cells[level]
             column = index(level) * width
@@ -162,7 +160,7 @@ def _vertex_values(table, r, k):
 @parallel
 def locate_back(unit, table, gradient, width, cells, offsets, masks, jobs, to_unit):
     """Gradient along the positions; zero along the axes on which a position was clamped."""
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         begin, end = share(len(unit), jobs, job), share(len(unit), jobs, job + 1)
         for chunk in range(begin, end, CHUNK):
             to_unit[chunk : min(chunk + CHUNK, end)] = _ZERO
@@ -209,7 +207,8 @@ class _Encode(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        (gradient,) = grad_outputs
         unit, table = ctx.saved_tensors
         points, received, width = array(unit), array(gradient), index(table.shape[1])
         levels, jobs = _levels(ctx.grid), threads()

@@ -6,7 +6,6 @@ the same intervals; but an empty cell is looked at once, not at every step insid
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.rays import Rays
-from invgraphics.kernels.numba.runtime import array, exact, exact_parallel, index, scratch, share, threads
+from invgraphics.kernels.numba.runtime import array, exact, exact_parallel, index, prange, scratch, share, threads
 from invgraphics.kernels.types import March, MarchSteps
 
 ROOM = 1 << 22
@@ -67,7 +66,11 @@ def _walk(origin, direction, t, far, occupied, box, contracted, step, cone, t0, 
         middle = (t + end) / _TWO
         if middle >= free:
             ux, uy, uz = _to_unit(
-                box, contracted, origin[0] + middle * direction[0], origin[1] + middle * direction[1], origin[2] + middle * direction[2]
+                box,
+                contracted,
+                origin[0] + middle * direction[0],
+                origin[1] + middle * direction[1],
+                origin[2] + middle * direction[2],
             )
             if ux >= _ZERO and uy >= _ZERO and uz >= _ZERO and ux <= _ONE and uy <= _ONE and uz <= _ONE:
                 x, y, z = _cell(ux, resolution), _cell(uy, resolution), _cell(uz, resolution)
@@ -75,7 +78,9 @@ def _walk(origin, direction, t, far, occupied, box, contracted, step, cone, t0, 
                     t0[index(kept)], t1[index(kept)] = t, end
                     kept += 1
                 elif not contracted:
-                    out = min(_way_out(ux, x, resolution, direction[0], box[3]), _way_out(uy, y, resolution, direction[1], box[4]))
+                    out = min(
+                        _way_out(ux, x, resolution, direction[0], box[3]), _way_out(uy, y, resolution, direction[1], box[4])
+                    )
                     free = middle + min(out, _way_out(uz, z, resolution, direction[2], box[5])) - MARGIN * length
         t = end
     return kept, t
@@ -84,7 +89,7 @@ def _walk(origin, direction, t, far, occupied, box, contracted, step, cone, t0, 
 @exact_parallel
 def walk(origins, directions, start, far, occupied, box, contracted, step, cone, jobs, t0, t1, counts, resume):
     """March all rays; ray i keeps ``counts[i]`` intervals, in row i of ``t0`` and ``t1``."""
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         # Neighbouring rays cost alike: dealing them out in turn balances the jobs.
         for i in range(job, len(start), jobs):
             counts[i], resume[i] = _walk(
@@ -95,7 +100,7 @@ def walk(origins, directions, start, far, occupied, box, contracted, step, cone,
 @exact_parallel
 def gather(t0, t1, counts, ends, first_ray, jobs, ray, packed0, packed1):
     """Write each ray's intervals behind one another."""
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         for i in range(share(len(counts), jobs, job), share(len(counts), jobs, job + 1)):
             begin = ends[i] - counts[i]
             for k in range(counts[i]):

@@ -9,14 +9,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.runtime import array, threads
 from invgraphics.kernels.numba.ewa import CENTRE, FOCAL, POSITION, SIZE, VIEW, project
 from invgraphics.kernels.numba.ewa_backward import project_back
+from invgraphics.kernels.numba.runtime import array, once_differentiable, threads
 from invgraphics.kernels.types import Footprints
 
 
@@ -43,9 +42,9 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
         means, quaternions, scales, sh, opacities, conics, radii, rgb, pose = ctx.saved_tensors
-        to_means2d, to_conics, to_depths, to_planes, _, to_rgb = gradients
+        to_means2d, to_conics, to_depths, to_planes, _, to_rgb = grad_outputs
         likes = (means[:, :2], conics, radii, rgb)
         given = (to_means2d, to_conics, to_depths, to_rgb)
         # A gradient that nobody asked for counts as zero.
@@ -57,9 +56,11 @@ class _Project(torch.autograd.Function):
         results.append(_pose_gradient(poses, pose))
         if to_planes is not None:
             gaussians = Gaussians(means, quaternions, scales, opacities, sh)
-            for result, extra in zip(results, _through_planes(gaussians, ctx.camera, ctx.dilation, to_planes, radii), strict=True):
+            for result, extra in zip(
+                results, _through_planes(gaussians, ctx.camera, ctx.dilation, to_planes, radii), strict=True
+            ):
                 if extra is not None:
-                    result += extra
+                    result.add_(extra)
         return (*results, None, None, None)
 
 
@@ -87,8 +88,9 @@ def _through_planes(
     """Gradients that arrive by the planes, which only depth losses use: left to the reference."""
     with torch.enable_grad():
         leaves = [x.detach().requires_grad_() for x in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.sh)]
+        means, quaternions, scales, sh = leaves
         pose = camera.cam_to_world.detach().requires_grad_()
-        again = Gaussians(*leaves[:3], gaussians.opacities.detach(), leaves[3])
+        again = Gaussians(means, quaternions, scales, gaussians.opacities.detach(), sh)
         footprints, _ = reference.splat_project(again, camera.moved(pose), dilation)
         visible = torch.where(radii[:, None] > 0, to_planes, 0.0)
         return torch.autograd.grad(footprints.planes, [*leaves, pose], visible, allow_unused=True)

@@ -6,10 +6,8 @@ scratch array, block after block, so that it stays in the L1 cache.
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
-from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel
 from invgraphics.kernels.numba.binning import (
     CONIC_XX,
     CONIC_XY,
@@ -21,6 +19,7 @@ from invgraphics.kernels.numba.binning import (
     OPACITY,
     chord,
 )
+from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 BLOCK = 4
@@ -176,7 +175,7 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, ends, 
     height, width = alpha.shape
     triples = (rows.shape[1] - FEATURES) // 3
     stride = LANES * index(2 + 3 * triples)
-    for job in nb.prange(len(bounds) - 1):
+    for job in prange(len(bounds) - 1):
         state = np.empty(index(edge * edge) * stride, np.float32)
         alive = np.empty(edge * edge, np.bool_)
         for tile in range(bounds[job], bounds[job + 1]):

@@ -6,12 +6,11 @@ final sum minus what has been composited so far; so nothing but the picture itse
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
-from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, share
 from invgraphics.kernels.numba.binning import CONIC_XX, CONIC_XY, CONIC_YY, FEATURES, MEAN_X, MEAN_Y, OPACITY
 from invgraphics.kernels.numba.raster import BLOCK, HALF_LOG2E, LANES, block_columns, block_rows
+from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 # What a block holds for each of its pixels, LANES values each: transmittance, weight of the current footprint, the loss's
@@ -21,6 +20,8 @@ _T, _WEIGHT, _BEHIND, _ALPHA, _ALONG, _PICTURE = (index(slot) * LANES for slot i
 
 # What is summed per footprint, before the features: v = dL/dalpha alpha times 1, x, y, x², x y, y².
 MOMENTS = 6
+FIRST_SUMS = MOMENTS + 3
+"""Sums that are kept lane by lane while a footprint is on a tile: adding lanes up once is cheaper than for every block."""
 
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
 _STOP = np.float32(TRANSMITTANCE_MIN)
@@ -31,7 +32,7 @@ _ONE, _ZERO = np.float32(1.0), np.float32(0.0)
 def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient):
     """Load a tile's gradients, and the derivative along the whole of each pixel."""
     height, width, channels = image.shape
-    state[: index(edge * edge) * stride] = _ZERO
+    state[:] = _ZERO
     for block in range(edge * edge):
         left, top = x0 + block % edge * BLOCK, y0 + block // edge * BLOCK
         for lane in range(BLOCK * BLOCK):
@@ -50,15 +51,13 @@ def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_
 
 
 @inlined
-def _unblend(state, base, rows, r, dx0, dy0):
-    """Repeat one footprint's blending onto one block; returns its sums over the block's pixels."""
+def _unblend(state, lanes, base, rows, r, dx0, dy0):
+    """Repeat one footprint's blending onto one block and add to its sums, lane by lane."""
     xx = rows[r, CONIC_XX] * HALF_LOG2E
     xy = rows[r, CONIC_XY] * (HALF_LOG2E + HALF_LOG2E)
     yy = rows[r, CONIC_YY] * HALF_LOG2E
     opacity = rows[r, OPACITY]
     red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
-    v0 = vx = vy = vxx = vxy = vyy = _ZERO
-    to_red = to_green = to_blue = _ZERO
     for lane in range(LANES):
         dx = dx0 + np.float32(lane & index(3))
         dy = dy0 + np.float32(lane >> index(2))
@@ -81,16 +80,17 @@ def _unblend(state, base, rows, r, dx0, dy0):
         # alpha raises its own contribution and hides what is behind; where it is clamped or skipped it does not change.
         v = response * (transmittance * along - behind / (_ONE - alpha))
         v = v if goes_on and alpha > _ZERO and alpha < _ALPHA_MAX else _ZERO
-        v0 += v
-        vx += v * dx
-        vy += v * dy
-        vxx += v * dx * dx
-        vxy += v * dx * dy
-        vyy += v * dy * dy
-        to_red += weight * g_red
-        to_green += weight * g_green
-        to_blue += weight * g_blue
-    return v0, vx, vy, vxx, vxy, vyy, to_red, to_green, to_blue
+        vx = v * dx
+        vy = v * dy
+        lanes[lane] += v
+        lanes[LANES + lane] += vx
+        lanes[index(2) * LANES + lane] += vy
+        lanes[index(3) * LANES + lane] += vx * dx
+        lanes[index(4) * LANES + lane] += vx * dy
+        lanes[index(5) * LANES + lane] += vy * dy
+        lanes[index(6) * LANES + lane] += weight * g_red
+        lanes[index(7) * LANES + lane] += weight * g_green
+        lanes[index(8) * LANES + lane] += weight * g_blue
 
 
 @inlined
@@ -117,12 +117,23 @@ def _sum_further(state, base, sums, r, triples):
 
 
 @inlined
-def _walk_tile(rows, entries, first, last, x0, y0, edge, triples, state, stride, ends, sums):
+def _add_up(lanes, sums, r):
+    """Move a footprint's sums from the lanes, which are cleared, to its row."""
+    for k in range(FIRST_SUMS):
+        total = _ZERO
+        for lane in range(LANES):
+            total += lanes[index(k) * LANES + lane]
+            lanes[index(k) * LANES + lane] = _ZERO
+        sums[r, index(k)] += total
+
+
+@inlined
+def _walk_tile(rows, entries, first, last, x0, y0, edge, triples, state, lanes, stride, ends, sums):
     """Walk a tile's footprints front to back and add what each of them receives to ``sums``."""
     ox, oy, half = np.float32(x0), np.float32(y0), np.float32(0.5)
     for entry in range(first, last):
         r = index(entries[index(entry)])
-        v0 = vx = vy = vxx = vxy = vyy = to_red = to_green = to_blue = _ZERO
+        visited = False
         top, bottom = block_rows(rows, r, oy, edge)
         for j in range(top, bottom + 1):
             left, right = block_columns(rows, r, ox, oy, j, edge)
@@ -134,21 +145,12 @@ def _walk_tile(rows, entries, first, last, x0, y0, edge, triples, state, stride,
                     dy = oy + np.float32(j * BLOCK) + half - rows[r, MEAN_Y]
                     if triples > 1:
                         _look_along(state, base, rows, r, triples)
-                    s = _unblend(state, base, rows, r, dx, dy)
-                    v0, vx, vy = v0 + s[0], vx + s[1], vy + s[2]
-                    vxx, vxy, vyy = vxx + s[3], vxy + s[4], vyy + s[5]
-                    to_red, to_green, to_blue = to_red + s[6], to_green + s[7], to_blue + s[8]
+                    visited = True
+                    _unblend(state, lanes, base, rows, r, dx, dy)
                     if triples > 1:
                         _sum_further(state, base, sums, r, triples)
-        sums[r, 0] += v0
-        sums[r, 1] += vx
-        sums[r, 2] += vy
-        sums[r, 3] += vxx
-        sums[r, 4] += vxy
-        sums[r, 5] += vyy
-        sums[r, MOMENTS] += to_red
-        sums[r, MOMENTS + 1] += to_green
-        sums[r, MOMENTS + 2] += to_blue
+        if visited:
+            _add_up(lanes, sums, r)
 
 
 @parallel
@@ -156,16 +158,17 @@ def walk_back(rows, entries, starts, bounds, edge, columns, ends, image, alpha, 
     """Per job and packed footprint, the sums from which `gather` makes gradients (arguments as in `rasterise`)."""
     triples = (rows.shape[1] - FEATURES) // 3
     stride = _PICTURE + LANES * index(3 * triples)
-    for job in nb.prange(len(bounds) - 1):
+    for job in prange(len(bounds) - 1):
         state = np.empty(index(edge * edge) * stride, np.float32)
         own = sums[job]
+        lanes = np.zeros(index(FIRST_SUMS) * LANES, np.float32)
         own[:] = _ZERO
         for tile in range(bounds[job], bounds[job + 1]):
             if starts[tile] < starts[tile + 1]:
                 x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
                 _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient)
                 _walk_tile(
-                    rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, triples, state, stride, ends[tile], own
+                    rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, triples, state, lanes, stride, ends[tile], own
                 )
 
 
@@ -173,7 +176,7 @@ def walk_back(rows, entries, starts, bounds, edge, columns, ends, image, alpha, 
 def gather(order, rows, sums, means, conics, opacities, features):
     """Add up the jobs in a fixed order and write gradients to the caller's arrays, which hold zeros for culled footprints."""
     jobs, m = sums.shape[0], len(order)
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
             i = index(order[r])
             for other in range(1, jobs):

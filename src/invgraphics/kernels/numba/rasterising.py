@@ -8,13 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.runtime import array, scratch, split_by_work, threads
-from invgraphics.kernels.numba.raster_backward import MOMENTS, gather, walk_back
 from invgraphics.kernels.numba.binning import FEATURES, Packed, pack
 from invgraphics.kernels.numba.raster import BLOCK, rasterise
+from invgraphics.kernels.numba.raster_backward import MOMENTS, gather, walk_back
+from invgraphics.kernels.numba.runtime import array, once_differentiable, scratch, split_by_work, threads
 from invgraphics.kernels.types import Footprints
 
 TILE = 32
@@ -61,7 +60,8 @@ class _Rasterise(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, image_gradient: Tensor | None, alpha_gradient: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        image_gradient, alpha_gradient = grad_outputs
         means2d, conics, opacities, features, image, alpha = ctx.saved_tensors
         packed, edge, columns, ends, work = ctx.walk
         to_image = array(torch.zeros_like(image) if image_gradient is None else image_gradient)
@@ -71,9 +71,22 @@ class _Rasterise(torch.autograd.Function):
         shape = (len(bounds) - 1, len(rows), width)
         sums = scratch("splat sums", int(np.prod(shape))).reshape(shape)
         walk_back(
-            rows, packed.entries, packed.starts, bounds, edge, columns, ends, array(image), array(alpha), to_image, to_alpha, sums
+            rows,
+            packed.entries,
+            packed.starts,
+            bounds,
+            edge,
+            columns,
+            ends,
+            array(image),
+            array(alpha),
+            to_image,
+            to_alpha,
+            sums,
         )
-        gradients = tuple(torch.zeros_like(x, memory_format=torch.contiguous_format) for x in (means2d, conics, opacities, features))
+        gradients = tuple(
+            torch.zeros_like(x, memory_format=torch.contiguous_format) for x in (means2d, conics, opacities, features)
+        )
         gather(packed.order, rows, sums, *(gradient.numpy() for gradient in gradients))
         return (*gradients, None, None, None)
 

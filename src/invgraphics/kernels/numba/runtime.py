@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -22,16 +23,27 @@ PACKAGE = __name__.rpartition(".")[0]
 FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """LLVM's fast-math without ``nnan`` and ``ninf``: comparisons must sort out NaN and infinity, not assume them away."""
 
-_OPTIONS: Any = {"cache": True, "nogil": True, "error_model": "numpy"}
-parallel = partial(nb.njit, parallel=True, fastmath=FASTMATH, **_OPTIONS)
-"""Decorator of kernels that loop over jobs with ``nb.prange``, one job per thread."""
-serial = partial(nb.njit, fastmath=FASTMATH, **_OPTIONS)
-"""Decorator of functions that one thread runs."""
-exact_parallel = partial(nb.njit, parallel=True, **_OPTIONS)
-exact = partial(nb.njit, forceinline=True, **_OPTIONS)
+_Decorator = Callable[[Callable[..., Any]], Any]
+
+
+def _njit(**options: Any) -> _Decorator:
+    """Numba's decorator; division by zero gives infinity, as it does in NumPy, and no C wrapper is made."""
+    return partial(nb.njit, error_model="numpy", no_cfunc_wrapper=True, **options)
+
+
+parallel = _njit(parallel=True, cache=True, nogil=True, fastmath=FASTMATH)
+"""Decorator of kernels that loop over jobs with `prange`, one job per thread."""
+serial = _njit(cache=True, nogil=True, fastmath=FASTMATH)
+"""Decorator of kernels that one thread runs."""
+inlined = _njit(fastmath=FASTMATH, forceinline=True, no_cpython_wrapper=True)
+"""Decorator of functions that kernels call; they are cached as part of those."""
+exact_parallel = _njit(parallel=True, cache=True, nogil=True)
+exact = _njit(forceinline=True, no_cpython_wrapper=True)
 """`parallel` and `inlined` in plain IEEE arithmetic."""
-inlined = partial(nb.njit, fastmath=FASTMATH, forceinline=True, **_OPTIONS)
-"""Decorator of small functions inside hot loops."""
+
+# Both packages type these in ways that no checker can follow.
+prange: Any = nb.prange
+once_differentiable: Any = torch.autograd.function.once_differentiable
 
 # Starting Numba's threads sets OpenMP's thread count for the whole process, torch's too: put it back.
 _torch_threads = torch.get_num_threads()

@@ -7,14 +7,22 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, scratch, share, threads
+from invgraphics.kernels.numba.runtime import (
+    array,
+    index,
+    inlined,
+    once_differentiable,
+    parallel,
+    prange,
+    scratch,
+    share,
+    threads,
+)
 from invgraphics.kernels.reference.ssim import C1, C2, SIGMA, WINDOW
 
 REACH = WINDOW // 2
@@ -85,7 +93,7 @@ def compare_rows(x, y, channels, window, jobs, derivatives, totals):
     """Sum of similarities per row, and the derivatives of each along the local mean, variance and covariance."""
     height, width = x.shape
     margin = index(REACH) * channels
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         moments = np.zeros((5, width + 2 * REACH * channels), np.float32)
         blurred = np.empty((5, width), np.float32)
         for row in range(share(height, jobs, job), share(height, jobs, job + 1)):
@@ -113,7 +121,7 @@ def gather_rows(x, y, channels, window, jobs, derivatives, gradient):
     height, width = x.shape
     margin = index(REACH) * channels
     scale = np.float32(1.0 / (height * width))
-    for job in nb.prange(jobs):
+    for job in prange(jobs):
         sums = np.zeros((3, width + 2 * REACH * channels), np.float32)
         blurred = np.empty((3, width), np.float32)
         for row in range(share(height, jobs, job), share(height, jobs, job + 1)):
@@ -144,7 +152,8 @@ class _Ssim(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, along: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        (along,) = grad_outputs
         (gradient,) = ctx.saved_tensors
         return gradient * along, None
 

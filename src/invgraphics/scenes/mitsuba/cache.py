@@ -6,7 +6,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -52,14 +52,18 @@ def read_truth(folder: Path) -> dict[str, Any] | None:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold the right to make ``folder``; whoever comes second waits. The system frees it when a process dies."""
+def locked(folder: Path, waiting: Callable[[], None]) -> Iterator[None]:
+    """Hold the right to make ``folder``; whoever comes second is told and waits. The system frees it when a process dies."""
     try:
         file = folder.with_name(f"{folder.name}.lock").open("w")
     except OSError as error:
         raise unwritable(folder.parent, error) from error
     with file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            waiting()
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 

@@ -51,10 +51,11 @@ def make(
     """
     job = _job(name, size, (train, test), spp, seed)
     folder = cache.root() / f"{job.spec.name}-{job.key()}"
+    report = progress or (lambda done, total, what: None)
     if cache.read_truth(folder) is None:
-        with cache.locked(folder):
-            if cache.read_truth(folder) is None:  # another process may have made it meanwhile
-                _make(job, folder, progress or (lambda done, total, what: None))
+        with cache.locked(folder, waiting=lambda: report(0, job.total, "waiting for another process that renders it")):
+            if cache.read_truth(folder) is None:  # that process may have made it meanwhile
+                _make(job, folder, report)
     return folder if out is None else cache.copy(folder, Path(out))
 
 
@@ -93,7 +94,7 @@ def _make(job: Job, folder: Path, progress: Progress) -> None:
 
 
 def _run(job: Job, partial: Path, progress: Progress) -> None:
-    command = [sys.executable, "-m", "invgraphics.scenes.mitsuba.render", str(partial)]
+    command = [sys.executable, "-P", "-m", "invgraphics.scenes.mitsuba.render", str(partial)]
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=complaints, text=True, env=llvm.status().environment()

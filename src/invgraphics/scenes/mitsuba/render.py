@@ -83,7 +83,7 @@ def _check_bounds(job: Job, gbuffer: GBuffer) -> None:
     seen = gbuffer.position[np.isfinite(gbuffer.depth)]
     lo, hi = np.array(job.spec.lo), np.array(job.spec.hi)
     if len(seen) and ((seen < lo - 1e-4).any() or (seen > hi + 1e-4).any()):
-        low, high = seen.min(axis=0).round(3).tolist(), seen.max(axis=0).round(3).tolist()
+        low, high = (corner.astype(float).round(3).tolist() for corner in (seen.min(axis=0), seen.max(axis=0)))
         raise InputError(f"Surfaces from {low} to {high} leave the scene's box.", "Widen 'lo' and 'hi' in its scene.toml.")
 
 

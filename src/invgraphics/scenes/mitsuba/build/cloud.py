@@ -11,8 +11,8 @@ from invgraphics.scenes.mitsuba.build.surfaces import Softbox, studio
 
 CELLS = (96, 96, 64)
 LO, HI = (-0.9, -0.9, -0.6), (0.9, 0.9, 0.6)
-EXTINCTION = 13.0
-"""Largest extinction, per world unit: the densest rays keep about a hundredth of their light."""
+EXTINCTION = 9.0
+"""Largest extinction, per world unit: the densest rays keep a few hundredths of their light."""
 PUFFS = 34
 
 SUNSET = (
@@ -25,7 +25,7 @@ def build(seed: int) -> Model:
     """The model; ``seed`` shapes the cloud."""
     rng = np.random.default_rng(seed)
     fog = Fog(EXTINCTION * density(rng), albedo=(0.985, 0.98, 0.97), anisotropy=0.35, lo=LO, hi=HI)
-    return Model(lights={"sunset": studio(SUNSET, sky=(0.55, 0.65, 0.95), floor=(0.5, 0.42, 0.42))}, fog=fog)
+    return Model(lights={"sunset": studio(SUNSET, sky=(0.55, 0.65, 0.95), floor=(0.42, 0.35, 0.36), exposure=0.86)}, fog=fog)
 
 
 def density(rng: np.random.Generator) -> Float[np.ndarray, "x y z"]:

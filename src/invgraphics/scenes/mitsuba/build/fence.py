@@ -34,7 +34,7 @@ def build(seed: int) -> Model:
 
 def _ground(rng: np.random.Generator) -> list[Part]:
     lawn = ramp(fractal((512, 512), 10, 6, rng), [rgb(code) for code in LAWN])
-    top = box((-0.9, -0.9, -0.02), (0.9, 0.9, 0), 0.01)
+    top = box((-0.9, -0.9, -0.02), (0.9, 0.9, 0), 0.008)
     flat = Mesh(top.vertices, top.faces, top.normals, top.vertices[:, :2] / 1.8 + 0.5)
     return [Part(flat, matte(lawn)), Part(box((-0.9, -0.9, -0.1), (0.9, 0.9, -0.021), 0.015), matte(rgb("#5a3d28")))]
 

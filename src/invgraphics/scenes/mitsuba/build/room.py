@@ -63,7 +63,7 @@ def _shell(rng: np.random.Generator) -> Iterator[Part]:
             ]
         )
     )
-    yield Part(lamp, matte((0.0, 0.0, 0.0)), radiance=(15.0, 14.2, 12.8))
+    yield Part(lamp, matte((0.0, 0.0, 0.0)), radiance=(12.0, 11.4, 10.2))
     yield Part(box((-0.53, -0.41, CEILING - 0.018), (0.53, 0.41, CEILING)), matte(rgb("#d0cdc4")))
 
 
@@ -181,13 +181,13 @@ def _corner(rng: np.random.Generator) -> Iterator[Part]:
     """A floor lamp, a plant in a pot and a chest in the corners."""
     stand = merge([cylinder(0.16, 0.025, 48, 0.008), cylinder(0.014, 0.8, 16)]).moved((-1.25, -0.95, FLOOR))
     yield Part(stand, metal("Al", 0.25))
-    foot = np.array([1.28, 0.98, FLOOR])
+    foot = np.array([1.2, 0.9, FLOOR])
     yield Part(lathe([(0, 0), (0.1, 0), (0.15, 0.26), (0.13, 0.26), (0, 0.23)], 48).moved(foot), plastic(rgb("#efe9dc"), 0.3))
     blades = []
     for _ in range(46):
         turn, lift = 2 * np.pi * rng.random(), 0.5 + 0.8 * rng.random()
         blade = leaf(0.42 + 0.2 * rng.random(), 0.035, 0.55).rotated(rotation("y", -np.degrees(lift)))
-        blades.append(blade.rotated(rotation("z", np.degrees(turn))).scaled(0.62).moved(foot + np.array([0, 0, 0.24])))
+        blades.append(blade.rotated(rotation("z", np.degrees(turn))).scaled(0.5).moved(foot + np.array([0, 0, 0.24])))
     yield Part(merge(blades), two_sided(matte(rgb("#3f8f4a"))))
     chest = box((1.15, -1.2, FLOOR), (1.57, -0.5, FLOOR + 0.5), 0.01)
     drawers = [box((1.142, -1.17, FLOOR + z), (1.152, -0.53, FLOOR + z + 0.2), 0.003) for z in (0.03, 0.26)]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 Colour = tuple[float, float, float]
 
-ENVIRONMENT_SIZE = (128, 256)
+ENVIRONMENT_SIZE = (64, 128)
 
 
 def rgb(code: str) -> Colour:
@@ -72,7 +72,7 @@ class Softbox:
 
 
 THREE_POINT = (
-    Softbox(-60, 50, 24, (6.0, 5.7, 5.3)),
+    Softbox(-60, 50, 28, (4.5, 4.3, 4.0)),
     Softbox(70, 35, 30, (1.3, 1.4, 1.6)),
     Softbox(175, 40, 22, (2.2, 2.3, 2.5)),
 )

@@ -1,0 +1,69 @@
+"""The main job on a toy data set: compare, then evaluate and report what it left."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from invgraphics.cli import main
+from invgraphics.cli.report import runs_in
+from invgraphics.errors import InputError
+
+SIZE = 16
+
+
+def write_blender_scene(folder: Path) -> None:
+    """A grey disc before nothing, seen by cameras on a ring; Blender's axes: the camera looks along its -z."""
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2
+    disc = ((x**2 + y**2) < 25)[..., None]
+    rgba = (np.concatenate([np.full((SIZE, SIZE, 3), 0.5) * disc, disc], axis=-1) * 255).astype(np.uint8)
+    for split, angles in {"train": [0.0, 1.0, 2.0, 3.0], "val": [5.0], "test": [4.0, 0.5]}.items():
+        frames = []
+        for index, angle in enumerate(angles):
+            back = np.array([math.cos(angle), math.sin(angle), 0.0])
+            up = np.array([0.0, 0.0, 1.0])
+            pose = np.eye(4)
+            pose[:3, :3] = np.stack([np.cross(up, back), up, back], axis=1)
+            pose[:3, 3] = 4 * back
+            name = f"{split}_{index}"
+            Image.fromarray(rgba, "RGBA").save(folder / f"{name}.png")
+            frames.append({"file_path": f"./{name}", "transform_matrix": pose.tolist()})
+        content = {"camera_angle_x": 0.7, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+def test_compare_then_evaluate_and_report(tmp_path, capsys) -> None:
+    data, out = tmp_path / "disc", tmp_path / "out"
+    data.mkdir()
+    write_blender_scene(data)
+    words = ["--methods", "splatting/gaussians", "--budget", "2steps", "--kernels", "reference", "--out", str(out)]
+    assert main.run(["compare", str(data), *words]) == main.DONE
+    text = capsys.readouterr().out
+    assert "splatting/gaussians" in text
+    assert "mean image" in text
+    assert text.splitlines()[-1] == str(out / "index.html")
+    assert (out / "index.html").is_file()
+
+    cell = out / "runs" / "splatting-gaussians" / "seed-0"
+    assert runs_in(out) == runs_in(cell) == [cell]
+    assert main.run(["evaluate", str(cell), "--protocol", "float"]) == main.DONE
+    assert "protocol float" in capsys.readouterr().out
+    assert json.loads((cell / "scores.float.json").read_text())["protocol"] == "float"
+
+    assert main.run(["report", str(cell)]) == main.BAD_INPUT
+    assert "--out" in capsys.readouterr().err
+    assert main.run(["report", str(cell), "--out", str(tmp_path / "page")]) == main.DONE
+    assert capsys.readouterr().out.strip() == str(tmp_path / "page" / "index.html")
+
+    assert main.run(["fit", "splatting/gaussians", str(data), "--out", str(cell)]) == main.BAD_INPUT
+    assert "--resume" in capsys.readouterr().err
+
+
+def test_folders_without_runs_are_told_apart(tmp_path) -> None:
+    with pytest.raises(InputError, match="no finished run"):
+        runs_in(tmp_path)
+    (tmp_path / "compare.json").write_text("{}")
+    assert runs_in(tmp_path) == []  # a comparison all of whose fits failed has a report as well

@@ -1,0 +1,184 @@
+"""The parts of a report against independent routes: brute force, closed forms, another reader."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from invgraphics.report import pictures
+from invgraphics.report.reading import read_comparison
+from invgraphics.report.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
+from invgraphics.report.summary import pareto_front, seconds_to_reach, time_to_quality
+from invgraphics.report.verdict import verdict
+from invgraphics.report.wording import budget_words, duration, listing, significant_decimals
+
+
+def test_pareto_front_is_what_brute_force_finds() -> None:
+    dice = random.Random(0)
+    for _ in range(300):
+        points = [(dice.randrange(6) / 2, dice.randrange(6) / 2) for _ in range(dice.randrange(1, 9))]
+        dominated = {
+            i for i, j in itertools.permutations(range(len(points)), 2)
+            if points[j] != points[i] and points[j][0] <= points[i][0] and points[j][1] <= points[i][1]
+        }  # fmt: skip
+        assert sorted(pareto_front(points)) == sorted(set(range(len(points))) - dominated)
+
+
+def test_time_to_reach_is_the_first_crossing(built_report: Path) -> None:
+    comparison = read_comparison(built_report)
+    for run in comparison.runs:
+        lines = [json.loads(line) for line in (run.folder / "history.jsonl").read_text().splitlines()]
+        measured = [(line["seconds"], line["psnr"]) for line in lines if "psnr" in line]
+        for level in (12.0, 20.0, 25.0, 99.0):
+            reached = [seconds for seconds, psnr in measured if psnr >= level]
+            assert seconds_to_reach(run, level) == (min(reached) if reached else None)
+    reach = time_to_quality(comparison)
+    assert reach is not None
+    assert list(reach.levels) == sorted(reach.levels)
+    assert all(any(times[i] != "not reached" for _, _, times in reach.rows) for i in range(len(reach.levels)))
+
+
+def test_error_maps_average_to_the_reported_flip(built_report: Path) -> None:
+    pytest.importorskip("flip_evaluator")
+    run = built_report / "runs/volumetric-hash/seed-0"
+    truth = next((built_report / "truth").iterdir())
+    scores = json.loads((run / "scores.json").read_text())["quality"]["flip"]["per_view"]
+    for view in (0, 3):
+        images = [np.asarray(Image.open(folder / f"{view:04d}.png")) for folder in (truth, run / "test")]
+        assert pictures.error_map(*images).mean() == pytest.approx(scores[view], abs=1e-5)
+
+
+def test_without_flip_the_map_is_the_absolute_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "has_flip", lambda: False)
+    a, b = np.zeros((4, 5, 3), np.uint8), np.full((4, 5, 3), 51, np.uint8)
+    assert pictures.error_map(a, b) == pytest.approx(np.full((4, 5), 0.2))
+
+
+def test_depth_maps_share_the_range_of_the_truth(built_report: Path) -> None:
+    """The same depth gets the same colour in every picture of a view, and transparent means not opaque."""
+    import matplotlib as mpl
+
+    truth_folder = next((built_report / "truth").iterdir())
+    truth = np.load(truth_folder / "0000.npz")
+    solid = truth["alpha"] >= 0.5
+    low, high = np.percentile(truth["depth"][solid], [1, 99])
+    colours = mpl.colormaps["viridis_r"]
+    # The file's 255 levels and the map's 256 bins disagree by at most one and a half bins; bytes are rounded by one half.
+    tolerance = 1.5 * np.abs(np.diff(colours(np.linspace(0, 1, 256))[:, :3], axis=0)).max() * 255 + 0.5
+    for name, source in (("truth", truth), ("1", np.load(built_report / "runs/volumetric-hash/seed-0/test/0000.npz"))):
+        picture = np.asarray(Image.open(built_report / f"figures/views/0000/depth-{name}.png").convert("RGBA"))
+        mask = source["alpha"].astype(np.float32) >= 0.5
+        assert np.array_equal(picture[..., 3] > 0, mask)
+        want = colours(((source["depth"][mask] - low) / (high - low)).clip(0, 1))[:, :3] * 255
+        assert np.abs(picture[mask][:, :3] - want).max() < tolerance < 5
+
+
+def test_views_shown_are_spread_and_hold_the_worst(built_report: Path) -> None:
+    comparison = read_comparison(built_report)
+    per_view = np.mean([run.quality["psnr"].per_view for run in comparison.runs], axis=0)
+    chosen = dict(pictures.choose_views(comparison.runs))
+    assert {0, 2, 3, 5} <= set(chosen)
+    assert "worst PSNR" in chosen[int(np.argmin(per_view))]
+
+
+def test_figures_are_xml_that_knows_the_dark(built_report: Path) -> None:
+    figures = sorted((built_report / "figures").glob("*.svg"))
+    assert len(figures) == 2 + 4 + 6
+    for path in figures:
+        ElementTree.parse(path)
+        assert "prefers-color-scheme: dark" in path.read_text()
+
+
+def test_report_is_the_same_when_built_again(built_report: Path, comparison_folder: Path) -> None:
+    from invgraphics.report.build import build_report
+
+    build_report(comparison_folder)
+    for name in ("index.html", "index.md", "results.csv", "table.tex", "figures/psnr-against-model-bytes.svg"):
+        assert (comparison_folder / name).read_text() == (built_report / name).read_text(), name
+
+
+def test_report_is_small(built_report: Path) -> None:
+    assert sum(path.stat().st_size for path in built_report.rglob("*") if path.is_file()) < 10e6
+
+
+def luminance(colour: str) -> float:
+    values = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def contrast(a: str, b: str) -> float:
+    high, low = sorted((luminance(a), luminance(b)), reverse=True)
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_colours_stand_out_on_both_pages() -> None:
+    for tone in (*SERIES, MUTED):
+        assert contrast(tone.light, PAGE.light) >= 3
+        assert contrast(tone.dark, PAGE.dark) >= 3
+    for tone in (INK, MUTED):
+        assert contrast(tone.light, PAGE.light) >= 4.5
+        assert contrast(tone.dark, PAGE.dark) >= 4.5
+    assert contrast(GRID.light, PAGE.light) < 1.5
+
+
+def test_labels_are_pushed_apart_no_further_than_needed() -> None:
+    placed = spread_labels([1.0, 1.1, 5.0], gap=1.0, low=0.0, high=10.0)
+    assert placed[1] - placed[0] == pytest.approx(1.0)
+    assert placed[2] == 5.0
+    assert spread_labels([0.1, 0.2], gap=1.0, low=0.0, high=10.0)[0] == pytest.approx(0.0)
+
+
+def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
+    from dataclasses import replace
+
+    from invgraphics.report.summary import summarise
+
+    comparison = read_comparison(built_report)
+    told = " ".join(verdict(comparison, summarise(comparison)))
+    assert "volumetric/hash reaches the highest PSNR" in told
+    assert "less than that lead" in told
+    single = replace(comparison, runs=tuple(run for run in comparison.runs if run.seed == 0))
+    assert "One seed per method" in " ".join(verdict(single, summarise(single)))
+    bad = replace(comparison, baselines={"nearest view": {"psnr": replace(comparison.runs[0].quality["psnr"], mean=28.0)}})
+    assert "did not beat the trivial baseline 'nearest view'" in " ".join(verdict(bad, summarise(bad)))
+
+
+def test_words() -> None:
+    assert listing(["a"]) == "a"
+    assert listing("abc") == "a, b and c"
+    assert [duration(s) for s in (12, 412, 7260)] == ["12 s", "6 min 52 s", "2 h 1 min"]
+    assert [budget_words(b) for b in ("60s", "5000steps", "odd")] == ["60 s", "5,000 steps", "odd"]
+    assert [significant_decimals(v) for v in (1234.0, 12.3, 0.0123)] == [0, 1, 4]
+
+
+def test_report_never_imports_torch() -> None:
+    code = "import sys, invgraphics.report.build; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_verdict_says_on_which_side_of_a_line_the_winner_is(built_report: Path) -> None:
+    from dataclasses import replace
+
+    from invgraphics.report.summary import summarise
+
+    comparison = read_comparison(built_report)
+    score = comparison.runs[0].quality["psnr"]
+    for ceiling, baseline, words in (
+        (41.7, 10.0, ("below the truth", "ahead of the better")),
+        (20.0, 50.0, ("above the", "behind the")),
+    ):
+        changed = replace(comparison, noise_ceiling=ceiling, baselines={"mean image": {"psnr": replace(score, mean=baseline)}})
+        told = verdict(changed, summarise(changed))[0]
+        assert all(word in told for word in words), told
+    alone = replace(comparison, methods=comparison.methods[:1], runs=comparison.runs_of(comparison.methods[0]))
+    assert "reaches a PSNR of" in verdict(alone, summarise(alone))[0]

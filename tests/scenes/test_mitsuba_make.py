@@ -1,0 +1,268 @@
+"""`make`: bitwise reproducible, cached, resumable, and clear about what goes wrong. Renders with the portable variant."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from invgraphics.core import Camera
+from invgraphics.errors import InputError
+from invgraphics.scenes.mitsuba import cache, llvm, make, maker
+
+PROBE = llvm.status  # the fixture below replaces the attribute
+
+SCENE = """
+name = "tiny"
+builder = "materials"
+summary = "Small."
+stresses = "Nothing."
+lo = [-1.05, -1.05, -0.8]
+hi = [1.05, 1.05, 0.7]
+background = [1.0, 1.0, 1.0]
+depth = 3
+size = [20, 16]
+rig = { kind = "hemisphere", radius = 3.5, fov = 38.0 }
+views = { train = 2, val = 1, test = 1 }
+samples = { train = 2, val = 1, test = 4 }
+"""
+
+
+@pytest.fixture(autouse=True)
+def _portable(monkeypatch):
+    monkeypatch.setattr(maker.llvm, "status", lambda: llvm.Status(llvm.PORTABLE, None, "For the test."))
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("description") / "scene.toml"
+    path.write_text(SCENE)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def rendered(scene_file, tmp_path_factory) -> Path:
+    """A rendered scene, in a cache of its own that no test writes to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(maker.llvm, "status", lambda: llvm.Status(llvm.PORTABLE, None, "For the test."))
+        patch.setenv(cache.VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        return make(scene_file)
+
+
+@pytest.fixture
+def fresh(tmp_path, monkeypatch) -> Path:
+    """An empty cache."""
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache" / "scenes"
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def _copy(rendered: Path, scenes: Path) -> Path:
+    return Path(shutil.copytree(rendered, scenes / rendered.name))
+
+
+@pytest.fixture
+def forbid_rendering(monkeypatch):
+    def refuse(*args, **kwargs):
+        raise AssertionError("a rendering process was started")
+
+    monkeypatch.setattr(maker.subprocess, "Popen", refuse)
+
+
+def test_folder_has_what_it_promises(rendered):
+    truth = json.loads((rendered / "truth.json").read_text())
+    assert {split: len(views) for split, views in truth["cameras"].items()} == {"train": 2, "val": 1, "test": 1}
+    assert set(_contents(rendered)) == {
+        "truth.json", "points.npz", "mesh.ply", "transforms_train.json", "transforms_val.json", "transforms_test.json",
+        *(f"{view}.{kind}" for view in ("train/0000", "train/0001", "val/0000", "test/0000") for kind in ("png", "npz")),
+    }  # fmt: skip
+    assert 5 < truth["noise_ceiling"] < 60
+    assert truth["samples_per_pixel"] == {"train": 2, "val": 1, "test": 4}
+    assert truth["background"] == [1.0, 1.0, 1.0]
+
+
+def test_png_is_straight_srgb_of_the_linear_values(rendered):
+    for picture in rendered.glob("*/*.png"):
+        rgba = np.asarray(Image.open(picture))
+        with np.load(picture.with_suffix(".npz")) as arrays:
+            linear = arrays["linear"].astype(np.float64)
+        assert rgba.shape == linear.shape == (16, 20, 4)
+        alpha = linear[..., 3]
+        assert (alpha == 0).any()
+        assert (alpha == 1).any()
+        straight = np.clip(
+            np.divide(linear[..., :3], alpha[..., None], where=alpha[..., None] > 0, out=np.zeros((16, 20, 3))), 0, 1
+        )
+        srgb = np.where(straight <= 0.0031308, 12.92 * straight, 1.055 * straight ** (1 / 2.4) - 0.055)
+        assert np.abs(rgba[..., :3] - 255 * srgb).max() <= 0.51
+        assert np.abs(rgba[..., 3] - 255 * alpha).max() <= 0.51
+
+
+def test_points_are_seen_where_they_are(rendered):
+    """Project the points into a training view: none lies in front of the depth that the view records."""
+    truth = json.loads((rendered / "truth.json").read_text())
+    table = truth["cameras"]["train"][0]
+    pose, focal, centre = (torch.tensor(table[key], dtype=torch.float64) for key in ("cam_to_world", "focal", "centre"))
+    camera = Camera(pose, focal, centre, 20, 16)
+    with np.load(rendered / "points.npz") as points, np.load(rendered / "train/0000.npz") as arrays:
+        position, depth = torch.from_numpy(points["position"]).double(), arrays["depth"]
+        assert ((points["rgb"] >= 0) & (points["rgb"] <= 1)).all()
+    pixel, z = camera.project(position)
+    distance = (position - camera.position).norm(dim=1)
+    own = ((pixel - pixel.floor() - 0.5).abs() < 1e-3).all(dim=1)  # points of this view lie on its pixel centres
+    assert (z > 0).all()
+    assert own.sum() >= np.isfinite(depth).sum()
+    column, row = pixel[own].floor().long().T
+    seen = depth[row.numpy(), column.numpy()]
+    assert (distance[own].numpy() > seen - 1e-3).all()
+    assert np.isclose(distance[own].numpy(), seen, atol=1e-4).sum() == np.isfinite(depth).sum()
+
+
+def test_transforms_tell_other_programs_the_same_cameras(rendered):
+    truth = json.loads((rendered / "truth.json").read_text())
+    other = json.loads((rendered / "transforms_test.json").read_text())
+    ours = np.array(truth["cameras"]["test"][0]["cam_to_world"])
+    theirs = np.array(other["frames"][0]["transform_matrix"])
+    np.testing.assert_allclose(theirs[:3], ours[:3] * [1, -1, -1, 1])
+    focal = 0.5 * 20 / np.tan(other["camera_angle_x"] / 2)
+    assert focal == pytest.approx(truth["cameras"]["test"][0]["focal"][0])
+    assert (rendered / f"{other['frames'][0]['file_path']}.png").is_file()
+
+
+def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_file):
+    """Also the proof of determinism: another process in another folder writes the very same files."""
+
+    def interrupt(done, total, what):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make(scene_file, progress=interrupt)
+    kept = next(fresh.glob("*.partial")) / "train/0000.npz"
+    first = kept.stat().st_mtime_ns
+    assert not (fresh / rendered.name).exists()
+    reports = []
+    folder = make(scene_file, progress=lambda *report: reports.append(report))
+    assert (folder / "train/0000.npz").stat().st_mtime_ns == first
+    assert _contents(folder) == _contents(rendered)
+    assert reports[0] == (0, 4, "train 0000")
+    assert reports[-1][:2] == (4, 4)
+
+
+@pytest.mark.usefixtures("forbid_rendering")
+def test_cache_hit_renders_nothing(rendered, fresh, scene_file, tmp_path):
+    folder = _copy(rendered, fresh)
+    assert make(scene_file) == folder
+    assert make(scene_file, size=(20, 16), train=2, test=1, spp=2) == folder
+    target = tmp_path / "mine"
+    assert make(scene_file, out=target) == target
+    assert _contents(target) == _contents(rendered)
+    assert make(scene_file, out=target) == target  # already there
+
+
+def test_damaged_cache_is_rendered_again(rendered, fresh, scene_file):
+    folder = _copy(rendered, fresh)
+    picture = folder / "test/0000.png"
+    picture.write_bytes(picture.read_bytes()[:100])
+    (folder / "stray.txt").write_text("not ours")
+    assert make(scene_file) == folder
+    assert _contents(folder) == _contents(rendered)
+
+
+@pytest.mark.usefixtures("fresh", "forbid_rendering")
+def test_whatever_matters_changes_the_key(rendered, scene_file):
+    for option in ({"size": (16, 16)}, {"train": 3}, {"test": 2}, {"spp": 4}, {"seed": 1}):
+        with pytest.raises(AssertionError, match="started"):
+            make(scene_file, **option)
+
+
+@pytest.mark.usefixtures("forbid_rendering")
+@pytest.mark.parametrize(
+    ("option", "word"),
+    [
+        ({"size": (4, 20)}, "size"),
+        ({"train": 0}, "training"),
+        ({"test": -1}, "test"),
+        ({"spp": 0}, "samples"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_impossible_options_are_refused(fresh, scene_file, option, word):
+    with pytest.raises(InputError, match=word):
+        make(scene_file, **option)
+
+
+@pytest.mark.usefixtures("fresh")
+def test_unknown_scene():
+    with pytest.raises(InputError, match=r"bricks, cloud, fence, materials, room, textured"):
+        make("lego")
+
+
+def test_cache_that_cannot_be_written(tmp_path, monkeypatch, scene_file):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
+    with pytest.raises(InputError, match=cache.VARIABLE):
+        make(scene_file)
+
+
+def test_copy_does_not_overwrite_other_things(rendered, fresh, scene_file, tmp_path):
+    _copy(rendered, fresh)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("precious")
+    with pytest.raises(InputError, match="mine"):
+        make(scene_file, out=tmp_path / "mine")
+    assert (tmp_path / "mine" / "thesis.tex").read_text() == "precious"
+
+
+@pytest.mark.usefixtures("fresh")
+def test_surfaces_outside_the_box_are_reported(tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE.replace("[1.05, 1.05, 0.7]", "[0.3, 1.05, 0.7]"))
+    with pytest.raises(InputError, match="Widen 'lo' and 'hi'") as caught:
+        make(str(tmp_path))
+    assert "[-0.846, -0.979, -0.619]" in caught.value.sentence
+
+
+@pytest.mark.usefixtures("fresh")
+def test_a_renderer_that_dies_is_reported_in_one_line(scene_file, monkeypatch):
+    monkeypatch.setattr(maker.llvm, "status", lambda: llvm.Status("no_such_variant", None, ""))
+    with pytest.raises(InputError, match="tiny") as caught:
+        make(scene_file)
+    assert len(str(caught.value).splitlines()) <= 2
+
+
+def test_second_process_waits_for_the_first(fresh):
+    fresh.mkdir(parents=True)
+    told = []
+    with cache.locked(fresh / "scene", waiting=lambda: told.append("first")):
+        code = (
+            "import sys; from pathlib import Path; from invgraphics.scenes.mitsuba import cache\n"
+            "with cache.locked(Path(sys.argv[1]), waiting=lambda: print('waiting', flush=True)): print('in', flush=True)"
+        )
+        other = subprocess.Popen([sys.executable, "-c", code, str(fresh / "scene")], stdout=subprocess.PIPE, text=True)
+        assert other.stdout is not None
+        assert other.stdout.readline() == "waiting\n"
+        assert other.poll() is None
+    assert other.stdout.read() == "in\n"
+    assert other.wait() == 0
+    assert told == []
+
+
+@pytest.mark.slow
+def test_the_fast_variant_is_reproducible_too(tmp_path, monkeypatch, scene_file):
+    status = PROBE()
+    if status.variant != llvm.FAST:
+        pytest.skip(status.reason)
+    monkeypatch.setattr(maker.llvm, "status", lambda: status)
+    folders = []
+    for number in range(2):
+        monkeypatch.setenv(cache.VARIABLE, str(tmp_path / str(number)))
+        folders.append(make(scene_file))
+    assert _contents(folders[0]) == _contents(folders[1])
