@@ -63,4 +63,4 @@ def use_kernels(name: str | None) -> None:
 def repeatable(device: torch.device) -> None:
     """Ask torch for sums in a fixed order; on a CPU that makes the same seed and threads give the same bits."""
     torch.use_deterministic_algorithms(device.type == "cpu", warn_only=True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # a debugging aid that costs a pass over every new tensor
+    torch.utils.deterministic.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]  # a debugging aid, slow
