@@ -32,7 +32,6 @@ SMALL = {
         "field.encoding.finest=48",
         "renderer.sampler.resolution=24",
         "renderer.sampler.steps_per_diagonal=96",
-        "renderer.sampler.warmup=16",
         "batches.rays=128",
         "batches.samples=4096",
     ],

@@ -13,7 +13,7 @@ from invgraphics.errors import NumericalError
 from invgraphics.training import checkpoint
 
 METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
-STEPS = {"volumetric/nerf": 250, "volumetric/hash": 120, "splatting/gaussians": 120}
+STEPS = {"volumetric/nerf": 400, "volumetric/hash": 400, "splatting/gaussians": 120}
 
 
 def _psnr(fit) -> float:
@@ -79,7 +79,7 @@ def test_resumed_equals_uninterrupted(name: str, scene, make_fit, tmp_path) -> N
 
 
 def test_gaussian_count_goes_up_and_down(scene, make_fit) -> None:
-    fit = make_fit("splatting/gaussians", scene, 200, 0, "hooks.1.threshold=1e-5")
+    fit = make_fit("splatting/gaussians", scene, 200, 0, "hooks.1.threshold=1e-5", "hooks.1.prune_opacity=0.05")
     counts = []
     fit.run(lambda loss: counts.append(fit.plan.field.primitive_count()) or False)
     rises = [b - a for a, b in itertools.pairwise(counts)]
