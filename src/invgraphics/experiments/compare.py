@@ -86,7 +86,7 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
     return {
         "schema": 1,
         "scene": scene.name,
-        "question": f"Given {request.budget} of optimisation each, how well do {names} show new views, at what cost?",
+        "question": f"Given {Budget.parse(request.budget)} of optimisation each, how well do {names} show new views, at what cost?",
         "methods": list(request.methods),
         "summaries": {name: load_method(name, request.preset, request.overrides).recipe.summary for name in request.methods},
         "seeds": list(request.seeds),

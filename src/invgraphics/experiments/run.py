@@ -53,16 +53,16 @@ def fit_run(request: FitRequest) -> Path:
     if same and folder.finished:
         return folder.root
     use_kernels(request.kernels)
-    fit = Fit(build_plan(method, scene, budget, request.seed, device))
-    if same and folder.checkpoint.is_file():
-        fit.load(checkpoint.load(folder.checkpoint, device), float(folder.read_json("fit.json")["seconds"]))
-        folder.cut_history(fit.steps)
-    else:
-        folder.clear()
-    _describe(folder, request, method, scene, identity, device)
-    fit.rehearse()
-    print(_prediction(request, fit), file=sys.stderr)
     with PeakMemory(device) as memory:
+        fit = Fit(build_plan(method, scene, budget, request.seed, device))
+        if same and folder.checkpoint.is_file():
+            fit.load(checkpoint.load(folder.checkpoint, device), float(folder.read_json("fit.json")["seconds"]))
+            folder.cut_history(fit.steps)
+        else:
+            folder.clear()
+        _describe(folder, request, method, scene, identity, device)
+        fit.rehearse()
+        print(_prediction(request, fit), file=sys.stderr)
         Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}").run()
     costs = {"fit_seconds": fit.seconds, "steps": fit.steps, "peak_memory_bytes": memory.peak_bytes}
     folder.write_json("fit.json", {"steps": fit.steps, "seconds": fit.seconds, "peak_memory_bytes": memory.peak_bytes})

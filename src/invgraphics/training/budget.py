@@ -45,5 +45,5 @@ class Budget:
         return Budget(seconds=number * _UNITS[found.group(2)])
 
     def __str__(self) -> str:
-        parts = ([f"{self.seconds:g}s"] if self.seconds is not None else []) + ([f"{self.steps}steps"] if self.steps else [])
+        parts = ([f"{self.seconds:g} s"] if self.seconds is not None else []) + ([f"{self.steps} steps"] if self.steps else [])
         return " or ".join(parts)
