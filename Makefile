@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
 
-.PHONY: env compare test slow check clean
+.PHONY: env compare picture test slow check clean
 
 env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
@@ -14,6 +14,9 @@ env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
 compare: env  ## the main job: three families on one scene under one budget, and a report
 	$(BIN)/invgraphics compare bricks --methods $(METHODS) --budget 60s --out reports/compare-bricks
+
+picture: compare  ## renew the README's picture
+	$(BIN)/python docs/picture.py reports/compare-bricks docs/compare-bricks.png
 
 test: env  ## the test suite (under 10 minutes on 2 cores)
 	$(BIN)/python -m pytest

@@ -25,7 +25,8 @@ COMPONENTS = {
 }
 """Title -> registry; the registry of scenes holds the formats of data sets that can be opened."""
 
-KINDS = ("methods", "scenes", *COMPONENTS)
+KINDS = ("matrix", "methods", "scenes", *COMPONENTS)
+EVERYTHING = KINDS[1:]
 
 
 @dataclass(frozen=True)
@@ -33,21 +34,30 @@ class List:
     """List methods, scenes and the components that recipes are made of, and where each comes from."""
 
     kinds: Annotated[Positional[tuple[str, ...]], arg(metavar="KIND", help_behavior_hint="(default: everything)")] = ()
-    """What to list: methods, scenes, fields, encodings, renderers, samplers, losses, hooks, metrics, formats."""
+    """What to list: methods, scenes, fields, encodings, renderers, samplers, losses, hooks, metrics, formats; or matrix, the
+    table of fields and renderers as Markdown."""
 
     def run(self) -> int:
         """Print the tables."""
         for kind in self.kinds:
             if kind not in KINDS:
                 raise InputError(f"There is no list of '{kind}'.", f"Lists: {', '.join(KINDS)}.")
-        for kind in self.kinds or KINDS:
-            if kind == "methods":
+        for kind in self.kinds or EVERYTHING:
+            if kind == "matrix":
+                _print_matrix()
+            elif kind == "methods":
                 _list_methods()
             elif kind == "scenes":
                 _list_scenes()
             else:
                 _list_components(kind)
         return 0
+
+
+def _print_matrix() -> None:
+    from invgraphics.experiments.matrix import markdown
+
+    print(markdown())
 
 
 def _list_methods() -> None:

@@ -82,11 +82,11 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
     """Everything of ``compare.json`` that is known before the fits."""
     protocol = protocol_named(request.protocol)
     camera = scene.test[0].camera
-    names = ", ".join(request.methods)
+    names, budget = ", ".join(request.methods), Budget.parse(request.budget)
     return {
         "schema": 1,
         "scene": scene.name,
-        "question": f"Given {Budget.parse(request.budget)} of optimisation each, how well do {names} show new views, at what cost?",
+        "question": f"Given {budget} of optimisation each, how well do {names} show new views, at what cost?",
         "methods": list(request.methods),
         "summaries": {name: load_method(name, request.preset, request.overrides).recipe.summary for name in request.methods},
         "seeds": list(request.seeds),

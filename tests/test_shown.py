@@ -1,0 +1,69 @@
+"""What is shown is true: the README's table, commands, recipes and files are those of the code."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from invgraphics.experiments.matrix import markdown
+from invgraphics.experiments.recipe import load_method, methods
+from invgraphics.scenes.mitsuba.spec import names
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+COMMANDS = [shlex.split(line, comments=True) for line in re.findall(r"^(invgraphics .*)$", README, re.MULTILINE)]
+TARGETS = re.findall(r"^make (\w+)", README, re.MULTILINE)
+
+
+def test_matrix_is_the_one_the_recipes_make() -> None:
+    """To renew it: `invgraphics list matrix`, pasted between the markers."""
+    shown = README.split("<!-- matrix: begin -->\n")[1].split("\n<!-- matrix: end -->")[0]
+    assert shown == markdown()
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_commands_and_their_flags_exist(command: list[str]) -> None:
+    help_text = subprocess.run(
+        [sys.executable, "-m", "invgraphics", command[1], "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    for word in command[2:]:
+        if word.startswith("--"):
+            assert word in help_text
+
+
+def test_named_methods_scenes_and_settings_exist() -> None:
+    for command in COMMANDS:
+        for i, word in enumerate(command):
+            if word == "--methods":
+                assert set(command[i + 1].split(",")) <= set(methods())
+            if word == "--set":
+                load_method(command[2], None, [command[i + 1]])
+    for scene in re.search(r"built-in ones \(([^;]*);", README).group(1).replace("\n", " ").split(","):
+        assert scene.strip(" `") in names()
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    assert TARGETS
+    for target in TARGETS:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+
+
+def test_linked_files_exist() -> None:
+    for page in ("README.md", "CONTRIBUTING.md"):
+        for link in re.findall(r"\]\((?!http)([^)#]+)\)", (ROOT / page).read_text()):
+            assert (ROOT / link).exists(), f"{page} links {link}"
+
+
+def test_nothing_names_this_workplace() -> None:
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False).stdout.split()
+    if not tracked:
+        pytest.skip("not a git checkout")
+    private = "../" + "shared"
+    for name in tracked:
+        path = ROOT / name
+        if name != ".ci/run" and path.suffix in {".py", ".md", ".toml", ".txt", ".yml", ""} and path.is_file():
+            assert private not in path.read_text(errors="ignore"), name
