@@ -121,7 +121,8 @@ def _fit_in_own_process(fit: FitRequest, root: Path) -> tuple[int, str]:
     process = subprocess.Popen([sys.executable, "-m", "invgraphics.experiments.run", str(job)])
     try:
         status = process.wait()
-    except KeyboardInterrupt:  # the child got the same Ctrl-C and is writing its checkpoint
+    except KeyboardInterrupt:
+        process.terminate()  # after Ctrl-C it is already writing its checkpoint, and a second signal changes nothing
         process.wait()
         status = 130
     if status in (0, 130):

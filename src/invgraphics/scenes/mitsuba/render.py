@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -42,9 +43,11 @@ def main(folder: Path) -> None:
     model = build(job.spec.builder, job.spec.seed)
     with tempfile.TemporaryDirectory() as scratch:
         scene = stage.load(model, job.spec.depth, job.spec.background is not None, Path(scratch))
-    done = 0
+    done, parent = 0, os.getppid()
     for split in SPLITS:
         for index, camera in enumerate(views[split]):
+            if os.getppid() != parent:
+                sys.exit("nobody waits for this rendering any more")  # what is done stays, and is gone on with
             _report(done, job.total, f"{split} {index:04d}")
             if not folders.view_paths(folder, split, index)[1].exists():
                 _render_view(job, scene, model, folder, (split, index, camera))

@@ -23,7 +23,7 @@ class Samples:
     """Samples per pixel of each split; those of ``test`` are taken in two independent halves."""
 
     train: int = 256
-    val: int = 64
+    val: int = 256
     test: int = 1024
 
     def __post_init__(self) -> None:
