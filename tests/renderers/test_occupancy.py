@@ -139,12 +139,27 @@ def test_steps_grow_in_a_contracted_space(make_scene: Callable[..., Scene]) -> N
     samples, _ = sampler.sample(rays, lambda s: torch.zeros(len(s)), context(scene, training=False))
     first = samples[samples.ray == 0]
     assert float(first.t1[-1]) == pytest.approx(float(rays.far[0]))
-    grown = first.t0 > 256 * sampler.length
-    torch.testing.assert_close(first.delta[grown][:-1], first.t0[grown][:-1] / 256, rtol=1e-3, atol=0)
+    steps = SMALL.steps_per_diagonal / 4
+    grown = first.t0 > steps * sampler.length
+    torch.testing.assert_close(first.delta[grown][:-1], first.t0[grown][:-1] / steps, rtol=1e-3, atol=0)
     # An even fog is worth as much per step as it is long: far cells must not be forgotten.
     sampler = learnt(SMALL, scene, Sphere(0.05, 1e6))
     far = sampler.ema[0, 8, 8] / sampler.ema[8, 8, 8]
     assert float(far) > 2
+
+
+def test_nothing_is_culled_before_the_field_was_fitted_at_all(make_scene: Callable[..., Scene]) -> None:
+    """In thin fog every cell is below the threshold; culled at once, none would ever be sampled again."""
+    scene = make_scene()
+    ctx, density = context(scene, training=True), lambda samples: torch.zeros(len(samples))
+    sampler = replace(SMALL, grace=3, every=1).build(scene)
+    for _ in range(3):
+        sampler.update(density, ctx)
+        assert bool(sampler.occupied.all())
+        assert float(sampler.ema.max()) == 0
+    thick = lambda samples: (samples.position[:, 0] > 0).float() * 100  # noqa: E731
+    sampler.update(thick, ctx)
+    assert 0.3 < float(sampler.occupied.float().mean()) < 0.7
 
 
 def test_refusals() -> None:

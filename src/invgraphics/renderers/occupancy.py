@@ -23,7 +23,10 @@ class OccupancyConfig:
     Attributes:
         resolution: cells along each edge of the unit cube.
         steps_per_diagonal: steps that a march across the bounds' diagonal takes.
-        cone: growth of the step with distance; ``None`` means 0 in a box and 1/256 in a contracted space.
+        cone: growth of the step with distance; ``None`` means 0 in a box and 4 / ``steps_per_diagonal`` (Instant-NGP's
+            1/256) in a contracted space.
+        grace: training steps before the first refresh. What is thinner than the threshold before it was ever seen would be
+            culled, never be sampled, and never grow.
         decay: what a cell's memory is multiplied with when the cell is looked at again.
         threshold: least optical depth of a step that counts as occupied; the grid's mean, where that is smaller.
         warmup: training steps during which a refresh looks at all cells.
@@ -37,6 +40,7 @@ class OccupancyConfig:
     resolution: int = 128
     steps_per_diagonal: int = 1024
     cone: float | None = None
+    grace: int = 0
     decay: float = 0.95
     threshold: float = 0.01
     warmup: int = 256
@@ -52,8 +56,8 @@ class OccupancyConfig:
                 raise ValueError(f"{key} must be at least 1, not {getattr(self, key)}")
         if not 0 <= self.decay <= 1 or not 0 <= self.transmittance < 1:
             raise ValueError(f"decay must be in [0, 1] and transmittance in [0, 1), not {self.decay} and {self.transmittance}")
-        if self.threshold < 0 or self.warmup < 0 or (self.cone or 0) < 0:
-            raise ValueError("threshold, warmup and cone must not be negative")
+        if min(self.threshold, self.warmup, self.grace, self.cone or 0) < 0:
+            raise ValueError("threshold, warmup, grace and cone must not be negative")
 
     def build(self, scene: Scene) -> Occupancy:
         """The sampler, every cell occupied."""
@@ -80,7 +84,7 @@ class Occupancy(Sampler):
         self.register_buffer("ema", torch.zeros(shape))
         self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool))
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
-        growing = 1 / 256 if bounds.space == "contracted" else 0.0
+        growing = 4 / config.steps_per_diagonal if bounds.space == "contracted" else 0.0
         self.cone = growing if config.cone is None else config.cone
         self.length = 2 * bounds.radius / config.steps_per_diagonal
 
@@ -126,7 +130,7 @@ class Occupancy(Sampler):
         """Count a training step; every so often, look at cells again."""
         step = int(self.step)
         self.step += 1
-        if step % self.config.every == 0:
+        if step >= self.config.grace and step % self.config.every == 0:
             cells = self._all_cells() if step < self.config.warmup else self._some_cells(ctx)
             self._refresh(cells, density, ctx)
 
