@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -143,9 +142,3 @@ ALPHA_MAX = 0.99
 """Alpha is clamped here for numerical stability (3DGS, appendix C)."""
 TRANSMITTANCE_MIN = 1e-4
 """Compositing of a pixel stops before transmittance falls below this (3DGS, appendix C)."""
-
-
-def empty_bins(tile: int, columns: int, rows: int) -> Bins:
-    """Bins without any footprint."""
-    starts = torch.zeros(columns * rows + 1, dtype=torch.int64)
-    return Bins(torch.zeros(0, dtype=torch.int64), starts, tile, columns, rows)
