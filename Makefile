@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
 
-.PHONY: env compare picture test slow check clean
+.PHONY: env compare picture bench notebooks test slow check clean
 
 env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
@@ -17,6 +17,13 @@ compare: env  ## the main job: three families on one scene under one budget, and
 
 picture: compare  ## renew the README's picture
 	$(BIN)/python docs/picture.py reports/compare-bricks docs/compare-bricks.png
+
+bench: env  ## every kernel against the reference and the machine's limits: reports/bench
+	$(BIN)/invgraphics bench
+
+notebooks: env  ## run the notebooks and write them as pages: reports/notebooks
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"
+	$(BIN)/python notebooks/render.py
 
 test: env  ## the test suite (under 10 minutes on 2 cores)
 	$(BIN)/python -m pytest

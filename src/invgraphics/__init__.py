@@ -1,1 +1,7 @@
 """Compare and teach differentiable rendering: NeRF volume rendering versus splatting, on one ruler."""
+
+import os
+
+# torch and Numba bring a thread pool each. A thread that waits by spinning takes the core that the other pool's thread needs;
+# with one more busy process on two cores, steps then took ten times as long. Read by libgomp when torch is imported.
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")

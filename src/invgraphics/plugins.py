@@ -8,6 +8,7 @@ for instance ``[project.entry-points."invgraphics.fields"] mine = "my_package:My
 from __future__ import annotations
 
 import importlib
+import sys
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -24,6 +25,7 @@ REGISTRIES = {
     "scenes": ("invgraphics.scenes", "LOADERS"),
     "metrics": ("invgraphics.metrics", "METRICS"),
     "recipes": ("invgraphics.experiments", "RECIPES"),
+    "executors": ("invgraphics.experiments.executors", "EXECUTORS"),
 }
 """Registry name -> (module, dictionary). ``recipes`` starts empty: built-in recipes are TOML files."""
 
@@ -34,8 +36,16 @@ def _own(registry: str) -> dict[str, str]:
     return dict(getattr(importlib.import_module(module), name))
 
 
+@cache
+def _entry_points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Our entry points found on ``path``; looking through every installed package takes long enough to be done once."""
+    found = entry_points()
+    return tuple(point for registry in REGISTRIES for point in found.select(group=f"invgraphics.{registry}"))
+
+
 def _foreign(registry: str) -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=f"invgraphics.{registry}")}
+    points = _entry_points(tuple(sys.path))
+    return {point.name: point for point in points if point.group == f"invgraphics.{registry}"}
 
 
 def names(registry: str) -> dict[str, str]:

@@ -44,15 +44,20 @@ _POINTWISE = {
 
 
 class TwoBalls(Field):
-    """A red and a blue ball of dense fog, shaded by height: enough structure for poses and colours to matter."""
+    """A red and a blue ball of dense fog, shaded by height: enough structure for poses and colours to matter.
+
+    Args:
+        checks: changes of shade per local unit along each axis; 0 leaves the balls plain.
+    """
 
     provides = Quantity.DENSITY | Quantity.RADIANCE
     centres: Tensor
     radii: Tensor
     colours: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, checks: float = 0.0) -> None:
         super().__init__()
+        self.checks = checks
         self.register_buffer("centres", torch.tensor([[-0.35, 0.1, -0.1], [0.4, -0.15, 0.25]]))
         self.register_buffer("radii", torch.tensor([0.45, 0.3]))
         self.register_buffer("colours", torch.tensor([[0.9, 0.25, 0.15], [0.15, 0.35, 0.9]]))
@@ -62,25 +67,38 @@ class TwoBalls(Field):
         distance = (samples.position[:, None] - self.centres).norm(dim=-1) - self.radii
         nearest = distance.argmin(dim=1)
         shade = 0.7 + 0.3 * samples.position[:, 2:].clamp(-1, 1)
+        # Odd cells of a checkerboard are half as bright; without checks every position is in cell 0.
+        odd = (samples.position * self.checks).floor().sum(dim=1, keepdim=True) % 2
+        shade = shade * (1 - 0.5 * odd)
         return FieldValues(density=30.0 * (distance.amin(dim=1) < 0), radiance=self.colours[nearest] * shade)
 
 
-def toy_cameras(count: int, size: int, turn: float = 0.0) -> list[Camera]:
-    """Cameras on a spiral around the origin at distance 3, seeing all of it."""
+def toy_cameras(count: int, size: int, turn: float = 0.0, zoom: float = 1.0) -> list[Camera]:
+    """Cameras on a spiral around the origin at distance 3, seeing all of the box [-1, 1]³ unless ``zoom`` exceeds 1."""
     cameras = []
     for i in range(count):
         azimuth = 2 * math.pi * (i * 0.618034 + turn)
         height = -0.5 + 1.4 * (i + 0.5) / count
         eye = 3 * torch.tensor([math.cos(azimuth) * math.cos(height), math.sin(azimuth) * math.cos(height), math.sin(height)])
         pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-        cameras.append(Camera(pose, torch.full((2,), 1.3 * size), torch.full((2,), size / 2), size, size))
+        cameras.append(Camera(pose, torch.full((2,), 1.3 * zoom * size), torch.full((2,), size / 2), size, size))
     return cameras
 
 
-def toy_scene(views: int = 12, size: int = 24, space: Literal["box", "contracted"] = "box") -> Scene:
-    """Two balls of fog seen from all around, with alpha, points and a white background; fits in well under a second."""
+def toy_scene(
+    views: int = 12, size: int = 24, space: Literal["box", "contracted"] = "box", checks: float = 0.0, zoom: float = 1.0
+) -> Scene:
+    """Two balls of fog seen from all around, with alpha, points and a white background; fits in well under a second.
+
+    Args:
+        views: training views.
+        size: width and height of the pictures in pixels.
+        space: kind of bounds.
+        checks: fineness of a checkerboard on the balls (see `TwoBalls`).
+        zoom: multiplies the focal length; the balls fill the pictures at 1.35.
+    """
     bounds = Bounds(-torch.ones(3), torch.ones(3), space)
-    truth, field = VolumetricConfig(StratifiedConfig(count=128)), TwoBalls()
+    truth, field = VolumetricConfig(StratifiedConfig(count=128)), TwoBalls(checks)
     box = Context(Bounds(-torch.ones(3), torch.ones(3)))
 
     def view(camera: Camera, name: str) -> View:
@@ -94,8 +112,10 @@ def toy_scene(views: int = 12, size: int = 24, space: Literal["box", "contracted
     which = torch.arange(400) % 2
     points = Points(field.centres[which] + field.radii[which][:, None] * directions, field.colours[which])
     scene = Scene("toy", (), (), torch.ones(3), bounds, points=points)
-    train = tuple(view(camera, f"train{i}") for i, camera in enumerate(toy_cameras(views, size)))
-    test = tuple(view(camera, f"test{i}") for i, camera in enumerate(toy_cameras(max(2, views // 4), size, turn=0.3)))
+    train = tuple(view(camera, f"train{i}") for i, camera in enumerate(toy_cameras(views, size, zoom=zoom)))
+    test = tuple(
+        view(camera, f"test{i}") for i, camera in enumerate(toy_cameras(max(2, views // 4), size, turn=0.3, zoom=zoom))
+    )
     return scene.with_views(train=train, test=test)
 
 

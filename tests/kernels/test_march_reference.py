@@ -64,7 +64,8 @@ def test_pieces_join_to_the_whole() -> None:
         pieces += listed(march)
         start = march.resume
     assert bool((start >= rays.far).all())
-    assert sorted(pieces) == whole
+    # Each piece counts its lattice from where it starts, so the last bits may differ.
+    torch.testing.assert_close(torch.tensor(sorted(pieces)), torch.tensor(whole))
 
 
 def test_a_full_box_is_tiled() -> None:

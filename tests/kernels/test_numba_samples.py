@@ -156,7 +156,7 @@ def test_march_goes_on_in_parts():
         part = numba.ray_march(rays, occupied, bounds, MarchSteps(0.01, limit=5), start)
         t0.append(part.t0[part.ray == 3])
         start = part.resume
-    assert torch.equal(torch.cat(t0), whole.t0[whole.ray == 3])
+    torch.testing.assert_close(torch.cat(t0), whole.t0[whole.ray == 3])
 
 
 def test_march_of_nothing_and_of_bad_numbers():

@@ -181,6 +181,7 @@ class Point:
     """Stands in for an installed package's entry point."""
 
     dist = type("Distribution", (), {"name": "their-package"})
+    group = "invgraphics.metrics"
 
     def __init__(self, name: str, target: str) -> None:
         self.name, self.value = name, f"{__name__}:{target}"
@@ -189,7 +190,7 @@ class Point:
 def test_a_strangers_metric_is_scored_and_cannot_spoil_the_others(monkeypatch) -> None:
     points = [Point("bias", "BIAS"), Point("faulty", "FAULTY"), Point("gone", "ABSENT"), Point("odd", "HEIGHT")]
     points.append(Point("nothing", "NOTHING"))
-    monkeypatch.setattr(plugins, "entry_points", lambda group: points if group == "invgraphics.metrics" else [])
+    monkeypatch.setattr(plugins, "_entry_points", lambda path: points)
     view = view_of(0.25)
     result = score(rendering_of(0.5), view, scene_of(view), PLAIN)
     assert result.values["bias"] == pytest.approx(0.25)

@@ -31,7 +31,8 @@ class Shared:
     preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: laptop)")] = None
     """Size of the method: laptop shows its character in a minute, paper holds the published values."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
-    """Change one value of the recipe, for instance --set batches.rays=2048."""
+    """Change one value of the recipe, for instance --set batches.rays=2048, or of the training data: data.train_views=10,
+    data.size, data.pose_noise (degrees and per cent), data.photo_noise, data.exposure (stops), data.background."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"

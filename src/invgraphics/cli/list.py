@@ -22,10 +22,11 @@ COMPONENTS = {
     "hooks": "hooks",
     "metrics": "metrics",
     "formats": "scenes",
+    "executors": "executors",
 }
 """Title -> registry; the registry of scenes holds the formats of data sets that can be opened."""
 
-KINDS = ("matrix", "methods", "scenes", *COMPONENTS)
+KINDS = ("matrix", "methods", "scenes", "studies", *COMPONENTS, "protocols")
 EVERYTHING = KINDS[1:]
 
 
@@ -34,8 +35,8 @@ class List:
     """List methods, scenes and the components that recipes are made of, and where each comes from."""
 
     kinds: Annotated[Positional[tuple[str, ...]], arg(metavar="KIND", help_behavior_hint="(default: everything)")] = ()
-    """What to list: methods, scenes, fields, encodings, renderers, samplers, losses, hooks, metrics, formats; or matrix, the
-    table of fields and renderers as Markdown."""
+    """What to list: methods, scenes, studies, fields, encodings, renderers, samplers, losses, hooks, metrics, formats,
+    executors, protocols; or matrix, the table of fields and renderers as Markdown."""
 
     def run(self) -> int:
         """Print the tables."""
@@ -49,6 +50,10 @@ class List:
                 _list_methods()
             elif kind == "scenes":
                 _list_scenes()
+            elif kind == "studies":
+                _list_studies()
+            elif kind == "protocols":
+                _list_protocols()
             else:
                 _list_components(kind)
         return 0
@@ -80,6 +85,24 @@ def _list_scenes() -> None:
             raise InputError(f"{path} is not valid TOML: {error}.") from error
         rows.append((path.parent.name, str(table.get("summary", "")), str(table.get("stresses", ""))))
     show_table("Scenes (rendered by Mitsuba; a path to a data set serves as well)", ("name", "what it shows", "stresses"), rows)
+
+
+def _list_studies() -> None:
+    from invgraphics.experiments.study import FILE, read_study
+
+    rows = []
+    for path in sorted(find("studies").glob(f"*/{FILE}")):
+        study = read_study(path)
+        rows.append((path.parent.name, study.question, str(len(study.expand()))))
+    show_table("Studies (invgraphics ablate NAME)", ("name", "question", "runs"), rows)
+
+
+def _list_protocols() -> None:
+    from invgraphics.metrics.conventions import CONVENTIONS, PROTOCOLS
+
+    rows = [(name, protocol.summary, "built in") for name, protocol in PROTOCOLS.items()]
+    rows += [(name, convention.summary, convention.source) for name, convention in CONVENTIONS.items()]
+    show_table("Protocols (for --protocol of rescore; fit and evaluate take ours)", ("name", "summary", "as read in"), rows)
 
 
 def _list_components(kind: str) -> None:

@@ -28,8 +28,11 @@ COMMANDS = {
     "make-scene": ("invgraphics.cli.make_scene:MakeScene", "render a scene's ground truth with Mitsuba"),
     "fit": ("invgraphics.cli.fit:Fit", "fit one method to one scene, and evaluate it"),
     "evaluate": ("invgraphics.cli.evaluate:Evaluate", "score a run again from its model"),
+    "rescore": ("invgraphics.cli.rescore:Rescore", "score saved pictures again, under the conventions of other tools"),
     "compare": ("invgraphics.cli.compare:Compare", "fit several methods to one scene under one budget, and report who wins"),
+    "ablate": ("invgraphics.cli.ablate:Ablate", "run a study: factors, levels and seeds, on this machine or a cluster"),
     "report": ("invgraphics.cli.report:Report", "write page, tables and figures from finished runs"),
+    "bench": ("invgraphics.cli.bench:Bench", "how fast the kernels are here, and what share of the machine they use"),
 }
 """Name -> (``module:class`` of its arguments, summary). A class is imported when its command is given."""
 

@@ -16,24 +16,47 @@ COMPARISON = "compare.json"
 
 @dataclass(frozen=True)
 class Report:
-    """Write a report from a comparison's folder, or from single runs on the same ground truth."""
+    """Write a report from a comparison's folder, from a study's folder, or from single runs on the same ground truth."""
 
     folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
-    """The folder of one comparison, or folders of runs."""
-    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the comparison's own folder)")] = None
+    """The folder of one comparison or of one study, or folders of runs."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the folder itself)")] = None
     """Where to write."""
+    public: bool = False
+    """Leave out absolute paths, user names and host names; writes to FOLDER-public unless --out says otherwise."""
 
     def run(self) -> int:
         """Write the report; print the page's path."""
-        runs = [run for folder in self.folders for run in runs_in(folder)]
-        if self.out is not None:
-            from invgraphics.report.build import build_from_runs
+        from invgraphics.report.studyreading import is_study
 
-            print(build_from_runs(runs, self.out))
+        if not self.folders:
+            raise InputError("There is nothing to report.", "Give the folder of a comparison, of a study, or of runs.")
+        first, alone, out = self.folders[0], len(self.folders) == 1, self.out
+        if alone and out is None and self.public:
+            out = first.resolve().with_name(f"{first.resolve().name}-public")
+        if any(is_study(folder) for folder in self.folders):
+            return self._study(first, out)
+        if alone and (first / COMPARISON).is_file():
+            write_report(first, out, self.public)
             return 0
-        if len(self.folders) != 1 or not (self.folders[0] / COMPARISON).is_file():
+        runs = [run for folder in self.folders for run in runs_in(folder)]
+        if out is None:
             raise InputError("A report of single runs needs a folder to be written to.", "Give one with --out.")
-        write_report(self.folders[0])
+        from invgraphics.report.build import build_from_runs
+
+        print(build_from_runs(runs, out, self.public))
+        return 0
+
+    def _study(self, folder: Path, out: Path | None) -> int:
+        """Write a study's report; print what its factors do and the page's path."""
+        if len(self.folders) > 1:
+            raise InputError("A study is reported alone.", "Give one study's folder, and nothing else.")
+        from invgraphics.report.study import build_study_report, study_sentences
+
+        page = build_study_report(folder, out, self.public)
+        for sentence in study_sentences(folder):
+            print(sentence)
+        print(page)
         return 0
 
 
@@ -52,13 +75,13 @@ def runs_in(folder: Path) -> list[Path]:
     return runs
 
 
-def write_report(folder: Path) -> None:
-    """Write the report of a comparison's folder; print its table and the page's path."""
+def write_report(folder: Path, out: Path | None = None, public: bool = False) -> None:
+    """Write the report of a comparison's folder, into itself or into ``out``; print its table and the page's path."""
     from invgraphics.report.build import build_report
     from invgraphics.report.reading import read_comparison
     from invgraphics.report.summary import summarise
 
-    page = build_report(folder)
+    page = build_report(folder, out, public)
     comparison = read_comparison(folder)
     summary = summarise(comparison)
     # Quantities down, methods across: there are more of the former, and a terminal is narrow.

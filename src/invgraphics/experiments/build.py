@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from invgraphics import kernels
+from invgraphics.config import fill
 from invgraphics.core import Field, Renderer, Scene, check
 from invgraphics.errors import InputError
-from invgraphics.experiments.recipe import Method
+from invgraphics.experiments.recipe import Method, assign
+from invgraphics.experiments.request import DATA, Settings
+from invgraphics.scenes.corrupt import TrainingData
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Plan
 
@@ -25,6 +30,17 @@ def device_of(name: str | None) -> torch.device:
             raise InputError("--device cuda: this machine offers torch no CUDA device.", "Use --device cpu.")
         return torch.device("cuda")
     raise InputError(f"--device cannot be '{name}'.", "Expected: cpu or cuda.")
+
+
+def training_data(settings: Settings) -> TrainingData:
+    """What a request does to training data.
+
+    Raises:
+        InputError: a key is unknown, or a value of the wrong type or range.
+    """
+    table: dict[str, Any] = {}
+    assign(table, settings.data_overrides)
+    return fill(TrainingData, table.get(DATA.rstrip("."), {}), DATA.rstrip("."))
 
 
 def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -> tuple[Field, Renderer]:

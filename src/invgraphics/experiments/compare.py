@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,14 +12,17 @@ import torch
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import device_of
+from invgraphics.experiments.build import device_of, training_data
 from invgraphics.experiments.environment import environment
-from invgraphics.experiments.folder import RunFolder, write_json
+from invgraphics.experiments.executors.base import INTERRUPTED
+from invgraphics.experiments.executors.local import LocalExecutor
+from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.recipe import load_method
 from invgraphics.experiments.recorder import Cadence
-from invgraphics.experiments.request import CompareRequest, FitRequest, slug
+from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named
+from invgraphics.scenes.corrupt import corrupt
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 
@@ -45,13 +46,16 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
     failures: list[dict[str, Any]] = []
     summary = _summary(request, scene)
     interrupted = False
-    for fit in request.fits():
-        status, error = _fit_in_own_process(fit, folder.root)
-        if status == 130:
-            interrupted = True
-            break
-        if status != 0:
-            failures.append({"method": fit.method, "seed": fit.seed, "error": error})
+    try:
+        with closing(LocalExecutor().run(request.fits(), folder.root / "jobs")) as outcomes:
+            for outcome in outcomes:
+                if outcome.status == INTERRUPTED:
+                    raise KeyboardInterrupt
+                if outcome.status != 0:
+                    fit = outcome.request
+                    failures.append({"method": fit.method, "seed": fit.seed, "error": outcome.error})
+    except KeyboardInterrupt:
+        interrupted = True
     done = [fit for fit in request.fits() if RunFolder(Path(fit.out)).finished]
     summary["runs"] = [Path(fit.out).relative_to(request.out).as_posix() for fit in done]
     summary["failures"] = failures
@@ -73,9 +77,11 @@ def _validate(request: CompareRequest) -> Scene:
     device_of(request.device)
     protocol_named(request.protocol)
     for name in request.methods:
-        load_method(name, request.preset, request.overrides)
+        load_method(name, request.preset, request.recipe_overrides)
+    data = training_data(request)
     RunFolder(Path(request.out)).create()
-    return open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+    scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+    return corrupt(scene, data, request.seeds[0])
 
 
 def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
@@ -88,7 +94,9 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
         "scene": scene.name,
         "question": f"Given {budget} of optimisation each, how well do {names} show new views, at what cost?",
         "methods": list(request.methods),
-        "summaries": {name: load_method(name, request.preset, request.overrides).recipe.summary for name in request.methods},
+        "summaries": {
+            name: load_method(name, request.preset, request.recipe_overrides).recipe.summary for name in request.methods
+        },
         "seeds": list(request.seeds),
         "budget": request.budget,
         "size": [camera.width, camera.height],
@@ -108,26 +116,3 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
         },
         "environment": environment(torch.device(request.device or "cpu")),
     }
-
-
-def _fit_in_own_process(fit: FitRequest, root: Path) -> tuple[int, str]:
-    """Spawn a fit, so that its time and memory are its own; returns its exit status and what went wrong."""
-    jobs = root / "jobs"
-    jobs.mkdir(exist_ok=True)
-    job = jobs / f"{slug(fit.method)}-seed-{fit.seed}.json"
-    report = job.with_suffix(".error.json")
-    report.unlink(missing_ok=True)
-    write_json(job, fit.to_json())
-    process = subprocess.Popen([sys.executable, "-m", "invgraphics.experiments.run", str(job)])
-    try:
-        status = process.wait()
-    except KeyboardInterrupt:
-        process.terminate()  # after Ctrl-C it is already writing its checkpoint, and a second signal changes nothing
-        process.wait()
-        status = 130
-    if status in (0, 130):
-        return status, ""
-    try:
-        return status, json.loads(report.read_text())["error"]
-    except (OSError, json.JSONDecodeError, KeyError):
-        return status, f"The process ended with status {status} and left no message."

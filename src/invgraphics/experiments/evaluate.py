@@ -142,20 +142,21 @@ def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
 
 
 def save_truth(scene: Scene, root: Path) -> Path:
-    """Keep the test views' truth once per content: ``root/<sha>/0000.png`` and, where known, ``0000.npz``."""
+    """Keep the test views' truth once per content: ``root/<sha>/0000.png`` and, for what it cannot hold, ``0000.npz``."""
     folder = root / scene.digest("test")[:16]
     folder.mkdir(parents=True, exist_ok=True)
     for index, view in enumerate(scene.test):
         stem = folder / f"{index:04d}"
         if not stem.with_suffix(".png").is_file():
             Image.fromarray(display(view.over(scene.background), scene).numpy()).save(stem.with_suffix(".png"))
-        arrays = _truth_geometry(view, scene)
+        arrays = _truth_arrays(view, scene)
         if arrays and not stem.with_suffix(".npz").is_file():
             np.savez_compressed(stem.with_suffix(".npz"), **arrays)
     return folder
 
 
-def _truth_geometry(view: View, scene: Scene) -> dict[str, Any]:
+def _truth_arrays(view: View, scene: Scene) -> dict[str, Any]:
+    """What an 8-bit picture over one background does not hold: geometry, mask, straight colour under transparency."""
     arrays: dict[str, Any] = {}
     if view.depth is not None:
         arrays["depth"] = view.depth.numpy() * np.float32(scene.scale)
@@ -163,4 +164,9 @@ def _truth_geometry(view: View, scene: Scene) -> dict[str, Any]:
         arrays["normal"] = view.normal.numpy().astype(np.float16)
     if view.alpha is not None:
         arrays["alpha"] = view.opacity().numpy().astype(np.float16)
+    if view.alpha is not None or view.image.dtype != torch.uint8:
+        image = view.image.numpy()
+        arrays["rgb"] = image if image.dtype == np.uint8 else image.astype(np.float16)
+    if view.mask is not None:
+        arrays["mask"] = view.mask.numpy().astype(bool)
     return arrays

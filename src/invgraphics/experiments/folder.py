@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,24 @@ class RunFolder:
         except OSError as error:
             raise InputError(f"The folder {self.root} cannot be written: {error.strerror}.", "Choose another --out.") from error
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Be the only process that writes this run; whoever comes second says so and waits. Freed when a process dies."""
+        with (self.root / ".lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                print(f"Waiting for another process that writes {self.root}.", file=sys.stderr, flush=True)
+                fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    @property
+    def identity(self) -> str:
+        """Identity of the run that is here, finished or not; empty where there is none."""
+        if not (self.root / "provenance.json").is_file():
+            return ""
+        return str(self.read_json("provenance.json").get("cell_sha256", ""))
+
     @property
     def checkpoint(self) -> Path:
         """Everything a resumed fit needs."""
@@ -48,6 +69,11 @@ class RunFolder:
     def finished(self) -> bool:
         """Whether the run has its scores."""
         return (self.root / "scores.json").is_file()
+
+    @property
+    def resumable(self) -> bool:
+        """Whether a fit can go on: from a checkpoint, and the seconds that it had taken."""
+        return self.checkpoint.is_file() and (self.root / "fit.json").is_file()
 
     def clear(self) -> None:
         """Remove the files of an earlier run, and nothing else."""

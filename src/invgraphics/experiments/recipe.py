@@ -80,12 +80,21 @@ def load_method(name: str, preset: str | None = None, overrides: Sequence[str] =
     if preset and preset not in known:
         raise InputError(f"{name} has no preset '{preset}'.", f"Its presets: {', '.join(known) or 'none'}.")
     table = merge(table, known.get(preset, {}))
-    for item in overrides:
+    assign(table, overrides)
+    return resolve(name, preset, table)
+
+
+def assign(table: dict[str, Any], items: Sequence[str]) -> None:
+    """Set values of a table from ``dotted.path=value`` items, in their order.
+
+    Raises:
+        InputError: an item has another form, or its path leads nowhere.
+    """
+    for item in items:
         path, equals, value = item.partition("=")
         if not equals or not path.strip():
             raise InputError(f"'--set {item}' is not of the form key=value.", "Example: --set batches.rays=2048.")
         set_path(table, path.strip(), _value(value.strip()))
-    return resolve(name, preset, table)
 
 
 def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:

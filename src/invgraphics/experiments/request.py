@@ -9,6 +9,9 @@ from typing import Any, Literal
 
 Existing = Literal["refuse", "resume", "reuse"]
 
+DATA = "data."
+"""How the keys begin that change the training data rather than the recipe (`invgraphics.scenes.corrupt.TrainingData`)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -19,7 +22,7 @@ class Settings:
         out: folder to write.
         budget: of each fit, ``60s`` or ``5000steps``.
         preset: preset of the recipes; ``None`` for their default.
-        overrides: ``key=value`` items laid over the recipes.
+        overrides: ``key=value`` items laid over the recipes, or over the training data where the key begins with ``data.``.
         size: longest side in pixels, or (width, height); ``None`` for the scene's own.
         test_views: how many test views to score; ``None`` for all.
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
@@ -39,6 +42,16 @@ class Settings:
     kernels: str | None = None
     protocol: str = "default"
     checkpoint_every: str = "30s"
+
+    @property
+    def recipe_overrides(self) -> tuple[str, ...]:
+        """The overrides of the recipe."""
+        return tuple(item for item in self.overrides if not item.startswith(DATA))
+
+    @property
+    def data_overrides(self) -> tuple[str, ...]:
+        """The overrides of the training data, with their prefix."""
+        return tuple(item for item in self.overrides if item.startswith(DATA))
 
     def flags(self) -> list[str]:
         """The common part of the command that reproduces this request."""
@@ -116,6 +129,59 @@ class CompareRequest(Settings):
         """The command that makes this comparison."""
         chosen = ["--methods", ",".join(self.methods), "--seeds", ",".join(map(str, self.seeds))]
         return shlex.join(["invgraphics", "compare", self.scene, *chosen, *self.flags()])
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblateRequest:
+    """A study, and what the command line says about it.
+
+    Attributes:
+        study: a built-in study's name, or the path of a ``study.toml``.
+        out: folder to write.
+        executor: what runs the cells, see `invgraphics.experiments.executors`.
+        jobs: cells that share one machine; each gets an equal part of its cores.
+        gpus: GPUs of each cell, for executors that hand them out.
+        address: of the cluster, for executors that have one.
+        seeds: instead of the study's; also ``budget``, ``size`` and ``test_views``, where they are not ``None``.
+        budget: of each fit.
+        size: longest side in pixels, or (width, height).
+        test_views: number of test views, or ``all``.
+        device: ``cpu`` or ``cuda``; ``None`` for the CPU.
+        kernels: implementation to force; ``None`` for the best one here.
+        checkpoint_every: for instance ``30s`` or ``100steps``.
+    """
+
+    study: str
+    out: str
+    executor: str = "local"
+    jobs: int = 1
+    gpus: float = 0.0
+    address: str | None = None
+    seeds: tuple[int, ...] | None = None
+    budget: str | None = None
+    size: int | tuple[int, int] | None = None
+    test_views: int | Literal["all"] | None = None
+    device: str | None = None
+    kernels: str | None = None
+    checkpoint_every: str = "30s"
+
+    def shell(self) -> str:
+        """The command that makes this study."""
+        size = self.size if not isinstance(self.size, tuple) else "x".join(map(str, self.size))
+        given = {
+            "--out": self.out,
+            "--executor": self.executor if self.executor != "local" else None,
+            "--jobs": self.jobs if self.jobs != 1 else None,
+            "--gpus": f"{self.gpus:g}" if self.gpus else None,
+            "--seeds": ",".join(map(str, self.seeds)) if self.seeds else None,
+            "--budget": self.budget,
+            "--size": size,
+            "--test-views": self.test_views,
+            "--device": self.device,
+            "--kernels": self.kernels,
+        }
+        words = [word for flag, value in given.items() if value is not None for word in (flag, str(value))]
+        return shlex.join(["invgraphics", "ablate", self.study, *words])
 
 
 def slug(method: str) -> str:

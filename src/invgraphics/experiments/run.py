@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import signal
 import sys
+import threading
 import traceback
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,16 @@ import torch
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import recipe
-from invgraphics.experiments.build import build_plan, device_of, repeatable, use_kernels
+from invgraphics.experiments.build import build_plan, device_of, repeatable, training_data, use_kernels
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
+from invgraphics.experiments.executors.local import WITH_PARENT
 from invgraphics.experiments.folder import RunFolder, write_json
+from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.recorder import Cadence, Recorder
 from invgraphics.experiments.request import FitRequest
 from invgraphics.metrics.cost import PeakMemory
+from invgraphics.scenes.corrupt import corrupt
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training import checkpoint
 from invgraphics.training.budget import Budget
@@ -38,36 +41,37 @@ def fit_run(request: FitRequest) -> Path:
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
     budget, cadence = Budget.parse(request.budget), Cadence.parse(request.checkpoint_every)
-    method = recipe.load_method(request.method, request.preset, request.overrides)
+    method = recipe.load_method(request.method, request.preset, request.recipe_overrides)
+    data = training_data(request)
     device = device_of(request.device)
     folder = RunFolder(Path(request.out))
     _check_existing(folder, request)
     repeatable(device)
-    scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
-    identity = _identity(request, method, scene)
-    known = folder.read_json("provenance.json") if (folder.root / "provenance.json").is_file() else {}
-    same = known.get("cell_sha256") == identity
-    if request.existing == "resume" and known and not same:
-        raise InputError(
-            f"{folder.root} holds another run: its method, scene, budget, seed or code differ.", "Choose another --out."
-        )
-    if same and folder.finished:
-        return folder.root
-    use_kernels(request.kernels)
-    with PeakMemory(device) as memory:
-        fit = Fit(build_plan(method, scene, budget, request.seed, device))
-        if same and folder.checkpoint.is_file():
-            fit.load(checkpoint.load(folder.checkpoint, device), float(folder.read_json("fit.json")["seconds"]))
-            folder.cut_history(fit.steps)
-        else:
-            folder.clear()
-        _describe(folder, request, method, scene, identity, device)
-        fit.rehearse()
-        print(_prediction(request, fit), file=sys.stderr)
-        Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}").run()
-    costs = {"fit_seconds": fit.seconds, "steps": fit.steps, "peak_memory_bytes": memory.peak_bytes}
-    folder.write_json("fit.json", {"steps": fit.steps, "seconds": fit.seconds, "peak_memory_bytes": memory.peak_bytes})
-    evaluate(folder, scene, (fit.plan.field, fit.plan.renderer), request.protocol, costs, method)
+    with folder.held():
+        scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+        shown = corrupt(scene, data, request.seed)
+        identity = identify(request, method, TruthDigest.of(scene), torch.get_num_threads())
+        same = folder.identity == identity
+        if request.existing == "resume" and folder.identity and not same:
+            raise InputError(
+                f"{folder.root} holds another run: its method, scene, budget, seed or code differ.", "Choose another --out."
+            )
+        if same and folder.finished:
+            return folder.root
+        use_kernels(request.kernels)
+        with PeakMemory(device) as memory:
+            fit = Fit(build_plan(method, shown, budget, request.seed, device))
+            if same and folder.resumable:
+                fit.load(checkpoint.load(folder.checkpoint, device), float(folder.read_json("fit.json")["seconds"]))
+                folder.cut_history(fit.steps)
+            else:
+                folder.clear()
+            _describe(folder, request, method, (scene, shown), identity, device)
+            fit.rehearse()
+            print(_prediction(request, fit), file=sys.stderr)
+            Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}").run()
+        spent = {"steps": fit.steps, "seconds": fit.seconds, "peak_memory_bytes": memory.peak_bytes}
+        _evaluate(folder, scene, fit, request, method, spent)
     return folder.root
 
 
@@ -88,24 +92,28 @@ def _prediction(request: FitRequest, fit: Fit) -> str:
     return f"{request.method} on {fit.plan.scene.name}: fit {fit.plan.budget}, then {evaluation}."
 
 
-def _identity(request: FitRequest, method: recipe.Method, scene: Scene) -> str:
-    """SHA-256 of everything that decides a run's result."""
-    parts: dict[str, Any] = {
-        "method": method.name,
-        "recipe": method.digest,
-        "truth": [scene.digest("train"), scene.digest("val"), scene.digest("test")],
-        "cameras": scene.camera_digest(),
-        "request": {key: getattr(request, key) for key in ("budget", "seed", "device", "kernels", "protocol")},
-        "code": code_version(),
-        "threads": torch.get_num_threads(),
-    }
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+def _evaluate(
+    folder: RunFolder, scene: Scene, fit: Fit, request: FitRequest, method: recipe.Method, spent: dict[str, Any]
+) -> None:
+    """Score the fit on the undisturbed scene. ``scores.json`` comes last, because a run that has it is finished."""
+    folder.write_json("fit.json", spent)
+    costs = {"fit_seconds": spent["seconds"], "steps": spent["steps"], "peak_memory_bytes": spent["peak_memory_bytes"]}
+    model = (fit.plan.field, fit.plan.renderer)
+    if request.protocol != "default":
+        evaluate(folder, scene, model, request.protocol, costs, method)
+    evaluate(folder, scene, model, "default", costs, method)
 
 
 def _describe(
-    folder: RunFolder, request: FitRequest, method: recipe.Method, scene: Scene, identity: str, device: torch.device
+    folder: RunFolder,
+    request: FitRequest,
+    method: recipe.Method,
+    scenes: tuple[Scene, Scene],
+    identity: str,
+    device: torch.device,
 ) -> None:
-    """Write what can be known before the fit."""
+    """Write what can be known before the fit, of the scene as it was loaded and as the fit sees it."""
+    scene, shown = scenes
     folder.write_recipe(method.table)
     folder.write_json("environment.json", environment(device))
     truth_root = Path(request.truth) if request.truth else folder.root / "truth"
@@ -120,12 +128,13 @@ def _describe(
         "seed": request.seed,
         "budget": request.budget,
         "truth_sha256": scene.digest("test"),
-        "train_sha256": scene.digest("train"),
+        "train_sha256": shown.digest("train"),
         "cameras_sha256": scene.camera_digest(),
         "truth": Path(*_relative(truth, folder.root)).as_posix(),
         "background": scene.background.tolist(),
         "colour": scene.colour,
-        "notes": scene.notes,
+        "data": training_data(request).changes(),
+        "notes": shown.notes,
         "code_version": code_version(),
         "command": request.shell(),
         "options": {"size": request.size, "test_views": request.test_views},
@@ -139,7 +148,7 @@ def _relative(target: Path, start: Path) -> tuple[str, ...]:
 
 
 def work(job: Path) -> int:
-    """Make the run of a JSON job file in this process; the exit status says how it went (see `compare`)."""
+    """Make the run of a JSON job file in this process; the exit status says how it went (see `executors.local`)."""
     try:
         fit_run(FitRequest.from_json(json.loads(job.read_text())))
     except KeyboardInterrupt:
@@ -152,6 +161,19 @@ def work(job: Path) -> int:
     return 0
 
 
+def end_with_parent() -> None:
+    """Ask this process to end when its standard input is closed, which happens however the parent dies."""
+
+    def watch() -> None:
+        while os.read(sys.stdin.fileno(), 1):  # not sys.stdin.read, whose lock would outlive the interpreter
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if WITH_PARENT in sys.argv[2:]:
+        end_with_parent()
     sys.exit(work(Path(sys.argv[1])))

@@ -19,8 +19,11 @@ from invgraphics.metrics.image import refuse_mask
 ALEXNET_FILE = "alexnet-owt-7be5be79.pth"
 """Torchvision's AlexNet backbone, under the name that torch's model cache gives it."""
 
+BACKBONES = {"alex": ("AlexNet", ALEXNET_FILE), "vgg": ("VGG-16", "vgg16-397923af.pth")}
+"""LPIPS's name of a network -> its usual name, and torchvision's file of its weights."""
+
 LPIPS_SHORTEST = 32
-"""AlexNet's strides leave nothing of smaller images."""
+"""The networks' strides leave nothing of smaller images."""
 
 
 def flip_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
@@ -43,40 +46,59 @@ def flip(pair: Pair) -> float:
     return pair.mean_within(errors.to(pair.truth.device))
 
 
-def lpips_weights() -> Path:
-    """Where the backbone of LPIPS is looked for: torch's own model cache."""
-    return Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET_FILE
+def lpips_weights(net: str = "alex") -> Path:
+    """Where a backbone of LPIPS is looked for: torch's own model cache."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[net][1]
 
 
-def why_no_lpips() -> str:
+def why_no_lpips(net: str = "alex") -> str:
     """Why LPIPS cannot be computed on this machine; empty if it can."""
     if importlib.util.find_spec("lpips") is None:
         return "the package lpips is not installed (pip install 'invgraphics[lpips]')"
-    if not lpips_weights().is_file():
-        return f"the AlexNet weights {lpips_weights()} are missing; invgraphics never downloads, put the file there"
+    if not lpips_weights(net).is_file():
+        name, missing = BACKBONES[net][0], lpips_weights(net)
+        return f"the {name} weights {missing} are missing; invgraphics never downloads, put the file there"
     return ""
 
 
 @cache
-def _lpips_network() -> Any:
+def _lpips_network(net: str = "alex") -> Any:
     try:
-        return importlib.import_module("lpips").LPIPS(net="alex", version="0.1", verbose=False).eval()
+        return importlib.import_module("lpips").LPIPS(net=net, version="0.1", verbose=False).eval()
     except Exception as error:  # a damaged weight file raises anything from EOFError to UnpicklingError
         raise Skip(f"LPIPS cannot be loaded: {type(error).__name__}: {error}") from error
 
 
+def lpips_distance(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], net: str, scaled: bool = True) -> float:
+    """LPIPS v0.1 (Zhang et al. 2018).
+
+    Args:
+        image: display sRGB in [0, 1].
+        truth: likewise.
+        net: the backbone, a key of `BACKBONES`.
+        scaled: whether colours are scaled to [-1, 1], as the network expects; some tools leave them in [0, 1].
+
+    Raises:
+        Skip: the network is not on this machine, or the images are too small.
+    """
+    reason = why_no_lpips(net)
+    if reason:
+        raise Skip(reason)
+    height, width = image.shape[:2]
+    if min(height, width) < LPIPS_SHORTEST:
+        raise Skip(f"needs {LPIPS_SHORTEST} pixels along the shorter side, the images are {width}x{height}")
+    pair = (values.float().cpu().permute(2, 0, 1)[None] for values in (image, truth))
+    with torch.no_grad():
+        return float(_lpips_network(net)(*pair, normalize=scaled))
+
+
 def lpips_alex(pair: Pair) -> float:
-    """LPIPS v0.1 with the AlexNet backbone (Zhang et al. 2018); colours are scaled to [-1, 1] as it expects."""
+    """LPIPS v0.1 with the AlexNet backbone; colours are scaled to [-1, 1] as it expects."""
     reason = why_no_lpips()
     if reason:
         raise Skip(reason)
     refuse_mask(pair)
-    height, width = pair.pred_alpha.shape
-    if min(height, width) < LPIPS_SHORTEST:
-        raise Skip(f"needs {LPIPS_SHORTEST} pixels along the shorter side, the images are {width}x{height}")
-    image, truth = (values.float().cpu().permute(2, 0, 1)[None] for values in (pair.image, pair.truth))
-    with torch.no_grad():
-        return float(_lpips_network()(image, truth, normalize=True))
+    return lpips_distance(pair.image, pair.truth, "alex")
 
 
 FLIP = Metric("flip", "", False, flip, "LDR-FLIP, mean over pixels, at 67 pixels per degree")

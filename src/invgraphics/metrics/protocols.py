@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,37 +16,7 @@ from invgraphics.core import Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.errors import InputError
 from invgraphics.metrics.base import Metric, Pair, Skip
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """What is fixed before a metric looks at a picture.
-
-    Attributes:
-        name: name in scores and on the command line.
-        quantise: whether both pictures are rounded to 8 bits after compositing, as their PNG files are.
-        background: what transparent pixels are put in front of; ``scene`` is the colour that the data set declares.
-        crop: pixels left out along each border.
-        aggregation: how views are joined: the mean of their values; or, for metrics in dB, the value of the mean error.
-        summary: one line for a table of protocols.
-    """
-
-    name: str
-    quantise: bool = True
-    background: Literal["scene", "white", "black"] = "scene"
-    crop: int = 0
-    aggregation: Literal["mean_of_views", "psnr_of_mean_mse"] = "mean_of_views"
-    summary: str = ""
-
-
-PROTOCOLS = {
-    protocol.name: protocol
-    for protocol in (
-        Protocol("default", summary="8-bit pictures over the scene's background, no crop, mean over views"),
-        Protocol("float", quantise=False, summary="as default, with unrounded pictures"),
-    )
-}
-"""The protocols by name."""
+from invgraphics.metrics.conventions import CONVENTIONS, PROTOCOLS, Protocol
 
 
 @dataclass(frozen=True)
@@ -65,11 +35,16 @@ class ViewScore:
 
 
 def protocol_named(name: str) -> Protocol:
-    """Look a protocol up.
+    """Look one of our own protocols up.
 
     Raises:
-        InputError: unknown name; the known ones are listed.
+        InputError: unknown name, the known ones are listed; or the name of another tool's, which only rescoring knows.
     """
+    if name in CONVENTIONS:
+        raise InputError(
+            f"'{name}' is the protocol of another tool; a fit is evaluated under our own: {', '.join(PROTOCOLS)}.",
+            f"Score the finished run again: invgraphics rescore RUN --protocol {name}.",
+        )
     if name not in PROTOCOLS:
         raise InputError(f"There is no protocol '{name}'.", f"Known protocols: {', '.join(PROTOCOLS)}.")
     return PROTOCOLS[name]
@@ -182,10 +157,27 @@ def _metric(name: str) -> Metric:
 def summarise(
     scores: Sequence[ViewScore], protocol: Protocol = PROTOCOLS["default"]
 ) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Join the views into the ``quality`` and the ``skipped`` part of a ``scores.json``.
+    """Join the views into the ``quality`` and the ``skipped`` part of a ``scores.json``, see `join_views`."""
+
+    def joined(name: str, values: list[float]) -> dict[str, Any]:
+        metric = _metric(name)
+        mean = _mean(values, metric.unit, protocol)
+        return {"mean": mean, "unit": metric.unit, "higher_is_better": metric.higher_is_better}
+
+    return join_views(scores, joined)
+
+
+def join_views(
+    scores: Sequence[ViewScore], joined: Callable[[str, list[float]], dict[str, Any]]
+) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Join the views' scores into the ``quality`` and the ``skipped`` part of a ``scores.json``.
 
     A metric that is missing in any view gets no mean: means over different views cannot be compared. Why it is missing, and
     in which view first, goes to ``skipped``.
+
+    Args:
+        scores: of all views.
+        joined: mean, unit and direction of a metric, from its name and its values.
     """
     names = list(dict.fromkeys(name for one in scores for name in (*one.values, *one.skipped)))
     quality: dict[str, dict[str, Any]] = {}
@@ -196,13 +188,8 @@ def summarise(
             reason = missing[0].skipped.get(name, "not computed")
             skipped[name] = reason if len(missing) == len(scores) else f"view {missing[0].view}: {reason}"
             continue
-        metric, values = _metric(name), [one.values[name] for one in scores]
-        quality[name] = {
-            "mean": _mean(values, metric.unit, protocol),
-            "unit": metric.unit,
-            "higher_is_better": metric.higher_is_better,
-            "per_view": values,
-        }
+        values = [one.values[name] for one in scores]
+        quality[name] = {**joined(name, values), "per_view": values}
     return quality, skipped
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from invgraphics.errors import InputError
+from invgraphics.report.public import Redactor
 
 Arrays = dict[str, Float[ndarray, "..."]]
 """What an ``.npz`` holds: alpha, depth, normal and so on."""
@@ -25,27 +26,44 @@ MASKED = 255
 
 @dataclass(frozen=True)
 class Folder:
-    """The folder a report is written to; everything its page shows lies inside."""
+    """The folder a report is written to; everything its page shows lies inside.
+
+    Attributes:
+        root: where ``index.html`` lies.
+        part: name of the part of the page whose files these are; empty where the page has only one.
+        redactor: cleans what is copied, for a public report; ``None`` for a private one.
+    """
 
     root: Path
+    part: str = ""
+    redactor: Redactor | None = None
+
+    @property
+    def figures(self) -> Path:
+        """Where this part's plots and maps go."""
+        return self.root / "figures" / self.part
 
     def url(self, path: Path) -> str:
         """The relative, quoted link to a file inside the folder."""
         return quote(Path(os.path.relpath(path.resolve(), self.root.resolve())).as_posix())
 
     def publish(self, path: Path, place: str) -> str:
-        """A relative link to ``path``, which is copied to ``place`` when it lies outside the folder.
+        """A relative link to ``path``, which is copied to ``place`` when it lies outside the folder or must be cleaned.
 
         Raises:
             InputError: there is no such file.
         """
         if not path.is_file():
             raise InputError(f"'{path}' is missing.", "Fit the run again, or leave it out of the report.")
-        if path.resolve().is_relative_to(self.root.resolve()):
+        inside = path.resolve().is_relative_to(self.root.resolve())
+        if inside and self.redactor is None:
             return self.url(path)
-        copy = self.root / place
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, copy)
+        copy = self.root / self.part / place
+        if self.redactor is not None:
+            self.redactor.copy(path, copy)
+        else:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
         return self.url(copy)
 
 

@@ -2,46 +2,47 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.errors import InputError
 from invgraphics.report.assets import Folder, read_picture
-from invgraphics.report.curves import draw_curves
-from invgraphics.report.distributions import draw_distributions
-from invgraphics.report.page import Drawn, write_html, write_markdown
-from invgraphics.report.pictures import draw_views
+from invgraphics.report.longtable import write_comparison_table
+from invgraphics.report.page import write_html, write_markdown
+from invgraphics.report.parts import draw_part, method_contrasts
+from invgraphics.report.public import check_apart, redactor_for
 from invgraphics.report.reading import check_comparable, read_comparison, read_run
 from invgraphics.report.records import Comparison, Run
-from invgraphics.report.summary import summarise, time_to_quality
-from invgraphics.report.tables import write_csv, write_latex
-from invgraphics.report.tradeoffs import draw_tradeoffs
-from invgraphics.report.verdict import verdict
+from invgraphics.report.tables import effects_caption, write_latex, write_latex_effects
 from invgraphics.report.wording import listing
 
 
-def build_report(folder: Path) -> Path:
-    """Write the report of a comparison into its own folder.
+def build_report(folder: Path, out: Path | None = None, public: bool = False) -> Path:
+    """Write the report of a comparison into its own folder, or into another one.
 
     Args:
         folder: what ``compare`` wrote: ``compare.json``, ``truth/`` and ``runs/``.
+        out: where to write; ``None`` for the comparison's own folder.
+        public: leave out everything private, which needs a folder of its own.
 
     Returns:
-        The page, ``folder/index.html``; beside it lie ``index.md``, ``results.csv``, ``table.tex`` and ``figures/``.
+        The page, ``index.html``; beside it lie ``index.md``, ``results.csv`` and ``.parquet``, ``table.tex`` and ``figures/``.
 
     Raises:
         InputError: a file is missing or broken, or the folder cannot be written.
     """
-    return _write(read_comparison(folder), folder)
+    return _write(read_comparison(folder), folder if out is None else out, folder, public)
 
 
-def build_from_runs(runs: Sequence[Path], out: Path) -> Path:
+def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Path:
     """Write a report of runs from anywhere; what the page shows is copied into ``out`` unless it lies there already.
 
     Args:
         runs: run folders.
         out: folder to write; created where absent.
+        public: leave out everything private.
 
     Returns:
         The page, ``out/index.html``.
@@ -68,26 +69,28 @@ def build_from_runs(runs: Sequence[Path], out: Path) -> Path:
         size=(picture.shape[1], picture.shape[0]),
         protocol={"name": first.protocol},
     )
-    return _write(comparison, out)
+    base = Path(os.path.commonpath([path.resolve().parent for path in folders])) if public else out
+    return _write(comparison, out, base, public)
 
 
-def _write(comparison: Comparison, out: Path) -> Path:
-    figures = out / "figures"
+def _write(comparison: Comparison, out: Path, base: Path, public: bool) -> Path:
+    """Write everything into ``out``; tables name runs by their path from ``base``."""
+    redactor = None
+    if public:
+        check_apart(out, [run.folder for run in comparison.runs])
+        redactor = redactor_for([comparison])
+        comparison = redactor.value(comparison)
+    folder = Folder(out, redactor=redactor)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        summary = summarise(comparison)
-        views = draw_views(comparison, Folder(out))  # first, because it reads the files that may be broken
-        drawn = Drawn(
-            curves=draw_curves(comparison, summary, figures),
-            tradeoffs=draw_tradeoffs(summary, figures),
-            distributions=draw_distributions(comparison, summary, figures),
-            views=views,
-        )
-        told = verdict(comparison, summary)
-        write_csv(comparison, out / "results.csv")
-        write_latex(comparison, summary, out / "table.tex")
-        write_markdown(comparison, summary, told, drawn, out)
-        write_html(comparison, summary, told, time_to_quality(comparison), drawn, out)
+        part = draw_part(comparison, folder)
+        contrasts = method_contrasts(comparison, folder)
+        write_comparison_table(comparison, out / "results", base)
+        write_latex(comparison, part.summary, out / "table.tex")
+        if contrasts.tables:
+            write_latex_effects(contrasts.first, effects_caption(contrasts.first), out / "effects.tex")
+        write_markdown(part, contrasts, folder)
+        write_html(part, contrasts, folder)
     except OSError as error:
         raise InputError(f"The report cannot be written to '{out}': {error}.", "Choose another --out.") from error
     return out / "index.html"

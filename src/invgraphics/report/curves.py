@@ -6,8 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
 from invgraphics.report.records import Comparison, Run
-from invgraphics.report.style import MUTED, Figure, canvas, save, series_style, spread_labels
+from invgraphics.report.statistics import band
+from invgraphics.report.style import MUTED, Figure, SeriesStyle, canvas, save, series_style, spread_labels
 from invgraphics.report.summary import Summary
 
 if TYPE_CHECKING:
@@ -16,18 +21,26 @@ if TYPE_CHECKING:
 WIDE = (940.0, 400.0)
 NARROW = (400.0, 380.0)
 
+MANY, STRONG, FAINT = 4, 0.16, 0.08
+"""Bands of more than ``MANY`` methods are drawn fainter."""
+
 End = tuple[int, str, float]
 """Where a line ends: series, method, PSNR in dB."""
 
 
 def draw_curves(comparison: Comparison, summary: Summary, folder: Path) -> Figure | None:
-    """One line per run, with the truth's noise ceiling and the better baseline; ``None`` where no run was monitored."""
-    if not any(entry.psnr is not None for run in comparison.runs for entry in run.history):
+    """One line per method, with the truth's noise ceiling and the better baseline; ``None`` where no run was monitored.
+
+    Of several seeds the line is the mean, and a band its t-interval over seeds; each seed's own end is marked.
+    """
+    methods = [method for _, method in comparison.drawn_methods]
+    runs = [run for method in methods for run in comparison.runs_of(method) if _last(run) is not None]
+    if not runs:
         return None
     title = "PSNR against optimisation time"
     wide = _draw(comparison, summary, folder / "time-to-quality", WIDE)
     narrow = _draw(comparison, summary, folder / "time-to-quality-narrow", NARROW)
-    ends = [f"{run.method} ends at {last:.1f} dB" for run in comparison.runs if (last := _last(run)) is not None]
+    ends = [f"{run.method} ends at {last:.1f} dB" for run in runs if (last := _last(run)) is not None]
     return Figure(wide, narrow, title, f"{title}: {'; '.join(ends)}.")
 
 
@@ -41,19 +54,13 @@ def _draw(comparison: Comparison, summary: Summary, stem: Path, size: tuple[floa
     with canvas(*size) as (figure, axes):
         ends: list[End] = []
         values: list[float] = []
-        for series, method in enumerate(comparison.methods):
-            runs, look, finals = comparison.runs_of(method), series_style(series), []
-            for run in runs:
-                points = [(entry.seconds, entry.psnr) for entry in run.history if entry.psnr is not None]
-                if not points:
-                    continue
-                times, psnrs = zip(*points, strict=True)
-                axes.plot(times, psnrs, color=look.colour, linestyle=look.dash, linewidth=2.4 if len(runs) == 1 else 1.6)
-                axes.plot(times[-1], psnrs[-1], look.marker, color=look.colour, markersize=7, clip_on=False, zorder=4)
-                values.extend(psnrs)
-                finals.append(psnrs[-1])
-            if finals:
-                ends.append((series, method, sum(finals) / len(finals)))
+        several = len(comparison.drawn_methods) > MANY
+        for series, method in comparison.drawn_methods:
+            curves = [curve for run in comparison.runs_of(method) if (curve := _curve(run)) is not None]
+            if curves:
+                _draw_seeds(axes, curves, series_style(series), FAINT if several else STRONG)
+                values.extend(float(psnr) for _, psnrs in curves for psnr in psnrs if np.isfinite(psnr))
+                ends.append((series, method, sum(float(psnrs[-1]) for _, psnrs in curves) / len(curves)))
         axes.set_xlim(left=0, right=axes.dataLim.x1 * 1.01)
         axes.set_xlabel("seconds of optimisation")
         axes.set_ylabel("PSNR on monitored views (dB)")
@@ -65,9 +72,40 @@ def _draw(comparison: Comparison, summary: Summary, stem: Path, size: tuple[floa
         return save(figure, stem)
 
 
+Curve = tuple[Float[ndarray, " time"], Float[ndarray, " time"]]
+"""Seconds of optimisation, and PSNR in dB then."""
+
+
+def _curve(run: Run) -> Curve | None:
+    points = [(entry.seconds, entry.psnr) for entry in run.history if entry.psnr is not None]
+    return (np.array([time for time, _ in points]), np.array([psnr for _, psnr in points])) if points else None
+
+
+def mean_curve(curves: Sequence[Curve]) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    """(seconds, mean, low, high) over seeds, at every moment at which one was measured and all were running.
+
+    Between its measurements a seed is read off by linear interpolation.
+    """
+    start, end = max(times[0] for times, _ in curves), min(times[-1] for times, _ in curves)
+    moments = np.unique(np.concatenate([times for times, _ in curves]))
+    moments = moments[(moments >= start) & (moments <= end)]
+    if not len(moments):  # one seed ended before another began to be measured
+        moments = np.array([end])
+    return moments, *band(np.stack([np.interp(moments, *curve) for curve in curves]))
+
+
+def _draw_seeds(axes: Axes, curves: Sequence[Curve], look: SeriesStyle, opacity: float) -> None:
+    moments, mean, low, high = mean_curve(curves)
+    axes.plot(moments, mean, color=look.colour, linestyle=look.dash, linewidth=2.4)
+    if len(curves) > 1:
+        axes.fill_between(moments, low, high, color=look.colour, alpha=opacity, linewidth=0)
+    for times, psnrs in curves:
+        axes.plot(times[-1], psnrs[-1], look.marker, color=look.colour, markersize=7, clip_on=False, zorder=4)
+
+
 def _reference_lines(axes: Axes, comparison: Comparison, summary: Summary, values: Sequence[float]) -> None:
     """The noise ceiling and the better baseline; a far one is named at the edge instead of squeezing the curves."""
-    low, high = min(values), max(values)
+    low, high = (min(values), max(values)) if values else (0.0, 1.0)
     span = max(high - low, 1.0)
     bottom, top = low - 0.06 * span, high + 0.08 * span
     lines = []

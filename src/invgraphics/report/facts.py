@@ -104,6 +104,11 @@ def reproduction(comparison: Comparison, folder: Folder) -> tuple[Cell, ...]:
     return tuple(cells)
 
 
+def plain_facts(table: Mapping[str, Any]) -> Facts:
+    """A record as it is, in words; empty values are left out."""
+    return tuple((_words(str(key)), text) for key, value in table.items() if (text := _text(value)))
+
+
 def _run_facts(run: Run) -> dict[str, str]:
     """Hashes, versions and machine of one run, under the names that people read."""
     names = {

@@ -111,7 +111,7 @@ def choose_views(runs: Sequence[Run]) -> list[tuple[int, str]]:
 
 def draw_views(comparison: Comparison, folder: Folder) -> tuple[ViewPage, ...]:
     """Write the maps of the chosen views below ``figures/views`` and link all pictures; the first seed stands for a method."""
-    firsts = [(runs[0], series) for series, method in enumerate(comparison.methods) if (runs := comparison.runs_of(method))]
+    firsts = [(runs[0], series) for series, method in comparison.drawn_methods if (runs := comparison.runs_of(method))]
     if not firsts:
         return ()
     return tuple(_draw_view(firsts, index, why, folder) for index, why in choose_views(comparison.runs))
@@ -140,7 +140,7 @@ def _draw_view(firsts: Sequence[tuple[Run, int]], index: int, why: str, folder: 
         if colour.shape != truth.shape:
             raise InputError(f"'{stem.with_suffix('.png')}' and '{truth_png}' differ in size.", "Score the run again.")
         shown.append(_Shown(run, series, colour, read_arrays(stem.with_suffix(".npz"))))
-    target = folder.root / "figures" / "views" / f"{index:04d}"
+    target = folder.figures / "views" / f"{index:04d}"
     layers = (
         _colour_layer(shown, index, folder),
         _error_layer(shown, truth, index, folder, target),

@@ -133,16 +133,23 @@ def check_comparable(runs: tuple[Run, ...]) -> None:
     """Refuse runs that were not scored against the same pixels in the same way.
 
     Raises:
-        InputError: ground truth, test views or protocol differ; the sentence names both runs.
+        InputError: ground truth, test views, background or protocol differ; the sentence names both runs.
     """
     for run in runs[1:]:
         first = runs[0]
+        backgrounds = [one.provenance.get("background") for one in (first, run)]
         facts: tuple[tuple[str, Any, Any], ...] = (
             ("ground truth", first.truth_hash[:12], run.truth_hash[:12]),
             ("test views", len(first.views), len(run.views)),
+            ("backgrounds", backgrounds[0], backgrounds[1]),
             ("protocol", first.protocol, run.protocol),
         )
-        equal = (first.truth_hash == run.truth_hash, first.views == run.views, first.protocol == run.protocol)
+        equal = (
+            first.truth_hash == run.truth_hash,
+            first.views == run.views,
+            backgrounds[0] == backgrounds[1],
+            first.protocol == run.protocol,
+        )
         for (what, left, right), same in zip(facts, equal, strict=True):
             if not same:
                 raise InputError(

@@ -111,6 +111,7 @@ class Comparison:
         scene_info: what is known about the scene.
         environment: machine and versions.
         wall_seconds: duration of the whole command.
+        shown: methods that get pictures and curves; empty for all.
     """
 
     scene: str
@@ -129,6 +130,12 @@ class Comparison:
     scene_info: dict[str, Any] = field(default_factory=dict)
     environment: dict[str, Any] = field(default_factory=dict)
     wall_seconds: float | None = None
+    shown: tuple[str, ...] = ()
+
+    @property
+    def drawn_methods(self) -> tuple[tuple[int, str], ...]:
+        """(series, method) of what gets pictures and curves."""
+        return tuple((series, method) for series, method in enumerate(self.methods) if not self.shown or method in self.shown)
 
     def runs_of(self, method: str) -> tuple[Run, ...]:
         """Runs of ``method``, by seed."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from invgraphics.report.records import Comparison, Failure, Run, Score
+from invgraphics.report.statistics import mean_half_width
 from invgraphics.report.wording import ABSENT, COSTS, Quantity, budget_words, metric_label, quality_quantity
 
 
@@ -19,6 +20,7 @@ class Cell:
     Attributes:
         mean: over seeds, in stored units; ``None`` where there is none.
         std: sample standard deviation over seeds; ``None`` for a single one.
+        half_width: half of the mean's t-interval over seeds; 0 for a single one.
         text: the mean as written.
         spread: the deviation as written; empty for a single seed.
         best: no method's written value is better.
@@ -31,6 +33,7 @@ class Cell:
     spread: str
     best: bool = False
     note: int = 0
+    half_width: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,8 @@ class Row:
         seeds: number of runs that succeeded.
         failures: its failed cells.
         cells: one per column.
+        complete: it has as many runs as the method with the most. Others are shown but never ranked: a hard seed that is
+            missing makes a mean look better than it is.
     """
 
     label: str
@@ -52,6 +57,7 @@ class Row:
     seeds: int
     failures: tuple[Failure, ...]
     cells: tuple[Cell, ...]
+    complete: bool = True
 
 
 @dataclass(frozen=True)
@@ -92,13 +98,15 @@ class Summary:
 
 def summarise(comparison: Comparison) -> Summary:
     """The summary of a comparison: means over seeds, the best of each column marked."""
-    columns = _columns(comparison)
+    columns = table_columns(comparison)
     notes: list[str] = []
     rows = []
+    most = max((len(comparison.runs_of(method)) for method in comparison.methods), default=0)
     for series, method in enumerate(comparison.methods):
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
         cells = tuple(_method_cell(column, runs, notes) for column in columns)
-        rows.append(Row(method, "method" if runs else "failed", series, len(runs), failures, cells))
+        kind: Literal["method", "failed"] = "method" if runs else "failed"
+        rows.append(Row(method, kind, series, len(runs), failures, cells, complete=len(runs) == most))
     for name, quality in comparison.baselines.items():
         cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
         rows.append(Row(name, "baseline", -1, 1, (), cells))
@@ -176,7 +184,8 @@ def _reach_text(runs: Sequence[Run], level: float) -> str:
     return f"{statistics.median(times):.1f} s"
 
 
-def _columns(comparison: Comparison) -> tuple[Quantity, ...]:
+def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
+    """Columns of the summary: quality metrics, then the costs that any run has."""
     time_budget = budget_words(comparison.budget).endswith(" s")
     costs = []
     for cost in COSTS:
@@ -228,14 +237,15 @@ def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
         return Cell(None, None, "n/a" if note else ABSENT, "", note=note)
     mean = statistics.fmean(values)
     std = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
-    return Cell(mean, std, column.text(mean), "" if std is None else column.spread(mean, std), note=note)
+    half = 0.0 if std is None else mean_half_width(std, len(values))
+    return Cell(mean, std, column.text(mean), "" if std is None else column.spread(mean, std), note=note, half_width=half)
 
 
 def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, ...]:
     """Mark, among methods, every cell that reads the same as the best one; a contest needs two methods."""
     marked = [list(row.cells) for row in rows]
     for index, column in enumerate(columns):
-        values = {i: row.cells[index].mean for i, row in enumerate(rows) if row.kind == "method"}
+        values = {i: row.cells[index].mean for i, row in enumerate(rows) if row.kind == "method" and row.complete}
         known = {i: value for i, value in values.items() if value is not None}
         if column.better == "none" or len(known) < 2:
             continue

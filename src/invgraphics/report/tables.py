@@ -1,90 +1,14 @@
-"""The summary for other programs: CSV for analysis, Markdown for a repository, LaTeX for a paper."""
+"""The summary for other programs: Markdown for a repository, LaTeX for a paper."""
 
 from __future__ import annotations
 
-import csv
-import math
-import os
 import re
 from pathlib import Path
-from typing import Any
 
-from invgraphics.report.records import Comparison, Run
+from invgraphics.report.effects import Effect
+from invgraphics.report.records import Comparison
 from invgraphics.report.summary import Cell, Row, Summary
-from invgraphics.report.wording import COSTS, Quantity, budget_words
-
-CSV_FIELDS: tuple[str, ...] = (
-    "scene",
-    "method",
-    "seed",
-    "status",
-    "group",
-    "metric",
-    "value",
-    "unit",
-    "higher_is_better",
-    "views",
-    "protocol",
-    "run",
-    "note",
-)
-
-_COST_UNITS = {
-    "fit_seconds": "s",
-    "render_seconds_per_view": "s",
-    "render_fps": "1/s",
-    "peak_memory_bytes": "bytes",
-    "model_bytes": "bytes",
-}
-
-
-def write_csv(comparison: Comparison, path: Path) -> None:
-    """One line per method, seed and metric, in stored units and full precision.
-
-    ``status`` is ``ok``, ``skipped`` (the note says why), ``failed`` (the note is the error) or ``baseline``.
-    """
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, CSV_FIELDS, restval="")
-        writer.writeheader()
-        for method in comparison.methods:
-            for run in comparison.runs_of(method):
-                writer.writerows(_run_lines(run, comparison, path.parent))
-            for failure in comparison.failures_of(method):
-                line = {"method": method, "seed": failure.seed, "status": "failed", "note": failure.error}
-                writer.writerow(line | {"scene": comparison.scene})
-        for name, quality in comparison.baselines.items():
-            for key, score in quality.items():
-                line = {"method": name, "status": "baseline", "group": "quality", "metric": key, "value": _plain(score.mean)}
-                line |= {"unit": score.unit, "higher_is_better": str(score.higher_is_better).lower()}
-                writer.writerow(line | {"scene": comparison.scene, "views": len(score.per_view) or ""})
-
-
-def _run_lines(run: Run, comparison: Comparison, folder: Path) -> list[dict[str, Any]]:
-    common: dict[str, Any] = {"scene": comparison.scene, "method": run.method, "seed": run.seed}
-    common |= {"views": len(run.views), "protocol": run.protocol, "run": relative(run.folder, folder)}
-    lines = []
-    for key, score in run.quality.items():
-        line = {"status": "ok", "group": "quality", "metric": key, "value": _plain(score.mean), "unit": score.unit}
-        lines.append(common | line | {"higher_is_better": str(score.higher_is_better).lower()})
-    for key, why in run.skipped.items():
-        lines.append(common | {"status": "skipped", "group": "quality", "metric": key, "note": why})
-    directions = {cost.key: cost.better for cost in COSTS}
-    for key, value in run.cost.items():
-        line = {"status": "ok", "group": "cost", "metric": key, "value": _plain(value), "unit": _COST_UNITS.get(key, "")}
-        better = directions.get(key, "none")
-        lines.append(common | line | {"higher_is_better": "" if better == "none" else str(better == "higher").lower()})
-    return lines
-
-
-def relative(path: Path, folder: Path) -> str:
-    """``path`` as seen from ``folder``."""
-    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-
-
-def _plain(value: float | None) -> str:
-    if value is None:
-        return ""
-    return str(int(value)) if math.isfinite(value) and value == int(value) and abs(value) < 2**53 else repr(value)
+from invgraphics.report.wording import Quantity, budget_words
 
 
 def escape_markdown(text: str) -> str:
@@ -137,6 +61,8 @@ _LATEX = {
     "−": r"$-$",
     "∞": r"$\infty$",
     "–": "--",
+    "×": r"$\times$",
+    "…": r"\ldots{}",
 }
 
 
@@ -186,3 +112,52 @@ def _latex_cell(cell: Cell) -> str:
     text = f"\\textbf{{{text}}}" if cell.best else text
     text += f" {escape_latex(cell.spread)}" if cell.spread else ""
     return f"{text}\\textsuperscript{{{cell.note}}}" if cell.note else text
+
+
+EFFECT_HEADS = ("Factor", "Levels", "Difference", "95% interval", "p (Holm)", "Based on")
+
+
+def effect_cells(effect: Effect) -> list[str]:
+    """A comparison as one line of a table, under ``EFFECT_HEADS``."""
+    unit = f" {effect.quantity.unit}" if effect.quantity.unit else ""
+    corrected = "" if effect.adjusted is None else f"{effect.adjusted:.2g}"
+    mean = f"{effect.text(effect.estimate.mean)}{unit}"
+    return [effect.factor, f"{effect.after} − {effect.before}", mean, effect.interval, corrected, effect.estimate.size]
+
+
+def markdown_effects(effects: list[Effect]) -> str:
+    """Comparisons as a Markdown table; what is called an effect is bold."""
+    lines = [_line(list(EFFECT_HEADS)), _line(["---", "---", "---:", "---:", "---:", "---"])]
+    for effect in effects:
+        cells = [escape_markdown(text) for text in effect_cells(effect)]
+        cells[2] = f"**{cells[2]}**" if effect.found else cells[2]
+        lines.append(_line(cells))
+    return "\n".join(lines) + "\n"
+
+
+def effects_caption(effects: list[Effect]) -> str:
+    """What a caption of a table of effects must say."""
+    quantity, family = effects[0].quantity, effects[0].comparisons
+    unit = f" ({quantity.unit})" if quantity.unit else ""
+    text = f"Paired differences in {quantity.label}{unit} with 95% intervals."
+    return f"{text} Bold: significant at a family-wise 5% (Holm's correction over {family} comparisons)."
+
+
+def write_latex_effects(effects: list[Effect], caption: str, path: Path) -> None:
+    """Comparisons as a ``booktabs`` table; what is called an effect is bold."""
+    lines = [
+        "% Needs \\usepackage{booktabs}.",
+        "\\begin{table}",
+        "  \\centering",
+        f"  \\caption{{{escape_latex(caption)}}}",
+        "  \\begin{tabular}{llrrrl}",
+        "    \\toprule",
+        _latex_line([escape_latex(head) for head in EFFECT_HEADS]),
+        "    \\midrule",
+    ]
+    for effect in effects:
+        cells = [escape_latex(text) for text in effect_cells(effect)]
+        cells[2] = f"\\textbf{{{cells[2]}}}" if effect.found else cells[2]
+        lines.append(_latex_line(cells))
+    lines += ["    \\bottomrule", "  \\end{tabular}", "\\end{table}"]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

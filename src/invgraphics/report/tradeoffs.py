@@ -24,9 +24,13 @@ SUBJECTS = {
 """The costs that are plotted, and what their axis is about."""
 
 
+MOST_LABELS = 8
+"""Of more points only those on the front are named."""
+
+
 @dataclass(frozen=True)
 class Point:
-    """A method in a plot: cost and quality as written, and the quality's deviation over seeds."""
+    """A method in a plot: cost and quality as written, and half of the quality's interval over seeds."""
 
     row: Row
     cost: float
@@ -56,28 +60,22 @@ def _points(summary: Summary, quality: Quantity, cost: Quantity) -> list[Point]:
         x, y = summary.cell(row, cost.key), summary.cell(row, quality.key)
         if x is None or y is None or x.mean is None or y.mean is None or not math.isfinite(y.mean) or x.mean <= 0:
             continue
-        points.append(Point(row, x.mean * cost.scale, y.mean * quality.scale, (y.std or 0.0) * quality.scale))
+        points.append(Point(row, x.mean * cost.scale, y.mean * quality.scale, y.half_width * quality.scale))
     return points
 
 
 def _draw(points: Sequence[Point], quality: Quantity, cost: Quantity, stem: Path) -> Figure:
-    # Costs are compared as they are written: a fit that ran a hundredth of a second longer is not dearer.
-    front = pareto_front([(cost.sort_key(float(f"{point.cost:.3g}")), quality.sort_key(point.quality)) for point in points])
+    front = _front(points, quality, cost)
     title = f"{quality.label} against {SUBJECTS[cost.key]}"
     with canvas(*PANEL) as (figure, axes):
         _cost_axis(axes, [point.cost for point in points])
-        axes.margins(y=0.2)
+        axes.set_ylim(*_quality_limits(points))
         for point in points:
             look = series_style(point.row.series)
-            edge: dict[str, Any] = {
-                "markeredgecolor": PAGE.light,
-                "markeredgewidth": 1.0,
-                "markersize": 11,
-                "capsize": 3,
-                "zorder": 3,
-            }
-            axes.errorbar(point.cost, point.quality, yerr=point.spread or None, fmt=look.marker, color=look.colour, **edge)
-        _staircase(axes, [points[i] for i in front], cost, quality)
+            mark: dict[str, Any] = {"markeredgecolor": PAGE.light, "markeredgewidth": 1.0, "markersize": 11, "zorder": 4}
+            axes.vlines(point.cost, point.quality - point.spread, point.quality + point.spread, color=look.colour, zorder=3)
+            axes.plot(point.cost, point.quality, look.marker, color=look.colour, **mark)
+        _staircase(axes, front, cost, quality)
         towards = f"{'up' if quality.better == 'higher' else 'down'} and {'right' if cost.better == 'higher' else 'left'}"
         axes.set_title(title, pad=24)
         note = f"better: {towards}.  Dashed: Pareto front"
@@ -85,10 +83,26 @@ def _draw(points: Sequence[Point], quality: Quantity, cost: Quantity, stem: Path
         axes.set_xlabel(f"{SUBJECTS[cost.key]} ({cost.unit})")
         axes.set_ylabel(f"{quality.label} ({quality.unit})" if quality.unit else quality.label)
         figure.draw_without_rendering()  # settles the layout, in whose pixels labels are placed
-        _labels(axes, points)
+        _labels(axes, points if len(points) <= MOST_LABELS else front)
         path = save(figure, stem)
-    best = listing(points[i].row.label for i in front)
+    best = listing(point.row.label for point in front)
     return Figure(path, None, title, f"{title}. On the Pareto front: {best}.")
+
+
+def _front(points: Sequence[Point], quality: Quantity, cost: Quantity) -> list[Point]:
+    """The Pareto front of the methods that have all their seeds, by cost."""
+    ranked = [point for point in points if point.row.complete] or list(points)
+    # Costs are compared as they are written: a fit that ran a hundredth of a second longer is not dearer.
+    keys = [(cost.sort_key(float(f"{point.cost:.3g}")), quality.sort_key(point.quality)) for point in ranked]
+    return [ranked[i] for i in pareto_front(keys)]
+
+
+def _quality_limits(points: Sequence[Point]) -> tuple[float, float]:
+    """Room about the points; bars longer than the points' own range are cut rather than squeezing it."""
+    values = [point.quality for point in points]
+    low, high = min(values), max(values)
+    room = max(0.3 * (high - low), min(max(point.spread for point in points), 0.6 * (high - low))) or 0.05 * abs(high) or 1.0
+    return low - room, high + room
 
 
 def _cost_axis(axes: Axes, values: Sequence[float]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from invgraphics.report.effects import METHOD, Factor, Observation, effects_on
 from invgraphics.report.records import Comparison
 from invgraphics.report.summary import Row, Summary
 from invgraphics.report.wording import Quantity, budget_words, listing
@@ -16,8 +17,9 @@ def verdict(comparison: Comparison, summary: Summary) -> list[str]:
 
 
 def _ranking(summary: Summary, column: Quantity) -> list[tuple[float, Row]]:
-    """(value, row) of the methods, best first."""
-    values = [(cell.mean, row) for row in summary.methods if (cell := summary.cell(row, column.key)) and cell.mean is not None]
+    """(value, row) of the methods that have all their seeds, best first."""
+    rows = [row for row in summary.methods if row.complete]
+    values = [(cell.mean, row) for row in rows if (cell := summary.cell(row, column.key)) and cell.mean is not None]
     return sorted(values, key=lambda entry: column.sort_key(entry[0]))
 
 
@@ -50,7 +52,7 @@ def _quality(comparison: Comparison, summary: Summary) -> list[str]:
         gaps.append((abs(comparison.noise_ceiling - value), name))
     worded = [f"{column.text(gap)}{unit} {where}" for gap, where in gaps]
     sentence += f": {listing(worded)}." if worded and math.isfinite(value) else "."
-    return [sentence, _resolution(summary, column, ranking), _other_metrics(summary, columns[1:], winner)]
+    return [sentence, _resolution(comparison, summary, column, ranking), _other_metrics(summary, columns[1:], winner)]
 
 
 def _best_baseline(summary: Summary, column: Quantity) -> tuple[float, Row] | None:
@@ -58,22 +60,23 @@ def _best_baseline(summary: Summary, column: Quantity) -> tuple[float, Row] | No
     return min(found, key=lambda entry: column.sort_key(entry[0])) if found else None
 
 
-def _resolution(summary: Summary, column: Quantity, ranking: list[tuple[float, Row]]) -> str:
-    """Whether seeds resolve the lead: the gap against the standard deviation of a difference of two seeds."""
+def _resolution(comparison: Comparison, summary: Summary, column: Quantity, ranking: list[tuple[float, Row]]) -> str:
+    """Whether seeds resolve the lead of the first over the second."""
     if len(ranking) < 2:
         return ""
     if max(row.seeds for _, row in ranking) < 2:
         return "One seed per method: how much of a small difference is chance cannot be told from this page."
-    cells = [summary.cell(row, column.key) for _, row in ranking[:2]]
-    deviations = [cell.std for cell in cells if cell is not None and cell.std is not None]
-    if len(deviations) < 2:
+    first, second = (row.label for _, row in ranking[:2])
+    runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
+    effects = effects_on(column, [Factor(METHOD, (first, second), second)], runs)
+    if not effects or effects[0].estimate.unit == "none":
         return ""
-    noise, gap = math.hypot(*deviations), abs(ranking[0][0] - ranking[1][0])
-    unit = f" {column.unit}" if column.unit else ""
-    spread = f"Seeds of a method differ by about {column.text(noise)}{unit}"
-    if gap > 2 * noise:
-        return f"{spread}, {gap / noise:.1f} times less than that lead." if noise > 0 else ""
-    return f"{spread}: that lead may be chance."
+    lead, unit = effects[0], f" {column.unit}" if column.unit else ""
+    low, high = sorted((abs(lead.estimate.low), abs(lead.estimate.high)))
+    if lead.found:
+        return f"Over {lead.estimate.size} that lead lies in [{lead.text(low)}, {lead.text(high)}]{unit} (95% interval)."
+    half = lead.text(lead.estimate.half_width)
+    return f"Over {lead.estimate.size} that lead may be chance: only one above about {half}{unit} could be told from it."
 
 
 def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> str:
@@ -126,6 +129,10 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
         ]
         if below:
             sentences.append(f"{listing(below)} did not beat the trivial baseline '{reference[1].label}' in {column.label}.")
+    short = [row.label for row in summary.methods if not row.complete]
+    if short:
+        words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"
+        sentences.append(f"{listing(short)} {words} left out of the ranking.")
     if comparison.failures:
         cells = len(comparison.runs) + len(comparison.failures)
         sentences.append(f"{len(comparison.failures)} of {cells} cells failed; they are listed below the table.")

@@ -20,14 +20,16 @@ def ray_march(
 ) -> March:
     """See `invgraphics.kernels.ray_march`.
 
-    The walk visits t, t + dt, t + 2 dt, ... from ``start`` with ``dt = max(step, cone * t)``; the last interval is cut at
-    ``far``, which must be finite. ``resume`` is the end of the last interval looked at.
+    The walk visits the lattice ``start + k * step``, or with a cone t, t + dt, ... where ``dt = max(step, cone * t)``; the last
+    interval is cut at ``far``, which must be finite. ``resume`` is the end of the last interval looked at.
     """
+    done = 0
     resume, room = start.clone(), torch.full_like(start, steps.limit, dtype=torch.int64)
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
     walking = torch.nonzero((start < rays.far) & (room > 0))[:, 0]
     while len(walking):
-        edges = _edges(resume[walking], rays.far[walking], steps)
+        edges = _edges(start[walking], resume[walking], rays.far[walking], steps, done)
+        done += BLOCK
         t0, t1 = edges[:, :-1], edges[:, 1:]
         unit = bounds.to_unit(rays[walking].at((t0 + t1) / 2))
         keep = (t1 > t0) & _look_up(occupied, unit)
@@ -43,8 +45,14 @@ def ray_march(
     return _packed(kept, resume)
 
 
-def _edges(t: Float[Tensor, " k"], far: Float[Tensor, " k"], steps: MarchSteps) -> Float[Tensor, "k edges"]:
-    """The next BLOCK + 1 interval ends of each ray; those beyond ``far`` fall onto it."""
+def _edges(
+    start: Float[Tensor, " k"], t: Float[Tensor, " k"], far: Float[Tensor, " k"], steps: MarchSteps, done: int
+) -> Float[Tensor, "k edges"]:
+    """The next BLOCK + 1 interval ends of rays that are at ``t`` after ``done`` steps; those beyond ``far`` fall onto it."""
+    if steps.cone == 0:
+        # Counted from the start, not added up, so that a walk may leap over steps and still meet the same lattice.
+        count = torch.arange(done, done + BLOCK + 1, dtype=t.dtype, device=t.device)
+        return torch.minimum(start[:, None] + count * steps.step, far[:, None])
     edges = [t]
     for _ in range(BLOCK):
         t = t + (steps.cone * t).clamp_min(steps.step)

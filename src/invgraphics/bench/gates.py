@@ -1,0 +1,70 @@
+"""What the project promises about speed, as ratios within one run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from invgraphics.bench import iterations, sample_cases, splat_cases
+from invgraphics.bench.results import BOTH, Results
+
+
+@dataclass(frozen=True)
+class Gate:
+    """A promise.
+
+    Attributes:
+        name: what is promised.
+        bound: ``at least`` or ``at most``.
+        target: the promised ratio.
+        measured: the ratio found; ``None`` where it was not measured.
+    """
+
+    name: str
+    bound: Literal["at least", "at most"]
+    target: float
+    measured: float | None
+
+    @property
+    def verdict(self) -> str:
+        """PASS, MISS, or a dash where there is no measurement."""
+        if self.measured is None:
+            return "-"
+        kept = self.measured >= self.target if self.bound == "at least" else self.measured <= self.target
+        return "PASS" if kept else "MISS"
+
+
+def gates(results: Results) -> list[Gate]:
+    """All promises beside what this run found."""
+    splat, encode = splat_cases.GATE, sample_cases.GATE
+    fast, plain = (results.find("splats", name, BOTH, **splat) for name in ("numba", "reference"))
+    raster = results.find("splat_rasterise", "numba", BOTH, **splat)
+    hashed = results.find("hash_encode", "numba", BOTH, **encode)
+    step = results.find(iterations.SPLAT_STEP, "numba", BOTH, **splat)
+    drawing = results.find(iterations.SPLAT_SHARE, "numba", BOTH, **splat)
+    whole = results.find(iterations.NERF_STEP, "numba", BOTH, **iterations.NERF_GATE)
+    networks = results.find(iterations.NERF_SHARE, "torch", BOTH, **iterations.NERF_GATE)
+    size = f"{splat['gaussians'] // 1000}k Gaussians at {splat['width']} x {splat['width']}"
+    return [
+        Gate(
+            f"Splats forward and backward, {size}: times the reference's speed",
+            "at least", 25, plain.timing.median / fast.timing.median if fast and plain else None,
+        ),
+        Gate(f"Splats forward and backward, {size}: share of the exp2 limit", "at least", 0.06, fast.share if fast else None),
+        Gate(
+            "The same, rasterising alone: share of the exp2 limit",
+            "at least", 0.06, raster.share if raster else None,
+        ),
+        Gate(
+            f"Whole splat step, {size}: times the rasteriser's part",
+            "at most", 1.7, step.timing.median / drawing.timing.median if step and drawing else None,
+        ),
+        Gate(
+            "Hash encoding forward and backward, 2^15 entries: share of the gather limit",
+            "at least", 0.40, hashed.share if hashed else None,
+        ),
+        Gate(
+            "Whole hash-grid step: share of its networks' sample rate",
+            "at least", 0.40, whole.rate / networks.rate if whole and networks else None,
+        ),
+    ]  # fmt: skip

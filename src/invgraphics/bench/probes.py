@@ -1,0 +1,30 @@
+"""Numba kernels that do nothing but reach a limit of the machine; imported only where Numba works."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from invgraphics.kernels.numba.runtime import exp2, index, parallel, prange, share
+
+_ONE = np.float32(1.0)
+
+
+@parallel
+def exp2_passes(values, passes):
+    """``passes`` times x <- 2^x - 1 in each job's row of ``values`` (which stays in the L1 cache; 0 is a fixed point)."""
+    for job in prange(len(values)):
+        row = values[job]
+        for _ in range(passes):
+            for number in range(len(row)):
+                i = index(number)
+                row[i] = exp2(row[i]) - _ONE
+
+
+@parallel
+def gather_sum(table, places, jobs, sums):
+    """Per job, the sum of the entries of ``table`` at its share of ``places``."""
+    for job in prange(jobs):
+        total = np.int64(0)
+        for number in range(share(len(places), jobs, job), share(len(places), jobs, job + 1)):
+            total += table[index(places[index(number)])]
+        sums[job] = total

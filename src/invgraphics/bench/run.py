@@ -1,0 +1,170 @@
+"""The benchmark: takes the parts in order, and measures every kernel in alternation with the reference and with its limit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from invgraphics import kernels
+from invgraphics.bench import PARTS, iterations, limits, sample_cases, splat_cases
+from invgraphics.bench.case import Case
+from invgraphics.bench.memory import footprints
+from invgraphics.bench.peers import peers
+from invgraphics.bench.results import BOTH, MACHINE, THREADS, Measurement, Results, Skipped
+from invgraphics.bench.timing import Effort, alternate
+from invgraphics.kernels.dispatch import IMPLEMENTATIONS, why_not
+
+QUICK, FULL = Effort(0.4, 2, 9), Effort(0.6, 3, 15)
+"""How long to look at each variant."""
+STEPS_QUICK, STEPS_FULL = Effort(2.0, 2, 9), Effort(4.0, 3, 15)
+"""The same for whole steps."""
+
+_CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
+    "splats": splat_cases.splats,
+    "hash": sample_cases.hash_encode,
+    "grid": sample_cases.grid_sample,
+    "march": sample_cases.ray_march,
+    "composite": sample_cases.composite,
+    "ssim": splat_cases.ssim,
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to measure.
+
+    Attributes:
+        parts: some of `PARTS`.
+        quick: only small sizes and those that promises are made for.
+        kernels: measure only this implementation; ``None`` for all that work here.
+        say: told, in a sentence, what comes next.
+    """
+
+    parts: tuple[str, ...] = PARTS
+    quick: bool = False
+    kernels: str | None = None
+    say: Callable[[str], None] = field(default=lambda sentence: None)
+
+    @property
+    def implementations(self) -> tuple[str, ...]:
+        """Kernels to measure, in alternation."""
+        return (self.kernels,) if self.kernels else tuple(name for name in IMPLEMENTATIONS if not why_not(name))
+
+
+def bench(request: Request) -> Results:
+    """Measure; the kernels in use afterwards are those in use before."""
+    results = Results()
+    results.skipped += [
+        Skipped(f"{name} kernels", why) for name in IMPLEMENTATIONS if (why := why_not(name)) and not request.kernels
+    ]
+    request.say("compiling")
+    with kernels.using(request.kernels):
+        kernels.warm_up()
+        _measure_limits(request, results)
+        for part in (part for part in PARTS if part in request.parts):
+            _measure_part(part, request, results)
+    return results
+
+
+def _measure_limits(request: Request, results: Results) -> None:
+    request.say("limits of the machine")
+    for limit in limits.all_limits():
+        timing = alternate({"": limit.run}, _effort(request))[""]
+        sizes, threads = limit.sizes, torch.get_num_threads()
+        results.measurements.append(Measurement(limit.name, MACHINE, "", sizes, threads, timing, limit.amount, limit.unit))
+
+
+def _measure_part(part: str, request: Request, results: Results) -> None:
+    steps = STEPS_QUICK if request.quick else STEPS_FULL
+    if part in _CASES:
+        for case in _CASES[part](request.quick):
+            results.measurements += measure_case(case, request, results.skipped)
+    elif part == "threads":
+        _measure_threads(request, results)
+    elif "numba" not in request.implementations:
+        results.skipped.append(Skipped(part, "it is measured with the Numba kernels only"))
+    elif part == "iterations":
+        request.say("whole steps")
+        results.measurements += iterations.steps(request.quick, steps)
+    elif part == "memory":
+        request.say("memory")
+        footprints(request.implementations, results)
+    elif part == "peers":
+        request.say("peers")
+        peers(_effort(request), results)
+
+
+def measure_case(case: Case, request: Request, skipped: list[Skipped]) -> list[Measurement]:
+    """One kernel on one size, every direction: all implementations and the limit in turn."""
+    request.say(str(case))
+    names = list(request.implementations)
+    if case.without_reference and "reference" in names and len(names) > 1:
+        names.remove("reference")
+        skipped.append(Skipped(f"{case} by the reference", case.without_reference))
+    found = []
+    for direction, work in case.prepare().items():
+        variants = {name: _by(name, work.run) for name in names}
+        if work.limit:
+            variants[MACHINE] = work.limit.run
+        timings = alternate(variants, _effort(request))
+        rate = work.limit.amount / timings[MACHINE].median if work.limit else 0.0
+        label, threads = work.limit.name if work.limit else "", torch.get_num_threads()
+        found += [
+            Measurement(
+                case.operation, name, direction, case.sizes, threads, timings[name], work.amount, work.unit, label, rate
+            )
+            for name in names
+        ]
+    return found
+
+
+def _by(name: str, run: Callable[[], object]) -> Callable[[], object]:
+    """The call with kernels forced."""
+
+    def forced() -> object:
+        with kernels.using(name):
+            return run()
+
+    return forced
+
+
+def _effort(request: Request) -> Effort:
+    return QUICK if request.quick else FULL
+
+
+def thread_counts(most: int) -> list[int]:
+    """1, 2, 4, ... and the most there are."""
+    return sorted({min(1 << power, most) for power in range(most.bit_length() + 1)})
+
+
+def _measure_threads(request: Request, results: Results) -> None:
+    """The promised sizes once more with fewer threads."""
+    most = torch.get_num_threads()
+    if most == 1:
+        results.skipped.append(Skipped("growth with threads", "there is one thread only"))
+        return
+    fast = [name for name in request.implementations if name != "reference"] or ["reference"]
+    alone = Request(request.parts, request.quick, fast[0], request.say)
+    try:
+        for count in thread_counts(most):
+            torch.set_num_threads(count)
+            for case in _promised():
+                for m in measure_case(case, alone, results.skipped):
+                    if m.direction == BOTH or case.operation == "ray_march":
+                        results.measurements.append(_renamed(m))
+    finally:
+        torch.set_num_threads(most)
+
+
+def _renamed(m: Measurement) -> Measurement:
+    """Kept apart from the other measurements of the same size."""
+    return replace(m, operation=f"{THREADS}: {m.operation}")
+
+
+def _promised() -> Iterable[Case]:
+    """One size of each kernel."""
+    everything = [case for make in _CASES.values() for case in make(True)]
+    last = {case.operation: case for case in everything}
+    return last.values()

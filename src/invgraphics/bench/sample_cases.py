@@ -1,0 +1,136 @@
+"""Encodings, marching and compositing: what works on samples along rays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics import kernels
+from invgraphics.bench import limits
+from invgraphics.bench.case import LARGE, Case, Pass
+from invgraphics.bench.results import BOTH, FORWARD
+from invgraphics.bench.splat_cases import both_ways, without_gradient
+from invgraphics.bench.subject import bounds, camera, occupied
+from invgraphics.core import Rays
+from invgraphics.kernels.types import HashGrid, MarchSteps
+
+GATE = {"levels": 16, "log2_size": 15, "points": 1 << 16}
+"""The size that the project's promise about hash grids is made for."""
+
+HASH_SIZES = ((15, 14), (15, 16), (15, 18), (17, 16), (19, 16), (19, 18))
+"""log2 of entries per level, and of points."""
+QUICK_HASH_SIZES = ((15, 14), (15, 16))
+LEVELS, BASE, FINEST = 16, 16, 4096
+"""Instant-NGP's pyramid with a growth of 1.447 per level."""
+MOST_FOR_REFERENCE = 1 << 16
+"""Points beyond which the reference of the hash encoding is left out: its graph holds every corner of every level."""
+
+GRID, GRID_CHANNELS = 128, 4
+GRID_POINTS, QUICK_GRID_POINTS = (1 << 14, 1 << 16, 1 << 18), (1 << 14, 1 << 16)
+
+OCCUPANCY, STEPS_PER_DIAGONAL = 128, 1024
+MARCH_RAYS, QUICK_MARCH_RAYS = (1 << 10, 1 << 12, 1 << 14), (1 << 10, 1 << 12)
+PICTURE = 400
+"""Edge of the picture whose pixels' rays are marched, taken at random."""
+MARCH_BYTES = 8 + 4 + 4
+"""What a kept interval is written as: ray, start, end."""
+
+COMPOSITE_SAMPLES, QUICK_COMPOSITE_SAMPLES = (1 << 16, 1 << 18, 1 << 20), (1 << 16, 1 << 18)
+SAMPLES_PER_RAY, CHANNELS = 32, 4
+COMPOSITE_BYTES = {FORWARD: 4 + 4 * CHANNELS + 8 + 4 + 4, BOTH: 2 * (4 + 4 * CHANNELS + 8 + 4 + 4) + 4 + 4 * CHANNELS}
+"""Per sample: depth, channels and ray are read, two numbers kept; backward, those are read again and gradients written."""
+
+
+def hash_encode(quick: bool) -> Iterator[Case]:
+    """The multi-resolution hash encoding over table sizes and points."""
+    for log2_size, log2_points in QUICK_HASH_SIZES if quick else HASH_SIZES:
+        points = 1 << log2_points
+        sizes = {"levels": LEVELS, "log2_size": log2_size, "points": points}
+        why = LARGE if points > MOST_FOR_REFERENCE else ""
+        yield Case("hash_encode", sizes, lambda size=log2_size, points=points: _hash(size, points), why)
+
+
+def grid_sample(quick: bool) -> Iterator[Case]:
+    """Trilinear look-ups in a dense grid over points."""
+    for points in QUICK_GRID_POINTS if quick else GRID_POINTS:
+        sizes = {"resolution": GRID, "channels": GRID_CHANNELS, "points": points}
+        yield Case("grid_sample", sizes, lambda points=points: _grid(points))
+
+
+def ray_march(quick: bool) -> Iterator[Case]:
+    """Marching through an occupancy grid over rays."""
+    for rays in QUICK_MARCH_RAYS if quick else MARCH_RAYS:
+        yield Case("ray_march", {"resolution": OCCUPANCY, "rays": rays}, lambda rays=rays: _march(rays))
+
+
+def composite(quick: bool) -> Iterator[Case]:
+    """Emission-absorption sums over samples."""
+    for samples in QUICK_COMPOSITE_SAMPLES if quick else COMPOSITE_SAMPLES:
+        yield Case("composite", {"channels": CHANNELS, "samples": samples}, lambda samples=samples: _composite(samples))
+
+
+def ray_ordered(points: int) -> Float[Tensor, "m 3"]:
+    """Points in the unit cube as a renderer asks for them: `SAMPLES_PER_RAY` of them along each of many random lines."""
+    generator = torch.Generator().manual_seed(0)
+    lines = math.ceil(points / SAMPLES_PER_RAY)
+    begin, end = (torch.rand(lines, 1, 3, generator=generator) for _ in range(2))
+    along = (torch.arange(SAMPLES_PER_RAY) + 0.5)[None, :, None] / SAMPLES_PER_RAY
+    return (begin + along * (end - begin)).reshape(-1, 3)[:points].contiguous()
+
+
+def _hash(log2_size: int, points: int) -> dict[str, Pass]:
+    grid = HashGrid(LEVELS, 2, log2_size, BASE, FINEST)
+    table = torch.rand(grid.entries, 2, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    unit = ray_ordered(points)
+    encode = lambda: kernels.hash_encode(unit, table, grid)[0]  # noqa: E731
+    # One level's table: the fastest that its look-ups could be, whatever the order of points and levels.
+    limit = limits.gather(8 << log2_size)
+    amount = 8.0 * LEVELS * points
+    return {
+        FORWARD: Pass(without_gradient(encode), amount, limit, "look-ups"),
+        BOTH: Pass(both_ways(encode, [table]), 2 * amount, limit, "look-ups"),
+    }
+
+
+def _grid(points: int) -> dict[str, Pass]:
+    shape = (GRID, GRID, GRID, GRID_CHANNELS)
+    values = torch.rand(shape, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    unit = ray_ordered(points)
+    sample = lambda: kernels.grid_sample(unit, values)  # noqa: E731
+    limit = limits.gather(4 * values.numel())
+    return {
+        FORWARD: Pass(without_gradient(sample), 8.0 * points, limit, "look-ups"),
+        BOTH: Pass(both_ways(sample, [values]), 16.0 * points, limit, "look-ups"),
+    }
+
+
+def _march(count: int) -> dict[str, Pass]:
+    region, cells, rays = bounds(), occupied(OCCUPANCY), some_rays(count)
+    steps = MarchSteps(2 * region.radius / STEPS_PER_DIAGONAL)
+    march = lambda: kernels.ray_march(rays, cells, region, steps, rays.near)  # noqa: E731
+    return {FORWARD: Pass(march, float(MARCH_BYTES * len(march().ray)), limits.triad(), "bytes")}
+
+
+def some_rays(count: int) -> Rays:
+    """Rays of random pixels of a picture of the object, clipped to its bounds."""
+    pixels = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * PICTURE
+    return bounds().clip(camera(PICTURE).rays(pixels.floor() + 0.5))
+
+
+def _composite(samples: int) -> dict[str, Pass]:
+    generator = torch.Generator().manual_seed(0)
+    depth = (0.2 * torch.rand(samples, generator=generator)).requires_grad_()
+    channels = torch.rand(samples, CHANNELS, generator=generator).requires_grad_()
+    ray = torch.arange(samples) // SAMPLES_PER_RAY
+    rays = int(ray[-1]) + 1
+    add_up = lambda: kernels.composite(depth, channels, ray, rays)  # noqa: E731
+    limit = limits.triad()
+    amount = {direction: float(size) * samples for direction, size in COMPOSITE_BYTES.items()}
+    return {
+        FORWARD: Pass(without_gradient(add_up), amount[FORWARD], limit, "bytes"),
+        BOTH: Pass(both_ways(add_up, [depth, channels]), amount[BOTH], limit, "bytes"),
+    }

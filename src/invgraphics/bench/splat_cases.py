@@ -1,0 +1,153 @@
+"""Splatting and SSIM: what works on whole pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from invgraphics import kernels
+from invgraphics.bench import limits
+from invgraphics.bench.case import SLOW, Case, Pass, Run
+from invgraphics.bench.results import BOTH, FORWARD
+from invgraphics.bench.subject import activated, camera, gaussian_field, leaves
+from invgraphics.core import Camera, Gaussians
+from invgraphics.kernels.dispatch import why_not
+from invgraphics.kernels.types import Footprints
+
+GATE = {"gaussians": 50_000, "width": 400}
+"""The size that the project's promise about splats is made for."""
+
+SIZES = ((10_000, 100), (10_000, 400), (50_000, 100), (50_000, 400), (50_000, 800), (200_000, 400), (200_000, 800))
+QUICK_SIZES = ((10_000, 100), (50_000, 400))
+MOST_FOR_REFERENCE = 50_000 * 400 * 400
+"""Gaussians times pixels beyond which the reference is left out."""
+
+SSIM_WIDTHS, QUICK_SSIM_WIDTHS = (100, 200, 400, 800), (100, 400)
+SSIM_FLOPS = {FORWARD: 5 * 2 * 11 * 2, BOTH: (5 + 3) * 2 * 11 * 2}
+"""Per pixel and channel: five moments are blurred forward, three gradients backward, by 11 taps in x and in y."""
+
+GAUSSIAN_FLOATS, FOOTPRINT_FLOATS = 3 + 4 + 3 + 1 + 48, 2 + 3 + 1 + 1 + 3 + 1 + 3
+"""What projecting reads and writes per Gaussian of SH degree 3."""
+
+
+def splats(quick: bool) -> Iterator[Case]:
+    """The pipeline (project, bin, rasterise) over sizes, and its two differentiable stages at one size."""
+    for n, width in QUICK_SIZES if quick else SIZES:
+        why = SLOW if n * width * width > MOST_FOR_REFERENCE else ""
+        yield Case("splats", {"gaussians": n, "width": width}, lambda n=n, width=width: _pipeline(n, width), why)
+    yield Case("splat_project", GATE, lambda: _project(**GATE))
+    yield Case("splat_rasterise", GATE, lambda: _rasterise(**GATE), "it is nearly all of the pipeline's time")
+
+
+def ssim(quick: bool) -> Iterator[Case]:
+    """SSIM and its gradient over picture sizes."""
+    for width in QUICK_SSIM_WIDTHS if quick else SSIM_WIDTHS:
+        yield Case("ssim", {"width": width, "channels": 3}, lambda width=width: _ssim(width))
+
+
+def splat_pipeline(gaussians: Gaussians, seen_by: Camera) -> tuple[Tensor, Tensor]:
+    """Project, bin and rasterise: colour and alpha."""
+    footprints, rgb = kernels.splat_project(gaussians, seen_by)
+    return kernels.splat_rasterise(footprints, rgb, seen_by.width, seen_by.height)
+
+
+def alpha_evaluations(footprints: Footprints, rgb: Tensor, width: int, height: int) -> float:
+    """How often the rasteriser's forward pass computes ``opacity exp(-q / 2)``; 0 where Numba cannot be asked.
+
+    It walks blocks of pixels and counts its visits. The backward pass visits the same blocks once more. The reference
+    evaluates every pixel of every tile that a footprint's square touches, which is more; the useful work is what counts.
+    """
+    if why_not("numba"):
+        return 0.0
+    from invgraphics.kernels.numba.raster import LANES
+
+    with kernels.using("numba"), torch.enable_grad():
+        image: Any = kernels.splat_rasterise(footprints, rgb.detach().requires_grad_(), width, height)[0]
+    return float(image.grad_fn.walk.work.sum()) * float(LANES)
+
+
+def both_ways(outputs: Run, inputs: list[Tensor]) -> Run:
+    """A call that makes ``outputs`` and carries fixed gradients back to ``inputs``."""
+    gradients: list[Tensor] = []
+
+    def run() -> object:
+        made: Any = outputs()
+        made = made if isinstance(made, tuple) else (made,)
+        if not gradients:
+            generator = torch.Generator().manual_seed(0)
+            gradients.extend(torch.randn(x.shape, generator=generator, dtype=x.dtype) for x in made)
+        return torch.autograd.grad(made, inputs, gradients, allow_unused=True)
+
+    return run
+
+
+def without_gradient(outputs: Run) -> Run:
+    """A call that makes ``outputs`` and keeps nothing for a backward pass."""
+
+    def run() -> object:
+        with torch.no_grad():
+            return outputs()
+
+    return run
+
+
+def _pipeline(gaussians: int, width: int) -> dict[str, Pass]:
+    primitives, seen_by = activated(gaussian_field(gaussians)), camera(width)
+    with torch.no_grad():
+        footprints, rgb = kernels.splat_project(primitives, seen_by)
+    amount = alpha_evaluations(footprints, rgb, width, width)
+    draw = lambda: splat_pipeline(primitives, seen_by)  # noqa: E731
+    return _alpha_passes(draw, leaves(primitives), amount)
+
+
+def _rasterise(gaussians: int, width: int) -> dict[str, Pass]:
+    primitives = activated(gaussian_field(gaussians))
+    with torch.no_grad():
+        found, rgb = kernels.splat_project(primitives, camera(width))
+    means, conics, opacities, colours = (
+        x.detach().requires_grad_() for x in (found.means2d, found.conics, found.opacities, rgb)
+    )
+    footprints = Footprints(means, conics, opacities, found.depths, found.planes, found.radii)
+    amount = alpha_evaluations(footprints, colours, width, width)
+    draw = lambda: kernels.splat_rasterise(footprints, colours, width, width)  # noqa: E731
+    return _alpha_passes(draw, [means, conics, opacities, colours], amount)
+
+
+def _alpha_passes(draw: Run, inputs: list[Tensor], amount: float) -> dict[str, Pass]:
+    limit, unit = limits.exp2(), "alpha evaluations"
+    return {
+        FORWARD: Pass(without_gradient(draw), amount, limit, unit),
+        BOTH: Pass(both_ways(draw, inputs), 2 * amount, limit, unit),
+    }
+
+
+def _project(gaussians: int, width: int) -> dict[str, Pass]:
+    primitives, seen_by = activated(gaussian_field(gaussians)), camera(width)
+
+    def project() -> tuple[Tensor, ...]:
+        footprints, rgb = kernels.splat_project(primitives, seen_by)
+        return footprints.means2d, footprints.conics, footprints.opacities, rgb
+
+    forward = 4.0 * gaussians * (GAUSSIAN_FLOATS + FOOTPRINT_FLOATS)
+    backward = 4.0 * gaussians * (2 * GAUSSIAN_FLOATS + FOOTPRINT_FLOATS)
+    limit = limits.triad()
+    return {
+        FORWARD: Pass(without_gradient(project), forward, limit, "bytes"),
+        BOTH: Pass(both_ways(project, leaves(primitives)), forward + backward, limit, "bytes"),
+    }
+
+
+def _ssim(width: int) -> dict[str, Pass]:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(width, width, 3, generator=generator).requires_grad_()
+    target = torch.rand(width, width, 3, generator=generator)
+    compare = lambda: kernels.ssim(image, target)  # noqa: E731
+    limit = limits.sgemm()
+    amount = {direction: float(flops) * 3 * width * width for direction, flops in SSIM_FLOPS.items()}
+    return {
+        FORWARD: Pass(without_gradient(compare), amount[FORWARD], limit, "flop"),
+        BOTH: Pass(both_ways(compare, [image]), amount[BOTH], limit, "flop"),
+    }

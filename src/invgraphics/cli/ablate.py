@@ -1,0 +1,115 @@
+"""``invgraphics ablate``: a study with factors, levels and seeds."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.arguments import parse_seeds, parse_size, parse_views
+from invgraphics.errors import InputError
+from invgraphics.experiments.request import AblateRequest
+from invgraphics.experiments.study import locate, name_of, read_study
+from invgraphics.training.budget import Budget
+
+if TYPE_CHECKING:
+    from invgraphics.experiments.forecast import Forecast
+
+MOST_HOURS = 4.0
+"""A longer study is not started without asking."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ablate:
+    """Run a study: methods and scenes under every level of its factors, with several seeds; then write its report.
+
+    The same command again keeps what is finished and goes on with what is not. Exit status 1 means that some runs failed.
+    """
+
+    study: Annotated[Positional[str], arg(metavar="STUDY")]
+    """A built-in study (see `invgraphics list studies`), or the path of a study.toml."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/STUDY)")] = None
+    """Folder of the report and its runs."""
+    executor: Annotated[str, arg(metavar="local|ray")] = "local"
+    """What runs the fits: this machine, or a Ray cluster, which must share its files."""
+    jobs: Annotated[int, arg(metavar="N")] = 1
+    """Fits that share a machine; each gets an equal part of its cores. One at a time keeps timings fair."""
+    gpus: Annotated[float | None, arg(metavar="N", help_behavior_hint="(default: 1 with --device cuda)")] = None
+    """GPUs of each fit on a cluster."""
+    address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: one started for this study)")] = None
+    """The Ray cluster."""
+    yes: bool = False
+    """Start a study of more than four hours without asking."""
+    seeds: Annotated[str | None, arg(metavar="0,1,2", help_behavior_hint="(default: the study's)")] = None
+    """Each cell is fitted once per seed."""
+    budget: Annotated[str | None, arg(metavar="60s|5000steps", help_behavior_hint="(default: the study's)")] = None
+    """How long each fit may optimise."""
+    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the study's)")] = None
+    """Size of the pictures; one number is the longest side."""
+    test_views: Annotated[str | None, arg(metavar="N|all", help_behavior_hint="(default: the study's)")] = None
+    """How many test views are scored, evenly spaced."""
+    device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
+    """Where to compute."""
+    kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
+    """Force an implementation of the hot operations: numba, or reference (plain torch)."""
+    checkpoint_every: Annotated[str, arg(metavar="30s|100steps")] = "30s"
+    """How much work an interruption may cost."""
+
+    def run(self) -> int:
+        """Make what is missing; print what failed, and the page's path."""
+        request = self.request()
+        read_study(locate(request.study)).overridden(request)  # refuses most mistakes before torch is imported
+
+        from invgraphics.experiments.ablate import ablate
+
+        folder, failed = ablate(request, self._confirm)
+        for cell in failed:
+            print(f"{cell['run']} failed: {(cell['error'] or 'no message').splitlines()[0]}")
+
+        from invgraphics.report.study import build_study_report
+
+        print(build_study_report(folder))
+        return 1 if failed else 0
+
+    def request(self) -> AblateRequest:
+        """The same as plain values, checked as far as that needs no data."""
+        if self.budget is not None:
+            Budget.parse(self.budget)
+        if self.jobs < 1:
+            raise InputError(f"--jobs cannot be {self.jobs}.", "Expected a number of fits, 1 or more.")
+        gpus = float(self.device == "cuda") if self.gpus is None else self.gpus
+        views = None if self.test_views is None else parse_views(self.test_views) or "all"
+        return AblateRequest(
+            study=self.study,
+            out=str(Path("reports") / name_of(locate(self.study)) if self.out is None else self.out),
+            executor=self.executor,
+            jobs=self.jobs,
+            gpus=gpus,
+            address=self.address,
+            seeds=None if self.seeds is None else parse_seeds(self.seeds),
+            budget=self.budget,
+            size=None if self.size is None else parse_size(self.size),
+            test_views=views,
+            device=self.device,
+            kernels=self.kernels,
+            checkpoint_every=self.checkpoint_every,
+        )
+
+    def _confirm(self, forecast: Forecast) -> None:
+        """Say what is ahead, and ask where it is long.
+
+        Raises:
+            InputError: the answer was no, or there is nobody to ask.
+        """
+        print(forecast, file=sys.stderr, flush=True)
+        if self.yes or forecast.hours <= MOST_HOURS:
+            return
+        advice = "Fewer --seeds or a smaller --budget make it shorter."
+        if not sys.stdin.isatty():
+            raise InputError(f"The study needs about {forecast.hours:.2g} h, and nobody can be asked.", f"Add --yes. {advice}")
+        print("Start it? [y/N] ", end="", file=sys.stderr, flush=True)
+        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+            raise InputError("The study was not started.", advice)

@@ -1,0 +1,116 @@
+"""``invgraphics bench``: how fast the kernels are, against the plain reference, the machine's limits and peers."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import arg
+
+from invgraphics.bench import PARTS, QUICK
+from invgraphics.cli.arguments import parse_list
+from invgraphics.cli.output import show_table
+from invgraphics.errors import InputError
+
+if TYPE_CHECKING:
+    from invgraphics.bench.plots import Look
+    from invgraphics.bench.run import Request
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure every kernel against the plain reference and against the machine's limits, in one run; write tables and a page.
+
+    Ratios are taken within the run, from calls in alternation; close other programs for times that mean something.
+    """
+
+    quick: bool = False
+    """Only small sizes and those that promises are made for (under two minutes)."""
+    only: Annotated[str | None, arg(metavar="A,B,C", help_behavior_hint="(default: everything)")] = None
+    """Parts to measure: splats, hash, grid, march, composite, ssim, iterations, threads, memory, peers."""
+    kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: all in alternation)")] = None
+    """Measure one implementation only: numba, or reference (plain torch)."""
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("reports/bench")
+    """Folder of the tables and the page."""
+    check: bool = False
+    """Exit with status 1 if a promise is missed or was not measured."""
+
+    def run(self) -> int:
+        """Measure; print the promises and the page's path."""
+        parts = self.parts()
+
+        from invgraphics.bench.gates import gates
+        from invgraphics.bench.page import headline, write
+        from invgraphics.bench.run import bench
+        from invgraphics.bench.tables import gate_table, kernel_table, step_table
+
+        began, record = time.perf_counter(), self._record()
+        results = bench(self.request(parts))
+        record |= {"seconds": round(time.perf_counter() - began), "load at the end": _load()}
+        page = write(results, record, self.out, _look())
+
+        for title, table in (("Kernels", kernel_table(results)), ("Whole steps", step_table(results))):
+            if table.rows:
+                show_table(title, table.columns, table.rows)
+        for skipped in results.skipped:
+            print(f"left out: {skipped.what} ({skipped.why})")
+        found = gates(results)
+        promises = gate_table(found)
+        show_table(headline(found), promises.columns, promises.rows)
+        print(f"Page: {page}")
+        return int(self.check and any(gate.verdict != "PASS" for gate in found))
+
+    def parts(self) -> tuple[str, ...]:
+        """What to measure, in order.
+
+        Raises:
+            InputError: there is no such part.
+        """
+        if self.only is None:
+            return QUICK if self.quick else PARTS
+        parts = parse_list(self.only, "--only")
+        for part in parts:
+            if part not in PARTS:
+                raise InputError(f"--only: there is no part '{part}'.", f"Parts: {', '.join(PARTS)}.")
+        return parts
+
+    def request(self, parts: tuple[str, ...]) -> Request:
+        """The same as plain values, checked.
+
+        Raises:
+            InputError: the kernels are unknown, or do not work here.
+        """
+        from invgraphics import kernels
+        from invgraphics.bench.run import Request
+
+        with kernels.using(self.kernels):  # refuses what cannot be used
+            return Request(parts, self.quick, self.kernels, lambda sentence: print(sentence, file=sys.stderr, flush=True))
+
+    def _record(self) -> dict[str, object]:
+        import torch
+
+        from invgraphics.experiments.environment import environment
+
+        command = shlex.join(["invgraphics", "bench", *sys.argv[2:]])
+        return {**environment(torch.device("cpu")), "load at the start": _load(), "command": command}
+
+
+def _load() -> str:
+    """Processes that wanted to run during the last minute, as the system counts them."""
+    return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+
+
+def _look() -> Look:
+    """The look of the reports."""
+    from importlib.resources import files
+
+    from invgraphics.bench.plots import Look
+    from invgraphics.report import style
+
+    sheet = files("invgraphics.report").joinpath("templates", "style.css").read_text(encoding="utf-8")
+    return Look(style.canvas, style.save, style.series_style, sheet)

@@ -1,0 +1,81 @@
+"""``invgraphics rescore``: score saved pictures again, under the conventions of other tools."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.output import show_table
+from invgraphics.cli.report import COMPARISON, runs_in
+from invgraphics.errors import InputError
+
+COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+
+
+@dataclass(frozen=True)
+class Rescore:
+    """Score saved pictures again under named protocols: those of a run, or of any tool. `list protocols` explains them."""
+
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|FOLDER", help_behavior_hint="(one or more)")]
+    """Runs, comparisons, or folders of predicted pictures (3DGS's renders/ + gt/ and nerfbaselines' color/ + gt-color/ bring
+    their truth). Several must share their truth."""
+    protocol: Annotated[str, arg(metavar="NAME,NAME|all")] = "all"
+    """Protocols, with commas between them."""
+    truth: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the folder's own)")] = None
+    """True pictures, matched by equal names, else in order."""
+    background: Annotated[str | None, arg(metavar="white|black|R,G,B", help_behavior_hint="(default: not stated)")] = None
+    """The data set's background, and what pictures without alpha show where the scene is transparent; runs know theirs."""
+    allow_8bit: bool = False
+    """Let 8-bit pictures stand in where a protocol wants unrounded predictions."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: into the run)")] = None
+    """Where to write scores, and the table as Markdown and CSV."""
+
+    def run(self) -> int:
+        """Score; print a table for each set of pictures."""
+        background = None if self.background is None else parse_colour(self.background)
+        if not self.folders:
+            raise InputError("There is nothing to score.", "Give a run, or a folder of predicted pictures.")
+
+        from invgraphics.experiments.pictures import open_pictures
+        from invgraphics.experiments.rescore import rescore, rules_named
+        from invgraphics.experiments.rescored import reasons, rows_of, winners, write_scores, write_tables
+
+        rules = rules_named(self.protocol)
+        folders = [one for folder in self.folders for one in (runs_in(folder) if (folder / COMPARISON).is_file() else [folder])]
+        results = rescore([open_pictures(folder, self.truth, background) for folder in folders], rules, self.allow_8bit)
+        for one in results:
+            width, height = one.pictures.size
+            title = f"{one.label}: {len(one.pictures.names)} views of {width}x{height}, truth {one.pictures.sha256[:12]}"
+            show_table(title, *rows_of(one))
+            for line in reasons(one):
+                print(line)
+            write_scores(one, None if self.out is None else self.out / one.label.replace("/", "-"))
+        for sentence in (winners(results, "psnr"), winners(results, "ssim")):
+            if sentence:
+                print(sentence)
+        if self.out is not None:
+            for path in write_tables(results, self.out):
+                print(path)
+        return 0
+
+
+def parse_colour(text: str) -> tuple[float, float, float]:
+    """Read ``white``, ``black``, or three numbers in [0, 1].
+
+    Raises:
+        InputError: anything else.
+    """
+    if text.strip() in COLOURS:
+        return COLOURS[text.strip()]
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not all(0 <= value <= 1 for value in (red, green, blue)):
+        raise InputError(
+            f"--background cannot be '{text}'.", "Expected white, black, or three numbers from 0 to 1: 0.5,0.5,0.5."
+        )
+    return red, green, blue

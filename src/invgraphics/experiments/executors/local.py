@@ -1,0 +1,110 @@
+"""Fits on this machine, each in its own spawned process, so that its time and memory are its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+
+from invgraphics.errors import InputError
+from invgraphics.experiments.executors.base import INTERRUPTED, Outcome, Resources
+from invgraphics.experiments.folder import write_json
+from invgraphics.experiments.request import FitRequest
+
+WITH_PARENT = "--while-stdin-is-open"
+"""Argument of `invgraphics.experiments.run` as a program that ties its life to that of the process that started it."""
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+"""Whoever may start threads in a fit reads one of these."""
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class FitProcess:
+    """A fit in a process of its own, which ends when this one does.
+
+    Args:
+        request: what to fit.
+        jobs: folder for the job file, the error message and the log.
+        resources: threads, and whether there is a log.
+    """
+
+    def __init__(self, request: FitRequest, jobs: Path, resources: Resources) -> None:
+        jobs.mkdir(parents=True, exist_ok=True)
+        job = jobs / f"{_name(request)}.json"
+        self._request, self._began = request, time.monotonic()
+        self._report = job.with_suffix(".error.json")
+        self._report.unlink(missing_ok=True)
+        write_json(job, request.to_json())
+        self._log = job.with_suffix(".log").open("a") if resources.logs else None
+        pinned = {} if resources.threads is None else dict.fromkeys(THREAD_VARIABLES, str(resources.threads))
+        # A process that dies closes its pipes, however it dies: the open standard input is what keeps the child alive.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "invgraphics.experiments.run", str(job), WITH_PARENT],
+            stdin=subprocess.PIPE,
+            stdout=self._log,
+            stderr=self._log,
+            env=os.environ | pinned,
+        )
+
+    def wait(self) -> Outcome:
+        """Wait for the end."""
+        status = self._process.wait()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        if self._log is not None:
+            self._log.close()
+        error = "" if status in (0, INTERRUPTED) else self._error(status)
+        return Outcome(self._request, status, error, time.monotonic() - self._began)
+
+    def stop(self) -> None:
+        """Ask it to write a checkpoint and end; after Ctrl-C it is doing so already, and a second signal changes nothing."""
+        self._process.terminate()
+
+    def _error(self, status: int) -> str:
+        try:
+            return str(json.loads(self._report.read_text())["error"])
+        except (OSError, json.JSONDecodeError, KeyError):
+            return f"The process ended with status {status} and left no message."
+
+
+def _name(request: FitRequest) -> str:
+    """A name for a run's job: its folder below ``runs``."""
+    *_, parent, name = Path(request.out).resolve().parts
+    return name if parent == "runs" else f"{parent}-{name}"
+
+
+class LocalExecutor:
+    """Runs a fixed number of fits at a time; one by default, so that nothing disturbs their timings."""
+
+    def __init__(self, resources: Resources | None = None) -> None:
+        self._resources = resources or Resources()
+        if not 1 <= self._resources.jobs <= cores():
+            raise InputError(f"--jobs cannot be {self._resources.jobs}: this machine has {cores()} cores.")
+
+    def run(self, requests: Sequence[FitRequest], jobs: Path) -> Generator[Outcome, None, None]:
+        """See `Executor.run`."""
+        queue = deque(requests)
+        running: dict[Future[Outcome], FitProcess] = {}
+        with ThreadPoolExecutor(self._resources.jobs) as pool:
+            try:
+                while queue or running:
+                    while queue and len(running) < self._resources.jobs:
+                        process = FitProcess(queue.popleft(), jobs, self._resources)
+                        running[pool.submit(process.wait)] = process
+                    done, _ = wait(running, return_when=FIRST_COMPLETED)
+                    for future in done:
+                        del running[future]
+                        yield future.result()
+            finally:
+                for process in running.values():
+                    process.stop()

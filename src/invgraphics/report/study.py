@@ -1,0 +1,117 @@
+"""From a study to its report: factor effects, interactions, every scene's tables and pictures, and the matrix of cells."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from invgraphics.errors import InputError
+from invgraphics.report.assets import Folder
+from invgraphics.report.effectplots import draw_heat_maps, file_name
+from invgraphics.report.effects import effects_on
+from invgraphics.report.longtable import write_study_table
+from invgraphics.report.parts import draw_contrasts, draw_part
+from invgraphics.report.public import check_apart, redactor_for
+from invgraphics.report.records import Comparison
+from invgraphics.report.studypage import StudyPage, write_study_html, write_study_markdown
+from invgraphics.report.studyreading import Study, read_study, scene_comparisons
+from invgraphics.report.summary import quality_columns, table_columns, value_of
+from invgraphics.report.tables import effects_caption, write_latex, write_latex_effects
+from invgraphics.report.wording import Quantity
+
+MOST_PICTURES = 8
+"""Variants of a scene that get pictures and curves; there are as many colours."""
+
+
+def build_study_report(folder: Path, out: Path | None = None, public: bool = False) -> Path:
+    """Write the report of a study, finished or not.
+
+    Args:
+        folder: what ``ablate`` wrote: ``study.json`` and ``runs/``.
+        out: where to write; ``None`` for the study's own folder.
+        public: leave out everything private, which needs a folder of its own.
+
+    Returns:
+        The page, ``index.html``; beside it lie ``index.md``, ``results.csv`` and ``.parquet``, ``effects.tex``, a
+        ``table-*.tex`` for each scene, and ``figures/``.
+
+    Raises:
+        InputError: a file is missing or broken, or the folder cannot be written.
+    """
+    study, target = read_study(folder), folder if out is None else out
+    redactor = None
+    if public:
+        check_apart(target, [folder])
+        redactor = redactor_for([study])
+        study = redactor.value(study)
+    place = Folder(target, redactor=redactor)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        page = _draw(study, place)
+        write_study_table(study, target / "results", folder)
+        for part in page.parts:
+            write_latex(part.comparison, part.summary, target / f"table-{part.key}.tex")
+        if page.contrasts.tables:
+            write_latex_effects(page.contrasts.first, effects_caption(page.contrasts.first), target / "effects.tex")
+        write_study_markdown(page, place)
+        write_study_html(page, place)
+    except OSError as error:
+        raise InputError(f"The report cannot be written to '{target}': {error}.", "Choose another --out.") from error
+    return target / "index.html"
+
+
+def study_sentences(folder: Path) -> list[str]:
+    """What a study's factors do to its first metric, a sentence for each pair of levels.
+
+    Raises:
+        InputError: a file is missing or broken.
+    """
+    study = read_study(folder)
+    quantities = _quantities(scene_comparisons(study))
+    return [effect.sentence for effect in effects_on(quantities[0], study.factors, study.observations())] if quantities else []
+
+
+def _draw(study: Study, folder: Folder) -> StudyPage:
+    comparisons = scene_comparisons(study)
+    keys = _keys([comparison.scene for comparison in comparisons])
+    parts = tuple(
+        draw_part(replace(comparison, shown=_shown(comparison)), replace(folder, part=key))
+        for key, comparison in zip(keys, comparisons, strict=True)
+    )
+    observations = study.observations()
+    quantities = _quantities(comparisons)
+    contrasts = draw_contrasts(quantities, study.factors, observations, folder)
+    heat = draw_heat_maps(study.factors, quantities[0], observations, folder.figures) if quantities else []
+    return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None)
+
+
+def _quantities(comparisons: Sequence[Comparison]) -> list[Quantity]:
+    """Every column of any scene's table, quality first."""
+    columns = [column for comparison in comparisons for column in table_columns(comparison)]
+    found = {column.key: column for column in reversed(columns)}
+    unique = [found[key] for key in dict.fromkeys(column.key for column in columns)]
+    quality = [column for column in unique if column.group != "cost"]
+    return [*quality, *(column for column in unique if column.group == "cost")] if quality else []
+
+
+def _keys(scenes: Sequence[str]) -> list[str]:
+    """Names that serve in anchors and folders, distinct for distinct scenes."""
+    names = [file_name(scene).strip("-") or "scene" for scene in scenes]
+    return [name if names.count(name) == 1 else f"{name}-{index}" for index, name in enumerate(names)]
+
+
+def _shown(comparison: Comparison) -> tuple[str, ...]:
+    """The variants that get pictures: all, or ``MOST_PICTURES`` evenly spaced from best to worst."""
+    columns = quality_columns(comparison)
+    if len(comparison.methods) <= MOST_PICTURES or not columns:
+        return ()
+    ranked: list[tuple[float, str]] = []
+    for method in comparison.methods:
+        values = [value for run in comparison.runs_of(method) if (value := value_of(run, columns[0])) is not None]
+        if values:
+            ranked.append((columns[0].sort_key(statistics.fmean(values)), method))
+    ranked.sort()
+    count = min(MOST_PICTURES, len(ranked))
+    return tuple(ranked[round(i * (len(ranked) - 1) / max(1, count - 1))][1] for i in range(count))

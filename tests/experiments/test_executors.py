@@ -1,0 +1,141 @@
+"""What runs fits: processes of their own, which neither outlive their parent nor lose what they did."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from training_fixtures import SMALL
+
+from invgraphics import plugins
+from invgraphics.errors import InputError
+from invgraphics.experiments.executors.base import Outcome, Resources
+from invgraphics.experiments.executors.local import LocalExecutor, cores
+from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.request import FitRequest
+from invgraphics.training.checkpoint import NAME
+
+METHOD = "splatting/gaussians"
+ENDLESS = {"budget": "1000000steps", "checkpoint_every": "10000s"}
+"""A fit whose only checkpoint is the one that it writes when it is stopped."""
+
+
+@pytest.fixture
+def request_for(toy_folder: Path, tmp_path: Path):
+    def make(name: str, **more) -> FitRequest:
+        out, truth = str(tmp_path / "runs" / name), str(tmp_path / "truth")
+        base = {"method": METHOD, "scene": str(toy_folder), "overrides": tuple(SMALL[METHOD]), "kernels": "reference"}
+        return FitRequest(**base | {"out": out, "truth": truth, "budget": "3steps", "existing": "reuse"} | more)
+
+    return make
+
+
+def wait_for(path: Path, seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not path.exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert path.exists(), f"{path} never appeared"
+
+
+def test_good_and_bad_fits_are_told_apart(request_for, tmp_path: Path) -> None:
+    good, bad = request_for("good"), request_for("bad", scene=str(tmp_path / "nowhere"))
+    executor = LocalExecutor(Resources(threads=1, logs=True))
+    outcomes = {Path(o.request.out).name: o for o in executor.run([bad, good], tmp_path / "jobs")}
+    assert outcomes["good"] == Outcome(good, 0, "", outcomes["good"].seconds)
+    assert outcomes["good"].seconds > 0
+    assert outcomes["bad"].status == 1 and "nowhere' is neither" in outcomes["bad"].error
+    assert (tmp_path / "runs" / "good" / "scores.json").is_file()
+    assert json.loads((tmp_path / "runs" / "good" / "environment.json").read_text())["threads"] == 1
+    assert "fit 3 steps" in (tmp_path / "jobs" / "good.log").read_text()
+
+
+def test_a_death_without_a_word_is_reported(request_for, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    (outcome,) = LocalExecutor().run([request_for("a")], tmp_path / "jobs")
+    assert outcome.status == 1 and "left no message" in outcome.error
+
+
+def test_threads_are_pinned(request_for, tmp_path: Path, monkeypatch) -> None:
+    """The child's environment, seen by a program that does nothing but write it down."""
+    program = tmp_path / "python"
+    program.write_text(f"#!/bin/sh\nenv > {tmp_path}/$OMP_NUM_THREADS.env\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    list(LocalExecutor(Resources(threads=7)).run([request_for("a")], tmp_path / "jobs"))
+    lines = (tmp_path / "7.env").read_text().splitlines()
+    assert {"OMP_NUM_THREADS=7", "MKL_NUM_THREADS=7", "NUMBA_NUM_THREADS=7"} <= set(lines)
+
+
+def test_at_most_so_many_run_at_a_time(request_for, tmp_path: Path, monkeypatch) -> None:
+    program = tmp_path / "python"
+    log = tmp_path / "log"
+    program.write_text(f"#!/bin/sh\necho begin >> {log}\nsleep 0.2\necho end >> {log}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr("invgraphics.experiments.executors.local.cores", lambda: 2)
+    requests = [request_for(str(i)) for i in range(5)]
+    for jobs in (1, 2):
+        log.unlink(missing_ok=True)
+        done = [Path(o.request.out).name for o in LocalExecutor(Resources(jobs=jobs)).run(requests, tmp_path / "jobs")]
+        assert sorted(done) == ["0", "1", "2", "3", "4"]
+        running = most = 0
+        for line in log.read_text().split():
+            running += 1 if line == "begin" else -1
+            most = max(most, running)
+        assert most == jobs
+
+
+def test_more_jobs_than_cores_are_refused() -> None:
+    with pytest.raises(InputError, match=f"has {cores()} cores"):
+        LocalExecutor(Resources(jobs=cores() + 1))
+
+
+def test_ctrl_c_stops_the_fit_with_a_checkpoint(request_for, tmp_path: Path) -> None:
+    """The signal comes while the executor waits, and to this process alone, as from `kill -INT`."""
+    run = tmp_path / "runs" / "long"
+    outcomes = LocalExecutor(Resources(threads=1)).run([request_for("long", **ENDLESS)], tmp_path / "jobs")
+
+    def interrupt() -> None:
+        wait_for(run / "history.jsonl")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        next(outcomes)
+    assert (run / NAME).is_file()
+    assert not (run / "scores.json").exists()
+
+
+def test_a_fit_does_not_outlive_its_parent(request_for, tmp_path: Path) -> None:
+    """Kill -9 leaves the parent no time to tidy up; the child must notice by itself, and leave a checkpoint."""
+    program = (
+        "import json, sys; from pathlib import Path\n"
+        "from invgraphics.experiments.executors.local import LocalExecutor\n"
+        "from invgraphics.experiments.request import FitRequest\n"
+        "list(LocalExecutor().run([FitRequest.from_json(json.loads(sys.argv[1]))], Path(sys.argv[2])))\n"
+    )
+    request = json.dumps(request_for("long", **ENDLESS).to_json())
+    parent = subprocess.Popen([sys.executable, "-c", program, request, str(tmp_path / "jobs")])
+    run = tmp_path / "runs" / "long"
+    wait_for(run / "history.jsonl")
+    parent.kill()
+    parent.wait()
+    wait_for(run / NAME, seconds=60)
+    with RunFolder(run).held():  # comes only once the child is gone
+        assert not (run / "scores.json").exists()
+
+
+def test_executors_are_a_registry() -> None:
+    assert set(plugins.names("executors")) == {"local", "ray"}
+    assert plugins.load("executors", "local") is LocalExecutor
+
+
+def test_without_ray_a_sentence(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"needs the package ray"):
+        plugins.load("executors", "ray")(Resources())

@@ -1,0 +1,140 @@
+"""A public report tells no path, no user and no host."""
+
+from __future__ import annotations
+
+import getpass
+import re
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image, PngImagePlugin
+from pyarrow import parquet
+
+from invgraphics.cli import main
+from invgraphics.errors import InputError
+from invgraphics.report.public import HIDDEN, Redactor, redactor_for
+from invgraphics.report.study import build_study_report
+
+USER, HOST, LOGIN, NODE = "ada_lovelace", "analyticalengine", "countess", "babbage-07"
+HOME = f"/home/{USER}/My Experiments/fox"
+
+
+@pytest.fixture(autouse=True)
+def _names(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(getpass, "getuser", lambda: LOGIN)
+    monkeypatch.setattr(socket, "gethostname", lambda: f"{NODE}.example.org")
+
+
+def plant_in_runs(folder: Path, edit: Callable[..., None]) -> None:
+    def plant(table: dict[str, Any]) -> None:
+        table["command"] = f"invgraphics fit volumetric/hash '{HOME}' --out /scratch/{LOGIN}/runs/1 --set a=/home/{USER}/b"
+        table["notes"] = {"source": f"photos of {USER.upper()}", "file": f"C:\\Users\\{USER}\\fox.jpg"}
+
+    def plant_machine(table: dict[str, Any]) -> None:
+        table |= {"hostname": f"{HOST}.lab", "note": f"ran on {HOST} by {LOGIN}", "cwd": f"/work/{LOGIN}/here"}
+
+    for run in folder.rglob("scores.json"):
+        edit(run.parent / "provenance.json", plant)
+        edit(run.parent / "environment.json", plant_machine)
+        (run.parent / "recipe.toml").write_text(f'method = "x"\npath = "{HOME}/recipe"\n')
+        edit(run, lambda table: table["skipped"].update(lpips=f"no weights in /home/{USER}/.cache/torch: not found"))
+    about = PngImagePlugin.PngInfo()
+    about.add_text("Author", USER)
+    for picture in [*folder.glob("truth/*/*.png"), *folder.glob("runs/**/test/*.png")]:
+        Image.open(picture).save(picture, pnginfo=about)
+
+
+def leaks(folder: Path) -> list[str]:
+    """Every file below ``folder`` that holds a planted word or an absolute path."""
+    words = [word.lower().encode() for word in (USER, HOST, LOGIN, NODE, "example.org", "My Experiments", "scratch")]
+    paths = re.compile(rb"(?<![\w./<])/(?:home|users|tmp|root|work|mnt|scratch|usr|var)/|file://|[a-z]:\\users", re.IGNORECASE)
+    found = []
+    for path in folder.rglob("*"):
+        if path.is_file():
+            content = path.read_bytes()
+            if path.suffix == ".parquet":  # compressed
+                content += repr(parquet.read_table(path).to_pydict()).encode()
+            hits = [word for word in words if word in content.lower()] + paths.findall(content)
+            found += [f"{path.relative_to(folder)}: {hits}"] if hits else []
+    return found
+
+
+def test_public_study_tells_nothing_private(study_folder: Path, tmp_path: Path, edit: Callable[..., None]) -> None:
+    def plant(table: dict[str, Any]) -> None:
+        table["command"] = f"invgraphics ablate /home/{USER}/studies/views.toml --out '{HOME}'"
+        table["environment"] |= {"hostname": HOST, "user": LOGIN, "home": f"/home/{USER}"}
+        table["question"] = f"Does {USER} need more views?"
+        for cell in table["cells"]:
+            cell["scene"] = f"{HOME}/{cell['scene']}"
+            if cell["status"] == "failed":
+                cell["error"] = f"'{HOME}/x.png' is missing on {HOST}: see /var/log/{LOGIN}/run.log"
+
+    edit(study_folder / "study.json", plant)
+    plant_in_runs(study_folder, edit)
+    out = tmp_path / "out"
+    build_study_report(study_folder, out, public=True)
+    assert leaks(out) == []
+    page = (out / "index.html").read_text()
+    assert "invgraphics ablate views.toml --out &#39;fox&#39;" in page
+    assert "Scene: balls" in page
+    assert len(list(out.rglob("provenance.json"))) == 34
+    private = tmp_path / "private"
+    build_study_report(study_folder, private)
+    assert len(leaks(private)) > 30  # the same search finds what is there
+
+
+def test_public_comparison_tells_nothing_private(
+    comparison_folder: Path, tmp_path: Path, edit: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def plant(table: dict[str, Any]) -> None:
+        table["command"] = f"invgraphics compare {HOME.replace(' ', '_')} --out ~{LOGIN}/reports"
+        table["scene_info"]["notes"] = {"photos": f"file:///home/{USER}/fox/images"}
+        table["environment"]["node"] = NODE
+
+    edit(comparison_folder / "compare.json", plant)
+    plant_in_runs(comparison_folder, edit)
+    assert main.run(["report", str(comparison_folder), "--public"]) == main.DONE
+    out = tmp_path / "balls-public"
+    assert capsys.readouterr().out.strip().endswith("index.html")
+    assert leaks(out) == []
+    runs = sorted(comparison_folder.glob("runs/*/seed-0"))
+    assert main.run(["report", *map(str, runs), "--out", str(tmp_path / "single"), "--public"]) == main.DONE
+    assert leaks(tmp_path / "single") == []
+    text = (out / "index.html").read_text()
+    for attribute in ("src", "href", "srcset"):
+        for part in text.split(f'{attribute}="')[1:]:
+            link = part.split('"')[0]
+            assert link.startswith(("#", "data:")) or (out / link).is_file(), link
+
+
+def test_public_report_refuses_the_folder_of_the_runs(pristine_study: Path) -> None:
+    with pytest.raises(InputError, match="private runs lie in it"):
+        build_study_report(pristine_study, pristine_study, public=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "clean"),
+    [
+        ("see /data/set/fox.png, or /x", "see fox.png, or x"),
+        ("--out=/a/b:/c/d", "--out=b:d"),
+        ("'/a/b c/d e' is missing", "'d e' is missing"),
+        ("volumetric/hash at 3 s/view, ../truth/0", "volumetric/hash at 3 s/view, ../truth/0"),
+        ("https://example.org/a/b and file:///a/b", "https://example.org/a/b and b"),
+        ("/home/zoe", HIDDEN),
+        ("~zoe/x and ~/y/z", "x and z"),
+        (r"C:\Users\Zoe\fox.jpg", "fox.jpg"),
+        ("Zoe ran it; zoetrope", f"{HIDDEN} ran it; zoetrope"),
+        ("1 / 2", "1 / 2"),
+    ],
+)
+def test_redaction(text: str, clean: str) -> None:
+    assert Redactor(("zoe",)).text(text) == clean
+
+
+def test_names_are_gathered_where_they_are_told() -> None:
+    words = redactor_for([{"a": ["/home/zoe/x"], "HOST": "turing.lab"}, "/Users/kim/y"]).words
+    assert {"zoe", "kim", "turing.lab", LOGIN, NODE} <= set(words)
+    assert "root" not in words
