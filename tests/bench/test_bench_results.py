@@ -3,7 +3,7 @@
 import csv
 
 import pytest
-from bench.made_up import measured
+from bench_made_up import measured
 
 from invgraphics.bench import iterations, sample_cases, splat_cases
 from invgraphics.bench.gates import gates

@@ -25,7 +25,7 @@ def clockwork(monkeypatch: pytest.MonkeyPatch):
 
 def test_variants_take_turns(clockwork) -> None:
     calls, variant = clockwork
-    alternate({"a": variant("a", 0.1), "b": variant("b", 0.1)}, Effort(0.3, 1, 10))
+    alternate({"a": variant("a", 0.125), "b": variant("b", 0.125)}, Effort(0.375, 1, 10))
     assert "".join(calls) == "ab" + "ababab"
 
 

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from bench.made_up import measured
+from bench_made_up import measured
 
 from invgraphics.bench import PARTS, QUICK, iterations, sample_cases, splat_cases
 from invgraphics.bench import run as bench_run

@@ -52,9 +52,9 @@ def pristine_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def study_folder(pristine_study: Path, tmp_path: Path) -> Path:
-    """A study folder of one's own."""
-    return Path(shutil.copytree(pristine_study, tmp_path / "views"))
+def small_study(tmp_path: Path) -> Path:
+    """A study of four cells, one of which failed."""
+    return write_study(tmp_path / "small", {"balls": (0,)}, {"data.train_views": [40, 20]}, (0, 1), {1: "failed"})
 
 
 @pytest.fixture(scope="session")

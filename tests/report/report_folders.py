@@ -270,10 +270,11 @@ def write_comparison(root: Path) -> Path:
     return root
 
 
-STUDY_SCENES = ("balls", "moons")
+STUDY_VIEWS = {"balls": (0, 1, 2), "moons": (3, 4)}
+STUDY_SCENES = tuple(STUDY_VIEWS)
 STUDY_SEEDS = (0, 1, 2)
 STUDY_FACTORS: dict[str, list[Any]] = {"data.train_views": [40, 20], "field.encoding.levels": [8, 12, 16]}
-FAILED, MISSING = 5, 17
+LOST = {5: "failed", 17: "missing"}
 
 
 def study_table(cells: Sequence[dict[str, Any]], factors: Mapping[str, list[Any]], **other: Any) -> dict[str, Any]:
@@ -312,22 +313,28 @@ def study_cells(
     return cells
 
 
-def write_study(root: Path) -> Path:
-    """2 scenes x 1 method x (2 x 3) levels x 3 seeds with pictures; one cell failed, one has not run."""
-    scenes = {}
-    for scene, views in zip(STUDY_SCENES, ((0, 1, 2), (3, 4)), strict=True):
+def write_study(
+    root: Path,
+    scenes: Mapping[str, Sequence[int]] = STUDY_VIEWS,
+    factors: Mapping[str, list[Any]] = STUDY_FACTORS,
+    seeds: Sequence[int] = STUDY_SEEDS,
+    lost: Mapping[int, str] = LOST,
+) -> Path:
+    """One method with pictures; of the cells, ``lost`` says which failed or have not run."""
+    truths = {}
+    for scene, views in scenes.items():
         truth = [truth_frame(view) for view in views]
-        scenes[scene] = (truth, write_truth(root, truth))
-    cells = study_cells(STUDY_SCENES, METHODS[1:2], STUDY_SEEDS, STUDY_FACTORS)
+        truths[scene] = (truth, write_truth(root, truth))
+    cells = study_cells(scenes, METHODS[1:2], seeds, factors)
     for index, cell in enumerate(cells):
-        if index == FAILED:
-            cell |= {"status": "failed", "error": "The loss is not finite at step 7.", "seconds": None}
-        elif index == MISSING:
-            cell |= {"status": "missing", "seconds": None}
+        if index in lost:
+            error = "The loss is not finite at step 7." if lost[index] == "failed" else None
+            cell |= {"status": lost[index], "error": error, "seconds": None}
         else:
-            worse = (40 / cell["levels"]["data.train_views"]) ** 0.5 * (16 / cell["levels"]["field.encoding.levels"]) ** 0.1
-            write_run(root / cell["run"], *scenes[cell["scene"]], cell["method"], cell["seed"], worse, cell["scene"])
-    (root / "study.json").write_text(json.dumps(study_table(cells, STUDY_FACTORS)))
+            levels = cell["levels"]
+            worse = (40 / levels["data.train_views"]) ** 0.5 * (16 / levels.get("field.encoding.levels", 16)) ** 0.1
+            write_run(root / cell["run"], *truths[cell["scene"]], cell["method"], cell["seed"], worse, cell["scene"])
+    (root / "study.json").write_text(json.dumps(study_table(cells, factors)))
     return root
 
 

@@ -22,7 +22,8 @@ HIDDEN = "…"
 HOMES = re.compile(r"(?:/home/|/Users/|/var/home/|[A-Za-z]:\\+Users\\+)([^/\\\s'\"]+)")
 WINDOWS = re.compile(r"[A-Za-z]:\\[^\s'\",;]*")
 QUOTED = re.compile(r"(['\"])((?:file://)?(?:~[\w.-]*)?/(?!/)[^'\"]*|[A-Za-z]:\\[^'\"]*)\1")
-POSIX = re.compile(r"(?:file://)?(?<![\w./~…])(?:~[\w.-]*)?/(?!/)[^\s'\",;:()\[\]{}<>|]+")
+INSIDE = r"[^\s'\",;:()\[\]{}<>|/]"
+POSIX = re.compile(rf"(?:file://|(?<![\w./~…])(?:~[\w.-]*)?(?=/(?!/)))/(?:{INSIDE}|/)+")
 
 NOBODY = {"root", "user", "ubuntu", "admin", "runner", "nobody", "localhost", "docker", "shared", "public", "jovyan", "app"}
 """Names that identify no one, and that are words of ordinary sentences."""
@@ -40,13 +41,17 @@ class Redactor:
 
     Attributes:
         words: user and host names, matched as whole words whatever their case.
+        paths: absolute paths that some record holds as a whole; elsewhere their spaces would hide where they end.
     """
 
     words: tuple[str, ...]
+    paths: tuple[str, ...] = ()
 
     def text(self, text: str) -> str:
         """Absolute paths become their last component, private words an ellipsis."""
         text = QUOTED.sub(lambda match: f"{match[1]}{self._last(match[2])}{match[1]}", text)
+        for path in self.paths:
+            text = re.sub(rf"{re.escape(path)}(?:/{INSIDE}*)*(?!\w)", lambda match: self._last(match[0]), text)
         text = POSIX.sub(lambda match: self._last(match[0]), text)
         text = WINDOWS.sub(lambda match: self._last(match[0]), text)
         for word in self.words:
@@ -103,16 +108,24 @@ def redactor_for(records: Iterable[Any]) -> Redactor:
     for record in records:
         _gather(record, found)
     names = {name for name in found if len(name) >= SHORTEST and name.lower() not in NOBODY}
-    return Redactor(tuple(sorted(names, key=lambda name: (-len(name), name))))
+    paths = {name for name in found if _is_path(name)}
+    longest = [tuple(sorted(group, key=lambda name: (-len(name), name))) for group in (names - paths, paths)]
+    return Redactor(*longest)
+
+
+def _is_path(text: str) -> bool:
+    return text.startswith("/") and len(text) > 1 and "\n" not in text
 
 
 def _gather(value: Any, found: set[str]) -> None:
     if isinstance(value, str | Path):
+        found.update([str(value)] if _is_path(str(value)) else [])
         found.update(match[1] for match in HOMES.finditer(str(value)))
     elif isinstance(value, Mapping):
         for key, item in value.items():
-            if str(key).lower() in PRIVATE_KEYS and isinstance(item, str):
-                found.update(part for part in re.split(r"[/\\@\s]+", item) if part)
+            if str(key).lower() in PRIVATE_KEYS and isinstance(item, str) and not _is_path(item):
+                parts = [part for part in re.split(r"[/\\@\s]+", item) if part]
+                found.update([*parts, *(part.partition(".")[0] for part in parts)])
             _gather(item, found)
     elif isinstance(value, list | tuple):
         for item in value:

@@ -77,7 +77,7 @@ def _draw(study: Study, folder: Folder) -> StudyPage:
     comparisons = scene_comparisons(study)
     keys = _keys([comparison.scene for comparison in comparisons])
     parts = tuple(
-        draw_part(replace(comparison, shown=_shown(comparison)), replace(folder, part=key))
+        draw_part(replace(comparison, shown=shown_variants(comparison)), replace(folder, part=key))
         for key, comparison in zip(keys, comparisons, strict=True)
     )
     observations = study.observations()
@@ -102,7 +102,7 @@ def _keys(scenes: Sequence[str]) -> list[str]:
     return [name if names.count(name) == 1 else f"{name}-{index}" for index, name in enumerate(names)]
 
 
-def _shown(comparison: Comparison) -> tuple[str, ...]:
+def shown_variants(comparison: Comparison) -> tuple[str, ...]:
     """The variants that get pictures: all, or ``MOST_PICTURES`` evenly spaced from best to worst."""
     columns = quality_columns(comparison)
     if len(comparison.methods) <= MOST_PICTURES or not columns:

@@ -32,7 +32,7 @@ class RayExecutor:
 
     def __init__(self, resources: Resources) -> None:
         try:
-            import ray
+            import ray  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise InputError("The executor 'ray' needs the package ray.", 'pip install "invgraphics[ray]"') from None
         self._ray: Any = ray
