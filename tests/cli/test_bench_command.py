@@ -29,8 +29,8 @@ def made_up_run(request) -> Results:
     results.measurements += [
         measured("splat_rasterise", "numba", BOTH, splat_cases.GATE, 0.1, **limit),
         measured("hash_encode", "numba", BOTH, sample_cases.GATE, 0.1, **limit),
-        measured(iterations.SPLAT_SHARE, "numba", BOTH, splat_cases.GATE, 0.1),
-        measured(iterations.SPLAT_STEP, "numba", BOTH, splat_cases.GATE, 0.2),
+        measured(iterations.SPLAT_SHARE, "numba", BOTH, splat_cases.GATE, 0.1, amount=1.0),
+        measured(iterations.SPLAT_STEP, "numba", BOTH, splat_cases.GATE, 0.2, amount=1.0),
         measured(iterations.NERF_SHARE, "torch", BOTH, iterations.NERF_GATE, 0.1, amount=100.0),
         measured(iterations.NERF_STEP, "numba", BOTH, iterations.NERF_GATE, 0.2, amount=100.0),
         measured(f"{PEERS}: hash encoding", "numba", BOTH, sample_cases.GATE, 0.1),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,10 +38,10 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def opened(browser: Any, built_report: Path) -> Iterator[Any]:
-    """Opens the report with given options; complaints of the page and requests are kept in ``page.heard``."""
+    """Opens a report (of the comparison, if nothing is said); complaints and requests are kept in ``page.heard``."""
     contexts = []
 
-    def visit(**options: Any) -> Any:
+    def visit(folder: Path = built_report, **options: Any) -> Any:
         context = browser.new_context(**options)
         contexts.append(context)
         page = context.new_page()
@@ -49,7 +50,7 @@ def opened(browser: Any, built_report: Path) -> Iterator[Any]:
         page.on("pageerror", lambda error: page.heard["complaints"].append(str(error)))
         page.on("requestfailed", lambda request: page.heard["complaints"].append(request.url))
         page.on("request", lambda request: page.heard["requests"].append(request.url))
-        page.goto((built_report / "index.html").as_uri())
+        page.goto((folder / "index.html").as_uri())
         page.wait_for_load_state("load")
         return page
 
@@ -61,31 +62,37 @@ def opened(browser: Any, built_report: Path) -> Iterator[Any]:
 CUT = "slider => getComputedStyle(slider.querySelector('.over')).clipPath"
 
 
-def test_page_is_quiet_and_asks_no_network(opened: Any) -> None:
-    page = opened()
+@pytest.fixture(params=["built_report", "built_study"])
+def either(request: pytest.FixtureRequest) -> Path:
+    """The folder of a reported comparison, then of a reported study."""
+    return Path(request.getfixturevalue(request.param))
+
+
+def test_page_is_quiet_and_asks_no_network(opened: Any, either: Path) -> None:
+    page = opened(either)
     assert page.heard["complaints"] == []
     assert page.heard["requests"]
     assert all(url.startswith(("file:", "data:")) for url in page.heard["requests"])
 
 
-def test_every_picture_has_size(opened: Any) -> None:
-    page = opened()
+def test_every_picture_has_size(opened: Any, either: Path) -> None:
+    page = opened(either)
     sizes = page.evaluate("[...document.images].map(image => [image.getAttribute('src'), image.naturalWidth])")
     assert len(sizes) > 60
     assert [source for source, width in sizes if not width] == []
 
 
-def test_every_link_resolves(opened: Any, built_report: Path) -> None:
-    page = opened()
+def test_every_link_resolves(opened: Any, either: Path) -> None:
+    page = opened(either)
     links = page.evaluate("[...document.querySelectorAll('a')].map(link => link.getAttribute('href'))")
     anchors = set(page.evaluate("[...document.querySelectorAll('[id]')].map(element => '#' + element.id)"))
     assert len(links) > 30
     for link in links:
-        assert link in anchors if link.startswith("#") else (built_report / link).is_file(), link
+        assert link in anchors if link.startswith("#") else (either / link).is_file(), link
 
 
-def test_slider_follows_pointer_and_keyboard(opened: Any) -> None:
-    page = opened(viewport={"width": 1280, "height": 900})
+def test_slider_follows_pointer_and_keyboard(opened: Any, either: Path) -> None:
+    page = opened(either, viewport={"width": 1280, "height": 900})
     slider = page.locator(".view:not([hidden]) .slider").first
     slider.scroll_into_view_if_needed()
     box = slider.bounding_box()
@@ -101,7 +108,7 @@ def test_slider_follows_pointer_and_keyboard(opened: Any) -> None:
     assert handle["x"] + handle["width"] / 2 == pytest.approx(box["x"] + box["width"] * 0.25, abs=2)
     page.keyboard.press("ArrowRight")
     assert slider.evaluate(CUT) != dragged
-    others = page.locator(".view:not([hidden]) .slider").all()
+    others = page.locator(".view:not([hidden])").first.locator(".slider").all()
     assert len({other.evaluate(CUT) for other in others}) == 1
 
 
@@ -144,8 +151,8 @@ def test_copy_button_copies_the_command(opened: Any) -> None:
 
 
 @pytest.mark.parametrize("width", [375, 768, 1280])
-def test_no_sideways_scrolling(opened: Any, width: int) -> None:
-    page = opened(viewport={"width": width, "height": 800})
+def test_no_sideways_scrolling(opened: Any, either: Path, width: int) -> None:
+    page = opened(either, viewport={"width": width, "height": 800})
     page.evaluate("document.querySelectorAll('details').forEach(details => (details.open = true))")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
@@ -174,3 +181,128 @@ def test_on_paper_all_views_are_shown(opened: Any) -> None:
     page.emulate_media(media="print")
     assert page.locator(".view:visible").count() == page.locator(".view").count()
     assert page.locator("button.copy:visible").count() == 0
+
+
+SEEN = """frame => {
+  // What part of the picture a frame shows: left, top, right and bottom in shares of the picture.
+  const box = frame.getBoundingClientRect();
+  const image = frame.querySelector('img').getBoundingClientRect();
+  const x = value => (value - image.left) / image.width;
+  const y = value => (value - image.top) / image.height;
+  return [x(box.left), y(box.top), x(box.right), y(box.bottom)];
+}"""
+
+
+def seen(page: Any) -> list[list[float]]:
+    """What every frame of the first open view shows."""
+    view = page.locator(".view:not([hidden])").first
+    return [frame.evaluate(SEEN) for frame in view.locator(".lens, .slider").all()]
+
+
+def test_buttons_zoom_all_pictures_of_a_view_about_their_middle(opened: Any, either: Path) -> None:
+    page = opened(either, viewport={"width": 1280, "height": 900})
+    view = page.locator(".view:not([hidden])").first
+    view.get_by_label("Zoom in").click()
+    view.get_by_label("Zoom in").click()
+    assert view.locator(".zoom output").inner_text() == "4×"
+    frames = seen(page)
+    assert len(frames) > 8
+    for frame in frames:
+        assert frame == pytest.approx([0.375, 0.375, 0.625, 0.625], abs=0.01)
+    other = page.locator("nav.views a").nth(1)
+    other.click()
+    assert seen(page)[0] == pytest.approx([0, 0, 1, 1], abs=0.01)  # another view has its own zoom
+    page.locator("nav.views a").nth(0).click()
+    for _ in range(2):
+        view.get_by_label("Zoom out").click()
+    assert seen(page)[3] == pytest.approx([0, 0, 1, 1], abs=0.01)
+
+
+def test_wheel_with_ctrl_zooms_at_the_pointer_and_without_it_scrolls(opened: Any) -> None:
+    page = opened(viewport={"width": 1280, "height": 900})
+    frame = page.locator(".view:not([hidden]) .lens").first
+    frame.scroll_into_view_if_needed()
+    box = frame.bounding_box()
+    page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"])
+    page.keyboard.down("Control")
+    for _ in range(3):
+        page.mouse.wheel(0, -40)
+    page.keyboard.up("Control")
+    page.wait_for_function("parseFloat(document.querySelector('.view.zoomed output').textContent) >= 3")
+    left, top, right, bottom = seen(page)[0]
+    assert left + 0.25 * (right - left) == pytest.approx(0.25, abs=0.01)
+    assert top + 0.5 * (bottom - top) == pytest.approx(0.5, abs=0.01)
+    assert len({tuple(round(value, 2) for value in part) for part in seen(page)}) == 1
+    before = page.evaluate("scrollY")
+    page.mouse.wheel(0, 200)
+    page.wait_for_function(f"scrollY > {before}")
+
+
+def test_drag_moves_zoomed_pictures_and_double_click_returns(opened: Any) -> None:
+    page = opened(viewport={"width": 1280, "height": 900})
+    frame = page.locator(".view:not([hidden]) .lens").first
+    frame.scroll_into_view_if_needed()
+    box = frame.bounding_box()
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.dblclick(*middle)
+    assert seen(page)[0] == pytest.approx([0.375, 0.375, 0.625, 0.625], abs=0.01)
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] - 0.4 * box["width"], middle[1] + 0.2 * box["height"], steps=4)
+    page.mouse.up()
+    for part in seen(page):
+        assert part == pytest.approx([0.475, 0.325, 0.725, 0.575], abs=0.02)
+    page.mouse.dblclick(*middle)
+    assert seen(page)[2] == pytest.approx([0, 0, 1, 1], abs=0.01)
+
+
+def test_line_of_a_zoomed_slider_stays_under_the_pointer(opened: Any) -> None:
+    page = opened(viewport={"width": 1280, "height": 900})
+    view = page.locator(".view:not([hidden])").first
+    view.get_by_label("Zoom in").click()
+    slider = view.locator(".slider").first
+    slider.scroll_into_view_if_needed()
+    box = slider.bounding_box()
+    page.mouse.move(box["x"] + box["width"] * 0.5, box["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.2, box["y"] + 20, steps=3)
+    page.mouse.up()
+    # Twice as large about the middle, the frame's 20% is the picture's 35%; the truth is cut 65% from its right.
+    cut = slider.evaluate("s => getComputedStyle(s.querySelector('.over')).clipPath")
+    assert float(re.findall(r"[\d.]+(?=%)", cut)[-1]) == pytest.approx(65, abs=1.5) or "calc" in cut
+    handle = slider.locator(".handle").bounding_box()
+    assert handle["x"] + handle["width"] / 2 == pytest.approx(box["x"] + 0.2 * box["width"], abs=2)
+
+
+def test_two_fingers_zoom(opened: Any) -> None:
+    page = opened(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
+    frame = page.locator(".view:not([hidden]) .slider").first
+    frame.scroll_into_view_if_needed()
+    box = frame.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    session = page.context.new_cdp_session(page)
+
+    def touch(kind: str, *offsets: float) -> None:
+        points = [{"x": x + offset, "y": y, "id": index} for index, offset in enumerate(offsets)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", -20, 20)
+    for spread in (30, 40, 50, 60):
+        touch("touchMove", -spread, spread)
+    touch("touchEnd")
+    page.wait_for_function("document.querySelector('.view.zoomed')")
+    assert float(page.locator(".view.zoomed output").inner_text().removesuffix("×")) == pytest.approx(3, abs=0.3)
+    assert page.evaluate("visualViewport.scale") == 1
+
+
+def test_folded_scene_opens_when_it_is_asked_for(opened: Any, built_study: Path) -> None:
+    page = opened(built_study)
+    assert page.locator("#moons-scene .view:visible").count() == 0
+    page.locator("nav a[href='#moons-scene']").click()
+    page.wait_for_function("document.querySelector('#moons-scene > details').open")
+    assert page.locator("#moons-scene .view:visible").count() == 1
+    assert page.locator("#balls-scene .view:visible").count() == 1
+    failed = page.locator(".matrix td.failed a")
+    failed.click()
+    page.wait_for_function("location.hash.startsWith('#failure-')")
+    assert "not finite" in page.locator(failed.get_attribute("href")).inner_text()

@@ -130,8 +130,9 @@ def nerf_step(sizes: dict[str, int], effort: Effort) -> list[Measurement]:
     """A step of a hash grid (draw, march, encode, networks, composite, Adam) beside its two networks alone."""
     running = nerf_fit(nerf_scene(), **sizes, warm_steps=WARM_STEPS)
     timings = alternate({NERF_SHARE: networks_alone(running.field, SAMPLES), NERF_STEP: running.refresh_cycle}, effort)
-    # While the first, uncounted cycle runs, the number of rays settles.
-    counted, rays = running.counter.samples[REFRESH:], running.counter.rays[REFRESH:]
+    # While the first cycle runs, the number of rays settles; it counts only where there is no other.
+    settled = REFRESH if len(running.counter.samples) > REFRESH else 0
+    counted, rays = running.counter.samples[settled:], running.counter.rays[settled:]
     per_step = sum(counted) / len(counted)
     note = f"{per_step:.0f} samples on {sum(rays) / len(rays):.0f} rays per step"
     threads, step = torch.get_num_threads(), timings[NERF_STEP].per(REFRESH)
