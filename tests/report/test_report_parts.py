@@ -19,7 +19,7 @@ from invgraphics.report.reading import read_comparison
 from invgraphics.report.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
 from invgraphics.report.summary import pareto_front, seconds_to_reach, time_to_quality
 from invgraphics.report.verdict import verdict
-from invgraphics.report.wording import budget_words, duration, listing, significant_decimals
+from invgraphics.report.wording import budget_words, duration, listing, significant_decimals, times
 
 
 def test_pareto_front_is_what_brute_force_finds() -> None:
@@ -156,6 +156,7 @@ def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
 def test_words() -> None:
     assert listing(["a"]) == "a"
     assert listing("abc") == "a, b and c"
+    assert [times(ratio) for ratio in (1.44, 14.2, 137.0)] == ["1.4", "14", "140"]
     assert [duration(s) for s in (12, 412, 7260)] == ["12 s", "6 min 52 s", "2 h 1 min"]
     assert [budget_words(b) for b in ("60s", "5000steps", "odd")] == ["60 s", "5,000 steps", "odd"]
     assert [significant_decimals(v) for v in (1234.0, 12.3, 0.0123)] == [0, 1, 4]

@@ -7,7 +7,7 @@ import math
 from invgraphics.report.effects import METHOD, Factor, Observation, effects_on
 from invgraphics.report.records import Comparison
 from invgraphics.report.summary import Row, Summary
-from invgraphics.report.wording import Quantity, budget_words, listing
+from invgraphics.report.wording import Quantity, budget_words, listing, times
 
 
 def verdict(comparison: Comparison, summary: Summary) -> list[str]:
@@ -112,7 +112,7 @@ def _costs(summary: Summary) -> list[str]:
         ratio = second / value if column.better == "lower" and value else value / second if second else math.inf
         if math.isfinite(ratio) and ratio >= 1.05:
             parts.append(
-                f"{row.label} {words[column.key]} ({column.text(value)} {column.unit}, {ratio:.2g}× better than the next)"
+                f"{row.label} {words[column.key]} ({column.text(value)} {column.unit}, {times(ratio)}× better than the next)"
             )
     text = "; ".join(parts)
     return [f"{text}."] if text else []

@@ -120,6 +120,11 @@ def significant_decimals(value: float, digits: int = 3) -> int:
     return min(6, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
 
 
+def times(ratio: float) -> str:
+    """A factor between two costs, to two digits: 1.4, 14, 140."""
+    return f"{ratio:.2g}" if ratio < 10 else f"{float(f'{ratio:.2g}'):.0f}"
+
+
 def listing(items: Iterable[str]) -> str:
     """``a``, ``a and b``, ``a, b and c``."""
     words = list(items)

@@ -1,0 +1,163 @@
+"""Every notebook runs at a small size, and what it prints in numbers holds."""
+
+import importlib.util
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+TAGS = {"parameters", "setup", "widget", "solution"}
+
+SMALL = {
+    "01-cameras-and-rays": "size = 48",
+    "02-volume-rendering-integral": "size, counts = 32, [4, 8, 16, 32, 64, 128]",
+    "03-fit-a-nerf": "views, size, steps, curve_steps = 16, 24, 150, 200",
+    "07-gaussians-and-ewa": "draws = 100_000",
+    "11-design-an-ablation": "size, views, steps, seeds, studies = 24, 8, 40, [0, 1], 100",
+}
+
+
+def _cells(path: Path) -> list[dict]:
+    return json.loads(path.read_text())["cells"]
+
+
+def _tagged(path: Path, tag: str) -> list[dict]:
+    return [cell for cell in _cells(path) if tag in cell["metadata"].get("tags", [])]
+
+
+def test_every_notebook_has_a_test_and_a_line_in_the_readme() -> None:
+    assert [path.stem for path in NOTEBOOKS] == sorted(SMALL)
+    linked = re.findall(r"\]\((\S+\.ipynb)\)", (FOLDER / "README.md").read_text())
+    assert linked == [path.name for path in NOTEBOOKS]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_committed_without_outputs_and_with_known_tags(path: Path) -> None:
+    cells = _cells(path)
+    assert len({cell["id"] for cell in cells}) == len(cells)
+    for cell in cells:
+        assert not cell.get("outputs") and cell.get("execution_count") is None, f"cell {cell['id']} keeps its output"
+        assert set(cell["metadata"]) <= {"tags", "jupyter"} and set(cell["metadata"].get("tags", [])) <= TAGS
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_ends_with_an_exercise_whose_solution_is_hidden(path: Path) -> None:
+    *_, exercise, solution = _cells(path)
+    assert "## Exercise" in "".join(exercise["source"])
+    assert solution["metadata"]["tags"] == ["solution"] and solution["metadata"]["jupyter"]["source_hidden"]
+    assert len(_tagged(path, "parameters")) == 1 and _tagged(path, "widget")
+
+
+@pytest.fixture(scope="module")
+def render() -> ModuleType:
+    for package in ("nbclient", "nbconvert", "ipykernel", "ipywidgets", "latex2mathml"):
+        pytest.importorskip(package, reason="needs the extra 'notebooks'")
+    spec = importlib.util.spec_from_file_location("render", FOLDER / "render.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class _Printed(str):
+    """What a notebook printed."""
+
+    __slots__ = ()
+
+    def numbers(self, *fragments: str) -> tuple[float, ...]:
+        """The number after each fragment, in order, all on one line."""
+        gaps = "".join(f"{re.escape(fragment)}\\s*([-+]?[0-9.]+(?:e[-+]?[0-9]+)?).*?" for fragment in fragments)
+        found = re.search(gaps, self)
+        assert found, f"not printed: {fragments}\n{self}"
+        return tuple(float(group.rstrip(".")) for group in found.groups())
+
+
+def _cameras(out: _Printed) -> None:
+    assert out.numbers("round trip pixel -> ray -> point -> pixel: at most") < (1e-3,)
+    right, wrong = out.numbers("PSNR of the true field:", "right camera,")
+    assert right > wrong + 5
+    began, ended = out.numbers("pose from points: error", "at the start,")
+    assert began > 1 and ended < 1e-2
+    assert out.numbers("pose from points: the camera is") < (1e-3,)
+    focal, shift = out.numbers("whole balls: focal length x", "distance")
+    assert focal == pytest.approx(1, abs=0.01) and shift == pytest.approx(0, abs=0.03)
+    slab, magnification = out.numbers("thin slab: focal length x", "f/Z x")
+    assert abs(slab - 1) > 0.02 and magnification == pytest.approx(1, abs=1e-3)
+
+
+def _integral(out: _Printed) -> None:
+    assert out.numbers("composite: weights and the equation differ by at most") < (1e-12,)
+    exact, one = out.numbers("slab: closed form", "one sample")
+    assert one == exact
+    assert out.numbers("a jump in density: error ~ N^")[0] == pytest.approx(-1, abs=0.25)
+    assert out.numbers("cut by the far plane: error ~ N^")[0] == pytest.approx(-2, abs=0.1)
+    equal, fine = (out.numbers(f"picture with {name}: error")[0] for name in ("8 equal strata", "4 coarse + 4 fine"))
+    assert fine < equal
+    mean, median = out.numbers("mean depth", "median")
+    assert mean == pytest.approx(2, abs=0.05) and median == pytest.approx(1, abs=0.06)
+
+
+def _nerf(out: _Printed) -> None:
+    none, some = (out.numbers(f"curve with {octaves} octaves: error")[0] for octaves in (0, 4))
+    assert some < none / 2
+    coordinates, encoded, hashed = (
+        out.numbers(f"{name}: PSNR")[0] for name in ("coordinates", "positional encoding", "hash grid")
+    )
+    assert min(encoded, hashed) > coordinates + 1
+    total, moved, share = out.numbers("hash grid:", "of one point moves", "(")
+    assert moved < total and share < 5
+    assert out.numbers("positional encoding:", "of one point moves", "(")[2] > 15
+    small, large = (out.numbers(f"T = 2^{log2_size}:", "PSNR")[1] for log2_size in (7, 15))
+    assert large > small
+
+
+def _ewa(out: _Printed) -> None:
+    assert out.numbers("(2 pi)^(-3/2) |V|^(-1/2) =") == (1.0,)
+    for claim in ("M V M^T by", "the block of V by", "W V W^T by"):
+        assert out.numbers(claim)[0] < 1.5, "percent; the noise to expect is 0.45"
+    for claim in ("automatic differentiation differ by", "footprint differs from J V J^T by", "depth plane differ by"):
+        assert out.numbers(claim)[0] < 1e-9
+    assert out.numbers("grows with the power")[0] == pytest.approx(2, abs=0.05)
+    assert out.numbers("within 3.37 sigma:")[0] == pytest.approx(99, abs=0.15)
+    lost, limit = out.numbers("the largest alpha lost in the image:", "1/255 =")
+    assert lost < limit
+    line, predicted = out.numbers("central ray: integral", "|V_hat|^(1/2)) =")
+    assert line == pytest.approx(predicted, rel=1e-4)
+    assert out.numbers("exact line integral: at most")[0] < 0.03
+    assert out.numbers("differs from V_hat + 0.3 I by")[0] < 1e-9
+
+
+def _ablation(out: _Printed) -> None:
+    assert out.numbers("failed fits:") == (0,)
+    assert out.numbers("design:", "combinations x", "seeds =") == (4, 2, 8)
+    for factor in ("data.train_views 8 instead of 4", "field.sh_degree 2 instead of 0"):
+        mean, low, high = out.numbers(f"{factor}:", "dB [", ",")
+        plain, half = out.numbers("the equation:", "+-") if "views" in factor else (mean, (high - low) / 2)
+        assert (plain, half) == pytest.approx((mean, (high - low) / 2), abs=0.02)
+    naive, nested = out.numbers("null studies:", "views as independent,")
+    assert naive > 20 and nested <= 12, "percent of 100 studies; 5 is right"
+    assert out.numbers("factorial:") == (36,) and out.numbers("one-at-a-time:") == (24,)
+
+
+HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
+    zip(sorted(SMALL), (_cameras, _integral, _nerf, _ewa, _ablation), strict=True)
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_runs_and_its_headline_numbers_hold(path: Path, render: ModuleType, tmp_path: Path) -> None:
+    notebook = render.execute(path, SMALL[path.stem], folder=tmp_path)
+    HEADLINES[path.stem](_Printed(render.printed(notebook)))
+    page = render.page(notebook)
+    assert "<math" in page or "\\frac" not in page, "equations are not MathML"
+    assert (
+        "<details><summary>Solution" in page
+        and "<script" not in page
+        and "http" not in re.sub(r"http://www.w3.org\S*", "", page)
+    )
