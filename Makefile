@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
 
-.PHONY: env compare picture bench notebooks test slow check clean
+.PHONY: env compare picture bench notebooks test test-notebooks slow check clean
 
 env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
@@ -27,6 +27,10 @@ notebooks: env  ## run the notebooks and write them as pages: reports/notebooks
 
 test: env  ## the test suite (under 10 minutes on 2 cores)
 	$(BIN)/python -m pytest
+
+test-notebooks: env  ## every notebook at a small size, and the numbers it prints
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"
+	$(BIN)/python -m pytest -m slow tests/notebooks
 
 slow: env  ## the longer checks
 	$(BIN)/python -m pytest -m slow

@@ -1,5 +1,7 @@
 """Fixtures shared by all tests."""
 
+import invgraphics  # noqa: F401, I001  # before torch, which then reads how long its waiting threads may spin
+
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -23,6 +23,8 @@ from invgraphics.experiments.run import fit_run
 from invgraphics.training.checkpoint import NAME, load
 
 METHOD = "splatting/gaussians"
+LONG = 300
+"""Steps of a fit that is interrupted: more than fit into the time until the signal."""
 
 
 def _request(toy_folder: Path, out: Path, **more) -> FitRequest:
@@ -104,9 +106,16 @@ def _wait_for(path: Path, seconds: float = 120) -> None:
     assert path.is_file(), f"{path.name} never appeared"
 
 
+@pytest.fixture(scope="module")
+def long_run(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing interrupted: the judge of those that something did."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    return fit_run(_request(toy_folder, out, budget=f"{LONG}steps", checkpoint_every="1000s"))
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_a_killed_run_resumes_to_the_same_bits(run: Path, toy_folder: Path, tmp_path: Path, number: int) -> None:
-    request = _request(toy_folder, tmp_path / "run", budget="600steps", checkpoint_every="1steps")
+def test_a_killed_run_resumes_to_the_same_bits(long_run: Path, toy_folder: Path, tmp_path: Path, number: int) -> None:
+    request = _request(toy_folder, tmp_path / "run", budget=f"{LONG}steps", checkpoint_every="1steps")
     process = _spawn(request, tmp_path)
     _wait_for(tmp_path / "run" / "fit.json")
     time.sleep(0.2)
@@ -114,12 +123,10 @@ def test_a_killed_run_resumes_to_the_same_bits(run: Path, toy_folder: Path, tmp_
     status = process.wait(timeout=60)
     assert status == (-9 if number == signal.SIGKILL else 130)
     steps = int(load(tmp_path / "run" / NAME)["fit"]["steps"])
-    assert 0 < steps < 600
+    assert 0 < steps < LONG
     assert not (tmp_path / "run" / "scores.json").exists()
-    # Same cell, so it goes on; a fresh one beside it is the judge.
     fit_run(replace(request, existing="resume"))
-    fit_run(replace(request, out=str(tmp_path / "whole"), checkpoint_every="1000s"))
-    assert _same_checkpoint(tmp_path / "run", tmp_path / "whole")
+    assert _same_checkpoint(tmp_path / "run", long_run)
     lines = [json.loads(line)["step"] for line in (tmp_path / "run" / "history.jsonl").read_text().splitlines()]
     assert lines == sorted(set(lines))
 
