@@ -90,6 +90,8 @@ def test_truncated_png_is_named(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(InputError, match=r"cut\.png is damaged"):
         read_pixels(path)
+    with pytest.raises(InputError, match=r"cut\.png is damaged"):
+        image_size(path)
     path.write_bytes(b"not a picture")
     with pytest.raises(InputError, match=r"cut\.png cannot be read as a picture"):
         read_pixels(path)

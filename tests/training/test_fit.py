@@ -13,7 +13,7 @@ from invgraphics.errors import NumericalError
 from invgraphics.training import checkpoint
 
 METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
-STEPS = {"volumetric/nerf": 250, "volumetric/hash": 200, "splatting/gaussians": 120}
+STEPS = {"volumetric/nerf": 350, "volumetric/hash": 300, "splatting/gaussians": 120}
 
 
 def _psnr(fit) -> float:

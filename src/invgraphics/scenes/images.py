@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,12 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Width and height from the file's header; ``like`` as in `read_pixels`."""
-    with _open(path) as image:
+    """Width and height from the file's header; ``like`` as in `read_pixels`.
+
+    Raises:
+        InputError: the file is missing, no picture, or cut short.
+    """
+    with _open(path) as image, _told(path, image):
         return image.size[::-1] if _is_turned(image, like) else image.size
 
 
@@ -76,17 +81,23 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
     """
     from PIL import ImageOps
 
-    with _open(path) as image:
-        stored = image.size
-        try:
-            upright = ImageOps.exif_transpose(image) if _is_turned(image, like) or not _is_sideways(image) else image
-            if upright.mode.startswith("I"):
-                grey = (np.asarray(upright).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
-                return np.repeat(grey[:, :, None], 3, axis=2)
-            clear = upright.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in upright.info
-            return np.array(upright.convert("RGBA" if clear else "RGB"))
-        except (OSError, ValueError, SyntaxError) as error:
-            raise InputError(f"{path} is damaged ({stored[0]}x{stored[1]}): {error}.", "Copy the file again.") from error
+    with _open(path) as image, _told(path, image):
+        upright = ImageOps.exif_transpose(image) if _is_turned(image, like) or not _is_sideways(image) else image
+        if upright.mode.startswith("I"):
+            grey = (np.asarray(upright).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
+            return np.repeat(grey[:, :, None], 3, axis=2)
+        clear = upright.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in upright.info
+        return np.array(upright.convert("RGBA" if clear else "RGB"))
+
+
+@contextmanager
+def _told(path: Path, image: Any) -> Iterator[None]:
+    """Say which file it was that could not be decoded; even its EXIF tags may lie behind the pixels."""
+    width, height = image.size
+    try:
+        yield
+    except (OSError, ValueError, SyntaxError) as error:
+        raise InputError(f"{path} is damaged ({width}x{height}): {error}.", "Copy the file again.") from error
 
 
 def _open(path: Path) -> Any:
