@@ -26,7 +26,7 @@ notebooks: env  ## run the notebooks and write them as pages: reports/notebooks
 	$(BIN)/python notebooks/render.py
 
 test: env  ## the test suite (under 10 minutes on 2 cores)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-notebooks: env  ## every notebook at a small size, and the numbers it prints
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"

@@ -25,8 +25,8 @@ def test_file_stays_short(path: Path) -> None:
 
 @pytest.mark.parametrize("path", FILES, ids=_id)
 def test_functions_stay_short_and_narrow(path: Path) -> None:
-    # Numba kernels take flat arrays, so their parameters are not counted; their length is.
-    kernels = "numba" in path.relative_to(ROOT).parts
+    # Compiled kernels take flat arrays, so their parameters are not counted; their length is.
+    kernels = {"numba", "cuda"} & {*path.relative_to(ROOT).parts}
     for function in _functions(path):
         lines = (function.end_lineno or function.lineno) - function.lineno + 1
         arguments = [arg for arg in (*function.args.args, *function.args.kwonlyargs) if arg.arg not in ("self", "cls")]

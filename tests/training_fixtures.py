@@ -53,7 +53,7 @@ def scene() -> Scene:
 @pytest.fixture
 def small() -> Callable[..., Method]:
     """A built-in method, shrunk for the toy scene."""
-    return lambda name, *more: load_method(name, None, [*SMALL[name], *more])
+    return lambda name, *more: load_method(name, None, [*SMALL.get(name, []), *more])
 
 
 @pytest.fixture

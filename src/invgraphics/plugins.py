@@ -24,6 +24,8 @@ REGISTRIES = {
     "hooks": ("invgraphics.training", "HOOKS"),
     "scenes": ("invgraphics.scenes", "LOADERS"),
     "metrics": ("invgraphics.metrics", "METRICS"),
+    "formats": ("invgraphics.formats", "FORMATS"),
+    "exporters": ("invgraphics.experiments", "EXPORTERS"),
     "recipes": ("invgraphics.experiments", "RECIPES"),
     "executors": ("invgraphics.experiments.executors", "EXECUTORS"),
 }

@@ -130,9 +130,10 @@ def test_without_numba_the_reference_is_measured_alone(monkeypatch) -> None:
     missing = lambda name: "ImportError: no numba" if name == "numba" else ""  # noqa: E731
     for module in (run, limits, splat_cases):
         monkeypatch.setattr(module, "why_not", missing)
+    monkeypatch.setattr(run, "here", lambda: ("reference",))
     results = bench(Request(("splats", "iterations", "peers"), quick=True))
     assert {m.implementation for m in results.measurements} == {"reference", "machine"}
-    assert {skipped.what for skipped in results.skipped} == {"numba kernels", "iterations", "peers"}
+    assert {skipped.what for skipped in results.skipped} == {"numba kernels", "cuda kernels", "iterations", "peers"}
     assert results.find("splats", "reference", BOTH).share is None
 
 

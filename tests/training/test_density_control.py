@@ -1,6 +1,7 @@
 """Density control against hand-made situations: what must grow grows, what must go goes, Adam's memory follows."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -141,3 +142,45 @@ def test_nothing_grows_after_the_end() -> None:
     _pull(state, hook, [1.0] * 3)
     hook.after_step(state)
     assert state.field.primitive_count() == 3
+
+
+@pytest.mark.parametrize(("clone", "split", "count"), [(False, True, 4), (True, False, 4), (False, False, 3)])
+def test_switched_off_growth_takes_no_room(clone: bool, split: bool, count: int) -> None:
+    """Two small Gaussians are pulled most, then a large one; without cloning there is room for the large one."""
+    state = _state(3)
+    with torch.no_grad():
+        state.field.log_scales[2] = math.log(0.5)
+    hook = DensityControlConfig(every=10, threshold=0.1, clone=clone, split=split, max_primitives=4).build()
+    _pull(state, hook, [3.0, 0.0, 2.0])
+    hook.after_step(state)
+    assert state.field.primitive_count() == count
+
+
+def test_absolute_gradients_are_used_where_the_renderer_gathers_them() -> None:
+    state = _state(2)
+    hook = DensityControlConfig(every=10, threshold=1.0).build()
+    means2d, pull = torch.zeros(2, 2, requires_grad=True), torch.zeros(2, 2, requires_grad=True)
+    means2d.grad, pull.grad = torch.zeros(2, 2), torch.tensor([[0.0, 0.0], [1.0, 0.0]])
+    state.trace = Trace(screen=Screen(means2d, torch.ones(2), 32, 32, pull))
+    hook.after_backward(state)
+    hook.after_step(state)
+    assert state.field.primitive_count() == 3
+
+
+@pytest.mark.parametrize(("background", "lowered"), [(1.0, True), (0.0, False)])
+def test_white_scenes_are_reset_when_growth_begins(background: float, lowered: bool) -> None:
+    state = _state(3)
+    state.scene = replace(state.scene, background=torch.full((3,), background))
+    hook = DensityControlConfig(every=1000, start=0.25, white_reset=True).build()
+    state.ctx = replace(state.ctx, progress=0.2)
+    hook.after_step(state)
+    assert float(torch.sigmoid(state.field.opacity_logits).min()) == pytest.approx(0.5)
+    state.ctx = replace(state.ctx, progress=0.3)
+    hook.after_step(state)
+    assert (float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02) == lowered
+    with torch.no_grad():
+        state.field.opacity_logits.fill_(0.0)
+    again = DensityControlConfig(every=1000, start=0.25, white_reset=True).build()
+    again.load_state_dict(hook.state_dict())
+    again.after_step(state)
+    assert float(torch.sigmoid(state.field.opacity_logits).min()) == pytest.approx(0.5)  # once only

@@ -14,7 +14,7 @@ from invgraphics.bench.memory import footprints
 from invgraphics.bench.peers import peers
 from invgraphics.bench.results import BOTH, MACHINE, THREADS, Measurement, Results, Skipped
 from invgraphics.bench.timing import Effort, alternate
-from invgraphics.kernels.dispatch import IMPLEMENTATIONS, why_not
+from invgraphics.kernels.dispatch import IMPLEMENTATIONS, here, why_not
 
 QUICK, FULL = Effort(0.4, 2, 9), Effort(0.6, 3, 15)
 """How long to look at each variant."""
@@ -50,15 +50,15 @@ class Request:
     @property
     def implementations(self) -> tuple[str, ...]:
         """Kernels to measure, in alternation."""
-        return (self.kernels,) if self.kernels else tuple(name for name in IMPLEMENTATIONS if not why_not(name))
+        return (self.kernels,) if self.kernels else here()
 
 
 def bench(request: Request) -> Results:
     """Measure; the kernels in use afterwards are those in use before."""
     results = Results()
-    results.skipped += [
-        Skipped(f"{name} kernels", why) for name in IMPLEMENTATIONS if (why := why_not(name)) and not request.kernels
-    ]
+    if not request.kernels:
+        missing = (name for name in IMPLEMENTATIONS if name not in here())
+        results.skipped += [Skipped(f"{name} kernels", why_not(name) or "measured on a CPU only") for name in missing]
     request.say("compiling")
     with kernels.using(request.kernels):
         kernels.warm_up()

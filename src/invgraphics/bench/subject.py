@@ -13,7 +13,8 @@ from invgraphics.core import Bounds, Camera, Gaussians, Points, Scene, View
 from invgraphics.core.colour import quantise
 from invgraphics.core.harmonics import BAND_0, count
 from invgraphics.core.transforms import look_at
-from invgraphics.fields.gaussian import GaussianField, starting_scales
+from invgraphics.fields.gaussian import GaussianField
+from invgraphics.fields.starting import starting_scales
 
 SCALE = 0.7
 """Standard deviations relative to the distance of neighbours."""

@@ -54,7 +54,7 @@ def examine(warm_up: bool) -> Iterator[Finding]:
     yield from _processor()
     yield _kernels(warm_up)
     yield _llvm()
-    yield _cuda()
+    yield from _cuda()
     yield _lpips()
     yield _data()
 
@@ -94,15 +94,27 @@ def _llvm() -> Finding:
     return Finding("Mitsuba", f"{found}, variant {status.variant}: {status.reason}", status.remedy)
 
 
-def _cuda() -> Finding:
+def _cuda() -> Iterator[Finding]:
     import torch
 
     if torch.cuda.is_available():
         name, memory = torch.cuda.get_device_name(0), torch.cuda.get_device_properties(0).total_memory
-        return Finding("CUDA", f"{torch.version.cuda}, {name}, {memory / 2**30:.0f} GiB")
+        yield Finding("CUDA", f"{torch.version.cuda}, {name}, {memory / 2**30:.0f} GiB")
+        yield from _cuda_kernels()
+        return
     if torch.version.cuda is None:
-        return Finding("CUDA", "this torch is built for the CPU", "with an NVIDIA GPU: install torch from https://pytorch.org")
-    return Finding("CUDA", f"torch is built for CUDA {torch.version.cuda}, but finds no device", "check `nvidia-smi`")
+        yield Finding("CUDA", "this torch is built for the CPU", "with an NVIDIA GPU: install torch from https://pytorch.org")
+        return
+    yield Finding("CUDA", f"torch is built for CUDA {torch.version.cuda}, but finds no device", "check `nvidia-smi`")
+
+
+def _cuda_kernels() -> Iterator[Finding]:
+    for package, purpose in (("triton", "hash encoding and compositing"), ("gsplat", "splatting")):
+        if importlib.util.find_spec(package) is None:
+            remedy = f"`pip install 'invgraphics[cuda]'`; until then {purpose} runs as plain torch on the GPU"
+            yield Finding(package, "not installed", remedy)
+        else:
+            yield Finding(package, f"{version(package)}, for {purpose} on the GPU")
 
 
 def _lpips() -> Finding:

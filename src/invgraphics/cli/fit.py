@@ -6,12 +6,13 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
 from invgraphics.cli.arguments import Shared
 from invgraphics.cli.output import show_scores
+from invgraphics.errors import InputError
 from invgraphics.experiments.recipe import presets
 from invgraphics.experiments.request import FitRequest, slug
 
@@ -28,6 +29,8 @@ class Fit(Shared):
     """Seed of the initial values and of the fit."""
     out: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="(default: runs/SCENE-METHOD-seed-N)")] = None
     """Folder of the run."""
+    snapshots: Annotated[int, arg(metavar="N")] = 0
+    """Keep N states of the model, evenly over the fit, besides the first, for `invgraphics render RUN --path timelapse`."""
     resume: bool = False
     """Go on with the run that --out holds, from its last checkpoint."""
 
@@ -53,5 +56,7 @@ class Fit(Shared):
         name = f"{Path(self.scene).resolve().name}-{slug(self.method)}-seed-{self.seed}"
         out = Path("runs") / name if self.out is None else self.out
         existing = "resume" if self.resume else "refuse"
-        settings = self.settings()
+        if self.snapshots < 0:
+            raise InputError(f"--snapshots cannot be {self.snapshots}.", "Expected a number of states, 0 or more.")
+        settings: dict[str, Any] = self.settings() | {"snapshots": self.snapshots}
         return FitRequest(method=self.method, scene=self.scene, seed=self.seed, out=str(out), existing=existing, **settings)

@@ -22,9 +22,13 @@ COMPONENTS = {
     "hooks": "hooks",
     "metrics": "metrics",
     "formats": "scenes",
+    "model-formats": "formats",
+    "exporters": "exporters",
     "executors": "executors",
 }
 """Title -> registry; the registry of scenes holds the formats of data sets that can be opened."""
+
+TITLES = {"formats": "Formats of data sets", "model-formats": "Formats of Gaussians (invgraphics import FILE)"}
 
 KINDS = ("matrix", "methods", "scenes", "studies", *COMPONENTS, "protocols")
 EVERYTHING = KINDS[1:]
@@ -36,7 +40,7 @@ class List:
 
     kinds: Annotated[Positional[tuple[str, ...]], arg(metavar="KIND", help_behavior_hint="(default: everything)")] = ()
     """What to list: methods, scenes, studies, fields, encodings, renderers, samplers, losses, hooks, metrics, formats,
-    executors, protocols; or matrix, the table of fields and renderers as Markdown."""
+    model-formats, exporters, executors, protocols; or matrix, the table of fields and renderers as Markdown."""
 
     def run(self) -> int:
         """Print the tables."""
@@ -108,5 +112,5 @@ def _list_protocols() -> None:
 def _list_components(kind: str) -> None:
     registry = COMPONENTS[kind]
     rows = [(name, plugins.origin(registry, name), target) for name, target in plugins.names(registry).items()]
-    title = "Formats of data sets" if kind == "formats" else kind.capitalize()
+    title = TITLES.get(kind, kind.capitalize())
     show_table(title, ("name", "from", "implementation"), rows)

@@ -31,7 +31,10 @@ COMMANDS = {
     "rescore": ("invgraphics.cli.rescore:Rescore", "score saved pictures again, under the conventions of other tools"),
     "compare": ("invgraphics.cli.compare:Compare", "fit several methods to one scene under one budget, and report who wins"),
     "ablate": ("invgraphics.cli.ablate:Ablate", "run a study: factors, levels and seeds, on this machine or a cluster"),
+    "render": ("invgraphics.cli.render:Render", "film a run: around the scene, from photograph to photograph, or its fit"),
     "report": ("invgraphics.cli.report:Report", "write page, tables and figures from finished runs"),
+    "export": ("invgraphics.cli.export:Export", "write a run's model as a file for other programs, and say what it lost"),
+    "import": ("invgraphics.cli.import_file:ImportFile", "make a run of a model that was trained elsewhere, and evaluate it"),
     "bench": ("invgraphics.cli.bench:Bench", "how fast the kernels are here, and what share of the machine they use"),
 }
 """Name -> (``module:class`` of its arguments, summary). A class is imported when its command is given."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from invgraphics.core.rays import Rays
@@ -56,13 +57,7 @@ class Camera:
             view: training-view index to record in the rays.
         """
         pixels = self.pixel_centres().reshape(-1, 2) if pixels is None else pixels
-        plane = (pixels - self.centre) / self.focal
-        in_camera = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
-        length = in_camera.norm(dim=1, keepdim=True)
-        directions = (in_camera / length) @ self.cam_to_world[:3, :3].T
-        # mip-NeRF (§3.1) sets the cone's radius at distance 1 to the pixel's width times 2/sqrt(12).
-        radius = (2 / 12**0.5) / self.focal.mean() / length[:, 0]
-        return Rays.make(self.position.expand(len(pixels), 3), directions, radius, view)
+        return _rays(pixels, self.cam_to_world, (self.focal, self.centre), view)
 
     def project(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
         """Image coordinates (x, y) of world points and their depth along the optical axis (z in camera axes).
@@ -85,3 +80,30 @@ class Camera:
     def to(self, *args: Any) -> Camera:
         """Move or cast all tensors."""
         return replace(self, cam_to_world=self.cam_to_world.to(*args), focal=self.focal.to(*args), centre=self.centre.to(*args))
+
+
+def rays_through(cameras: Sequence[Camera], camera: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"], view: Tensor) -> Rays:
+    """Rays of several cameras at once, which costs less than asking each.
+
+    Args:
+        cameras: the cameras.
+        camera: which of them each ray belongs to.
+        pixels: image coordinates (x, y).
+        view: training-view index to record for each ray.
+    """
+    pose, *lens = (torch.stack([getattr(c, name) for c in cameras])[camera] for name in ("cam_to_world", "focal", "centre"))
+    return _rays(pixels, pose, (lens[0], lens[1]), view)
+
+
+def _rays(pixels: Float[Tensor, "n 2"], pose: Tensor, lens: tuple[Tensor, Tensor], view: Tensor | int) -> Rays:
+    """Rays from poses (4, 4) or (n, 4, 4) and lenses: focal lengths and principal points, each (2,) or (n, 2)."""
+    focal, centre = lens
+    plane = (pixels - centre) / focal
+    in_camera = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
+    length = in_camera.norm(dim=1, keepdim=True)
+    rotation, position = pose[..., :3, :3], pose[..., :3, 3]
+    unit = in_camera / length
+    directions = unit @ rotation.T if pose.ndim == 2 else (rotation @ unit[:, :, None])[:, :, 0]
+    # mip-NeRF (§3.1) sets the cone's radius at distance 1 to the pixel's width times 2/sqrt(12).
+    radius = (2 / 12**0.5) / focal.mean(dim=-1) / length[:, 0]
+    return Rays.make(position.expand(len(pixels), 3), directions, radius, view)

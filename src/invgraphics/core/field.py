@@ -121,6 +121,12 @@ class Renderer(nn.Module, ABC):
         """Refresh what is learnt without gradients; called once after each training step."""
 
 
+SAMPLES_EXPECTED = 16
+"""Samples per ray that a picture's first rays are counted with, to keep within `Context.chunk`."""
+MORE_RAYS = 16
+"""How many times as many rays a part may have where they take fewer samples than expected."""
+
+
 class RayRenderer(Renderer):
     """A renderer whose pixels are independent, so that it can train on any set of rays."""
 
@@ -129,11 +135,20 @@ class RayRenderer(Renderer):
         """Render n rays; the rendering has shape (n,)."""
 
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
-        """Render the camera's rays in chunks. The trace is that of the last chunk."""
-        rays_at_once = max(1, ctx.chunk // 16)
-        parts = [self.render_rays(field, part, ctx) for part in camera.rays().chunks(rays_at_once)]
-        rendering = Rendering.cat([rendering for rendering, _ in parts])
-        return rendering.reshape(camera.height, camera.width), parts[-1][1]
+        """Render the camera's rays in parts, larger ones where rays take few samples. The trace is the last part's."""
+        rays = camera.rays()
+        least = max(1, ctx.chunk // SAMPLES_EXPECTED)
+        size = min(least, len(rays))
+        rendering, trace = self.render_rays(field, rays[:size], ctx)
+        parts, begin = [rendering], size
+        while begin < len(rays):
+            if trace.samples is not None:
+                fitting = size * ctx.chunk // max(len(trace.samples), 1)
+                size = min(max(fitting, least), 2 * size, MORE_RAYS * least)
+            rendering, trace = self.render_rays(field, rays[begin : begin + size], ctx)
+            parts.append(rendering)
+            begin += size
+        return Rendering.cat(parts).reshape(camera.height, camera.width), trace
 
 
 def check(field: Field, renderer: Renderer) -> None:

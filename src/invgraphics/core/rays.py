@@ -75,6 +75,8 @@ class Rays:
             yield self[start : start + size]
 
     def to(self, *args: Any) -> Rays:
-        """Move or cast every float tensor; ``view`` follows the device only."""
+        """Move all tensors, or cast those that are floating-point."""
         moved = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Rays(**{name: value.to(*args) if value.is_floating_point() else value for name, value in moved.items()})
+        device = next((arg for arg in args if isinstance(arg, torch.device | str)), self.view.device)
+        moved = {name: value.to(*args) if value.is_floating_point() else value.to(device) for name, value in moved.items()}
+        return Rays(**moved)

@@ -57,19 +57,30 @@ class Rendering:
 
 @dataclass(eq=False)
 class Screen:
-    """What a splatting pass knows about its n primitives on the screen, for density control.
+    """What a splatting pass knows about its n primitives, for density control and for losses on them.
 
     Attributes:
         means2d: image positions; after ``backward`` its ``grad`` is the gradient in pixels.
         radii: extent in pixels, 0 where the primitive was culled.
         width: image width in pixels.
         height: image height in pixels.
+        pull: after ``backward`` its ``grad`` is the sum over pixels of the absolute gradients in pixels, where that was wanted.
+        opacities: peak opacities in [0, 1].
+        scales: standard deviations along the primitives' axes, local units.
     """
 
     means2d: Float[Tensor, "n 2"]
     radii: Float[Tensor, " n"]
     width: int
     height: int
+    pull: Float[Tensor, "n 2"] | None = None
+    opacities: Float[Tensor, " n"] | None = None
+    scales: Float[Tensor, "n 3"] | None = None
+
+    @property
+    def gradient(self) -> Float[Tensor, "n 2"] | None:
+        """What pulls each primitive over the screen, in loss per pixel: of absolute values, if those were wanted."""
+        return self.means2d.grad if self.pull is None else self.pull.grad
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ class Samples:
         direction: unit direction of the ray.
         radius: pixel footprint of the ray at distance 1.
         view: training-view index of the ray, -1 where there is none.
+        density: what the sampler has found the field's density to be, outside the graph; ``None`` where it did not ask.
     """
 
     ray: Int[Tensor, " m"]
@@ -32,13 +33,20 @@ class Samples:
     direction: Float[Tensor, "m 3"]
     radius: Float[Tensor, " m"]
     view: Int[Tensor, " m"]
+    density: Float[Tensor, " m"] | None = None
 
     @staticmethod
-    def on(rays: Rays, ray: Int[Tensor, " m"], t0: Float[Tensor, " m"], t1: Float[Tensor, " m"]) -> Samples:
-        """Samples from intervals on ``rays``."""
+    def on(
+        rays: Rays,
+        ray: Int[Tensor, " m"],
+        t0: Float[Tensor, " m"],
+        t1: Float[Tensor, " m"],
+        density: Float[Tensor, " m"] | None = None,
+    ) -> Samples:
+        """Samples from intervals on ``rays``, and their densities where they are known already."""
         direction = rays.directions[ray]
         position = torch.addcmul(rays.origins[ray], ((t0 + t1) / 2)[:, None], direction)
-        return Samples(ray, t0, t1, position, direction, rays.radius[ray], rays.view[ray])
+        return Samples(ray, t0, t1, position, direction, rays.radius[ray], rays.view[ray], density)
 
     @staticmethod
     def at(position: Float[Tensor, "m 3"], direction: Float[Tensor, "m 3"] | None = None) -> Samples:
@@ -53,7 +61,9 @@ class Samples:
         return len(self.t0)
 
     def __getitem__(self, index: slice | Int[Tensor, " k"] | Bool[Tensor, " m"]) -> Samples:
-        return Samples(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+        always = (field.name for field in fields(self) if field.name != "density")
+        density = None if self.density is None else self.density[index]
+        return Samples(**{name: getattr(self, name)[index] for name in always}, density=density)
 
     @property
     def mid(self) -> Float[Tensor, " m"]:

@@ -12,7 +12,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.errors import InputError
+
 Pose = Float[Tensor, "4 4"]
+
+AXES = {"opencv": "RDF", "opengl": "RUB", "z-up": "RFU"}
+"""Frames by name, as the letters that `axes_to_opencv` reads."""
+
+_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 
 
 def _flipped(pose: Pose, signs: tuple[float, float, float]) -> Pose:
@@ -61,6 +68,31 @@ def opencv_to_llff(pose: Pose) -> Float[Tensor, "3 4"]:
     """Inverse of `llff_to_opencv`."""
     right, down, forward, position = pose[:3].unbind(dim=1)
     return torch.stack([down, right, -forward, position], dim=1)
+
+
+def axes_to_opencv(axes: str) -> Pose:
+    """The rotation from a world frame to the one whose axes point right, down and forward, float64.
+
+    Args:
+        axes: a name in `AXES`; or three letters that say where +x, +y and +z point: R or L, U or D, F or B.
+
+    Raises:
+        InputError: these are no axes, or those of a left-handed frame, to which no rotation leads.
+    """
+    letters = AXES.get(axes, axes.upper())
+    if len(letters) != 3 or not set(letters) <= set(_DIRECTIONS):
+        raise InputError(
+            f"'{axes}' names no axes.", f"Expected {', '.join(AXES)}, or where +x, +y, +z point: RDF is right, down, forward."
+        )
+    rotation = torch.tensor([_DIRECTIONS[letter] for letter in letters], dtype=torch.float64).T
+    if float(torch.linalg.det(rotation)) < 0.5:
+        raise InputError(f"The axes '{axes}' are no right-handed frame.", "Convert the file to RDF or RUB axes first.")
+    return rigid(rotation, torch.zeros(3, dtype=torch.float64))
+
+
+def opencv_to_axes(axes: str) -> Pose:
+    """Inverse of `axes_to_opencv`."""
+    return axes_to_opencv(axes).T.contiguous()
 
 
 def rigid(rotation: Float[Tensor, "3 3"], translation: Float[Tensor, 3]) -> Pose:

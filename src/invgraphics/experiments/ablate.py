@@ -15,6 +15,7 @@ import torch
 from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
+from invgraphics.experiments.analyses import write_analyses
 from invgraphics.experiments.build import device_of, training_data
 from invgraphics.experiments.cells import Planned, make_plan
 from invgraphics.experiments.environment import environment
@@ -24,6 +25,7 @@ from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.forecast import Cost, Forecast, duration, total, try_method
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.progress import Reporter
+from invgraphics.experiments.renderings import check_eyes, rendered
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.experiments.study import Study, locate, name_of, read_study
 from invgraphics.metrics.protocols import protocol_named
@@ -89,6 +91,7 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         _check_disk(forecast, folder.root)
         confirm(forecast)
         record.start({planned.id for planned in missing})
+        write_analyses(study.analyses, folder.root)
         _run(executor, missing, costs, (record, folder.root / "jobs"))
         return folder.root, record.failed()
 
@@ -154,12 +157,14 @@ def _entry(planned: Planned, before: dict[str, Any]) -> dict[str, Any]:
 def _summary(study: Study, name: str, request: AblateRequest, resources: Resources) -> dict[str, Any]:
     """Everything of ``study.json`` but the cells."""
     keys = ("question", "design", "factors", "base", "scenes", "methods", "seeds", "budget", "preset", "size", "test_views")
+    keys += ("render_with", "analyses")
     machine = environment(device_of(request.device))
     machine |= {"threads": resources.threads, "executor": request.executor, "jobs": resources.jobs}
     return {
         "schema": 1,
         "name": name,
         **{key: getattr(study, key) for key in keys},
+        "approximations": [asdict(pair) for pair in study.approximations],
         "protocol": asdict(protocol_named(study.protocol)),
         "command": request.shell(),
         "environment": machine,
@@ -181,6 +186,7 @@ def _open_scenes(study: Study, plan: list[Planned]) -> tuple[Scene, dict[str, Tr
             scene = open_scene(name, options, lambda done, n, what, r=reporter: r.show(done / max(n, 1), what))
         for data in dict.fromkeys(training_data(planned.fit) for planned in plan):
             data.check(scene)
+        check_eyes(study.render_with, {planned.method.digest: planned.method for planned in plan}.values(), scene)
         first, truths[name] = first or scene, TruthDigest.of(scene)
     assert first is not None, "a study has at least one scene"
     return first, truths
@@ -188,7 +194,8 @@ def _open_scenes(study: Study, plan: list[Planned]) -> tuple[Scene, dict[str, Tr
 
 def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
     run = RunFolder(Path(planned.fit.out))
-    return run.finished and run.identity == identify(planned.fit, planned.method, truth, threads)
+    same = run.finished and run.identity == identify(planned.fit, planned.method, truth, threads)
+    return same and rendered(run, planned.fit, planned.method)
 
 
 def _try_methods(missing: list[Planned], scene: Scene) -> dict[str, Cost]:

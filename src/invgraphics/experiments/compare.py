@@ -19,6 +19,7 @@ from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.recipe import load_method
 from invgraphics.experiments.recorder import Cadence
+from invgraphics.experiments.renderings import check_eyes
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named
@@ -76,11 +77,11 @@ def _validate(request: CompareRequest) -> Scene:
     Cadence.parse(request.checkpoint_every)
     device_of(request.device)
     protocol_named(request.protocol)
-    for name in request.methods:
-        load_method(name, request.preset, request.recipe_overrides)
+    methods = [load_method(name, request.preset, request.recipe_overrides) for name in request.methods]
     data = training_data(request)
     RunFolder(Path(request.out)).create()
     scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+    check_eyes(request.render_with, methods, scene)
     return corrupt(scene, data, request.seeds[0])
 
 
@@ -101,6 +102,7 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
         "budget": request.budget,
         "size": [camera.width, camera.height],
         "preset": request.preset or "laptop",
+        "render_with": list(request.render_with),
         "command": request.shell(),
         "baselines": baseline_scores(scene, protocol),
         "noise_ceiling": scene.noise_ceiling,

@@ -8,6 +8,7 @@ import platform
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -46,7 +47,7 @@ def environment(device: torch.device) -> dict[str, object]:
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
-        "kernels": kernels.in_use(),
+        "kernels": kernels.in_use(device),
         "device": str(device),
         "deterministic": device.type == "cpu",
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -55,5 +56,7 @@ def environment(device: torch.device) -> dict[str, object]:
         record[package] = version(package)
     if device.type == "cuda":
         record["gpu"] = torch.cuda.get_device_name(device)
-        record["note"] = "GPU sums are not ordered: repeating a run gives close, not equal, bits."
+        record["note"] = "Atomic sums on a GPU are not ordered: repeating a run gives close, not equal, bits."
+        for package in ("triton", "gsplat"):
+            record[package] = version(package) if find_spec(package) else None
     return record

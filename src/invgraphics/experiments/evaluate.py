@@ -13,14 +13,12 @@ from PIL import Image
 
 from invgraphics.core import Camera, Context, Field, Renderer, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
-from invgraphics.errors import InputError
-from invgraphics.experiments.build import build_model, device_of
+from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.progress import Reporter
-from invgraphics.experiments.recipe import Method, resolve
+from invgraphics.experiments.recipe import Method
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
-from invgraphics.training import checkpoint
 
 
 def render_view(
@@ -97,30 +95,27 @@ def evaluate(
 
 
 def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> dict[str, Any]:
-    """Score a finished run again from its checkpoint, on its own scene or on another copy of it.
+    """Score a finished run or rendering again from its checkpoint, on its own scene or on another copy of it.
 
     Raises:
         InputError: the folder holds no run, or its checkpoint does not fit its recipe.
     """
-    from invgraphics.scenes.open import SceneOptions, open_scene
+    return _evaluate_fitted(open_fitted(run, scene_spec), protocol)
 
-    folder = RunFolder(run)
-    provenance = folder.read_json("provenance.json")
-    method = resolve(provenance["method"], provenance["preset"], folder.read_recipe())
-    size = provenance["options"]["size"]
-    options = SceneOptions(tuple(size) if isinstance(size, list) else size, provenance["options"]["test_views"])
-    scene = open_scene(scene_spec or provenance["scene"], options)
-    device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
-    field, renderer = build_model(method, scene, provenance["seed"], device)
-    state = checkpoint.load(folder.checkpoint, device)
-    try:
-        field.load_state_dict(state.get("field", {}))
-        renderer.load_state_dict(state.get("renderer", {}))
-    except RuntimeError as error:
-        raise InputError(f"{folder.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
-    fit = folder.read_json("fit.json")
+
+def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> dict[str, Any]:
+    """Score the model of a run from its checkpoint; a rendering's is that of the run it shows (see `experiments.renderings`).
+
+    Raises:
+        InputError: the checkpoint is missing or does not fit the recipe.
+    """
+    return _evaluate_fitted(load_fitted(folder, scene), protocol)
+
+
+def _evaluate_fitted(fitted: Fitted, protocol: str) -> dict[str, Any]:
+    fit = fitted.source.read_json("fit.json")
     costs = {"fit_seconds": fit["seconds"], "steps": fit["steps"], "peak_memory_bytes": fit.get("peak_memory_bytes")}
-    return evaluate(folder, scene, (field, renderer), protocol, costs, method)
+    return evaluate(fitted.folder, fitted.scene, (fitted.field, fitted.renderer), protocol, costs, fitted.method)
 
 
 def _save_view(stem: Path, picture: Rendering, scene: Scene) -> None:

@@ -60,6 +60,15 @@ class RunFolder:
         """Everything a resumed fit needs."""
         return self.root / checkpoint.NAME
 
+    def snapshot(self, index: int) -> Path:
+        """The model at one moment of the fit, for time-lapses."""
+        return self.root / "snapshots" / f"{index:04d}.safetensors"
+
+    @property
+    def snapshots(self) -> list[Path]:
+        """The kept states of the model, first to last."""
+        return sorted((self.root / "snapshots").glob("*.safetensors"))
+
     @property
     def history(self) -> Path:
         """One JSON line for each recorded moment of the fit."""
@@ -84,9 +93,12 @@ class RunFolder:
             "error.txt",
             "environment.json",
             "provenance.json",
+            "renderings.json",
             checkpoint.NAME,
         ]
-        for path in [*(self.root / name for name in names), *self.root.glob("scores*.json"), *self.root.glob("test/*")]:
+        patterns = ("scores*.json", "test/*", "snapshots/*")
+        found = [path for pattern in patterns for path in self.root.glob(pattern)]
+        for path in [*(self.root / name for name in names), *found]:
             path.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Any) -> None:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError, NumericalError
-from invgraphics.experiments.build import build_plan, device_of, training_data, use_kernels
+from invgraphics.experiments.build import build_model, build_plan, device_of, training_data, use_kernels
 from invgraphics.experiments.evaluate import expected_seconds
 from invgraphics.experiments.recipe import Method
+from invgraphics.experiments.renderings import eye_named, through
 from invgraphics.experiments.request import FitRequest
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.scenes.corrupt import corrupt
@@ -91,12 +92,15 @@ def try_method(request: FitRequest, method: Method, scene: Scene) -> Cost:
         fit.step()
         step = time.perf_counter() - began
         evaluation = expected_seconds(fit.plan.field, fit.plan.renderer, scene, device)
+        for name in request.render_with:
+            seen = through(method, eye_named(name))
+            evaluation += expected_seconds(*build_model(seen, scene, request.seed, device), scene, device)
         size = CHECKPOINT_COPIES * model_bytes((fit.plan.field, fit.plan.renderer))
     except InputError:
         raise
     except (NumericalError, MemoryError, RuntimeError):  # its cell will fail with a sentence, and the others go on
         return Cost(0.0, START_SECONDS, 0)
-    return Cost(step, START_SECONDS + evaluation, size + PIXEL_BYTES * pixels)
+    return Cost(step, START_SECONDS + evaluation, size + PIXEL_BYTES * pixels * (1 + len(request.render_with)))
 
 
 def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int) -> Forecast:

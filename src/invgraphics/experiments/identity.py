@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from invgraphics.core import Scene
 from invgraphics.experiments.build import training_data
 from invgraphics.experiments.environment import code_version
+from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.recipe import Method
 from invgraphics.experiments.request import FitRequest
 from invgraphics.training.budget import Budget
@@ -43,8 +45,11 @@ def identify(request: FitRequest, method: Method, truth: TruthDigest, threads: i
         truth: of the undisturbed scene.
         threads: of the process that fits, which decide the order of sums.
     """
+    source = getattr(method.recipe.field, "source", "")
+    started_from = {"source": RunFolder(Path(source)).identity} if source else {}
     return _sha256(
-        {
+        started_from
+        | {
             "method": method.name,
             "recipe": method.digest,
             "truth": truth.pixels,

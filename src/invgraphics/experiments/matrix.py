@@ -8,7 +8,12 @@ from invgraphics.experiments.recipe import methods, source
 
 FIELD_WORDS = {"neural": "network", "gaussians": "anisotropic 3D Gaussians"}
 ENCODING_WORDS = {"frequency": "frequency encoding", "hash": "multi-resolution hash grid"}
-RENDERER_WORDS = {"volumetric": "volume rendering", "splatting": "splatting"}
+RENDERER_WORDS = {
+    "volumetric": "volume rendering",
+    "splatting": "splatting",
+    "gaussian_exact": "exact line integrals",
+    "gaussian_sorted": "line integrals in ray order",
+}
 
 
 def matrix() -> tuple[list[str], list[str], dict[tuple[str, str], list[str]]]:

@@ -101,7 +101,7 @@ def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
     """A method from a complete table, for instance from a run's ``recipe.toml``."""
     from invgraphics.experiments.schema import Recipe
 
-    recipe = fill(Recipe, table)
+    recipe = fill(Recipe, table).capped()
     return Method(name, preset, recipe, to_table(recipe))
 
 

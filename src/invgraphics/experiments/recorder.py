@@ -89,13 +89,15 @@ class Recorder:
         folder: where to write.
         cadence: how often to write a checkpoint.
         title: what the progress display says.
+        snapshots: how many states of the model to keep, evenly over the fit, besides the first.
     """
 
-    def __init__(self, fit: Fit, folder: RunFolder, cadence: Cadence, title: str) -> None:
+    def __init__(self, fit: Fit, folder: RunFolder, cadence: Cadence, title: str, snapshots: int = 0) -> None:
         self._fit, self._folder, self._cadence, self._title = fit, folder, cadence, title
         self._monitor = Monitor(fit.plan.scene, fit.plan.device)
         self._saved_at = (fit.steps, time.monotonic())
         self._marks = [mark for mark in MARKS if mark > fit.progress]
+        self._snapshots = snapshots
         self._asked_to_stop = False
         self._loss = math.nan
 
@@ -110,6 +112,7 @@ class Recorder:
             with Reporter(self._title) as reporter:
                 if self._fit.steps == 0:
                     self._record()
+                    self._keep_snapshot(0.0)
                 self._fit.run(lambda loss: self._after_step(loss, reporter))
             self._save()
         finally:
@@ -124,6 +127,7 @@ class Recorder:
     def _after_step(self, loss: float, reporter: Reporter) -> bool:
         fit = self._fit
         self._loss = loss
+        self._keep_snapshot(min(fit.progress, 1.0))
         if self._marks and fit.progress >= self._marks[0]:
             self._marks = [mark for mark in self._marks if mark > fit.progress]
             psnr = self._record()
@@ -144,6 +148,14 @@ class Recorder:
         checkpoint.save(self._folder.checkpoint, self._fit.state())
         self._folder.write_json("fit.json", {"steps": self._fit.steps, "seconds": self._fit.seconds})
         self._saved_at = (self._fit.steps, time.monotonic())
+
+    def _keep_snapshot(self, progress: float) -> None:
+        """Keep the model, if the fit has come to a moment that is wanted and is not there."""
+        path = self._folder.snapshot(math.floor(progress * self._snapshots))
+        if self._snapshots and not path.is_file():
+            path.parent.mkdir(exist_ok=True)
+            state = self._fit.state()
+            checkpoint.save(path, {part: state[part] for part in ("field", "renderer", "fit")})
 
     def _record(self) -> float:
         fit = self._fit

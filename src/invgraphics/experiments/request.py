@@ -29,6 +29,7 @@ class Settings:
         kernels: implementation to force; ``None`` for the best one here.
         protocol: how to score.
         checkpoint_every: for instance ``30s`` or ``100steps``.
+        render_with: renderers that show the fitted field besides its own (see `invgraphics.experiments.renderings`).
     """
 
     scene: str
@@ -42,6 +43,7 @@ class Settings:
     kernels: str | None = None
     protocol: str = "default"
     checkpoint_every: str = "30s"
+    render_with: tuple[str, ...] = ()
 
     @property
     def recipe_overrides(self) -> tuple[str, ...]:
@@ -64,6 +66,7 @@ class Settings:
         words += ["--device", self.device] if self.device else []
         words += ["--kernels", self.kernels] if self.kernels else []
         words += ["--protocol", self.protocol] if self.protocol != "default" else []
+        words += ["--render-with", ",".join(self.render_with)] if self.render_with else []
         return [*words, "--out", self.out]
 
 
@@ -77,16 +80,19 @@ class FitRequest(Settings):
         existing: what to do with a run that is already there: ``refuse``; ``resume`` it, if it is the same; or ``reuse`` what
             is the same and replace what is not.
         truth: folder for truth images, shared by runs; ``None`` for ``OUT/truth``.
+        snapshots: how many states of the model are kept between start and end, for time-lapses.
     """
 
     method: str
     seed: int = 0
     existing: Existing = "refuse"
     truth: str | None = None
+    snapshots: int = 0
 
     def shell(self) -> str:
         """The command that makes this run."""
-        return shlex.join(["invgraphics", "fit", self.method, self.scene, "--seed", str(self.seed), *self.flags()])
+        kept = ["--snapshots", str(self.snapshots)] if self.snapshots else []
+        return shlex.join(["invgraphics", "fit", self.method, self.scene, "--seed", str(self.seed), *kept, *self.flags()])
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for a job file."""

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,9 @@ from invgraphics.experiments.executors.local import WITH_PARENT
 from invgraphics.experiments.folder import RunFolder, write_json
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.recorder import Cadence, Recorder
+from invgraphics.experiments.renderings import check_eyes, render_missing
 from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.start import memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.scenes.corrupt import corrupt
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -49,6 +52,7 @@ def fit_run(request: FitRequest) -> Path:
     repeatable(device)
     with folder.held():
         scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+        check_eyes(request.render_with, [method], scene)
         shown = corrupt(scene, data, request.seed)
         identity = identify(request, method, TruthDigest.of(scene), torch.get_num_threads())
         same = folder.identity == identity
@@ -57,21 +61,23 @@ def fit_run(request: FitRequest) -> Path:
                 f"{folder.root} holds another run: its method, scene, budget, seed or code differ.", "Choose another --out."
             )
         if same and folder.finished:
+            render_missing(folder, request, method, scene)
             return folder.root
         use_kernels(request.kernels)
         with PeakMemory(device) as memory:
-            fit = Fit(build_plan(method, shown, budget, request.seed, device))
+            fit = Fit(started(build_plan(method, shown, budget, request.seed, device), method, request.scene))
             if same and folder.resumable:
                 fit.load(checkpoint.load(folder.checkpoint, device), float(folder.read_json("fit.json")["seconds"]))
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            _describe(folder, request, method, (scene, shown), identity, device)
+            describe(folder, request, method, (scene, shown), identity, device)
             fit.rehearse()
-            print(_prediction(request, fit), file=sys.stderr)
-            Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}").run()
+            print(_prediction(request, fit, method), file=sys.stderr)
+            Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}", request.snapshots).run()
         spent = {"steps": fit.steps, "seconds": fit.seconds, "peak_memory_bytes": memory.peak_bytes}
         _evaluate(folder, scene, fit, request, method, spent)
+        render_missing(folder, request, method, scene)
     return folder.root
 
 
@@ -84,12 +90,17 @@ def _check_existing(folder: RunFolder, request: FitRequest) -> None:
     folder.create()
 
 
-def _prediction(request: FitRequest, fit: Fit) -> str:
-    """What the person is in for, said before the work starts."""
+def _prediction(request: FitRequest, fit: Fit, method: recipe.Method) -> str:
+    """What the person is in for, said before the work starts.
+
+    Raises:
+        InputError: the primitives would need more memory than the machine has.
+    """
     views = len(fit.plan.scene.test)
     seconds = expected_seconds(fit.plan.field, fit.plan.renderer, fit.plan.scene, fit.plan.device)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
-    return f"{request.method} on {fit.plan.scene.name}: fit {fit.plan.budget}, then {evaluation}."
+    memory = memory_forecast(fit.plan.field, method)
+    return f"{request.method} on {fit.plan.scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}."
 
 
 def _evaluate(
@@ -104,15 +115,26 @@ def _evaluate(
     evaluate(folder, scene, model, "default", costs, method)
 
 
-def _describe(
+def describe(
     folder: RunFolder,
     request: FitRequest,
     method: recipe.Method,
     scenes: tuple[Scene, Scene],
     identity: str,
     device: torch.device,
+    origin: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write what can be known before the fit, of the scene as it was loaded and as the fit sees it."""
+    """Write what can be known before the fit, of the scene as it was loaded and as the fit sees it.
+
+    Args:
+        folder: of the run.
+        request: what was asked for.
+        method: its resolved recipe.
+        scenes: undisturbed, and as the fit sees it.
+        identity: of the run.
+        device: where it computes.
+        origin: further provenance, of a model that was not fitted here.
+    """
     scene, shown = scenes
     folder.write_recipe(method.table)
     folder.write_json("environment.json", environment(device))
@@ -140,7 +162,7 @@ def _describe(
         "options": {"size": request.size, "test_views": request.test_views},
         "device": str(device),
     }
-    folder.write_json("provenance.json", provenance)
+    folder.write_json("provenance.json", provenance | dict(origin or {}))
 
 
 def _relative(target: Path, start: Path) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Annotated, Any
 
@@ -24,6 +24,7 @@ class Recipe:
         hooks: what happens between steps.
         optimiser: Adam's settings and parameter groups.
         batches: size of a step.
+        max_primitives: most explicit primitives, of fields and hooks that make some; ``None`` leaves it to their own settings.
     """
 
     field: Annotated[Any, Slot("fields")]
@@ -34,3 +35,17 @@ class Recipe:
     paper: str = ""
     hooks: tuple[Annotated[Any, Slot("hooks")], ...] = ()
     batches: BatchConfig = default(default_factory=BatchConfig)
+    max_primitives: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_primitives is not None and self.max_primitives < 1:
+            raise ValueError(f"max_primitives must be at least 1, not {self.max_primitives}.")
+
+    def capped(self) -> Recipe:
+        """The recipe with ``max_primitives`` handed to every part that makes primitives, which offers a ``capped`` itself."""
+        if self.max_primitives is None:
+            return self
+        return replace(self, field=self._cap(self.field), hooks=tuple(map(self._cap, self.hooks)))
+
+    def _cap(self, part: Any) -> Any:
+        return part.capped(self.max_primitives) if hasattr(part, "capped") else part

@@ -22,6 +22,7 @@ from typing import Any, Literal
 from invgraphics.config import fill
 from invgraphics.data import find
 from invgraphics.errors import InputError
+from invgraphics.experiments.analyses import check_analyses
 from invgraphics.experiments.request import AblateRequest, FitRequest
 from invgraphics.training.budget import Budget
 
@@ -30,6 +31,21 @@ BUDGET = "budget"
 
 Levels = dict[str, Any]
 """Factor -> level."""
+
+
+@dataclass(frozen=True)
+class Approximation:
+    """Two renderers that differ in one approximation only, to be compared on every fit.
+
+    Attributes:
+        name: of the approximation.
+        exact: renderer without it, one of the study's ``render_with``.
+        approximate: renderer with it, likewise.
+    """
+
+    name: str
+    exact: str
+    approximate: str
 
 
 @dataclass(frozen=True)
@@ -52,6 +68,9 @@ class Study:
         test_views: how many test views to score, or ``all``.
         size: longest side in pixels, or [width, height]; ``None`` for the scenes' own.
         preset: preset of the recipes; ``None`` for their default.
+        render_with: renderers that show every fitted field besides its own (see `invgraphics.experiments.renderings`).
+        approximations: pairs of these renderers whose pictures of the same fit are compared.
+        analyses: computations beside the fits (see `invgraphics.experiments.analyses`).
     """
 
     question: str
@@ -67,6 +86,9 @@ class Study:
     test_views: int | Literal["all"] = 16
     size: int | tuple[int, int] | None = None
     preset: str | None = None
+    render_with: tuple[str, ...] = ()
+    approximations: tuple[Approximation, ...] = ()
+    analyses: tuple[str, ...] = ()
 
     def points(self) -> list[Levels]:
         """Every combination of levels that the design asks for, in the order of the factors; at least the base."""
@@ -107,6 +129,7 @@ class Study:
             checkpoint_every=request.checkpoint_every,
             existing="reuse",
             truth=str(Path(request.out) / "truth"),
+            render_with=self.render_with,
         )
 
     def overridden(self, request: AblateRequest) -> Study:
@@ -238,6 +261,10 @@ def _checked(study: Study, where: str) -> Study:
             raise InputError(
                 f"{where}: '{twice[0]}' is set by two entries for {method}.", "Let their scopes exclude each other."
             )
+    check_analyses(study.analyses, where)
+    for name in (name for pair in study.approximations for name in (pair.exact, pair.approximate)):
+        if name not in study.render_with:
+            raise InputError(f"{where}: an approximation names '{name}', which is not in 'render_with'.")
     Budget.parse(study.budget)
     views = study.test_views
     if any(seed < 0 for seed in study.seeds) or (views != "all" and views < 1):

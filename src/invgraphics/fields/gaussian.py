@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -11,23 +11,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics.core import harmonics
-from invgraphics.core.bounds import Bounds
-from invgraphics.core.colour import srgb_to_linear
 from invgraphics.core.field import Field, Gaussians, Quantity
 from invgraphics.core.rendering import Context
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Points, Scene
-from invgraphics.errors import InputError, NotComposableError
+from invgraphics.errors import NotComposableError
+from invgraphics.fields.convert import visible_points
+from invgraphics.fields.starting import depth_points, random_points, scene_points, starting_scales
 from invgraphics.fields.transformed import move_gaussians
-
-NEIGHBOURS = 3
-"""A Gaussian starts as wide as the mean distance to this many nearest neighbours (3DGS, §5.1)."""
-FAR_SHARE = 0.2
-"""Share of random points that goes outside the inner box of a contracted space."""
-FAR_REACH = 30.0
-"""How far out those go, in half-extents of the box; log-uniformly, so that every shell gets its share."""
-SCALE_RANGE = (1e-5, 0.5)
-"""Limits of a starting scale, relative to the scene's radius (or to the distance from its centre, where that is larger)."""
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 """Names of a `GaussianField`'s parameters; the first axis of each is the primitive."""
@@ -40,8 +31,10 @@ class GaussianFieldConfig:
     Attributes:
         sh_degree: degree of the colour's spherical harmonics, 0 to 3.
         count: random Gaussians where the scene has no points, or ``init`` is ``random``.
-        init: start from the scene's points, or at random in its bounds.
-        max_init: most of the scene's points to start from; a random subset if there are more.
+        init: start from the scene's points, at random in its bounds, from the training views' depth maps, or from the
+            fitted ``field`` of the run that ``source`` names.
+        source: folder of a run of a density field on the same scene; for ``init = "field"``.
+        max_init: most points to start from; a random subset if there are more.
         opacity: opacity at the start.
         scale_factor: multiplies the starting scales.
         isotropic: whether all three axes of a Gaussian stay equal.
@@ -49,7 +42,8 @@ class GaussianFieldConfig:
 
     sh_degree: int = 3
     count: int = 10_000
-    init: Literal["scene", "random"] = "scene"
+    init: Literal["scene", "random", "depth", "field"] = "scene"
+    source: str = ""
     max_init: int = 100_000
     opacity: float = 0.1
     scale_factor: float = 1.0
@@ -64,19 +58,39 @@ class GaussianFieldConfig:
             raise ValueError(f"opacity must lie between 0 and 1, not be {self.opacity}.")
         if not self.scale_factor > 0:
             raise ValueError(f"scale_factor must be positive, not {self.scale_factor}.")
+        if (self.init == "field") != bool(self.source):
+            raise ValueError("init = 'field' needs the folder of a run as 'source', and nothing else does.")
+
+    def capped(self, most: int) -> GaussianFieldConfig:
+        """The same, starting with at most ``most`` Gaussians."""
+        return replace(self, count=min(self.count, most), max_init=min(self.max_init, most))
 
     def build(self, scene: Scene) -> GaussianField:
         """The Gaussians that a fit of ``scene`` starts from; randomness comes from torch's global generator.
 
+        With ``init = "field"`` they are random until `converted` is given the field.
+
         Raises:
-            InputError: the scene's point cloud is empty or not finite.
+            InputError: the scene's point cloud is empty or not finite, or there are no depth maps.
         """
+        if self.init == "depth":
+            return self.from_points(depth_points(scene, self.max_init), scene)
         if self.init == "scene" and scene.points is not None:
-            points = _subset(_checked(scene.points, scene.name), self.max_init)
-        else:
-            points = random_points(scene.bounds, self.count)
-        rgb = srgb_to_linear(points.rgb) if scene.colour == "linear" else points.rgb
-        n = len(points)
+            return self.from_points(scene_points(scene, self.max_init), scene)
+        points = random_points(scene.bounds, self.count)
+        return self.from_points(points, scene)
+
+    def converted(self, source: Field, scene: Scene) -> GaussianField:
+        """Gaussians where the training views see the density field ``source``.
+
+        Raises:
+            InputError: it has no density and radiance, or is empty.
+        """
+        return self.from_points(visible_points(source, scene, self.max_init), scene)
+
+    def from_points(self, points: Points, scene: Scene) -> GaussianField:
+        """One Gaussian per point, whose colour is in the scene's colour space; as wide as its neighbours are far."""
+        n, rgb = len(points), points.rgb
         scales = starting_scales(points.position, scene.bounds) * self.scale_factor
         logit = torch.logit(torch.tensor(self.opacity))
         tensors = {
@@ -93,6 +107,9 @@ class GaussianFieldConfig:
 class GaussianField(Field):
     """n Gaussians. Parameters are stored before activation; `primitives` activates them.
 
+    The buffer ``smoothing`` holds the standard deviation, in local units, of an isotropic filter that every Gaussian is seen
+    through (Mip-Splatting, §4.1): 0 where there is none. `primitives` has it applied.
+
     Args:
         tensors: one per name in `PARAMETERS`, all with n rows.
         isotropic: whether all three axes of a Gaussian are kept equal (their mean log-scale counts).
@@ -106,6 +123,7 @@ class GaussianField(Field):
     sh_dc: Tensor
     sh_rest: Tensor
     sh_active: Tensor
+    smoothing: Tensor
 
     def __init__(self, tensors: Mapping[str, Tensor], isotropic: bool = False) -> None:
         super().__init__()
@@ -113,6 +131,7 @@ class GaussianField(Field):
         for name in PARAMETERS:
             setattr(self, name, nn.Parameter(tensors[name]))
         self.register_buffer("sh_active", torch.tensor(self.sh_degree))
+        self.register_buffer("smoothing", torch.zeros(len(self.means)))
 
     @property
     def sh_degree(self) -> int:
@@ -135,10 +154,10 @@ class GaussianField(Field):
         raise NotComposableError(f"GaussianField has no {want.words()} at points.", "It provides gaussians.")
 
     def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
-        """The activated Gaussians, with the active bands of their colour."""
+        """The activated Gaussians, smoothed, with the active bands of their colour."""
         if want != Quantity.GAUSSIANS:
             return super().primitives(want, ctx)
-        return self._gaussians(harmonics.count(self.active_degree))
+        return self._smoothed(self._gaussians(harmonics.count(self.active_degree)))
 
     def primitive_count(self) -> int:
         """Number of Gaussians."""
@@ -146,7 +165,7 @@ class GaussianField(Field):
 
     @torch.no_grad()
     def replace(self, tensors: Mapping[str, Tensor]) -> None:
-        """Swap all parameters for new ones, of any common number of rows. An optimiser must be told.
+        """Swap all parameters for new ones, of any common number of rows, without smoothing. An optimiser must be told.
 
         Raises:
             ValueError: a name is missing or unknown, the numbers of rows differ, or a row has another shape than before.
@@ -160,6 +179,7 @@ class GaussianField(Field):
             if tensor.shape[1:] != old.shape[1:]:
                 raise ValueError(f"rows of {name} have shape {tuple(old.shape[1:])}, not {tuple(tensor.shape[1:])}.")
             setattr(self, name, nn.Parameter(tensor.detach(), requires_grad=old.requires_grad))
+        self.smoothing = self.means.new_zeros(len(self.means))
 
     @torch.no_grad()
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> GaussianField:
@@ -179,9 +199,12 @@ class GaussianField(Field):
         }
         field = GaussianField(tensors, self.isotropic)
         field.active_degree = self.active_degree
+        # A length: it grows with the scale, which is the cube root of the volume's.
+        field.smoothing = self.smoothing * torch.linalg.det(similarity.to(self.means)[:3, :3]) ** (1 / 3)
         return field
 
     def _gaussians(self, coefficients: int) -> Gaussians:
+        """The Gaussians as stored, without smoothing."""
         log_scales = self.log_scales.mean(dim=1, keepdim=True).expand(-1, 3) if self.isotropic else self.log_scales
         return Gaussians(
             means=self.means,
@@ -191,6 +214,13 @@ class GaussianField(Field):
             sh=torch.cat([self.sh_dc, self.sh_rest[:, : coefficients - 1]], dim=1),
         )
 
+    def _smoothed(self, gaussians: Gaussians) -> Gaussians:
+        """Convolved with the filter: wider, and fainter such that each keeps its integral (Mip-Splatting, §4.1)."""
+        if not bool(self.smoothing.any()):
+            return gaussians
+        scales = (gaussians.scales.square() + self.smoothing[:, None].square()).sqrt()
+        return replace(gaussians, scales=scales, opacities=gaussians.opacities * (gaussians.scales / scales).prod(dim=1))
+
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Resize to the checkpoint's number of Gaussians first, which density control may have changed."""
         for name in PARAMETERS:
@@ -199,47 +229,7 @@ class GaussianField(Field):
                 # Resized in place, so that whoever holds the parameter still holds it after loading.
                 parameter.data = parameter.new_empty(stored.shape)
                 parameter.grad = None
+        # Kept by runs that have it; others are not smoothed.
+        self.smoothing = self.means.new_zeros(len(self.means))
+        state_dict.setdefault(prefix + "smoothing", self.smoothing)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-def starting_scales(positions: Float[Tensor, "n 3"], bounds: Bounds) -> Float[Tensor, " n"]:
-    """Mean distance to the nearest neighbours, kept within `SCALE_RANGE`."""
-    from scipy.spatial import KDTree
-
-    reach = (positions - bounds.centre).norm(dim=1).clamp_min(bounds.radius)
-    if len(positions) == 1:
-        return SCALE_RANGE[1] * reach
-    neighbours = min(NEIGHBOURS, len(positions) - 1)
-    points = positions.detach().double().cpu().numpy()
-    distances, _ = KDTree(points).query(points, k=neighbours + 1)
-    mean = torch.from_numpy(distances[:, 1:]).mean(dim=1).to(positions)
-    return mean.clamp(SCALE_RANGE[0] * reach, SCALE_RANGE[1] * reach)
-
-
-def random_points(bounds: Bounds, count: int) -> Points:
-    """Uniform points of random colour in the box; in a contracted space some of them on shells far around it."""
-    x = torch.rand(count, 3) * 2 - 1
-    if bounds.space == "contracted":
-        far = round(FAR_SHARE * count)
-        shell = nn.functional.normalize(torch.randn(far, 3), dim=1)
-        x[:far] = shell * FAR_REACH ** torch.rand(far, 1)
-    return Points(bounds.centre + x * bounds.half, torch.rand(count, 3))
-
-
-def _checked(points: Points, scene: str) -> Points:
-    if len(points) == 0:
-        remedy = "Set the field's init = 'random', or give the scene points."
-        raise InputError(f"The point cloud of scene '{scene}' is empty, so there is nothing to start Gaussians from.", remedy)
-    for name in ("position", "rgb"):
-        bad = int((~torch.isfinite(getattr(points, name))).any(dim=1).sum())
-        if bad:
-            remedy = "Remove them, or set the field's init = 'random'."
-            raise InputError(f"The point cloud of scene '{scene}': {bad} points have a {name} that is not finite.", remedy)
-    return points
-
-
-def _subset(points: Points, most: int) -> Points:
-    if len(points) <= most:
-        return points
-    keep = torch.randperm(len(points))[:most]
-    return Points(points.position[keep], points.rgb[keep])

@@ -48,7 +48,7 @@ class Mlp(nn.Module):
     def _last_hidden(self, x: Float[Tensor, "m inputs"]) -> Float[Tensor, "m width"]:
         h = x
         for index, layer in enumerate(self.hidden):
-            h = softplus(layer(h), beta=100) if self.smooth else relu(layer(h))
+            h = softplus(layer(h), beta=100) if self.smooth else relu(layer(h), inplace=True)
             if index == self.skip:
                 h = torch.cat([h, x], dim=1)
         return h

@@ -1,7 +1,8 @@
 """The hot operations, one function each; which implementation runs is decided in `dispatch`.
 
-``reference`` is plain torch, any dtype, meant to be read; it is the oracle of the others. ``numba`` is float32 on the CPU.
-All are differentiable where their docstring says so, and deterministic for a given number of threads.
+``reference`` is plain torch, any dtype, meant to be read; it is the oracle of the others. ``numba`` is float32 on the CPU,
+``cuda`` float32 on NVIDIA GPUs. All are differentiable where their docstring says so; ``reference`` and ``numba`` are
+deterministic for a given number of threads, ``cuda`` adds up some gradients in any order.
 """
 
 from __future__ import annotations
@@ -75,18 +76,35 @@ def composite(
     return choose("composite", optical_depth)(optical_depth, channels, ray, rays)
 
 
-def splat_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.3) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+def splat_project(
+    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, compensate: bool = False
+) -> tuple[Footprints, Float[Tensor, "n 3"]]:
     """EWA projection of 3D Gaussians (Zwicker et al. 2001; 3DGS §4) and their colours towards the camera.
 
     Args:
         gaussians: activated primitives.
         camera: pinhole camera, differentiable in its pose.
         dilation: variance in square pixels added to both screen axes (low-pass filter).
+        compensate: whether opacities are lowered so that the filter keeps a footprint's integral (Mip-Splatting, §4.2).
 
     Returns:
         Conic footprints, culled where the 99% ellipsoid misses the frustum; and rgb = max(0, SH(direction) + 0.5).
     """
-    return choose("splat_project", gaussians.means)(gaussians, camera, dilation)
+    return choose("splat_project", gaussians.means)(gaussians, camera, dilation, compensate)
+
+
+def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 0.5) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+    """Flat discs instead of ellipsoids (2DGS, Huang et al. 2024, §4.2): each is spanned by its two longest axes.
+
+    Args:
+        gaussians: activated primitives; the shortest scale is ignored.
+        camera: pinhole camera, differentiable in its pose.
+        dilation: variance in square pixels of the smallest footprint (2DGS uses 0.5).
+
+    Returns:
+        Disc footprints, whose response is taken where a pixel's ray meets the disc; and colours as in `splat_project`.
+    """
+    return choose("splat_project_discs", gaussians.means)(gaussians, camera, dilation)
 
 
 def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bins:
@@ -95,7 +113,12 @@ def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bin
 
 
 def splat_rasterise(
-    footprints: Footprints, features: Float[Tensor, "n c"], width: int, height: int, tile: int | None = None
+    footprints: Footprints,
+    features: Float[Tensor, "n c"],
+    width: int,
+    height: int,
+    tile: int | None = None,
+    receivers: int = 0,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """Front-to-back alpha compositing of footprints at pixel centres (3DGS, appendix C).
 
@@ -107,11 +130,20 @@ def splat_rasterise(
         width: image width in pixels.
         height: image height in pixels.
         tile: edge of a tile in pixels; ``None`` for the implementation's own.
+        receivers: how many footprints of each pixel, counted from the front, receive its gradient; 0 for all.
 
     Returns:
         Sums of w * features and of w per pixel, differentiable in means2d, conics (or homography), opacities and features.
     """
-    return choose("splat_rasterise", footprints.means2d)(footprints, features, width, height, tile)
+    return choose("splat_rasterise", footprints.means2d)(footprints, features, width, height, tile, receivers)
+
+
+def splat_median(footprints: Footprints, width: int, height: int, tile: int | None = None) -> Float[Tensor, "h w"]:
+    """Distance along each pixel's ray of the footprint at which transmittance falls to 1/2; inf where it stays above.
+
+    Not differentiable. Arguments as in `splat_rasterise`.
+    """
+    return choose("splat_median", footprints.means2d)(footprints, width, height, tile)
 
 
 def ssim(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:

@@ -15,8 +15,11 @@ from invgraphics.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-IMPLEMENTATIONS = ("reference", "numba")
+IMPLEMENTATIONS = ("reference", "numba", "cuda")
 """Packages beside this file; each exposes the operations it has, under the names of `invgraphics.kernels`."""
+
+DEVICES = {"numba": "cpu", "cuda": "cuda"}
+"""The kind of device that the compiled ones are written for; the reference runs anywhere."""
 
 _forced: str | None = None
 
@@ -57,26 +60,40 @@ def _module(name: str) -> ModuleType | str:
 
 def why_not(name: str) -> str:
     """Why an implementation cannot run here; empty if it can."""
+    if name == "cuda" and not torch.cuda.is_available():
+        return "torch finds no CUDA device"
     module = _module(name)
     return module if isinstance(module, str) else ""
+
+
+def here() -> tuple[str, ...]:
+    """The implementations that tensors on this machine's CPU can be given to, the plainest first."""
+    return tuple(name for name in IMPLEMENTATIONS if DEVICES.get(name, "cpu") == "cpu" and not why_not(name))
 
 
 def choose(operation: str, like: torch.Tensor) -> Any:
     """The function that runs ``operation`` for tensors like ``like``.
 
-    Numba kernels are written for float32 on the CPU; everything else runs on the plain torch reference.
+    Compiled kernels are written for float32 on one kind of device; everything else runs on the plain torch reference.
     """
-    name = _forced or ("numba" if like.device.type == "cpu" else "reference")
-    if name == "numba" and like.dtype == torch.float32 and like.device.type == "cpu":
-        module = _module("numba")
+    name = _name_for(like.device.type)
+    if like.dtype == torch.float32 and DEVICES.get(name) == like.device.type:
+        module = _module(name)
         if isinstance(module, ModuleType) and hasattr(module, operation):
             return getattr(module, operation)
     return getattr(_module("reference"), operation)
 
 
-def in_use() -> str:
-    """Name of the kernels that float32 tensors on the CPU get, for a run's record."""
-    return _forced or ("numba" if not why_not("numba") else "reference")
+def _name_for(kind: str) -> str:
+    """What is asked for on a kind of device: what was forced, else what is written for it."""
+    return _forced or next((name for name, device in DEVICES.items() if device == kind), "reference")
+
+
+def in_use(device: torch.device | None = None) -> str:
+    """Name of the kernels that float32 tensors on a device (``None``: the CPU) get, for a run's record."""
+    kind = "cpu" if device is None else device.type
+    name = _name_for(kind)
+    return name if DEVICES.get(name) == kind and not why_not(name) else "reference"
 
 
 def warm_up() -> float:

@@ -91,7 +91,8 @@ class Footprints:
     """n primitives on the screen.
 
     A footprint's response at pixel p is ``opacity * exp(-0.5 q)``. For conics ``q = d^T C d`` with ``d = p - mean``; for flat
-    discs ``q = u² + v²`` with ``(u, v) = (a, b) / c`` and ``(a, b, c) = H (x, y, 1)``, where ``homography`` is H.
+    discs ``q = u² + v²`` with ``(u, v) = (a, b) / c`` and ``(a, b, c) = H (x, y, 1)``, where ``homography`` is H, scaled so
+    that c > 0 in front of the camera.
 
     Attributes:
         means2d: centres in pixels.
@@ -103,6 +104,10 @@ class Footprints:
         radii: half-width in pixels of the square outside which the response is below the smallest visible alpha;
             0 for culled primitives.
         homography: pixel to disc coordinates, where the footprints are discs.
+        blur: variance in square pixels of a Gaussian around the centre below which a disc's response never falls (low-pass
+            filter, 2DGS §4.2); ``None`` for no filter.
+        pull: zeros, whose gradient after ``backward`` is the sum over pixels of the absolute values of dL/d(means2d) (AbsGS,
+            Ye et al. 2024), where that is wanted. Conics only.
     """
 
     means2d: Float[Tensor, "n 2"]
@@ -112,6 +117,8 @@ class Footprints:
     planes: Float[Tensor, "n 3"]
     radii: Float[Tensor, " n"]
     homography: Float[Tensor, "n 3 3"] | None = None
+    blur: Float[Tensor, " n"] | None = None
+    pull: Float[Tensor, "n 2"] | None = None
 
     def __len__(self) -> int:
         return len(self.means2d)
@@ -140,5 +147,7 @@ ALPHA_MIN = 1 / 255
 """Responses below this are skipped (3DGS, appendix C)."""
 ALPHA_MAX = 0.99
 """Alpha is clamped here for numerical stability (3DGS, appendix C)."""
+FADE_MIN = 0.005
+"""The low-pass filter's compensation (Mip-Splatting) fades no footprint more than this (3DGS, anti-aliased rasteriser)."""
 TRANSMITTANCE_MIN = 1e-4
 """Compositing of a pixel stops before transmittance falls below this (3DGS, appendix C)."""

@@ -3,6 +3,8 @@
 RENDERERS = {
     "volumetric": "invgraphics.renderers.volumetric:VolumetricConfig",
     "splatting": "invgraphics.renderers.splatting:SplattingConfig",
+    "gaussian_exact": "invgraphics.renderers.gaussian_volume:GaussianExactConfig",
+    "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
 }
 
 SAMPLERS = {

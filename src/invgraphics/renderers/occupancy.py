@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -12,8 +12,9 @@ from torch import Tensor
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.core.field import Density
-from invgraphics.kernels.types import MarchSteps
+from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.samplers import uniform
+from invgraphics.renderers.termination import in_front
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class OccupancyConfig:
         warmup: training steps during which a refresh looks at all cells.
         every: training steps between two refreshes.
         cells: cells that a refresh looks at after warm-up, half of them drawn from the occupied ones.
-        stop: when to march in waves and leave out samples behind opaque surfaces, at the price of a density look-up.
+        stop: when to leave out samples behind opaque surfaces, at the price of a density look-up.
         transmittance: a ray stops when less than this is left of its light.
-        wave: samples per ray between two looks at the transmittance.
+        wave: samples per ray before the first look at the transmittance; each later wave is half as long again.
     """
 
     resolution: int = 128
@@ -48,7 +49,7 @@ class OccupancyConfig:
     cells: int = 1 << 17
     stop: Literal["always", "evaluation", "never"] = "always"
     transmittance: float = 1e-3
-    wave: int = 32
+    wave: int = 6
 
     def __post_init__(self) -> None:
         for key in ("resolution", "steps_per_diagonal", "every", "cells", "wave"):
@@ -89,41 +90,29 @@ class Occupancy(Sampler):
         self.length = 2 * bounds.radius / config.steps_per_diagonal
 
     def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
-        """Samples in occupied cells, in front of what is opaque."""
-        ray, t0, t1 = self._march(rays, density, ctx)
-        return Samples.on(rays, ray, t0, t1), ()
+        """Samples in occupied cells, in front of what is opaque; with their densities where those were asked for."""
+        march = self._march(rays, ctx)
+        if self.config.stop == "always" or (self.config.stop == "evaluation" and not ctx.training):
+            return in_front(rays, march, density, self.config.transmittance, self.config.wave), ()
+        return Samples.on(rays, march.ray, march.t0, march.t1), ()
 
     @torch.no_grad()
-    def _march(self, rays: Rays, density: Density, ctx: Context) -> tuple[Tensor, Tensor, Tensor]:
-        """March all rays in waves: intervals in an order sorted by ray, then distance."""
-        stopping = self.config.stop == "always" or (self.config.stop == "evaluation" and not ctx.training)
-        steps = MarchSteps(self.length, self.cone, self.config.wave) if stopping else MarchSteps(self.length, self.cone)
-        start = rays.near.clone()
+    def _march(self, rays: Rays, ctx: Context) -> March:
+        """March all rays to their ends."""
+        steps = MarchSteps(self.length, self.cone)
+        start = rays.near
         if ctx.training:
             # The whole lattice of steps is shifted, so that over many visits every distance gets its turn.
-            start += uniform((len(rays),), ctx, like=start) * (self.cone * start).clamp_min(self.length)
-        optical_depth = torch.zeros_like(start)
-        waves: list[tuple[Tensor, Tensor, Tensor]] = []
-        marching = torch.nonzero(start < rays.far)[:, 0]
-        while len(marching):
-            march = kernels.ray_march(rays[marching], self.occupied, ctx.bounds, steps, start[marching])
-            start[marching] = march.resume
-            ray, t0, t1 = marching[march.ray], march.t0, march.t1
-            going = march.resume < rays.far[marching]
-            if stopping:
-                tau = density(Samples.on(rays, ray, t0, t1)) * (t1 - t0)
-                before, total = running_sums(tau, march.ray, len(marching), self.config.wave)
-                reached = torch.exp(-(optical_depth[ray] + before)) >= self.config.transmittance
-                ray, t0, t1 = ray[reached], t0[reached], t1[reached]
-                optical_depth[marching] += total
-                going &= torch.exp(-optical_depth[marching]) >= self.config.transmittance
-            waves.append((ray, t0, t1))
-            marching = marching[going]
-        if not waves:
-            return torch.zeros(0, dtype=torch.int64, device=start.device), start[:0], start[:0]
-        ray, t0, t1 = (torch.cat(parts) for parts in zip(*waves, strict=True))
-        order = torch.argsort(ray, stable=True)
-        return ray[order], t0[order], t1[order]
+            start = start + uniform((len(rays),), ctx, like=start) * (self.cone * start).clamp_min(self.length)
+        march = kernels.ray_march(rays, self.occupied, ctx.bounds, steps, start)
+        parts = [march]
+        going = torch.nonzero(march.resume < rays.far)[:, 0]
+        while len(going):
+            march = kernels.ray_march(rays[going], self.occupied, ctx.bounds, steps, march.resume)
+            parts.append(replace(march, ray=going[march.ray]))
+            unfinished = march.resume < rays.far[going]
+            going, march = going[unfinished], replace(march, resume=march.resume[unfinished])
+        return parts[0] if len(parts) == 1 else _joined(parts)
 
     @torch.no_grad()
     def update(self, density: Density, ctx: Context) -> None:
@@ -145,7 +134,8 @@ class Occupancy(Sampler):
         return torch.cat([anywhere, occupied[self._draw(len(occupied), half, ctx)]]) if len(occupied) else anywhere
 
     def _draw(self, below: int, count: int, ctx: Context) -> Int[Tensor, " count"]:
-        return torch.randint(below, (count,), generator=ctx.generator, device=self.ema.device)
+        device = self.ema.device if ctx.generator is None else ctx.generator.device
+        return torch.randint(below, (count,), generator=ctx.generator, device=device).to(self.ema.device)
 
     def _refresh(self, cells: Int[Tensor, " k"], density: Density, ctx: Context) -> None:
         """Look at one random point in each of ``cells`` and decide anew which cells are occupied."""
@@ -172,20 +162,9 @@ class Occupancy(Sampler):
         return density(Samples.at(position)) * (self.cone * distance).clamp_min(self.length)
 
 
-def running_sums(
-    values: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int, most: int
-) -> tuple[Float[Tensor, " m"], Float[Tensor, " n"]]:
-    """Per ray, the sum of the values in front of each sample, and the sum of all.
-
-    Args:
-        values: one per sample.
-        ray: ray of each sample, non-decreasing.
-        rays: number of rays.
-        most: no ray has more samples than this.
-    """
-    counts = torch.bincount(ray, minlength=rays)
-    nth = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-    table = values.new_zeros(rays, most)
-    table[ray, nth] = values
-    sums = torch.nn.functional.pad(table.cumsum(dim=1), (1, 0))
-    return sums[ray, nth], sums[:, -1]
+def _joined(parts: list[March]) -> March:
+    """Parts of a march, each sorted by ray and farther than those before it, as one; a stable sort keeps distances in order."""
+    ray = torch.cat([part.ray for part in parts])
+    order = torch.argsort(ray, stable=True)
+    t0, t1 = (torch.cat([getattr(part, name) for part in parts])[order] for name in ("t0", "t1"))
+    return March(ray[order], t0, t1, parts[-1].resume)

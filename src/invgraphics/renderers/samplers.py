@@ -151,8 +151,9 @@ def quantiles(rays: int, count: int, ctx: Context, like: Tensor) -> Float[Tensor
 
 
 def uniform(shape: tuple[int, ...], ctx: Context, like: Tensor) -> Tensor:
-    """Random numbers in [0, 1) from the context's generator."""
-    return torch.rand(shape, generator=ctx.generator, dtype=like.dtype, device=like.device)
+    """Random numbers in [0, 1) from the context's generator, drawn on its device: a GPU gets the same ones as a CPU."""
+    device = like.device if ctx.generator is None else ctx.generator.device
+    return torch.rand(shape, generator=ctx.generator, dtype=like.dtype, device=device).to(like.device)
 
 
 def invert(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from invgraphics import kernels
 from invgraphics.core import Camera, Context, Field, Gaussians, Quantity, Renderer, Rendering, Scene, Screen, Trace
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.kernels.types import Footprints
-from invgraphics.renderers.base import picture
+from invgraphics.renderers.base import SEEN, picture
 
 
 @dataclass(frozen=True)
@@ -21,18 +21,36 @@ class SplattingConfig:
     """Rasterised anisotropic Gaussians.
 
     Attributes:
-        dilation: variance in square pixels added to every footprint (low-pass filter).
+        shape: ``ellipsoid`` projects to an ellipse, to first order (EWA); ``disc`` drops the shortest axis and meets each
+            pixel's ray exactly (2DGS).
+        dilation: variance in square pixels added to every footprint (low-pass filter); of the smallest one, for discs.
+        compensate: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
+        depth: ``expected`` averages the distances of a pixel's splats by weight; ``median`` takes that of the splat at which
+            half of the light is gone. For evaluation: gradients pass through the expected one only.
+        normals: ``shortest`` averages the splats' shortest axes; ``depth`` takes the slope of the depth map.
+        absolute_gradients: whether density control sees the sum of absolute gradients over pixels (AbsGS), in which opposite
+            pulls do not cancel.
+        receivers: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
+            limited bandwidth uses 10).
         tile: edge of a tile in pixels; ``None`` leaves it to the kernel.
     """
 
+    shape: Literal["ellipsoid", "disc"] = "ellipsoid"
     dilation: float = 0.3
+    compensate: bool = False
+    depth: Literal["expected", "median"] = "expected"
+    normals: Literal["shortest", "depth"] = "shortest"
+    absolute_gradients: bool = False
+    receivers: int = 0
     tile: int | None = None
 
     def __post_init__(self) -> None:
-        if self.dilation < 0:
-            raise ValueError(f"dilation must not be negative, not {self.dilation}")
+        if self.dilation < 0 or self.receivers < 0:
+            raise ValueError("dilation and receivers must not be negative")
         if self.tile is not None and self.tile < 1:
             raise ValueError(f"tile must be at least 1, not {self.tile}")
+        if self.shape == "disc" and (self.compensate or self.absolute_gradients):
+            raise ValueError("discs know neither 'compensate' nor 'absolute_gradients'")
 
     def build(self, scene: Scene) -> Splatting:
         """The renderer; it needs nothing from the scene."""
@@ -40,7 +58,7 @@ class SplattingConfig:
 
 
 class Splatting(Renderer):
-    """Projects a field's Gaussians by EWA splatting and composites them front to back."""
+    """Projects a field's Gaussians to footprints and composites them front to back."""
 
     requires: ClassVar[Quantity] = Quantity.GAUSSIANS
 
@@ -51,31 +69,50 @@ class Splatting(Renderer):
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
         """Render every pixel. Depth is left at infinity in training, unless ``ctx.geometry`` asks for it."""
         gaussians: Gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
-        footprints, rgb = kernels.splat_project(gaussians, camera, self.config.dilation)
-        if footprints.means2d.requires_grad:
-            footprints.means2d.retain_grad()
+        footprints, rgb = self._project(gaussians, camera)
         features = [rgb]
         if ctx.geometry or not ctx.training:
             features.append(_distance_coefficients(footprints))
         if ctx.geometry:
             features.append(_normals(gaussians, camera))
+        size = camera.width, camera.height
         sums, alpha = kernels.splat_rasterise(
-            footprints, torch.cat(features, dim=1), camera.width, camera.height, self.config.tile
+            footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.receivers
         )
-        screen = Screen(footprints.means2d, footprints.radii, camera.width, camera.height)
-        return _picture(sums, alpha, camera), Trace(screen=screen, rays=alpha.numel())
+        rendering = self._picture(sums, alpha, camera, footprints)
+        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.pull, gaussians.opacities, gaussians.scales)
+        return rendering, Trace(screen=screen, rays=alpha.numel())
 
+    def _project(self, gaussians: Gaussians, camera: Camera) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+        """Footprints, which record what pulls them where something learns, and colours."""
+        config = self.config
+        if config.shape == "disc":
+            footprints, rgb = kernels.splat_project_discs(gaussians, camera, config.dilation)
+        else:
+            footprints, rgb = kernels.splat_project(gaussians, camera, config.dilation, config.compensate)
+        if footprints.means2d.requires_grad:
+            footprints.means2d.retain_grad()
+            if config.absolute_gradients:
+                footprints = replace(footprints, pull=torch.zeros_like(footprints.means2d, requires_grad=True))
+        return footprints, rgb
 
-def _picture(sums: Float[Tensor, "h w c"], alpha: Float[Tensor, "h w"], camera: Camera) -> Rendering:
-    """Take the pixel sums apart: colour, then three distance coefficients, then the normal, as far as they are there."""
-    far = torch.full_like(alpha, torch.inf)
-    if sums.shape[2] == 3:
-        return Rendering(sums, alpha, far)
-    homogeneous = torch.nn.functional.pad(camera.pixel_centres(), (0, 1), value=1.0)
-    distance = (sums[..., 3:6] * homogeneous).sum(dim=2)
-    normal = sums[..., 6:] if sums.shape[2] > 6 else None
-    directions = camera.rays().directions.view(*alpha.shape, 3)
-    return picture(sums[..., :3], alpha, distance, normal, far, directions)
+    def _picture(
+        self, sums: Float[Tensor, "h w c"], alpha: Float[Tensor, "h w"], camera: Camera, footprints: Footprints
+    ) -> Rendering:
+        """Take the pixel sums apart: colour, then three distance coefficients, then the normal, as far as they are there."""
+        far = torch.full_like(alpha, torch.inf)
+        if sums.shape[2] == 3:
+            return Rendering(sums, alpha, far)
+        homogeneous = torch.nn.functional.pad(camera.pixel_centres(), (0, 1), value=1.0)
+        distance = (sums[..., 3:6] * homogeneous).sum(dim=2)
+        normal = sums[..., 6:] if sums.shape[2] > 6 else None
+        directions = camera.rays().directions.view(*alpha.shape, 3)
+        if self.config.depth == "median":
+            median = kernels.splat_median(footprints, camera.width, camera.height, self.config.tile)
+            distance = torch.where(torch.isfinite(median), median * alpha, distance)
+        if normal is not None and self.config.normals == "depth":
+            normal = _slope(distance / alpha.clamp_min(SEEN), alpha >= SEEN, directions)
+        return picture(sums[..., :3], alpha, distance, normal, far, directions)
 
 
 def _distance_coefficients(footprints: Footprints) -> Float[Tensor, "n 3"]:
@@ -91,3 +128,25 @@ def _normals(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
     normal = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
     away = (normal * (gaussians.means - camera.position)).sum(dim=1, keepdim=True) > 0
     return torch.where(away, -normal, normal)
+
+
+def _slope(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Normals of the surface through neighbouring pixels' points; sided, where a neighbour sees nothing.
+
+    A pixel without a neighbour in one direction gets its own viewing direction, reversed.
+    """
+    points = depth[..., None] * directions
+    along_x, along_y = _difference(points, seen, 1), _difference(points, seen, 0)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(along_x, along_y), dim=-1)
+    alone = normal.square().sum(dim=-1, keepdim=True) < SEEN
+    return torch.where(alone, -directions, normal)
+
+
+def _difference(points: Float[Tensor, "h w 3"], seen: Tensor, axis: int) -> Float[Tensor, "h w 3"]:
+    """The step to the next point plus that from the one before, leaving out what is not seen."""
+    last = points.shape[axis] - 1
+    step = points.narrow(axis, 1, last) - points.narrow(axis, 0, last)
+    both = seen.narrow(axis, 1, last) & seen.narrow(axis, 0, last)
+    step = torch.where(both[..., None], step, 0.0)
+    none = torch.zeros_like(points.narrow(axis, 0, 1))
+    return torch.cat([step, none], dim=axis) + torch.cat([none, step], dim=axis)

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar
 
 import torch
 
+from invgraphics import kernels
 from invgraphics.config import Slot
 from invgraphics.core import (
     Context,
@@ -24,6 +25,11 @@ from invgraphics.core import (
 )
 from invgraphics.renderers.quadrature import integrate
 from invgraphics.renderers.samplers import StratifiedConfig
+from invgraphics.renderers.termination import weighty
+
+UNSEEN = 1e-3
+"""Outside the graph, what all samples together that are not asked for their colour may contribute to a ray: a quarter of
+the smallest step of an 8-bit picture."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +60,31 @@ class Volumetric(RayRenderer):
         """Render n rays; normals are added when ``ctx.geometry`` asks for them and the field has some."""
         samples, levels = self.sampler.sample(ctx.bounds.clip(rays), no_grad_density(field), ctx)
         want = self.requires | (field.provides & Quantity.NORMAL if ctx.geometry else Quantity.NONE)
-        values = query(field, samples, want, ctx.chunk)
+        if samples.density is not None and not torch.is_grad_enabled():
+            values = _seen(field, samples, len(rays), want, ctx.chunk)
+        else:
+            values = query(field, samples, want, ctx.chunk)
         assert values.density is not None
         return integrate(rays, samples, values, values.density * samples.delta, levels)
 
     def update(self, field: Field, ctx: Context) -> None:
         """Let the sampler refresh what it remembers of the field."""
         self.sampler.update(no_grad_density(field), ctx)
+
+
+def _seen(field: Field, samples: Samples, rays: int, want: Quantity, chunk: int) -> FieldValues:
+    """Values of samples whose density is known: what contributes next to nothing is not asked for its colour and stays zero."""
+    assert samples.density is not None
+    weights, _, _ = kernels.composite(samples.density * samples.delta, samples.density[:, None], samples.ray, rays)
+    seen = weighty(weights, samples.ray, rays, UNSEEN)
+    found = query(field, samples[seen], want & ~Quantity.DENSITY, chunk)
+    values = {entry.name: getattr(found, entry.name) for entry in fields(FieldValues)}
+    spread = {
+        name: value.new_zeros(len(samples), *value.shape[1:]).index_copy_(0, seen, value)
+        for name, value in values.items()
+        if value is not None
+    }
+    return FieldValues(**spread | {"density": samples.density})
 
 
 def query(field: Field, samples: Samples, want: Quantity, chunk: int) -> FieldValues:

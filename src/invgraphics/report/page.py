@@ -7,6 +7,7 @@ from typing import Any
 
 from invgraphics.report import facts
 from invgraphics.report.assets import Folder
+from invgraphics.report.crossed import Crossed
 from invgraphics.report.parts import Contrasts, Part
 from invgraphics.report.pictures import has_flip
 from invgraphics.report.style import SERIES, Figure
@@ -76,6 +77,27 @@ def markdown_part(part: Part) -> list[str]:
     lines = [markdown_table(part.summary)]
     for why, labels in part.summary.skipped.items():
         lines.append(f"Not computed: {escape_markdown(listing(labels))} ({escape_markdown(why)}).")
+    return lines + markdown_crossed(part.crossed)
+
+
+def markdown_crossed(crossed: Crossed | None) -> list[str]:
+    """Fit x render, and what each approximation changes."""
+    if crossed is None:
+        return []
+    text = escape_markdown
+    lines = ["", f"{text(crossed.quantity.heading)} of each fit (row) through each renderer (column); in brackets the image "]
+    lines[-1] += "difference from the fitting renderer, dB."
+    lines += ["", f"| fitted by | {' | '.join(map(text, crossed.renderers))} |", "|---" * (1 + len(crossed.renderers)) + "|"]
+    for row in crossed.rows:
+        cells = [
+            "–" if cell is None else f"{cell.text}{f' ({cell.difference})' if cell.difference else ''}" for cell in row.cells
+        ]
+        lines.append(f"| {text(row.method)} | {' | '.join(cells)} |")
+    if crossed.steps:
+        names = " | ".join(text(row.method) for row in crossed.rows)
+        lines += ["", "Image difference that one approximation makes, dB.", ""]
+        lines += [f"| approximation | {names} |", "|---" * (1 + len(crossed.rows)) + "|"]
+        lines += [f"| {text(step.name)} | {' | '.join(step.differences)} |" for step in crossed.steps]
     return lines
 
 

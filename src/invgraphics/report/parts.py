@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from invgraphics.report.assets import Folder
+from invgraphics.report.crossed import Crossed, cross
 from invgraphics.report.curves import draw_curves
 from invgraphics.report.distributions import draw_distributions
 from invgraphics.report.effectplots import draw_intervals
@@ -83,6 +85,7 @@ class Part:
         reach: who reaches a quality when.
         drawn: plots and pictures.
         thumbnails: the truth of every test view.
+        crossed: the same fits through other renderers, where that was asked for.
     """
 
     key: str
@@ -92,6 +95,7 @@ class Part:
     reach: Reach | None
     drawn: Drawn
     thumbnails: list[Thumbnail]
+    crossed: Crossed | None
 
     @property
     def groups(self) -> list[tuple[str, str, list[int]]]:
@@ -123,8 +127,13 @@ class Part:
         return f"{self.key}-{name}" if self.key else name
 
 
-def draw_part(comparison: Comparison, folder: Folder) -> Part:
+def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[dict[str, Any]] = ()) -> Part:
     """Draw a scene's plots and pictures below ``folder.figures``, and say what its numbers mean.
+
+    Args:
+        comparison: the scene's runs.
+        folder: where to write.
+        approximations: pairs of renderers that a study compares on every fit.
 
     Raises:
         InputError: a picture or an array is missing or broken.
@@ -137,7 +146,9 @@ def draw_part(comparison: Comparison, folder: Folder) -> Part:
         distributions=draw_distributions(comparison, summary, folder.figures),
     )
     thumbnails = _thumbnails(comparison, drawn, folder)
-    return Part(folder.part, comparison, summary, verdict(comparison, summary), time_to_quality(comparison), drawn, thumbnails)
+    told, reach = verdict(comparison, summary), time_to_quality(comparison)
+    crossed = cross(comparison, approximations, folder)
+    return Part(folder.part, comparison, summary, told, reach, drawn, thumbnails, crossed)
 
 
 def draw_contrasts(

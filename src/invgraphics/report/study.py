@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.errors import InputError
+from invgraphics.report.analysisplots import draw_analyses
 from invgraphics.report.assets import Folder
 from invgraphics.report.effectplots import draw_heat_maps, file_name
 from invgraphics.report.effects import effects_on
@@ -49,7 +50,7 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
     place = Folder(target, redactor=redactor)
     try:
         target.mkdir(parents=True, exist_ok=True)
-        page = _draw(study, place)
+        page = _draw(study, place, folder)
         write_study_table(study, target / "results", folder)
         for part in page.parts:
             write_latex(part.comparison, part.summary, target / f"table-{part.key}.tex")
@@ -73,18 +74,19 @@ def study_sentences(folder: Path) -> list[str]:
     return [effect.sentence for effect in effects_on(quantities[0], study.factors, study.observations())] if quantities else []
 
 
-def _draw(study: Study, folder: Folder) -> StudyPage:
+def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
     comparisons = scene_comparisons(study)
     keys = _keys([comparison.scene for comparison in comparisons])
     parts = tuple(
-        draw_part(replace(comparison, shown=shown_variants(comparison)), replace(folder, part=key))
+        draw_part(replace(comparison, shown=shown_variants(comparison)), replace(folder, part=key), study.approximations)
         for key, comparison in zip(keys, comparisons, strict=True)
     )
     observations = study.observations()
     quantities = _quantities(comparisons)
     contrasts = draw_contrasts(quantities, study.factors, observations, folder)
     heat = draw_heat_maps(study.factors, quantities[0], observations, folder.figures) if quantities else []
-    return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None)
+    analyses = draw_analyses(root, study.analyses, folder.figures)
+    return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None, analyses)
 
 
 def _quantities(comparisons: Sequence[Comparison]) -> list[Quantity]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from invgraphics.report import facts
+from invgraphics.report.analysisplots import AnalysisPart
 from invgraphics.report.assets import Folder
 from invgraphics.report.effects import METHOD
 from invgraphics.report.page import markdown_commands, markdown_figures, markdown_part, render
@@ -34,6 +35,7 @@ class StudyPage:
         contrasts: the factors' effects.
         heat: heat maps of pairs of factors.
         quantity: the metric that sentences, plots and the matrix are about; ``None`` where nothing ran.
+        analyses: computations beside the fits.
     """
 
     study: Study
@@ -41,6 +43,7 @@ class StudyPage:
     contrasts: Contrasts
     heat: list[Figure]
     quantity: Quantity | None
+    analyses: list[AnalysisPart]
 
     @property
     def headline(self) -> list[str]:
@@ -165,10 +168,14 @@ def write_study_markdown(page: StudyPage, folder: Folder) -> None:
         lines += ["", "## Effects", "", markdown_effects(page.contrasts.first)]
     for part in page.parts:
         lines += ["", f"## Scene {text(part.comparison.scene)}", "", *markdown_part(part)]
+    if page.analyses:
+        lines += ["", "## Approximations by themselves", ""]
+        lines += [f"- {text(part.sentence)}" for part in page.analyses]
     if study.failures:
         lines += ["", "## Failures", ""]
         lines += [f"- {text(f'{cell.variant}, {cell.scene}, seed {cell.seed}: {cell.error}')}" for cell in study.failures]
     figures = [*([page.contrasts.figure] if page.contrasts.figure else []), *page.heat]
+    figures += [part.figure for part in page.analyses]
     lines += markdown_figures(figures + [figure for part in page.parts for figure in part.drawn.figures], folder)
     lines += markdown_commands([study.command])
     (folder.root / "index.md").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -67,6 +67,8 @@ class Study:
         command: reproduces the study.
         environment: machine and versions.
         cells: all of them, in order.
+        approximations: ``name``, and the renderers ``exact`` and ``approximate`` that are compared on every fit.
+        analyses: names of the computations beside the fits.
     """
 
     name: str
@@ -84,6 +86,8 @@ class Study:
     command: str
     environment: dict[str, Any]
     cells: tuple[StudyCell, ...]
+    approximations: tuple[dict[str, Any], ...] = ()
+    analyses: tuple[str, ...] = ()
 
     @property
     def variants(self) -> tuple[str, ...]:
@@ -141,6 +145,8 @@ def read_study(folder: Path) -> Study:
         command=optional(table, "command", str, source, ""),
         environment=optional(table, "environment", dict, source, {}),
         cells=tuple(replace(cell, variant=_variant(cell, factors)) for cell in cells),
+        approximations=tuple(_approximations(table, source)),
+        analyses=tuple(str(name) for name in optional(table, "analyses", list, source, [])),
     )
 
 
@@ -200,6 +206,11 @@ def _cell(entry: Any, base: Mapping[str, str], folder: Path, protocol: str) -> S
         seconds=number(entry.get("seconds"), "seconds", source),
         run=run,
     )
+
+
+def _approximations(table: Mapping[str, Any], source: Path) -> list[dict[str, Any]]:
+    pairs = optional(table, "approximations", list, source, [])
+    return [{key: need(pair, key, str, source) for key in ("name", "exact", "approximate")} for pair in pairs]
 
 
 def _protocol(value: Any, source: Path) -> dict[str, Any]:

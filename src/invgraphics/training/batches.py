@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core import Batch, Camera, Rays, Scene, View
+from invgraphics.core.camera import rays_through
 
 
 @dataclass(frozen=True)
@@ -66,21 +67,22 @@ class Batches:
         count = min(config.views, len(train), self._rays)
         chosen = torch.randperm(len(train), generator=self._generator)[:count]
         shares = [self._rays // count + (i < self._rays % count) for i in range(count)]
-        parts = [self._rays_of(int(view), share, background) for view, share in zip(chosen, shares, strict=True)]
-        rays, targets, alphas = zip(*parts, strict=True)
-        batch = Batch(torch.cat(targets), torch.cat(alphas), background)
-        return Rays.cat(rays).to(self._device), batch.to(self._device)
+        views = [train[int(view)] for view in chosen]
+        flat = [self._pixels_of(view, share) for view, share in zip(views, shares, strict=True)]
+        which = torch.repeat_interleave(torch.arange(count), torch.tensor(shares))
+        wide = torch.tensor([view.camera.width for view in views])[which]
+        index = torch.cat(flat)
+        pixels = torch.stack([index % wide, index // wide], dim=1) + 0.5
+        rays = rays_through([view.camera for view in views], which, pixels, chosen[which])
+        batch = Batch(*_seen(views, flat, background), background)
+        return rays.to(self._device), batch.to(self._device)
 
-    def _rays_of(self, index: int, count: int, background: Tensor) -> tuple[Rays, Tensor, Tensor]:
-        view = self._scene.train[index]
-        camera = view.camera
+    def _pixels_of(self, view: View, count: int) -> Tensor:
+        """Flat indices of random pixels that count."""
         if view.mask is None:
-            flat = torch.randint(camera.width * camera.height, (count,), generator=self._generator)
-        else:
-            valid = view.mask.reshape(-1).nonzero()[:, 0]
-            flat = valid[torch.randint(len(valid), (count,), generator=self._generator)]
-        pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
-        return camera.rays(pixels, view=index), view.over(background, flat), view.opacity(flat)
+            return torch.randint(view.camera.width * view.camera.height, (count,), generator=self._generator)
+        valid = view.mask.reshape(-1).nonzero()[:, 0]
+        return valid[torch.randint(len(valid), (count,), generator=self._generator)]
 
     def observe(self, rays: int, samples: int) -> None:
         """Let the ray count follow the samples that ``rays`` rays led to."""
@@ -124,3 +126,18 @@ class Batches:
     def load(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state`."""
         self._order, self._rays = state["order"], int(state["rays"])
+
+
+def _seen(views: list[View], flat: list[Tensor], background: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """Colour in front of the background, and alpha, at pixels of several views, one view after another.
+
+    Views alike are put behind one another before their bytes are converted: the conversions then are few.
+    """
+    kinds = {(view.image.dtype, None if view.alpha is None else view.alpha.dtype) for view in views}
+    if len(kinds) > 1:
+        parts = [(view.over(background, index), view.opacity(index)) for view, index in zip(views, flat, strict=True)]
+        return torch.cat([colour for colour, _ in parts]), torch.cat([alpha for _, alpha in parts])
+    image = torch.cat([view.image.reshape(-1, 3)[index] for view, index in zip(views, flat, strict=True)])
+    alphas = [view.alpha.reshape(-1)[index] for view, index in zip(views, flat, strict=True) if view.alpha is not None]
+    strip = replace(views[0], image=image[None], alpha=torch.cat(alphas)[None] if alphas else None)
+    return strip.over(background)[0], strip.opacity()[0]

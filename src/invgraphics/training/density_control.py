@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, cast
 
 import torch
@@ -19,7 +19,9 @@ from invgraphics.training.hooks import FitState, Hook
 
 @dataclass(frozen=True)
 class DensityControlConfig:
-    """The 3DGS rules, on a schedule of progress so that they fit any budget.
+    """The 3DGS rules, on a schedule of progress so that they fit any budget; ``stop = 0`` leaves the Gaussians as they are.
+
+    With a renderer's ``absolute_gradients`` the gradients are those of AbsGS (Ye et al. 2024), whose threshold is higher: 8e-4.
 
     Attributes:
         start: progress at which growing begins (paper: 500 of 30,000 steps).
@@ -31,6 +33,8 @@ class DensityControlConfig:
         prune_extent: share of the scene's extent above which a Gaussian goes, after the first reset.
         prune_pixels: radius in pixels above which a Gaussian goes, after the first reset; 0 never.
         resets: progress values at which opacities are pulled down to at most twice ``prune_opacity``.
+        white_reset: whether they are also pulled down at ``start`` where the scene's background is white, before splats of the
+            background's colour settle in front of it.
         max_primitives: growth stops here; those with the largest gradients come first.
         clone: whether small Gaussians are cloned.
         split: whether large Gaussians are split.
@@ -45,6 +49,7 @@ class DensityControlConfig:
     prune_extent: float = 0.1
     prune_pixels: float = 0.0
     resets: tuple[float, ...] = ()
+    white_reset: bool = False
     max_primitives: int = 1_000_000
     clone: bool = True
     split: bool = True
@@ -53,12 +58,16 @@ class DensityControlConfig:
         if self.every < 1 or self.max_primitives < 1:
             raise ValueError("'every' and 'max_primitives' must be at least 1.")
 
+    def capped(self, most: int) -> DensityControlConfig:
+        """The same, growing to at most ``most`` Gaussians."""
+        return replace(self, max_primitives=most)
+
     def build(self) -> Hook:
         """The hook."""
         return DensityControl(self)
 
 
-class _Splats(Protocol):
+class Splats(Protocol):
     """The part of a Gaussian field that density control edits."""
 
     means: Float[Tensor, "n 3"]
@@ -66,7 +75,19 @@ class _Splats(Protocol):
     quaternions: Float[Tensor, "n 4"]
     opacity_logits: Float[Tensor, " n"]
 
-    def replace(self, tensors: dict[str, Tensor]) -> None: ...
+    def replace(self, tensors: dict[str, Tensor]) -> None:
+        """Swap all parameters for new ones."""
+        ...
+
+
+def check_splats(hook: str, field: Field) -> None:
+    """Refuse a field without Gaussians that can be edited.
+
+    Raises:
+        InputError: names the hook and the field.
+    """
+    if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "replace"):
+        raise InputError(f"The hook '{hook}' needs Gaussians, which {type(field).__name__} does not have.")
 
 
 class DensityControl(Hook):
@@ -84,20 +105,20 @@ class DensityControl(Hook):
         self._seen = torch.zeros(0)
         self._radius = torch.zeros(0)
         self._resets_done = 0
+        self._started = False
 
     @override
     def check(self, field: Field, renderer: Renderer) -> None:
-        if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "replace"):
-            raise InputError(f"The hook 'density_control' needs Gaussians, which {type(field).__name__} does not have.")
+        check_splats("density_control", field)
 
     @override
     def after_backward(self, state: FitState) -> None:
         screen = state.trace.screen if state.trace is not None else None
-        if screen is None or screen.means2d.grad is None or state.ctx.progress >= self._config.stop:
+        if screen is None or screen.gradient is None or state.ctx.progress >= self._config.stop:
             return
         if len(self._pull) != len(screen.radii):
             self._restart(len(screen.radii), screen.radii)
-        ndc = screen.means2d.grad * screen.means2d.new_tensor([screen.width / 2, screen.height / 2])
+        ndc = screen.gradient * screen.means2d.new_tensor([screen.width / 2, screen.height / 2])
         visible = screen.radii > 0
         self._pull += torch.where(visible, ndc.norm(dim=1), 0)
         self._seen += visible
@@ -106,27 +127,34 @@ class DensityControl(Hook):
     @override
     def after_step(self, state: FitState) -> None:
         config, progress = self._config, state.ctx.progress
-        field = cast(_Splats, state.field)
+        field = cast(Splats, state.field)
         due = (state.step + 1) % config.every == 0 and len(self._pull) == len(field.means)
         if due and config.start <= progress < config.stop:
             self._regrow(state)
         if self._resets_done < len(config.resets) and progress >= config.resets[self._resets_done]:
             self._resets_done += 1
-            ceiling = math.log(2 * config.prune_opacity / (1 - 2 * config.prune_opacity))
-            with torch.no_grad():
-                field.opacity_logits.clamp_(max=ceiling)
-            state.optimiser.forget("field.opacity_logits")
+            self._reset(state)
+        if not self._started and progress >= config.start:
+            self._started = True
+            if config.white_reset and bool((state.scene.background >= 1).all()):
+                self._reset(state)
+
+    @torch.no_grad()
+    def _reset(self, state: FitState) -> None:
+        ceiling = 2 * self._config.prune_opacity
+        cast(Splats, state.field).opacity_logits.clamp_(max=math.log(ceiling / (1 - ceiling)))
+        state.optimiser.forget("field.opacity_logits")
 
     @torch.no_grad()
     def _regrow(self, state: FitState) -> None:
-        config, field = self._config, cast(_Splats, state.field)
+        config, field = self._config, cast(Splats, state.field)
         pull = self._pull / self._seen.clamp_min(1)
         largest = field.log_scales.exp().amax(dim=1)
         keep = ~self._to_prune(field, largest, state.scene.extent)
-        grows = keep & self._to_grow(pull, config.max_primitives - int(keep.sum()))
         small = largest <= config.dense * state.scene.extent
-        cloned = (grows & small).nonzero()[:, 0] if config.clone else torch.zeros(0, dtype=torch.int64)
-        split = (grows & ~small).nonzero()[:, 0] if config.split else torch.zeros(0, dtype=torch.int64)
+        able = keep & torch.where(small, config.clone, config.split)
+        grows = self._to_grow(torch.where(able, pull, 0.0), config.max_primitives - int(keep.sum()))
+        cloned, split = (grows & small).nonzero()[:, 0], (grows & ~small).nonzero()[:, 0]
         keep[split] = False
         if not bool(keep.any()) and len(split) == 0:
             keep[torch.argmax(field.opacity_logits)] = True  # a field of nothing could never grow again
@@ -142,7 +170,7 @@ class DensityControl(Hook):
             grows &= pull > self._config.threshold
         return grows
 
-    def _to_prune(self, field: _Splats, largest: Float[Tensor, " n"], extent: float) -> Bool[Tensor, " n"]:
+    def _to_prune(self, field: Splats, largest: Float[Tensor, " n"], extent: float) -> Bool[Tensor, " n"]:
         config = self._config
         prune = torch.sigmoid(field.opacity_logits) < config.prune_opacity
         if self._resets_done:
@@ -162,7 +190,7 @@ class DensityControl(Hook):
         rotation = quaternion_to_matrix(old["quaternions"][parts])
         new["means"][first:] += (rotation @ offset[:, :, None])[:, :, 0]
         new["log_scales"][first:] -= math.log(self.SPLIT_SHRINK)
-        cast(_Splats, field).replace(new)
+        cast(Splats, field).replace(new)
         for name, parameter in field.named_parameters():
             state.optimiser.rechoose(f"field.{name}", cast(nn.Parameter, parameter), keep, len(rows) - len(keep))
         self._restart(len(rows), new["means"])
@@ -173,9 +201,9 @@ class DensityControl(Hook):
     @override
     def state_dict(self) -> dict[str, Tensor]:
         gathered = {"pull": self._pull, "seen": self._seen, "radius": self._radius}
-        return gathered | {"resets_done": torch.tensor(self._resets_done)}
+        return gathered | {"resets_done": torch.tensor(self._resets_done), "started": torch.tensor(self._started)}
 
     @override
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self._pull, self._seen, self._radius = state["pull"], state["seen"], state["radius"]
-        self._resets_done = int(state["resets_done"])
+        self._resets_done, self._started = int(state["resets_done"]), bool(state["started"])

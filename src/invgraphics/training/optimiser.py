@@ -102,6 +102,10 @@ class Optimiser:
         """Current learning rate of each group."""
         return {group["name"]: group["lr"] for group in self._adam.param_groups}
 
+    def rate_of(self, name: str) -> float:
+        """Current learning rate of one parameter."""
+        return self.rates()[self._group_of(name)]
+
     def zero_grad(self) -> None:
         """Forget all gradients."""
         self._adam.zero_grad(set_to_none=True)
@@ -123,11 +127,11 @@ class Optimiser:
                 state[key] = torch.cat([kept, kept.new_zeros(fresh, *kept.shape[1:])])
             self._adam.state[parameter] = state
 
-    def forget(self, name: str) -> None:
-        """Zero the moments of a parameter (after an opacity reset)."""
+    def forget(self, name: str, rows: Int[Tensor, " k"] | None = None) -> None:
+        """Zero the moments of a parameter (after an opacity reset), or of some of its rows."""
         for key, value in self._adam.state.get(self._names[name], {}).items():
             if key != "step":
-                value.zero_()
+                value[slice(None) if rows is None else rows] = 0.0
 
     def state(self) -> dict[str, Tensor]:
         """Moments and step counts by parameter name."""

@@ -10,6 +10,7 @@ from invgraphics.kernels.numba.grid import grid_sample as grid_sample
 from invgraphics.kernels.numba.hash import hash_encode as hash_encode
 from invgraphics.kernels.numba.march import ray_march as ray_march
 from invgraphics.kernels.numba.projecting import splat_project as splat_project
+from invgraphics.kernels.numba.rasterising import splat_median as splat_median
 from invgraphics.kernels.numba.rasterising import splat_rasterise as splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim as ssim
 from invgraphics.kernels.numba.warming import warm_up as warm_up

@@ -7,7 +7,7 @@ import numpy as np
 from invgraphics.kernels.numba.harmonics import harmonics
 from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, share
 from invgraphics.kernels.reference.splat_project import ILL_CONDITIONED, MARGIN, NEAR
-from invgraphics.kernels.types import ALPHA_MIN
+from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN
 
 # A camera as a flat array: rotation to the world row by row, position, focal lengths, principal point, width, height.
 ROTATION, POSITION, FOCAL, CENTRE, SIZE, VIEW = 0, 9, 12, 14, 16, 18
@@ -15,7 +15,7 @@ ROTATION, POSITION, FOCAL, CENTRE, SIZE, VIEW = 0, 9, 12, 14, 16, 18
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 _NEAR, _MARGIN, _THIN = np.float32(NEAR), np.float32(MARGIN), np.float32(ILL_CONDITIONED)
 _TINY, _EPSILON = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
-_NORM_MIN = np.float32(1e-12)
+_NORM_MIN, _FADE_MIN = np.float32(1e-12), np.float32(FADE_MIN)
 
 
 @inlined
@@ -121,6 +121,14 @@ def covariance(x, y, dilation):
 
 
 @inlined
+def fade_of(x, y, dilation):
+    """Factor that gives a filtered footprint the integral it had unfiltered, and the unfiltered covariance."""
+    xx, xy, yy, area = covariance(x, y, _ZERO)
+    _, _, _, det = covariance(x, y, dilation)
+    return max(np.sqrt(area / det), _FADE_MIN), xx, xy, yy, area
+
+
+@inlined
 def _plane(mean, x, y, root, dilation):
     """Distance of the centre, and its change per pixel along the ridge of maximal response."""
     distance = np.sqrt(dot(mean, mean))
@@ -149,19 +157,22 @@ def _radius(view, u, v, xx, xy, yy, opacity):
 
 
 @inlined
-def _write_footprint(view, dilation, mean, q, scales, opacity, mean2d, conic, plane):
-    """Write the footprint of a primitive in front of the camera, unless it is culled; returns its radius."""
+def _write_footprint(view, dilation, compensate, mean, q, scales, opacity, mean2d, conic, plane):
+    """Write the footprint of a primitive in front of the camera, unless it is culled; returns its radius and its fade."""
     _, root = scaled_axes(view, q, scales)
     x, y, _, _ = screen_axes(view, mean, root)
     xx, xy, yy, det = covariance(x, y, dilation)
     u = view[CENTRE] + view[FOCAL] * mean[0] / mean[2]
     v = view[CENTRE + 1] + view[FOCAL + 1] * mean[1] / mean[2]
-    radius = _radius(view, u, v, xx, xy, yy, opacity)
+    fade = _ONE
+    if compensate:
+        fade, _, _, _, _ = fade_of(x, y, dilation)
+    radius = _radius(view, u, v, xx, xy, yy, opacity * fade)
     if radius > _ZERO:
         mean2d[0], mean2d[1] = u, v
         conic[0], conic[1], conic[2] = yy / det, -xy / det, xx / det
         plane[0], plane[1], plane[2] = _plane(mean, x, y, root, dilation)
-    return radius
+    return radius, fade
 
 
 @inlined
@@ -178,7 +189,10 @@ def _write_colour(offset, distance, sh, weights, rgb):
 
 
 @parallel
-def project(view, dilation, means, quaternions, scales, opacities, sh, jobs, means2d, conics, depths, planes, radii, rgb):
+def project(
+    view, dilation, compensate, means, quaternions, scales, opacities, sh, jobs,
+    means2d, conics, depths, planes, radii, rgb, fades,
+):  # fmt: skip
     """Footprints and colours; those of culled primitives are set to something harmless."""
     n = len(means)
     for job in prange(jobs):
@@ -187,11 +201,13 @@ def project(view, dilation, means, quaternions, scales, opacities, sh, jobs, mea
             i = index(number)
             offset, mean = camera_point(view, means[i])
             depths[i] = mean[2]
-            radius = _ZERO
+            radius, fade = _ZERO, _ONE
             if mean[2] > _NEAR:
                 q, _ = normalised(quaternions[i])
-                radius = _write_footprint(view, dilation, mean, q, scales[i], opacities[i], means2d[i], conics[i], planes[i])
-            radii[i] = radius
+                radius, fade = _write_footprint(
+                    view, dilation, compensate, mean, q, scales[i], opacities[i], means2d[i], conics[i], planes[i]
+                )
+            radii[i], fades[i] = radius, fade
             if radius > _ZERO:
                 _write_colour(offset, planes[i, 0], sh[i], weights, rgb[i])
             else:

@@ -9,6 +9,7 @@ from invgraphics.kernels.numba.ewa import (
     camera_point,
     column,
     dot,
+    fade_of,
     matrix_of,
     normalised,
     rotation_of,
@@ -18,8 +19,10 @@ from invgraphics.kernels.numba.ewa import (
 )
 from invgraphics.kernels.numba.harmonics import harmonics, harmonics_gradient
 from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, share
+from invgraphics.kernels.types import FADE_MIN
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
+_FADE_MIN = np.float32(FADE_MIN)
 
 
 @inlined
@@ -33,12 +36,28 @@ def _through_inverse(conic, g):
 
 
 @inlined
-def _through_screen(view, mean, root, conic, to_conic, to_mean2d):
+def _through_fade(x, y, dilation, conic, to_fade):
+    """Gradients along the screen axes: d ln fade = (d area / area - d det / det) / 2, both quadratic in the axes."""
+    fade, xx, xy, yy, area = fade_of(x, y, dilation)
+    g = to_fade * fade if fade > _FADE_MIN else _ZERO
+    a, b, c = g * (yy / area - conic[0]), -g * (xy / area + conic[1]), g * (xx / area - conic[2])
+    return (
+        (a * x[0] + b * y[0], a * x[1] + b * y[1], a * x[2] + b * y[2]),
+        (b * x[0] + c * y[0], b * x[1] + c * y[1], b * x[2] + c * y[2]),
+    )
+
+
+@inlined
+def _through_screen(view, dilation, mean, root, conic, to_conic, to_mean2d, to_fade):
     """Gradients along the mean in camera axes and along the covariance's root."""
     x, y, sx, sy = screen_axes(view, mean, root)
     gxx, gxy, gyy = _through_inverse(conic, to_conic)
     gx = (_TWO * gxx * x[0] + gxy * y[0], _TWO * gxx * x[1] + gxy * y[1], _TWO * gxx * x[2] + gxy * y[2])
     gy = (_TWO * gyy * y[0] + gxy * x[0], _TWO * gyy * y[1] + gxy * x[1], _TWO * gyy * y[2] + gxy * x[2])
+    if to_fade != _ZERO:
+        hx, hy = _through_fade(x, y, dilation, conic, to_fade)
+        gx = (gx[0] + hx[0], gx[1] + hx[1], gx[2] + hx[2])
+        gy = (gy[0] + hy[0], gy[1] + hy[1], gy[2] + hy[2])
     inverse = _ONE / mean[2]
     fx, fy = view[FOCAL] * inverse, view[FOCAL + 1] * inverse
     to_root = (
@@ -111,8 +130,8 @@ def _add_pose(pose, offset, turned, to_turn, to_mean, to_world_mean):
 
 @parallel
 def project_back(
-    view, means, quaternions, scales, sh, radii, conics, rgb,
-    to_means2d, to_conics, to_depths, to_rgb,
+    view, dilation, means, quaternions, scales, sh, radii, conics, rgb,
+    to_means2d, to_conics, to_depths, to_rgb, to_fades,
     to_means, to_quaternions, to_scales, to_sh, pose,
 ):  # fmt: skip
     """Write the gradients along the primitives and, per job, along the camera's pose."""
@@ -127,7 +146,9 @@ def project_back(
                 offset, mean = camera_point(view, means[i])
                 q, norm = normalised(quaternions[i])
                 turn, root = scaled_axes(view, q, scales[i])
-                to_mean, to_root = _through_screen(view, mean, root, conics[i], to_conics[i], to_means2d[i])
+                to_mean, to_root = _through_screen(
+                    view, dilation, mean, root, conics[i], to_conics[i], to_means2d[i], to_fades[i]
+                )
                 to_mean = (to_mean[0], to_mean[1], to_mean[2] + to_depths[i])
                 to_turn = scaled_columns(to_root, scales[i])
                 rotation = rotation_of(view)

@@ -1,7 +1,7 @@
 """Walking along rays through an occupancy grid.
 
 In plain IEEE arithmetic, operation for operation what `invgraphics.kernels.reference.march` does in float32, so that both keep
-the same intervals; but an empty cell, or an empty block of cells, is looked at once, not at every step inside it.
+the same intervals; but empty space is leapt over: a cell at a time near what is occupied, many blocks of cells farther away.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.rays import Rays
-from invgraphics.kernels.numba.runtime import array, exact, exact_parallel, index, prange, scratch, share, threads
+from invgraphics.kernels.numba.runtime import array, exact, exact_parallel, index, prange, scratch, serial, share, threads
 from invgraphics.kernels.types import March, MarchSteps
 
 ROOM = 1 << 22
@@ -21,10 +21,12 @@ ROOM = 1 << 22
 MARGIN = np.float32(1e-2)
 """Share of a step by which a leap over an empty cell ends early, so that rounding never leaps into the next cell."""
 
-BLOCK = 8
-"""Cells along the edge of a block."""
+BLOCKS = 32
+"""Most blocks along the grid's edge; their edges are powers of two, ``1 << shift`` cells long."""
 
-_ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
+_PARALLEL = np.float32(1e-20)
+"""Directions with less than this along an axis never reach a wall on it."""
+_ZERO, _ONE, _TWO = (np.float32(value) for value in (0.0, 1.0, 2.0))
 
 
 @exact
@@ -47,16 +49,34 @@ def _cell(unit, resolution):
 
 
 @exact
-def _way_out(unit, first, cells, resolution, direction, half):
-    """Distance along the ray to the far wall, on one axis, of ``cells`` cells from ``first`` on; infinite where parallel."""
-    wall = np.float32(first + cells if direction > _ZERO else first) / np.float32(resolution)
-    return (wall - unit) * _TWO * half / direction if direction != _ZERO else np.float32(np.inf)
+def _way_out(unit, first, cells, cell, pace):
+    """Distance along the ray to the far wall, on one axis, of ``cells`` cells from ``first`` on.
+
+    ``cell`` is a cell's edge in the unit cube, ``pace`` the distance along the ray per unit on this axis.
+    """
+    return (np.float32(first + cells if pace > _ZERO else first) * cell - unit) * pace
 
 
 @exact
-def _walk(origin, direction, first, far, occupied, blocks, box, contracted, step, cone, t0, t1):
+def _aligned(cell, shift, gap):
+    """First cell, on one axis, of the blocks less than ``gap`` away from a cell's own."""
+    return ((cell >> shift) - gap + 1) << shift
+
+
+@exact
+def _pace(direction, half):
+    """Distance along the ray per unit on one axis of the unit cube; next to endless where parallel."""
+    return (
+        _TWO * half / direction if abs(direction) > _PARALLEL else np.float32(np.copysign(_TWO * half / _PARALLEL, direction))
+    )
+
+
+@exact
+def _walk(origin, direction, first, far, occupied, gaps, shift, box, contracted, step, cone, t0, t1):
     """Keep intervals of one ray until ``far`` or until ``t0`` is full; returns their number and where to go on."""
     resolution = occupied.shape[0]
+    cell, per_step = _ONE / np.float32(resolution), _ONE / step
+    pace_x, pace_y, pace_z = _pace(direction[0], box[3]), _pace(direction[1], box[4]), _pace(direction[2], box[5])
     t = first
     kept = taken = 0
     free = -np.float32(np.inf)
@@ -82,19 +102,21 @@ def _walk(origin, direction, first, far, occupied, blocks, box, contracted, step
                     t0[index(kept)], t1[index(kept)] = t, end
                     kept += 1
                 elif not contracted:
-                    cells = 1
-                    if not blocks[index(x // BLOCK), index(y // BLOCK), index(z // BLOCK)]:
-                        cells = BLOCK
-                        x, y, z = x // BLOCK * BLOCK, y // BLOCK * BLOCK, z // BLOCK * BLOCK
-                    out = min(
-                        _way_out(ux, x, cells, resolution, direction[0], box[3]),
-                        _way_out(uy, y, cells, resolution, direction[1], box[4]),
-                    )
-                    out = min(out, _way_out(uz, z, cells, resolution, direction[2], box[5]))
+                    cells, gap = 1, gaps[index(1 + (x >> shift)), index(1 + (y >> shift)), index(1 + (z >> shift))]
+                    if gap > 0:
+                        # All blocks less than ``gap`` away are empty too, on every side.
+                        cells = (2 * gap - 1) << shift
+                        x, y, z = (
+                            ((x >> shift) - gap + 1) << shift,
+                            ((y >> shift) - gap + 1) << shift,
+                            ((z >> shift) - gap + 1) << shift,
+                        )
+                    out = min(_way_out(ux, x, cells, cell, pace_x), _way_out(uy, y, cells, cell, pace_y))
+                    out = min(out, _way_out(uz, z, cells, cell, pace_z))
                     free = min(middle + out - MARGIN * (end - t), far)
                     if cone == _ZERO:
                         # To a step or two before the wall; the comparison with ``free`` settles the rest.
-                        leap = np.int64((free - first) / step) - 2
+                        leap = np.int64((free - first) * per_step) - 2
                         if leap > taken + 1:
                             taken = leap - 1
                             end = first + np.float32(leap) * step
@@ -104,26 +126,52 @@ def _walk(origin, direction, first, far, occupied, blocks, box, contracted, step
 
 
 @exact_parallel
-def summarise(occupied, blocks):
-    """Mark the blocks that have an occupied cell."""
-    resolution = occupied.shape[0]
-    for i in prange(blocks.shape[0]):
-        blocks[i] = False
-        for x in range(i * BLOCK, min((i + 1) * BLOCK, resolution)):
+def summarise(occupied, shift, gaps):
+    """Set ``gaps`` to 0 for blocks that have an occupied cell, to a distance that no two blocks have for all others.
+
+    ``gaps`` has one more block than the grid on every side.
+    """
+    resolution, far = occupied.shape[0], gaps.shape[0]
+    for i in prange(gaps.shape[0]):
+        gaps[i] = far
+        for x in range(max(i - 1, 0) << shift, min(i << shift, resolution)):
             for y in range(resolution):
                 for z in range(resolution):
                     if occupied[x, y, z]:
-                        blocks[i, y // BLOCK, z // BLOCK] = True
+                        gaps[i, 1 + (y >> shift), 1 + (z >> shift)] = 0
+
+
+@serial
+def measure(gaps):
+    """Turn the zeros of ``gaps`` into every block's distance to the nearest of them, the largest of its three coordinates.
+
+    Two sweeps that look back at the 13 neighbours already visited give exactly that (Rosenfeld and Pfaltz 1968). The blocks
+    on the rim of ``gaps`` are not part of the grid; they keep the neighbours' indices in range.
+    """
+    last = gaps.shape[0] - 2
+    for sweep in range(2):
+        back = 2 * sweep - 1
+        for i in range(last):
+            x = last - i if sweep else 1 + i
+            for j in range(last):
+                y = last - j if sweep else 1 + j
+                for k in range(last):
+                    z = last - k if sweep else 1 + k
+                    nearest = min(gaps[x, y, z] - 1, gaps[x, y, z + back])
+                    for w in range(z - 1, z + 2):
+                        row = min(gaps[x + back, y - 1, w], gaps[x + back, y, w])
+                        nearest = min(nearest, row, gaps[x + back, y + 1, w], gaps[x, y + back, w])
+                    gaps[x, y, z] = nearest + 1
 
 
 @exact_parallel
-def walk(origins, directions, start, far, occupied, blocks, box, contracted, step, cone, jobs, t0, t1, counts, resume):
+def walk(origins, directions, start, far, occupied, gaps, shift, box, contracted, step, cone, jobs, t0, t1, counts, resume):
     """March all rays; ray i keeps ``counts[i]`` intervals, in row i of ``t0`` and ``t1``."""
     for job in prange(jobs):
         # Neighbouring rays cost alike: dealing them out in turn balances the jobs.
         for i in range(job, len(start), jobs):
             counts[i], resume[i] = _walk(
-                origins[i], directions[i], start[i], far[i], occupied, blocks, box, contracted, step, cone, t0[i], t1[i]
+                origins[i], directions[i], start[i], far[i], occupied, gaps, shift, box, contracted, step, cone, t0[i], t1[i]
             )
 
 
@@ -145,8 +193,11 @@ def ray_march(
     """See `invgraphics.kernels.ray_march`."""
     box = array(torch.cat([bounds.centre, bounds.half]).float())
     cells = array(occupied)
-    blocks = np.empty(3 * (-(-occupied.shape[0] // BLOCK),), np.bool_)
-    summarise(cells, blocks)
+    shift = max(0, (-(-len(cells) // BLOCKS) - 1).bit_length())
+    gaps = np.empty(3 * (2 - (-len(cells) >> shift),), np.int64)
+    summarise(cells, shift, gaps)
+    if bounds.space == "box":
+        measure(gaps)
     resume = torch.empty(len(rays))
     parts = []
     limit = _most(rays, start, steps)
@@ -159,7 +210,7 @@ def ray_march(
         counts = np.empty(n, np.int64)
         lines = (array(x[some]) for x in (rays.origins, rays.directions, start, rays.far))
         settings = (box, bounds.space == "contracted", np.float32(steps.step), np.float32(steps.cone), threads())
-        walk(*lines, cells, blocks, *settings, t0, t1, counts, resume[some].numpy())
+        walk(*lines, cells, gaps, shift, *settings, t0, t1, counts, resume[some].numpy())
         ends = np.cumsum(counts)
         kept = int(ends[-1])
         packed = (torch.empty(kept, dtype=torch.int64), torch.empty(kept), torch.empty(kept))

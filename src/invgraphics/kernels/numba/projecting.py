@@ -26,14 +26,14 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, pose: Tensor, *constants: Any
     ) -> tuple[Tensor, ...]:
-        opacities, camera, dilation = constants
+        opacities, camera, dilation, compensate = constants
         n = len(means)
         view = _flat(camera)
         means2d, conics, rgb = means.new_empty(n, 2), means.new_empty(n, 3), means.new_empty(n, 3)
-        depths, planes, radii = means.new_empty(n), means.new_empty(n, 3), means.new_empty(n)
-        outputs = (means2d, conics, depths, planes, radii, rgb)
+        depths, planes, radii, fades = means.new_empty(n), means.new_empty(n, 3), means.new_empty(n), means.new_empty(n)
+        outputs = (means2d, conics, depths, planes, radii, rgb, fades)
         inputs = (array(x) for x in (means, quaternions, scales, opacities, sh))
-        project(view, np.float32(dilation), *inputs, threads(), *(output.numpy() for output in outputs))
+        project(view, np.float32(dilation), compensate, *inputs, threads(), *(output.numpy() for output in outputs))
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(means, quaternions, scales, sh, opacities, conics, radii, rgb, pose)
@@ -44,15 +44,17 @@ class _Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         means, quaternions, scales, sh, opacities, conics, radii, rgb, pose = ctx.saved_tensors
-        to_means2d, to_conics, to_depths, to_planes, _, to_rgb = grad_outputs
-        likes = (means[:, :2], conics, radii, rgb)
-        given = (to_means2d, to_conics, to_depths, to_rgb)
+        to_means2d, to_conics, to_depths, to_planes, _, to_rgb, to_fades = grad_outputs
+        likes = (means[:, :2], conics, radii, rgb, radii)
+        given = (to_means2d, to_conics, to_depths, to_rgb, to_fades)
         # A gradient that nobody asked for counts as zero.
         received = [torch.zeros(x.shape) if g is None else g for x, g in zip(likes, given, strict=True)]
         results = [torch.empty(x.shape) for x in (means, quaternions, scales, sh)]
         poses = np.empty((threads(), 12))
         inputs = (array(x) for x in (means, quaternions, scales, sh, radii, conics, rgb))
-        project_back(ctx.view, *inputs, *(array(g) for g in received), *(r.numpy() for r in results), poses)
+        project_back(
+            ctx.view, np.float32(ctx.dilation), *inputs, *(array(g) for g in received), *(r.numpy() for r in results), poses
+        )
         results.append(_pose_gradient(poses, pose))
         if to_planes is not None:
             gaussians = Gaussians(means, quaternions, scales, opacities, sh)
@@ -61,7 +63,7 @@ class _Project(torch.autograd.Function):
             ):
                 if extra is not None:
                     result.add_(extra)
-        return (*results, None, None, None)
+        return (*results, None, None, None, None)
 
 
 def _flat(camera: Camera) -> np.ndarray:
@@ -96,13 +98,16 @@ def _through_planes(
         return torch.autograd.grad(footprints.planes, [*leaves, pose], visible, allow_unused=True)
 
 
-def splat_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.3) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+def splat_project(
+    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, compensate: bool = False
+) -> tuple[Footprints, Float[Tensor, "n 3"]]:
     """See `invgraphics.kernels.splat_project`; a camera whose lens is being optimised is left to the reference."""
     if camera.focal.requires_grad or camera.centre.requires_grad:
-        return reference.splat_project(gaussians, camera, dilation)
+        return reference.splat_project(gaussians, camera, dilation, compensate)
     g = gaussians
-    constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation)
-    means2d, conics, depths, planes, radii, rgb = _Project.apply(
+    constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation, compensate)
+    means2d, conics, depths, planes, radii, rgb, fades = _Project.apply(
         g.means, g.quaternions, g.scales, g.sh, camera.cam_to_world, *constants
     )
-    return Footprints(means2d, conics, g.opacities, depths, planes, radii), rgb
+    opacities = g.opacities * fades if compensate else g.opacities
+    return Footprints(means2d, conics, opacities, depths, planes, radii), rgb

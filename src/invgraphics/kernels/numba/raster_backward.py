@@ -22,6 +22,12 @@ _T, _WEIGHT, _BEHIND, _ALPHA, _ALONG, _PICTURE = (index(slot) * LANES for slot i
 MOMENTS = 6
 FIRST_SUMS = MOMENTS + 3
 """Sums that are kept lane by lane while a footprint is on a tile: adding lanes up once is cheaper than for every block."""
+PULLS = 2
+"""Further sums, behind those of the features, where absolute gradients are wanted."""
+
+# What few fits need must not slow down the others. A switch is a tuple whose length says whether it is on: Numba compiles the
+# kernel anew for each length, and LLVM drops the code of what is off.
+OFF, ON = 1, 2
 
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
 _STOP = np.float32(TRANSMITTANCE_MIN)
@@ -51,8 +57,11 @@ def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_
 
 
 @inlined
-def _unblend(state, lanes, base, rows, r, dx0, dy0):
-    """Repeat one footprint's blending onto one block and add to its sums, lane by lane."""
+def _unblend(state, lanes, base, rows, r, dx0, dy0, rank, absolute, receivers):
+    """Repeat one footprint's blending onto one block and add to its sums, lane by lane.
+
+    With ``receivers`` on, ``rank`` is where the block counts the footprints that each of its pixels has seen.
+    """
     xx = rows[r, CONIC_XX] * HALF_LOG2E
     xy = rows[r, CONIC_XY] * (HALF_LOG2E + HALF_LOG2E)
     yy = rows[r, CONIC_YY] * HALF_LOG2E
@@ -76,10 +85,15 @@ def _unblend(state, lanes, base, rows, r, dx0, dy0):
         behind = state[base + _BEHIND + lane] - weight * along
         state[base + _BEHIND + lane] = behind
         state[base + lane] = after if goes_on else -abs(transmittance)
-        state[base + _WEIGHT + lane] = weight
         # alpha raises its own contribution and hides what is behind; where it is clamped or skipped it does not change.
         v = response * (transmittance * along - behind / (_ONE - alpha))
         v = v if goes_on and alpha > _ZERO and alpha < _ALPHA_MAX else _ZERO
+        if len(receivers) == ON:
+            seen = state[rank + lane] + (_ONE if alpha > _ZERO else _ZERO)
+            state[rank + lane] = seen
+            v = v if seen <= receivers[0] else _ZERO
+            weight = weight if seen <= receivers[0] else _ZERO
+        state[base + _WEIGHT + lane] = weight
         vx = v * dx
         vy = v * dy
         lanes[lane] += v
@@ -91,6 +105,9 @@ def _unblend(state, lanes, base, rows, r, dx0, dy0):
         lanes[index(6) * LANES + lane] += weight * g_red
         lanes[index(7) * LANES + lane] += weight * g_green
         lanes[index(8) * LANES + lane] += weight * g_blue
+        if len(absolute) == ON:
+            lanes[index(9) * LANES + lane] += abs(rows[r, CONIC_XX] * vx + rows[r, CONIC_XY] * vy)
+            lanes[index(10) * LANES + lane] += abs(rows[r, CONIC_XY] * vx + rows[r, CONIC_YY] * vy)
 
 
 @inlined
@@ -117,18 +134,21 @@ def _sum_further(state, base, sums, r, triples):
 
 
 @inlined
-def _add_up(lanes, sums, r):
+def _add_up(lanes, sums, r, absolute):
     """Move a footprint's sums from the lanes, which are cleared, to its row."""
-    for k in range(FIRST_SUMS):
+    for k in range(FIRST_SUMS + (PULLS if len(absolute) == ON else 0)):
         total = _ZERO
         for lane in range(LANES):
             total += lanes[index(k) * LANES + lane]
             lanes[index(k) * LANES + lane] = _ZERO
-        sums[r, index(k)] += total
+        to = k if k < FIRST_SUMS else sums.shape[1] - PULLS + k - FIRST_SUMS
+        sums[r, index(to)] += total
 
 
 @inlined
-def _walk_tile(rows, entries, first, last, x0, y0, edge, triples, state, lanes, stride, ends, sums):
+def _walk_tile(
+    rows, entries, first, last, x0, y0, edge, triples, state, lanes, stride, ends, sums, absolute, receivers
+):  # fmt: skip
     """Walk a tile's footprints front to back and add what each of them receives to ``sums``."""
     ox, oy, half = np.float32(x0), np.float32(y0), np.float32(0.5)
     for entry in range(first, last):
@@ -146,35 +166,45 @@ def _walk_tile(rows, entries, first, last, x0, y0, edge, triples, state, lanes, 
                     if triples > 1:
                         _look_along(state, base, rows, r, triples)
                     visited = True
-                    _unblend(state, lanes, base, rows, r, dx, dy)
+                    _unblend(state, lanes, base, rows, r, dx, dy, base + stride - LANES, absolute, receivers)
                     if triples > 1:
                         _sum_further(state, base, sums, r, triples)
         if visited:
-            _add_up(lanes, sums, r)
+            _add_up(lanes, sums, r, absolute)
 
 
 @parallel
-def walk_back(rows, entries, starts, bounds, edge, columns, ends, image, alpha, image_gradient, alpha_gradient, sums):
-    """Per job and packed footprint, the sums from which `gather` makes gradients (arguments as in `rasterise`)."""
+def walk_back(
+    rows, entries, starts, bounds, edge, columns, ends, image, alpha, image_gradient, alpha_gradient, sums, absolute, receivers
+):
+    """Per job and packed footprint, the sums from which `gather` makes gradients (arguments as in `rasterise`).
+
+    Two switches: ``absolute`` adds `PULLS` sums of absolute gradients; ``receivers`` lets only so many footprints of a pixel,
+    from the front, receive its gradient.
+    """
     triples = (rows.shape[1] - FEATURES) // 3
-    stride = _PICTURE + LANES * index(3 * triples)
+    stride = _PICTURE + LANES * index(3 * triples + (1 if len(receivers) == ON else 0))
     for job in prange(len(bounds) - 1):
         state = np.empty(index(edge * edge) * stride, np.float32)
         own = sums[job]
-        lanes = np.zeros(index(FIRST_SUMS) * LANES, np.float32)
+        lanes = np.zeros(index(FIRST_SUMS + PULLS) * LANES, np.float32)
         own[:] = _ZERO
         for tile in range(bounds[job], bounds[job + 1]):
             if starts[tile] < starts[tile + 1]:
                 x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
                 _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient)
                 _walk_tile(
-                    rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, triples, state, lanes, stride, ends[tile], own
-                )
+                    rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, triples, state, lanes, stride, ends[tile], own,
+                    absolute, receivers,
+                )  # fmt: skip
 
 
 @parallel
-def gather(order, rows, sums, means, conics, opacities, features):
-    """Add up the jobs in a fixed order and write gradients to the caller's arrays, which hold zeros for culled footprints."""
+def gather(order, rows, sums, means, conics, opacities, features, pulls):
+    """Add up the jobs in a fixed order and write gradients to the caller's arrays, which hold zeros for culled footprints.
+
+    ``pulls`` has no rows where absolute gradients are not wanted.
+    """
     jobs, m = sums.shape[0], len(order)
     for job in prange(jobs):
         for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
@@ -190,3 +220,5 @@ def gather(order, rows, sums, means, conics, opacities, features):
             opacities[i] = s[0] / rows[r, OPACITY] if s[0] != _ZERO else _ZERO
             for k in range(features.shape[1]):
                 features[i, k] = s[MOMENTS + k]
+            if len(pulls):
+                pulls[i, 0], pulls[i, 1] = s[len(s) - 2], s[len(s) - 1]

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.binning import FEATURES, Packed, pack
+from invgraphics.kernels.numba.median import median
 from invgraphics.kernels.numba.raster import BLOCK, rasterise
-from invgraphics.kernels.numba.raster_backward import MOMENTS, gather, walk_back
+from invgraphics.kernels.numba.raster_backward import MOMENTS, OFF, ON, PULLS, gather, walk_back
 from invgraphics.kernels.numba.runtime import array, once_differentiable, scratch, split_by_work, threads
 from invgraphics.kernels.types import Footprints
 
@@ -31,20 +32,13 @@ class _Walk(NamedTuple):
 
 
 class _Rasterise(torch.autograd.Function):
-    """Differentiable in means2d, conics, opacities and features."""
+    """Differentiable in means2d, conics, opacities and features; `Footprints.pull` gets the absolute gradients."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means2d: Tensor,
-        conics: Tensor,
-        opacities: Tensor,
-        features: Tensor,
-        footprints: Footprints,
-        size: tuple[int, int],
-        tile: int,
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, pull: Tensor | None, *constants: Any
     ) -> tuple[Tensor, Tensor]:
-        width, height = size
+        footprints, (width, height), tile, ctx.receivers = constants
         edge = max(1, -(-tile // BLOCK))
         columns, lines = -(-width // (edge * BLOCK)), -(-height // (edge * BLOCK))
         packed = pack(footprints, features, columns, lines, edge * BLOCK)
@@ -67,7 +61,9 @@ class _Rasterise(torch.autograd.Function):
         to_image = array(torch.zeros_like(image) if image_gradient is None else image_gradient)
         to_alpha = array(torch.zeros_like(alpha) if alpha_gradient is None else alpha_gradient)
         bounds = _bounds(work)
-        rows, width = packed.rows, MOMENTS + packed.rows.shape[1] - FEATURES
+        absolute = ctx.needs_input_grad[4]
+        rows = packed.rows
+        width = MOMENTS + rows.shape[1] - FEATURES + (PULLS if absolute else 0)
         shape = (len(bounds) - 1, len(rows), width)
         sums = scratch("splat sums", int(np.prod(shape))).reshape(shape)
         walk_back(
@@ -83,12 +79,15 @@ class _Rasterise(torch.autograd.Function):
             to_image,
             to_alpha,
             sums,
+            (np.float32(0),) * (ON if absolute else OFF),
+            (np.float32(ctx.receivers),) * (ON if ctx.receivers else OFF),
         )
         gradients = tuple(
             torch.zeros_like(x, memory_format=torch.contiguous_format) for x in (means2d, conics, opacities, features)
         )
-        gather(packed.order, rows, sums, *(gradient.numpy() for gradient in gradients))
-        return (*gradients, None, None, None)
+        pulls = means2d.new_zeros(len(means2d) if absolute else 0, PULLS)
+        gather(packed.order, rows, sums, *(gradient.numpy() for gradient in (*gradients, pulls)))
+        return (*gradients, pulls if absolute else None, None, None, None, None)
 
 
 def _bounds(work: np.ndarray) -> np.ndarray:
@@ -100,10 +99,29 @@ def _bounds(work: np.ndarray) -> np.ndarray:
 
 
 def splat_rasterise(
-    footprints: Footprints, features: Float[Tensor, "n c"], width: int, height: int, tile: int | None = None
+    footprints: Footprints,
+    features: Float[Tensor, "n c"],
+    width: int,
+    height: int,
+    tile: int | None = None,
+    receivers: int = 0,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """See `invgraphics.kernels.splat_rasterise`; discs are left to the reference."""
     if footprints.homography is not None:
-        return reference.splat_rasterise(footprints, features, width, height, tile)
+        return reference.splat_rasterise(footprints, features, width, height, tile, receivers)
     f = footprints
-    return _Rasterise.apply(f.means2d, f.conics, f.opacities, features, footprints, (width, height), tile or TILE)
+    constants = (footprints, (width, height), tile or TILE, receivers)
+    return _Rasterise.apply(f.means2d, f.conics, f.opacities, features, f.pull, *constants)
+
+
+@torch.no_grad()
+def splat_median(footprints: Footprints, width: int, height: int, tile: int | None = None) -> Float[Tensor, "h w"]:
+    """See `invgraphics.kernels.splat_median`; discs are left to the reference."""
+    if footprints.homography is not None:
+        return reference.splat_median(footprints, width, height, tile)
+    edge = max(1, -(-(tile or TILE) // BLOCK))
+    columns, lines = -(-width // (edge * BLOCK)), -(-height // (edge * BLOCK))
+    packed = pack(footprints, footprints.planes, columns, lines, edge * BLOCK)
+    depth = torch.full((height, width), torch.inf)
+    median(packed.rows, packed.entries, packed.starts, _bounds(np.diff(packed.starts)), edge, columns, depth.numpy())
+    return depth

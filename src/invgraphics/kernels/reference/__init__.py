@@ -4,7 +4,9 @@ from invgraphics.kernels.reference.composite import composite as composite
 from invgraphics.kernels.reference.grid import grid_sample as grid_sample
 from invgraphics.kernels.reference.hash import hash_encode as hash_encode
 from invgraphics.kernels.reference.march import ray_march as ray_march
+from invgraphics.kernels.reference.splat_discs import splat_project_discs as splat_project_discs
 from invgraphics.kernels.reference.splat_project import splat_project as splat_project
 from invgraphics.kernels.reference.splat_raster import splat_bin as splat_bin
+from invgraphics.kernels.reference.splat_raster import splat_median as splat_median
 from invgraphics.kernels.reference.splat_raster import splat_rasterise as splat_rasterise
 from invgraphics.kernels.reference.ssim import ssim as ssim

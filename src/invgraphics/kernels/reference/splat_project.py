@@ -10,7 +10,7 @@ from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.core.harmonics import evaluate
 from invgraphics.core.transforms import quaternion_to_matrix
-from invgraphics.kernels.types import ALPHA_MIN, Footprints
+from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN, Footprints
 
 NEAR = 0.01
 """Primitives whose centre is nearer than this along the optical axis are culled, local units (as in gsplat)."""
@@ -20,38 +20,51 @@ ILL_CONDITIONED = 1e-4
 """Ratio of determinant to squared trace below which a footprint without dilation is too thin to invert."""
 
 
-def splat_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.3) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+def splat_project(
+    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, compensate: bool = False
+) -> tuple[Footprints, Float[Tensor, "n 3"]]:
     """See `invgraphics.kernels.splat_project`.
 
     The map from camera axes to (x pixels, y pixels, distance) is replaced by its derivative J at the mean, under which
     the covariance becomes ``J V J^T`` (Zwicker et al. 2001, equation 29). With ``V = L L^T`` this is ``A A^T``, A = J L.
     """
-    to_world = camera.cam_to_world[:3, :3]
-    mean = (gaussians.means - camera.position) @ to_world
-    in_front = mean[:, 2] > NEAR
-    # Culled primitives go to a harmless place: their gradients must be zero, not undefined.
-    mean = torch.where(in_front[:, None], mean, mean.new_tensor([0.0, 0.0, 1.0]))
-    factor = to_world.T @ quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
-    a = _jacobian(mean, camera) @ factor
+    mean, in_front = in_camera(gaussians, camera)
+    factor = camera.cam_to_world[:3, :3].T @ quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
+    a = jacobian(mean, camera) @ factor
 
     xx, xy, yy, det = _covariance(a, dilation)
+    opacities = gaussians.opacities * _fades(a, det) if compensate else gaussians.opacities
     conics = torch.stack([yy / det, -xy / det, xx / det], dim=1)
     means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]
     with torch.no_grad():
-        # o exp(-q/2) >= 1/255 exactly where q <= 2 ln(255 o).
-        reach = (2 * torch.log((gaussians.opacities / ALPHA_MIN).clamp_min(1.0))).sqrt()
+        reach = visible_reach(opacities)
         largest = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
         box = reach[:, None] * torch.stack([xx, yy], dim=1).sqrt()
-        visible = in_front & _meets_image(means2d, box, camera)
+        visible = in_front & meets_image(means2d, box, camera)
         radii = torch.where(visible, reach * largest.sqrt(), 0.0)
+    return Footprints(means2d, conics, opacities, mean[:, 2], planes_of(mean, a, dilation), radii), colours(gaussians, camera)
 
+
+def in_camera(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
+    """Means in camera axes, and which of them lie in front of the camera."""
+    mean = (gaussians.means - camera.position) @ camera.cam_to_world[:3, :3]
+    in_front = mean[:, 2] > NEAR
+    # Culled primitives go to a harmless place: their gradients must be zero, not undefined.
+    return torch.where(in_front[:, None], mean, mean.new_tensor([0.0, 0.0, 1.0])), in_front
+
+
+def visible_reach(opacities: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Standard deviations within which a response is visible: o exp(-q/2) >= 1/255 exactly where q <= 2 ln(255 o)."""
+    return (2 * torch.log((opacities / ALPHA_MIN).clamp_min(1.0))).sqrt()
+
+
+def colours(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
+    """Colours towards the camera, cut off at zero."""
     towards = torch.nn.functional.normalize(gaussians.means - camera.position, dim=1)
-    rgb = (evaluate(gaussians.sh, towards) + 0.5).clamp_min(0.0)
-    planes = _planes(mean, a, dilation)
-    return Footprints(means2d, conics, gaussians.opacities, mean[:, 2], planes, radii), rgb
+    return (evaluate(gaussians.sh, towards) + 0.5).clamp_min(0.0)
 
 
-def _jacobian(mean: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3 3"]:
+def jacobian(mean: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3 3"]:
     """Derivative of (x pixels, y pixels, distance from the camera) with respect to the point in camera axes.
 
     Far outside the image the perspective is so strong that the affine map is worthless and its footprints explode, so
@@ -85,7 +98,13 @@ def _covariance(a: Float[Tensor, "n 3 3"], dilation: float) -> tuple[Tensor, Ten
     return xx + dilation, xy, yy + dilation, det.clamp_min(torch.finfo(det.dtype).tiny)
 
 
-def _meets_image(means2d: Float[Tensor, "n 2"], box: Float[Tensor, "n 2"], camera: Camera) -> Bool[Tensor, " n"]:
+def _fades(a: Float[Tensor, "n 3 3"], det: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Factor that gives a filtered footprint, of covariance determinant ``det``, the integral it had unfiltered."""
+    *_, area = _covariance(a, 0.0)
+    return (area / det).clamp_min(FADE_MIN**2).sqrt()
+
+
+def meets_image(means2d: Float[Tensor, "n 2"], box: Float[Tensor, "n 2"], camera: Camera) -> Bool[Tensor, " n"]:
     """Whether the visible ellipse's bounding box overlaps the image.
 
     The box reaches to response 1/255, at most 3.33 sigma: nothing of the 99% ellipsoid (3.37 sigma) that could be seen is lost.
@@ -95,7 +114,7 @@ def _meets_image(means2d: Float[Tensor, "n 2"], box: Float[Tensor, "n 2"], camer
     return overlaps.all(dim=1)
 
 
-def _planes(mean: Float[Tensor, "n 3"], a: Float[Tensor, "n 3 3"], dilation: float) -> Float[Tensor, "n 3"]:
+def planes_of(mean: Float[Tensor, "n 3"], a: Float[Tensor, "n 3 3"], dilation: float) -> Float[Tensor, "n 3"]:
     """Distance of the maximal response along each pixel's ray, as an affine function of the pixel.
 
     In (x, y, distance) the primitive is a Gaussian, and for given (x, y) its density peaks at the conditional mean

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -11,7 +14,9 @@ from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, B
 TILE = 16
 """Edge of a tile in pixels (3DGS)."""
 EDGE_ON = 1e-6
-"""Smallest denominator of a disc's homography: rays parallel to the disc see nothing of it."""
+"""Smallest denominator of a disc's homography: rays parallel to the disc, or that meet it behind the camera, see no disc."""
+MISSED = 1e6
+"""``q`` where a ray misses a disc."""
 
 
 @torch.no_grad()
@@ -42,13 +47,53 @@ def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bin
 
 
 def splat_rasterise(
-    footprints: Footprints, features: Float[Tensor, "n c"], width: int, height: int, tile: int | None = None
+    footprints: Footprints,
+    features: Float[Tensor, "n c"],
+    width: int,
+    height: int,
+    tile: int | None = None,
+    receivers: int = 0,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """See `invgraphics.kernels.splat_rasterise`."""
-    bins = splat_bin(footprints, width, height, tile or TILE)
-    starts = bins.starts.tolist()
     # Alpha is one more feature, the sum of w * 1.
     columns = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
+
+    def paint(splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p c"]:
+        return _composite(_responses(footprints, splats, pixels), columns[splats], receivers)
+
+    image = over_tiles(footprints, (width, height), tile or TILE, paint)
+    return image[..., :-1], image[..., -1]
+
+
+@torch.no_grad()
+def splat_median(footprints: Footprints, width: int, height: int, tile: int | None = None) -> Float[Tensor, "h w"]:
+    """See `invgraphics.kernels.splat_median`."""
+
+    def paint(splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p 1"]:
+        after = torch.cumprod(1 - _alphas(_responses(footprints, splats, pixels)), dim=1)
+        offset = pixels[:, None] - footprints.means2d[splats]
+        distance = footprints.planes[splats, 0] + (offset * footprints.planes[splats, 1:]).sum(dim=2)
+        # A last column, which every pixel reaches, stands for those that stay transparent.
+        crossed = torch.nn.functional.pad(after <= 0.5, (0, 1), value=True)
+        return torch.nn.functional.pad(distance, (0, 1), value=torch.inf).gather(1, crossed.int().argmax(dim=1, keepdim=True))
+
+    return over_tiles(footprints, (width, height), tile or TILE, paint)[..., 0]
+
+
+def over_tiles(
+    footprints: Footprints, size: tuple[int, int], tile: int, paint: Callable[[Tensor, Tensor], Tensor]
+) -> Float[Tensor, "h w c"]:
+    """Ask ``paint`` for every tile of a ``size = (width, height)`` picture.
+
+    Args:
+        footprints: what is drawn.
+        size: width and height in pixels.
+        tile: edge of a tile in pixels.
+        paint: gets the tile's splats (k,), front to back, and its pixel centres (p, 2); gives (p, c).
+    """
+    width, height = size
+    bins = splat_bin(footprints, width, height, tile)
+    starts = bins.starts.tolist()
     rows_of_tiles = []
     for row in range(bins.rows):
         y = torch.arange(row * bins.tile, min((row + 1) * bins.tile, height))
@@ -58,31 +103,60 @@ def splat_rasterise(
             index = row * bins.columns + column
             splats = bins.splats[starts[index] : starts[index + 1]]
             pixels = torch.cartesian_prod(y, x).flip(dims=(1,)).to(footprints.means2d) + 0.5
-            tiles.append(_composite(_responses(footprints, splats, pixels), columns[splats]).reshape(len(y), len(x), -1))
+            tiles.append(paint(splats, pixels).reshape(len(y), len(x), -1))
         rows_of_tiles.append(torch.cat(tiles, dim=1))
-    image = torch.cat(rows_of_tiles)
-    return image[..., :-1], image[..., -1]
+    return torch.cat(rows_of_tiles)
+
+
+class _GatherAbsolute(torch.autograd.Function):
+    """Passes offsets (p, k, 2) on, and gives each footprint's probe (k, 2) the sum over pixels of their absolute gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, offset: Tensor, probe: Tensor) -> Tensor:
+        return offset.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        return grad_outputs[0], grad_outputs[0].abs().sum(dim=0)
 
 
 def _responses(footprints: Footprints, splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p k"]:
     """``opacity * exp(-q / 2)`` of each splat at each pixel centre."""
+    offset = pixels[:, None] - footprints.means2d[splats]
+    if footprints.pull is not None:
+        offset = _GatherAbsolute.apply(offset, footprints.pull[splats])
     if footprints.homography is None:
-        dx, dy = (pixels[:, None] - footprints.means2d[splats]).unbind(dim=2)
+        dx, dy = offset.unbind(dim=2)
         xx, xy, yy = footprints.conics[splats].unbind(dim=1)
         q = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
     else:
         homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
         a, b, c = torch.einsum("kij,pj->ipk", footprints.homography[splats], homogeneous)
-        c = torch.where(c.abs() < EDGE_ON, EDGE_ON, c)
-        q = (a * a + b * b) / (c * c)
+        hit = c > EDGE_ON
+        c = torch.where(hit, c, 1.0)
+        q = torch.where(hit, (a * a + b * b) / (c * c), MISSED)
+        if footprints.blur is not None:
+            q = torch.minimum(q, offset.square().sum(dim=2) / footprints.blur[splats])
     return footprints.opacities[splats] * torch.exp(-0.5 * q)
 
 
-def _composite(responses: Float[Tensor, "p k"], features: Float[Tensor, "k c"]) -> Float[Tensor, "p c"]:
+def _alphas(responses: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+    """Responses below the visible are skipped, those near 1 clamped."""
+    return torch.where(responses < ALPHA_MIN, 0.0, responses.clamp_max(ALPHA_MAX))
+
+
+def _composite(responses: Float[Tensor, "p k"], features: Float[Tensor, "k c"], receivers: int) -> Float[Tensor, "p c"]:
     """Blend splats front to back: sum over i of T_i alpha_i f_i, T_i = product over j < i of (1 - alpha_j)."""
-    alpha = torch.where(responses < ALPHA_MIN, 0.0, responses.clamp_max(ALPHA_MAX))
+    alpha = _alphas(responses)
+    if not receivers:
+        return _weights(alpha) @ features
+    receives = torch.cumsum(alpha > 0, dim=1) <= receivers
+    weights = _weights(torch.where(receives, alpha, alpha.detach()))
+    return torch.where(receives, weights, 0.0) @ features + torch.where(receives, 0.0, weights) @ features.detach()
+
+
+def _weights(alpha: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+    """T_i alpha_i. The transmittance never grows again, so once it would fall too low all later splats are left out as well."""
     after = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
-    # The transmittance never grows again, so once it would fall too low all later splats are left out as well.
-    weights = torch.where(after < TRANSMITTANCE_MIN, 0.0, alpha * before)
-    return weights @ features
+    return torch.where(after < TRANSMITTANCE_MIN, 0.0, alpha * before)

@@ -1,0 +1,50 @@
+"""``invgraphics export``: a run's model as a file for other programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics import plugins
+from invgraphics.cli.output import show_table
+from invgraphics.errors import InputError
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a run's model, in the coordinates of the data set's world, as a file that other programs read.
+
+    The file is read back and rendered from the run's test cameras, to say what it lost.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a run."""
+    to: Annotated[str, arg(metavar="NAME")]
+    """What to write: ply (3DGS's own, without loss), splat (32 bytes per Gaussian, no view dependence), or spz (smallest)."""
+    out: Annotated[Path, arg(metavar="FILE")]
+    """The file to write; one that exists is replaced."""
+    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    """Another copy of the scene, for instance where the data set has moved."""
+    world: Annotated[str, arg(metavar="opencv|opengl|z-up|RDF")] = "opencv"
+    """Where the world's +x, +y, +z point, for formats that want certain axes (spz: right, up, back): opencv is right, down,
+    forward; opengl right, up, back; z-up right, forward, up. Built-in and Blender scenes are z-up."""
+
+    def run(self) -> int:
+        """Write; print facts about the file."""
+        known = plugins.names("exporters")
+        if self.to not in known:
+            raise InputError(f"--to cannot be '{self.to}'.", f"Expected one of: {', '.join(known)}.")
+        if not (self.folder / "recipe.toml").is_file():
+            raise InputError(
+                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
+            )
+
+        from invgraphics.experiments.export import ExportRequest, export_run
+
+        exported = export_run(ExportRequest(self.folder, self.to, self.out, self.scene, self.world))
+        show_table(f"Exported {self.folder} as {self.to}", ("fact", "value"), exported.facts.items())
+        print(exported.path)
+        return 0

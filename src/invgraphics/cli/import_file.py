@@ -1,0 +1,77 @@
+"""``invgraphics import``: a model that was trained elsewhere becomes a run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from invgraphics.cli.arguments import parse_size, parse_views
+from invgraphics.cli.output import show_scores
+from invgraphics.errors import InputError
+from invgraphics.experiments.recipe import presets
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportFile:
+    """Make a run of a file of 3D Gaussians that any tool trained, then render and score its test views like any other run's."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """A .ply of 3DGS, a compressed .ply, a .splat or a .spz (see `invgraphics list model-formats`)."""
+    scene: Annotated[str, arg(metavar="SCENE")]
+    """The scene that it was trained on: built-in, or the path of a data set."""
+    out: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="(default: runs/SCENE-FILE)")] = None
+    """Folder of the run."""
+    method: Annotated[str, arg(metavar="METHOD")] = "splatting/gaussians"
+    """A method of Gaussians, whose renderer shows the model."""
+    overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
+    """Change one value of the recipe, for instance --set renderer.dilation=0.1."""
+    frame: Annotated[str | None, arg(metavar="opencv|opengl|z-up|RDF", help_behavior_hint="(default: as the file says)")] = None
+    """Where the file's +x, +y, +z point: opencv is right, down, forward; opengl right, up, back; z-up right, forward, up; or
+    three letters. Files that do not say (all but spz) are taken to be in the data set's world."""
+    world: Annotated[str, arg(metavar="opencv|opengl|z-up|RDF")] = "opencv"
+    """Where the axes of the data set's world point, for files with certain axes; opencv fits what converters write."""
+    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
+    """Size of the pictures; one number is the longest side."""
+    test_views: Annotated[str, arg(metavar="N|all")] = "16"
+    """How many test views are scored, evenly spaced."""
+    device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
+    """Where to compute."""
+    kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
+    """Force an implementation of the hot operations: numba, or reference (plain torch)."""
+    protocol: Annotated[str, arg(metavar="NAME")] = "default"
+    """How pictures are scored: default (rounded to 8 bits), or float."""
+
+    def run(self) -> int:
+        """Make the run; print its scores and its folder."""
+        size = None if self.size is None else parse_size(self.size)
+        views = parse_views(self.test_views)
+        presets(self.method)  # refuses an unknown method before torch is imported
+        if not self.file.is_file():
+            raise InputError(f"There is no file '{self.file}'.")
+
+        from invgraphics.experiments.imported import ImportRequest, import_run
+
+        out = self.out or Path("runs") / f"{Path(self.scene).resolve().name}-{self.file.name}"
+        folder = import_run(
+            ImportRequest(
+                file=str(self.file),
+                scene=self.scene,
+                out=str(out),
+                method=self.method,
+                overrides=tuple(self.overrides),
+                frame=self.frame,
+                world=self.world,
+                size=size,
+                test_views=views,
+                device=self.device,
+                kernels=self.kernels,
+                protocol=self.protocol,
+            )
+        )
+        show_scores(json.loads((folder / "scores.json").read_text()))
+        print(folder)
+        return 0

@@ -1,0 +1,48 @@
+"""``invgraphics render``: a film of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.arguments import parse_size
+from invgraphics.errors import InputError
+
+
+@dataclass(frozen=True)
+class Render:
+    """Film a finished run: once around the scene, from photograph to photograph, or the fit itself."""
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a run."""
+    out: Annotated[Path, arg(metavar="FILM.mp4")]
+    """File to write."""
+    path: Literal["orbit", "interpolate", "timelapse"] = "orbit"
+    """The camera's way. A timelapse stands still and shows the states that `fit --snapshots N` kept; of Gaussians also the
+    ellipsoids."""
+    frames: Annotated[int, arg(metavar="N")] = 90
+    """Pictures of an orbit or interpolation."""
+    fps: Annotated[int, arg(metavar="N")] = 15
+    """Pictures per second."""
+    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the run's own)")] = None
+    """Size of the pictures; one number is the longest side."""
+    view: Annotated[int, arg(metavar="N")] = 0
+    """Test view that a timelapse shows."""
+    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    """Another copy of the scene, for instance where the data set has moved."""
+
+    def run(self) -> int:
+        """Film; print the file."""
+        size = None if self.size is None else parse_size(self.size)
+        if not (self.folder / "recipe.toml").is_file():
+            raise InputError(
+                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
+            )
+
+        from invgraphics.experiments.film import FilmRequest, film
+
+        print(film(FilmRequest(self.folder, self.out, self.path, self.frames, self.fps, size, self.view, self.scene)))
+        return 0

@@ -1,0 +1,159 @@
+"""Writing a run's model as a file that other programs read, and saying what the file lost."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from invgraphics import plugins
+from invgraphics.core import Camera, Context, Field, Gaussians, Quantity, Renderer, Scene, harmonics
+from invgraphics.core.samples import FieldValues, Samples
+from invgraphics.errors import InputError, NotComposableError
+from invgraphics.experiments.evaluate import render_view
+from invgraphics.experiments.fitted import Fitted, open_fitted
+from invgraphics.experiments.placing import WORLD, file_from_local, local_from_file
+from invgraphics.experiments.progress import Reporter
+from invgraphics.fields.transformed import move_gaussians
+from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What to write.
+
+    Attributes:
+        run: folder of the run.
+        to: a name in `invgraphics.experiments.EXPORTERS`.
+        out: the file.
+        scene: another copy of the run's scene.
+        world: how the axes of the data set's world point, for formats that want certain axes.
+    """
+
+    run: Path
+    to: str
+    out: Path
+    scene: str | None = None
+    world: str = WORLD
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written: a file, and facts about it, name -> value in words."""
+
+    path: Path
+    facts: dict[str, str]
+
+
+class FixedGaussians(Field):
+    """Gaussians as they are, to be rendered and not fitted."""
+
+    provides = Quantity.GAUSSIANS
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        super().__init__()
+        self._gaussians = gaussians
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        """Gaussians have no pointwise reading here."""
+        raise NotComposableError(f"FixedGaussians has no {want.words()} at points.", "It provides gaussians.")
+
+    def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
+        """The Gaussians."""
+        return self._gaussians if want == Quantity.GAUSSIANS else super().primitives(want, ctx)
+
+    def primitive_count(self) -> int:
+        """Their number."""
+        return len(self._gaussians)
+
+
+def export_run(request: ExportRequest) -> Exported:
+    """Write the file.
+
+    Raises:
+        InputError: the run cannot be opened, its model cannot be written in this way, or the file cannot be written.
+    """
+    out = request.out
+    if not out.absolute().parent.is_dir() or out.is_dir():
+        raise InputError(f"--out cannot be '{out}': expected a file in a folder that exists.")
+    return plugins.load("exporters", request.to)(open_fitted(request.run, request.scene), request)
+
+
+def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
+    """Write the Gaussians as the renderer reads them, in world coordinates, and render the file once more.
+
+    Raises:
+        InputError: the model has no Gaussians, or they do not fit into the format.
+    """
+    if Quantity.GAUSSIANS not in fitted.field.provides:
+        raise InputError(
+            f"The model of '{request.run}' ({fitted.method.name}) has no Gaussians to write as {request.to}.",
+            "Runs of splatting methods have some.",
+        )
+    scene = fitted.scene
+    axes = plugins.load("formats", request.to).axes
+    with torch.no_grad():
+        local = fitted.field.primitives(Quantity.GAUSSIANS, Context(scene.bounds.to(fitted.device)))
+    placed = on_cpu(move_gaussians(on_cpu(local), file_from_local(scene, axes, request.world).float()))
+    shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
+    note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
+    antialiased = getattr(fitted.method.recipe.renderer, "compensate", False)
+    write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)))
+
+    _, written = read_gaussians(request.out)
+    back = move_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
+    loss = agreement(local, on_device(back, fitted.device), fitted)
+    degree = harmonics.degree_of(written.gaussians.sh.shape[1])
+    had = harmonics.degree_of(local.sh.shape[1])
+    return Exported(
+        request.out,
+        {
+            "Gaussians": str(len(written.gaussians)),
+            "bytes": str(request.out.stat().st_size),
+            "SH degree": str(degree) if degree == had else f"{degree} (the run has {had})",
+            "axes": axes or "the data set's world",
+            "PSNR to the run's own pictures": decibels(loss),
+        },
+    )
+
+
+def agreement(gaussians: Gaussians, others: Gaussians, fitted: Fitted) -> list[float]:
+    """PSNR in dB between the pictures of two sets of Gaussians, one value for each test view; infinite where equal."""
+    psnr = []
+    with Reporter("comparing") as reporter:
+        for index, view in enumerate(fitted.scene.test):
+            ours, theirs = (
+                shown(each, fitted.renderer, view.camera, fitted.scene, fitted.device) for each in (gaussians, others)
+            )
+            error = float((ours - theirs).square().mean())
+            psnr.append(-10 * math.log10(error) if error else math.inf)
+            reporter.show((index + 1) / len(fitted.scene.test), f"view {index + 1} of {len(fitted.scene.test)}")
+    return psnr
+
+
+def shown(gaussians: Gaussians, renderer: Renderer, camera: Camera, scene: Scene, device: torch.device) -> Tensor:
+    """The picture of Gaussians over the scene's background, clipped to [0, 1], shape (height, width, 3)."""
+    picture = render_view(FixedGaussians(gaussians), renderer, camera, scene, device, geometry=False)
+    return picture.over(scene.background).clamp(0, 1)
+
+
+def decibels(values: list[float]) -> str:
+    """Mean and worst of several PSNRs in words."""
+    if math.isinf(min(values)):
+        return "equal"
+    mean = sum(values) / len(values)
+    return f"{mean:.1f} dB on average over {len(values)} test views, {min(values):.1f} dB at worst"
+
+
+def on_device(gaussians: Gaussians, device: torch.device) -> Gaussians:
+    """Move all tensors, outside the graph."""
+    names = ("means", "quaternions", "scales", "opacities", "sh")
+    return replace(gaussians, **{name: getattr(gaussians, name).detach().to(device) for name in names})
+
+
+def on_cpu(gaussians: Gaussians) -> Gaussians:
+    """Move all tensors to the CPU, outside the graph."""
+    return on_device(gaussians, torch.device("cpu"))

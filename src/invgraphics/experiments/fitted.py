@@ -1,0 +1,73 @@
+"""A finished run, opened again: its scene and its model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from invgraphics.core import Field, Renderer, Scene
+from invgraphics.errors import InputError
+from invgraphics.experiments.build import build_model, device_of
+from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.recipe import Method, resolve
+from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.training import checkpoint
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a run holds.
+
+    Attributes:
+        folder: of the run.
+        method: its recipe.
+        scene: undisturbed, at the run's size and with its test views.
+        field: fitted.
+        renderer: fitted as well, where it has parameters.
+        device: where both are.
+        source: the folder that holds the checkpoint: the run itself, or the run that a rendering shows.
+    """
+
+    folder: RunFolder
+    method: Method
+    scene: Scene
+    field: Field
+    renderer: Renderer
+    device: torch.device
+    source: RunFolder
+
+
+def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
+    """Open a run, on its own scene or on another copy of it.
+
+    Raises:
+        InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe.
+    """
+    folder = RunFolder(run)
+    provenance = folder.read_json("provenance.json")
+    size = provenance["options"]["size"]
+    options = SceneOptions(tuple(size) if isinstance(size, list) else size, provenance["options"]["test_views"])
+    return load_fitted(folder, open_scene(scene_spec or provenance["scene"], options))
+
+
+def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
+    """The model of a run from its checkpoint; a rendering's is that of the run it shows (see `experiments.renderings`).
+
+    Raises:
+        InputError: the checkpoint is missing or does not fit the recipe.
+    """
+    provenance = folder.read_json("provenance.json")
+    method = resolve(provenance["method"], provenance["preset"], folder.read_recipe())
+    device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
+    field, renderer = build_model(method, scene, provenance["seed"], device)
+    shown = provenance.get("fitted_run")
+    source = folder if shown is None else RunFolder(folder.root / shown)
+    state = checkpoint.load(source.checkpoint, device)
+    try:
+        field.load_state_dict(state.get("field", {}))
+        renderer.load_state_dict(state.get("renderer", {}) if shown is None else {})
+    except RuntimeError as error:
+        raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
+    return Fitted(folder, method, scene, field, renderer, device, source)

@@ -1,0 +1,94 @@
+"""From a density field to points where it shows something, from which Gaussians can start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics import kernels
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.field import Field, Quantity
+from invgraphics.core.rays import Rays
+from invgraphics.core.samples import Samples
+from invgraphics.core.scene import Points, Scene
+from invgraphics.errors import InputError
+
+SAMPLES = 512
+"""Intervals along a ray."""
+RAYS = 512
+"""Rays that are looked along at once."""
+EFFORT = 64
+"""Rays tried per wanted point before a field counts as empty enough."""
+
+
+@torch.no_grad()
+def visible_points(field: Field, scene: Scene, count: int) -> Points:
+    """Points drawn where the training views see the field: each on a random ray, at a depth drawn by the weights along it.
+
+    A pixel of opacity alpha gives a point with probability alpha, so points are as dense as what is seen; what is hidden inside
+    a solid gets none. Randomness comes from torch's global generator.
+
+    Args:
+        field: a fitted field of density and radiance, in the scene's local frame.
+        scene: whose training cameras and bounds are used.
+        count: points wanted; fewer are returned where the field is nearly empty.
+
+    Returns:
+        Positions, and the radiance towards the camera that saw them, in the scene's colour space.
+
+    Raises:
+        InputError: the field has no density and radiance, or is empty.
+    """
+    if Quantity.DENSITY | Quantity.RADIANCE not in field.provides:
+        remedy = "Any field with density and radiance can be turned into Gaussians."
+        raise InputError(f"{type(field).__name__} provides {field.provides.words()}, not density and radiance.", remedy)
+    device = next((parameter.device for parameter in field.parameters()), torch.device("cpu"))
+    parts, found = [], 0
+    for rays in _random_rays(scene, EFFORT * count):
+        part = _drawn(field, rays.to(device), scene.bounds.to(device))
+        parts.append(part)
+        found += len(part)
+        if found >= count:
+            break
+    if found == 0:
+        raise InputError(f"The field shows nothing to the training views of scene '{scene.name}'.", "Fit it for longer.")
+    position, rgb = (torch.cat([getattr(part, name) for part in parts])[:count].cpu() for name in ("position", "rgb"))
+    return Points(position, rgb)
+
+
+def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
+    """Batches of random pixels' rays, each of one random training view."""
+    for _ in range(-(-most // RAYS)):
+        camera = scene.train[int(torch.randint(len(scene.train), ()))].camera
+        flat = torch.randint(camera.width * camera.height, (RAYS,))
+        yield camera.rays(torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5)
+
+
+def _drawn(field: Field, rays: Rays, bounds: Bounds) -> Points:
+    """At most one point on each ray."""
+    rays = bounds.clip(rays)
+    edges = _edges(rays, bounds)
+    index = torch.arange(len(rays), device=edges.device).repeat_interleave(SAMPLES)
+    samples = Samples.on(rays, index, edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1))
+    density = field.query(samples, Quantity.DENSITY).density
+    assert density is not None
+    weights, _, _ = kernels.composite(density * samples.delta, density[:, None], index, len(rays))
+    # Inverse of the cumulated weight; a draw beyond a ray's alpha goes through.
+    cumulated = weights.view(len(rays), SAMPLES).cumsum(dim=1)
+    draw = torch.rand(len(rays), 1).to(cumulated)
+    hit = (draw < cumulated[:, -1:])[:, 0].nonzero()[:, 0]
+    chosen = samples[hit * SAMPLES + torch.searchsorted(cumulated[hit], draw[hit], right=True)[:, 0]]
+    radiance = field.query(chosen, Quantity.RADIANCE).radiance
+    assert radiance is not None
+    jitter = (torch.rand(len(chosen), 1).to(cumulated) - 0.5) * chosen.delta[:, None]
+    return Points(chosen.position + jitter * chosen.direction, radiance)
+
+
+def _edges(rays: Rays, bounds: Bounds) -> Float[Tensor, "n samples_plus_1"]:
+    """Interval ends: even steps through a box, even ratios of distance where space is unbounded."""
+    s = torch.linspace(0, 1, SAMPLES + 1, device=rays.near.device)
+    near, far = rays.near[:, None], rays.far[:, None]
+    return near * (far / near) ** s if bounds.space == "contracted" else near + (far - near) * s

@@ -1,0 +1,104 @@
+"""Where Gaussians start: points of the scene, of its depth maps or at random, and sizes from their neighbours."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.colour import srgb_to_linear
+from invgraphics.core.scene import Points, Scene, View
+from invgraphics.errors import InputError
+
+NEIGHBOURS = 3
+"""A Gaussian starts as wide as the mean distance to this many nearest neighbours (3DGS, §5.1)."""
+FAR_SHARE = 0.2
+"""Share of random points that goes outside the inner box of a contracted space."""
+FAR_REACH = 30.0
+"""How far out those go, in half-extents of the box; log-uniformly, so that every shell gets its share."""
+SCALE_RANGE = (1e-5, 0.5)
+"""Limits of a starting scale, relative to the scene's radius (or to the distance from its centre, where that is larger)."""
+
+
+def starting_scales(positions: Float[Tensor, "n 3"], bounds: Bounds) -> Float[Tensor, " n"]:
+    """Mean distance to the nearest neighbours, kept within `SCALE_RANGE`."""
+    from scipy.spatial import KDTree
+
+    reach = (positions - bounds.centre).norm(dim=1).clamp_min(bounds.radius)
+    if len(positions) == 1:
+        return SCALE_RANGE[1] * reach
+    neighbours = min(NEIGHBOURS, len(positions) - 1)
+    points = positions.detach().double().cpu().numpy()
+    distances, _ = KDTree(points).query(points, k=neighbours + 1)
+    mean = torch.from_numpy(distances[:, 1:]).mean(dim=1).to(positions)
+    return mean.clamp(SCALE_RANGE[0] * reach, SCALE_RANGE[1] * reach)
+
+
+def random_points(bounds: Bounds, count: int) -> Points:
+    """Uniform points of random colour in the box; in a contracted space some of them on shells far around it."""
+    x = torch.rand(count, 3) * 2 - 1
+    if bounds.space == "contracted":
+        far = round(FAR_SHARE * count)
+        shell = nn.functional.normalize(torch.randn(far, 3), dim=1)
+        x[:far] = shell * FAR_REACH ** torch.rand(far, 1)
+    return Points(bounds.centre + x * bounds.half, torch.rand(count, 3))
+
+
+def scene_points(scene: Scene, most: int) -> Points:
+    """Up to ``most`` of the scene's points, at random, with colours in the scene's colour space.
+
+    Raises:
+        InputError: the point cloud is empty or not finite.
+    """
+    assert scene.points is not None
+    points = _subset(_checked(scene.points, scene.name), most)
+    return Points(points.position, srgb_to_linear(points.rgb)) if scene.colour == "linear" else points
+
+
+def depth_points(scene: Scene, most: int) -> Points:
+    """Up to ``most`` surface points that the training views' depth maps show, evenly over the views, pixels at random.
+
+    Raises:
+        InputError: no training view has a depth map, or they show nothing.
+    """
+    views = [view for view in scene.train if view.depth is not None and bool(torch.isfinite(view.depth).any())]
+    if not views:
+        remedy = "Set field.init = 'scene' or 'random'."
+        raise InputError(f"The training views of scene '{scene.name}' have no depth maps to start Gaussians from.", remedy)
+    shares = [most // len(views) + (i < most % len(views)) for i in range(len(views))]
+    parts = [_seen_points(view, share) for view, share in zip(views, shares, strict=True)]
+    return Points(torch.cat([part.position for part in parts]), torch.cat([part.rgb for part in parts]))
+
+
+def _seen_points(view: View, most: int) -> Points:
+    """Points on a view's depth map; where it is transparent, nothing is hit."""
+    assert view.depth is not None
+    depth = view.depth.reshape(-1)
+    hit = torch.isfinite(depth)
+    if view.mask is not None:
+        hit &= view.mask.reshape(-1)
+    flat = hit.nonzero()[:, 0]
+    flat = flat[torch.randperm(len(flat))[:most]]
+    pixels = torch.stack([flat % view.camera.width, flat // view.camera.width], dim=1) + 0.5
+    rays = view.camera.rays(pixels)
+    return Points(rays.origins + depth[flat, None] * rays.directions, view.colour(flat))
+
+
+def _checked(points: Points, scene: str) -> Points:
+    if len(points) == 0:
+        remedy = "Set the field's init = 'random', or give the scene points."
+        raise InputError(f"The point cloud of scene '{scene}' is empty, so there is nothing to start Gaussians from.", remedy)
+    for name in ("position", "rgb"):
+        bad = int((~torch.isfinite(getattr(points, name))).any(dim=1).sum())
+        if bad:
+            remedy = "Remove them, or set the field's init = 'random'."
+            raise InputError(f"The point cloud of scene '{scene}': {bad} points have a {name} that is not finite.", remedy)
+    return points
+
+
+def _subset(points: Points, most: int) -> Points:
+    if len(points) <= most:
+        return points
+    keep = torch.randperm(len(points))[:most]
+    return Points(points.position[keep], points.rgb[keep])

@@ -1,0 +1,145 @@
+"""What a format is, and the one way to read and write a file of Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from invgraphics import plugins
+from invgraphics.core import Gaussians
+from invgraphics.errors import InputError
+
+HEAD_BYTES = 1 << 16
+"""How much of a file `Format.matches` gets to see."""
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """What a file of Gaussians holds.
+
+    Attributes:
+        gaussians: activated, in the file's own axes and units.
+        axes: where the file's +x, +y and +z point, as `core.transforms.axes_to_opencv` reads it; ``None`` where the file does
+            not say.
+        antialiased: whether they were fitted with Mip-Splatting's opacity compensation; ``None`` where the file does not say.
+        notes: what else there is to know, in sentences.
+    """
+
+    gaussians: Gaussians
+    axes: str | None = None
+    antialiased: bool | None = None
+    notes: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class Format(Protocol):
+    """A format that can be read.
+
+    Attributes:
+        suffixes: usual ends of its files' names.
+        axes: the axes in which its files are written, as in `Splats`; ``None`` where the format leaves them open.
+    """
+
+    suffixes: tuple[str, ...]
+    axes: str | None
+
+    def matches(self, path: Path, head: bytes) -> bool:
+        """Whether ``path``, which begins with ``head``, is in this format."""
+        ...
+
+    def read(self, path: Path) -> Splats:
+        """The file's content; bad input raises `InputError`."""
+        ...
+
+
+@runtime_checkable
+class WritableFormat(Format, Protocol):
+    """A format that can be written as well."""
+
+    def write(self, path: Path, splats: Splats) -> None:
+        """Write ``splats``, which are in the format's axes; `InputError` where they do not fit into it."""
+        ...
+
+
+def read_gaussians(path: Path) -> tuple[str, Splats]:
+    """Read a file in any known format; returns the format's name and the content.
+
+    Raises:
+        InputError: the file is missing, broken, of no known format, empty, or holds numbers that are not finite.
+    """
+    if not path.is_file():
+        raise InputError(f"There is no file '{path}'." if not path.exists() else f"'{path}' is not a file.")
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    known = plugins.names("formats")
+    for name in known:
+        form: Format = plugins.load("formats", name)()
+        if form.matches(path, head):
+            return name, checked(form.read(path), path)
+    raise InputError(f"'{path}' is no file of 3D Gaussians in a known format.", f"Known formats: {', '.join(known)}.")
+
+
+def write_gaussians(path: Path, name: str, splats: Splats) -> None:
+    """Write a file in the format ``name``, whole or not at all.
+
+    Raises:
+        InputError: the format is unknown or cannot be written, there are no Gaussians, or they do not fit into the format.
+    """
+    form = plugins.load("formats", name)()
+    if not isinstance(form, WritableFormat):
+        raise InputError(f"The format '{name}' can only be read.")
+    splats = checked(splats, path)
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        form.write(temporary, splats)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def checked(splats: Splats, path: Path) -> Splats:
+    """What both directions rely on: some Gaussians, finite numbers; rotations of length zero become the identity.
+
+    Raises:
+        InputError: there are no Gaussians, or some are not finite.
+    """
+    gaussians = splats.gaussians
+    if len(gaussians) == 0:
+        raise InputError(f"'{path}': there are no Gaussians.")
+    for what, values in (
+        ("centres", gaussians.means),
+        ("rotations", gaussians.quaternions),
+        ("scales", gaussians.scales),
+        ("opacities", gaussians.opacities),
+        ("colours", gaussians.sh),
+    ):
+        bad = int((~torch.isfinite(values.reshape(len(values), -1))).any(dim=1).sum())
+        if bad:
+            raise InputError(
+                f"'{path}': the {what} of {bad} of {len(gaussians)} Gaussians are not finite numbers.",
+                "The fit that made them diverged, or the file is damaged; remove these Gaussians.",
+            )
+    still = gaussians.quaternions.norm(dim=1) == 0
+    if not bool(still.any()):
+        return splats
+    identity = gaussians.quaternions.new_tensor([1.0, 0.0, 0.0, 0.0])
+    mended = replace(gaussians, quaternions=torch.where(still[:, None], identity, gaussians.quaternions))
+    return replace(splats, gaussians=mended, notes=(*splats.notes, f"{int(still.sum())} rotations of length zero."))
+
+
+def cut_off(path: Path, expected: int, present: int) -> InputError:
+    """The complaint about a file that ends too early, in bytes."""
+    return InputError(f"'{path}' is cut off: {expected} bytes are expected, {present} are there.", "Copy the file again.")
+
+
+def complete_quaternions(largest: Int[Tensor, " n"], others: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Unit quaternions from three components in order, among which the largest one goes to index ``largest``."""
+    stored = torch.cat([others, (1 - others.square().sum(dim=1, keepdim=True)).clamp_min(0).sqrt()], dim=1)
+    place, gap = torch.arange(4).expand(len(others), 4), largest[:, None]
+    source = (place - (place > gap).long()).masked_fill(place == gap, 3)
+    return stored.gather(1, source)

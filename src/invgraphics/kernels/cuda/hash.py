@@ -1,0 +1,163 @@
+"""Multi-resolution hash encoding in Triton: positions and indices as in `invgraphics.kernels.reference.hash`.
+
+A program takes a block of points through one level, so that the programs that run together read the same level's entries.
+"""
+
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.kernels import reference
+from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of, once_differentiable
+from invgraphics.kernels.reference.hash import PRIMES
+from invgraphics.kernels.types import HashGrid
+
+BLOCK = 256
+"""Points of one program."""
+
+_PRIME_Y, _PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
+
+
+@triton.jit
+def _axis(unit, point, axis: tl.constexpr, there, edge):
+    """Lower vertex along one axis, the fraction beyond it, and 1 where the position was not clamped."""
+    coordinate = tl.load(unit + 3 * point + axis, mask=there, other=0.0)
+    inside = (coordinate >= 0.0) & (coordinate <= 1.0)
+    position = tl.minimum(tl.maximum(coordinate, 0.0), 1.0) * edge.to(tl.float32)
+    # The last vertex belongs to the last cell, so that it needs no neighbour beyond.
+    lower = tl.minimum(position.to(tl.int32), edge - 1)
+    return lower, position - lower.to(tl.float32), inside.to(tl.float32)
+
+
+@triton.jit
+def _entry(x, y, z, edge, mask):
+    """Entry of a level's table that a vertex reads; ``mask`` is 0 on dense levels."""
+    dense = x + (edge + 1) * (y + (edge + 1) * z)
+    hashed = x.to(tl.uint32) ^ (y.to(tl.uint32) * _PRIME_Y) ^ (z.to(tl.uint32) * _PRIME_Z)
+    return tl.where(mask == 0, dense, (hashed & mask.to(tl.uint32)).to(tl.int32))
+
+
+@triton.jit
+def encode(unit, table, levels, out, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr):
+    """Features of one level at a block of points. ``levels`` holds cells, offsets and masks, ``count`` of each."""
+    level = tl.program_id(1)
+    point = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
+    there, column = point < points, tl.arange(0, WIDTH)
+    edge, offset, mask = tl.load(levels + level), tl.load(levels + count + level), tl.load(levels + 2 * count + level)
+    x, fx, _ = _axis(unit, point, 0, there, edge)
+    y, fy, _ = _axis(unit, point, 1, there, edge)
+    z, fz, _ = _axis(unit, point, 2, there, edge)
+    wanted = there[:, None] & (column < FEATURES)[None, :]
+    total = tl.zeros((SIZE, WIDTH), tl.float32)
+    for corner in tl.static_range(8):
+        i, j, k = corner % 2, corner // 2 % 2, corner // 4
+        weight = (fx if i else 1.0 - fx) * (fy if j else 1.0 - fy) * (fz if k else 1.0 - fz)
+        row = (offset + _entry(x + i, y + j, z + k, edge, mask)).to(tl.int64) * FEATURES
+        total += weight[:, None] * tl.load(table + row[:, None] + column[None, :], mask=wanted, other=0.0)
+    tl.store(out + (point * count + level)[:, None] * FEATURES + column[None, :], total, mask=wanted)
+
+
+@triton.jit
+def encode_back(
+    unit, gradient, levels, to_table, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr
+):
+    """Gradient along one level of the table, added atomically by all blocks of points."""
+    level = tl.program_id(1)
+    point = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
+    there, column = point < points, tl.arange(0, WIDTH)
+    edge, offset, mask = tl.load(levels + level), tl.load(levels + count + level), tl.load(levels + 2 * count + level)
+    x, fx, _ = _axis(unit, point, 0, there, edge)
+    y, fy, _ = _axis(unit, point, 1, there, edge)
+    z, fz, _ = _axis(unit, point, 2, there, edge)
+    wanted = there[:, None] & (column < FEATURES)[None, :]
+    given = tl.load(gradient + (point * count + level)[:, None] * FEATURES + column[None, :], mask=wanted, other=0.0)
+    for corner in tl.static_range(8):
+        i, j, k = corner % 2, corner // 2 % 2, corner // 4
+        weight = (fx if i else 1.0 - fx) * (fy if j else 1.0 - fy) * (fz if k else 1.0 - fz)
+        row = (offset + _entry(x + i, y + j, z + k, edge, mask)).to(tl.int64) * FEATURES
+        tl.atomic_add(to_table + row[:, None] + column[None, :], weight[:, None] * given, mask=wanted)
+
+
+@triton.jit
+def locate_back(
+    unit, table, gradient, levels, to_unit, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr
+):
+    """Gradient along the positions, all levels; zero along the axes on which a position was clamped."""
+    point = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
+    there, column = point < points, tl.arange(0, WIDTH)
+    wanted = there[:, None] & (column < FEATURES)[None, :]
+    along_x, along_y, along_z = (tl.zeros((SIZE,), tl.float32) for _ in tl.static_range(3))
+    for level in range(count):
+        edge, offset, mask = tl.load(levels + level), tl.load(levels + count + level), tl.load(levels + 2 * count + level)
+        x, fx, in_x = _axis(unit, point, 0, there, edge)
+        y, fy, in_y = _axis(unit, point, 1, there, edge)
+        z, fz, in_z = _axis(unit, point, 2, there, edge)
+        given = tl.load(gradient + (point * count + level)[:, None] * FEATURES + column[None, :], mask=wanted, other=0.0)
+        for corner in tl.static_range(8):
+            i, j, k = corner % 2, corner // 2 % 2, corner // 4
+            wx, wy, wz = fx if i else 1.0 - fx, fy if j else 1.0 - fy, fz if k else 1.0 - fz
+            row = (offset + _entry(x + i, y + j, z + k, edge, mask)).to(tl.int64) * FEATURES
+            value = tl.load(table + row[:, None] + column[None, :], mask=wanted, other=0.0)
+            pull = tl.sum(value * given, axis=1) * edge.to(tl.float32)
+            along_x += pull * wy * wz * in_x * (2 * i - 1)
+            along_y += pull * wx * wz * in_y * (2 * j - 1)
+            along_z += pull * wx * wy * in_z * (2 * k - 1)
+    tl.store(to_unit + 3 * point, along_x, mask=there)
+    tl.store(to_unit + 3 * point + 1, along_y, mask=there)
+    tl.store(to_unit + 3 * point + 2, along_z, mask=there)
+
+
+@cache
+def _levels(grid: HashGrid, device: torch.device) -> Tensor:
+    """Cells along an edge, first entries, and masks of the hash (0 where all vertices are stored), behind one another."""
+    masks = [2**grid.log2_size - 1 if (r + 1) ** 3 > 2**grid.log2_size else 0 for r in grid.resolutions]
+    return torch.tensor([*grid.resolutions, *grid.offsets[:-1], *masks], dtype=torch.int32, device=device)
+
+
+class _Encode(torch.autograd.Function):
+    """Differentiable in positions and table."""
+
+    @staticmethod
+    def forward(ctx: Any, unit: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
+        unit, table = unit.contiguous(), table.contiguous()
+        features, levels = table.shape[1], _levels(grid, table.device)
+        out = table.new_empty(len(unit), grid.levels * features)
+        ctx.sizes = (len(unit), grid.levels, features, at_least_2(features), BLOCK)
+        if len(unit):
+            with on_device_of(table):
+                encode[(blocks(len(unit), BLOCK), grid.levels)](unit, table, levels, out, *ctx.sizes)
+        ctx.save_for_backward(unit, table, levels)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        unit, table, levels = ctx.saved_tensors
+        gradient, along, count = grad_outputs[0].contiguous(), blocks(len(unit), BLOCK), ctx.sizes[1]
+        to_unit = torch.zeros_like(unit) if ctx.needs_input_grad[0] else None
+        to_table = torch.zeros_like(table) if ctx.needs_input_grad[1] else None
+        if len(unit):
+            with on_device_of(table):
+                if to_unit is not None:
+                    locate_back[(along,)](unit, table, gradient, levels, to_unit, *ctx.sizes)
+                if to_table is not None:
+                    encode_back[(along, count)](unit, gradient, levels, to_table, *ctx.sizes)
+        return to_unit, to_table, None
+
+
+def hash_encode(
+    unit: Float[Tensor, "m 3"], table: Float[Tensor, "entries f"], grid: HashGrid, jacobian: bool = False
+) -> tuple[Float[Tensor, "m width"], Float[Tensor, "m width 3"] | None]:
+    """See `invgraphics.kernels.hash_encode`; the Jacobian is left to the reference."""
+    if jacobian:
+        return reference.hash_encode(unit, table, grid, jacobian)
+    return _Encode.apply(unit, table, grid), None

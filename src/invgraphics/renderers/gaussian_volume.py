@@ -1,0 +1,182 @@
+"""Gaussians seen along rays instead of splatted: composited one after the other, or integrated where they overlap."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from invgraphics import kernels
+from invgraphics.core import Camera, Context, Field, Quantity, RayRenderer, Rays, Rendering, Scene, Trace
+from invgraphics.kernels.types import ALPHA_MIN
+from invgraphics.renderers.base import picture
+from invgraphics.renderers.gaussian_quadrature import Weights, integrate_overlapping, phi
+from invgraphics.renderers.gaussian_rays import SURE, Encounters, Opacity, Primitives, colours, encounter, normals, prepare
+
+TILE = 16
+"""Edge in pixels of the square whose rays are searched for Gaussians together."""
+
+
+@dataclass(frozen=True)
+class GaussianExactConfig:
+    """The volume-rendering equation over overlapping Gaussian densities; the order of primitives does not matter.
+
+    Optical depths are closed forms (differences of error functions), so alpha is exact for any number of steps; only which
+    share of it each overlapping Gaussian has is found by quadrature, with an error of second order.
+
+    Attributes:
+        opacity: what opacity means, see `invgraphics.renderers.gaussian_rays.Opacity`.
+        steps: intervals of each ray, placed where alpha and optical depth grow.
+        smallest: optical depth below which a Gaussian is left out of a ray.
+    """
+
+    opacity: Literal["peak", "physical"] = "peak"
+    steps: int = 32
+    smallest: float = ALPHA_MIN / 4
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ValueError(f"steps must be at least 1, not {self.steps}.")
+        _check_smallest(self.smallest)
+
+    def build(self, scene: Scene) -> GaussianExact:
+        """The renderer; it needs nothing from the scene."""
+        return GaussianExact(self)
+
+
+@dataclass(frozen=True)
+class GaussianSortedConfig:
+    """Each Gaussian integrated along the ray by itself, then composited front to back as if none overlapped.
+
+    Attributes:
+        opacity: what opacity means, see `invgraphics.renderers.gaussian_rays.Opacity`.
+        order: ``ray`` sorts by the distance of the largest response on each ray; ``centre`` by the depth of the centre along
+            the optical axis, one order for all pixels as splatters have it (along the ray itself where there is no camera).
+        smallest: optical depth below which a Gaussian is left out of a ray; ``splat`` leaves out alphas below 1/255.
+    """
+
+    opacity: Opacity = "peak"
+    order: Literal["ray", "centre"] = "ray"
+    smallest: float = ALPHA_MIN / 4
+
+    def __post_init__(self) -> None:
+        _check_smallest(self.smallest)
+
+    def build(self, scene: Scene) -> GaussianSorted:
+        """The renderer; it needs nothing from the scene."""
+        return GaussianSorted(self)
+
+
+class GaussianRays(RayRenderer):
+    """What both ways to see Gaussians along rays have in common."""
+
+    requires: ClassVar[Quantity] = Quantity.GAUSSIANS
+
+    def __init__(self, opacity: Opacity, smallest: float) -> None:
+        super().__init__()
+        self._opacity: Opacity = opacity
+        self._smallest = smallest
+
+    @abstractmethod
+    def weigh(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None, far_too: bool) -> Weights:
+        """Share of each Gaussian in its ray's light.
+
+        Args:
+            encounters: Gaussians on rays.
+            rays: with near and far.
+            axis: along which centres are sorted; ``None`` for each ray's own direction.
+            far_too: whether distances are wanted.
+        """
+
+    def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
+        """Render n rays from any number of cameras."""
+        primitives = prepare(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest)
+        return self._render(primitives, rays, None, ctx), Trace(rays=len(rays))
+
+    def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
+        """Render every pixel, tile by tile. Depth is left at infinity in training, unless ``ctx.geometry`` asks for it."""
+        gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
+        primitives = prepare(gaussians, self._opacity, self._smallest, camera.position)
+        rays, order = camera.rays(), _by_tiles(camera)
+        axis = camera.cam_to_world[:3, 2]
+        parts = [self._render(primitives, rays[part], axis, ctx) for part in order]
+        rendering, place = Rendering.cat(parts), torch.cat(order).argsort()
+        normal = None if rendering.normal is None else rendering.normal[place]
+        ordered = Rendering(rendering.rgb[place], rendering.alpha[place], rendering.depth[place], normal)
+        return ordered.reshape(camera.height, camera.width), Trace(rays=len(rays))
+
+    def _render(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, ctx: Context) -> Rendering:
+        rays = rays.within(rays.near.clamp_min(ctx.bounds.near), rays.far)
+        encounters = encounter(primitives, rays)
+        geometry = ctx.geometry or not ctx.training
+        weights, distances = self.weigh(encounters, rays, axis, geometry)
+        values = [weights[:, None], weights[:, None] * colours(primitives, encounters)]
+        if distances is not None:
+            values.append(distances[:, None])
+        if ctx.geometry:
+            values.append(weights[:, None] * normals(primitives, encounters, rays))
+        joined = torch.cat(values, dim=1)
+        sums = joined.new_zeros(len(rays), joined.shape[1]).index_add(0, encounters.ray, joined)
+        if not geometry:
+            return Rendering(sums[:, 1:4], sums[:, 0], rays.far)
+        normal = sums[:, 5:] if ctx.geometry else None
+        return picture(sums[:, 1:4], sums[:, 0], sums[:, 4], normal, rays.far, rays.directions)
+
+
+class GaussianExact(GaussianRays):
+    """Integrates overlapping Gaussian densities."""
+
+    def __init__(self, config: GaussianExactConfig) -> None:
+        super().__init__(config.opacity, config.smallest)
+        self.config = config
+
+    def weigh(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None, far_too: bool) -> Weights:
+        """See `integrate_overlapping`; there is no order."""
+        return integrate_overlapping(encounters, rays, self.config.steps, far_too)
+
+
+class GaussianSorted(GaussianRays):
+    """Composites Gaussians one after the other."""
+
+    def __init__(self, config: GaussianSortedConfig) -> None:
+        super().__init__(config.opacity, config.smallest)
+        self.config = config
+
+    def weigh(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None, far_too: bool) -> Weights:
+        """Front to back: alpha_i = 1 - exp(-tau_i), seen through all that come before."""
+        near, far = rays.near[encounters.ray], rays.far[encounters.ray]
+        t, sigma, depth = encounters.t, encounters.sigma, encounters.depth
+        if self.config.opacity != "splat":
+            start, end = (
+                ((limit - t) / sigma).clamp(-SURE, SURE) for limit in (near, far.minimum((t + SURE * sigma).detach()))
+            )
+            depth = depth * (phi(end) - phi(start))
+        order = self._order(encounters, rays, axis)
+        ordered, _, _ = kernels.composite(depth[order], t.new_zeros(len(t), 0), encounters.ray, len(rays))
+        weights = ordered[order.argsort()]
+        return weights, weights * t.clamp(near, far) if far_too else None
+
+    @torch.no_grad()
+    def _order(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None) -> Int[Tensor, " p"]:
+        """Encounters by ray, then front to back."""
+        key = encounters.t
+        if self.config.order == "centre":
+            axes = rays.directions[encounters.ray] if axis is None else axis
+            key = (encounters.offset * axes).sum(dim=1)
+        order = key.argsort(stable=True)
+        return order[encounters.ray[order].argsort(stable=True)]
+
+
+def _check_smallest(smallest: float) -> None:
+    if not smallest > 0:
+        raise ValueError(f"smallest must be positive, not {smallest}.")
+
+
+def _by_tiles(camera: Camera) -> list[Tensor]:
+    """Pixel numbers, tile after tile."""
+    pixels = torch.arange(camera.width * camera.height, device=camera.focal.device).view(camera.height, camera.width)
+    return [tile.reshape(-1) for row in pixels.split(TILE, dim=0) for tile in row.split(TILE, dim=1)]

@@ -1,0 +1,59 @@
+"""Early ray termination: leaving out what lies behind opaque surfaces, with as few looks at the field as that takes."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from invgraphics.core import Rays, Samples
+from invgraphics.core.field import Density
+from invgraphics.kernels.types import March
+
+
+@torch.no_grad()
+def in_front(rays: Rays, march: March, density: Density, transmittance: float, wave: int) -> Samples:
+    """Samples that at least the share ``transmittance`` of the light still reaches, with the densities found on the way.
+
+    Each ray's first ``wave`` intervals are looked at, then half as many again of those rays that are not opaque yet, and so
+    on: every look is one call for all rays together, and there are few of them even where nothing is opaque.
+
+    Args:
+        rays: the n rays marched.
+        march: their intervals.
+        density: what to ask about them.
+        transmittance: least share of light, in [0, 1).
+        wave: intervals per ray of the first look, >= 1.
+    """
+    most = -math.log(transmittance) if transmittance > 0 else math.inf
+    counts = torch.bincount(march.ray, minlength=len(rays))
+    first = counts.cumsum(0) - counts
+    found, reached = torch.zeros_like(march.t0), torch.zeros_like(march.t0, dtype=torch.bool)
+    depth = rays.near.new_zeros(len(rays))
+    going, done = torch.nonzero(counts)[:, 0], 0
+    while len(going):
+        left = counts[going] - done
+        # One row per ray that goes on, one column per interval of this wave; the last rows' ends stay empty.
+        table = rays.near.new_zeros(len(going), wave)
+        there = torch.arange(wave, device=left.device) < left[:, None]
+        place = torch.nonzero(there.view(-1))[:, 0]
+        index = (first[going] + done)[place // wave] + place % wave
+        t0, t1 = march.t0[index], march.t1[index]
+        sigma = density(Samples.on(rays, march.ray[index], t0, t1))
+        found[index] = sigma
+        table.view(-1)[place] = sigma * (t1 - t0)
+        sums = torch.nn.functional.pad(table.cumsum(dim=1), (1, 0)) + depth[going, None]
+        reached[index] = sums[:, :-1].reshape(-1)[place] <= most
+        depth[going] = sums[:, -1]
+        going = going[(left > wave) & (sums[:, -1] <= most)]
+        done, wave = done + wave, wave + (wave + 1) // 2
+    kept = torch.nonzero(reached)[:, 0]
+    return Samples.on(rays, march.ray[kept], march.t0[kept], march.t1[kept], found[kept])
+
+
+def weighty(weights: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int, share: float) -> Int[Tensor, " k"]:
+    """Indices of the samples that must be looked at so that all others of a ray together weigh no more than ``share``."""
+    counts = torch.bincount(ray, minlength=rays)
+    return torch.nonzero(weights * counts[ray] > share)[:, 0]

@@ -1,0 +1,154 @@
+"""Gaussians as samples of a Markov chain: relocated where they are dead, moved by noise (3DGS-MCMC, Kheradmand et al. 2024)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import cast
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from typing_extensions import override
+
+from invgraphics.core import Field, Renderer
+from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.training.density_control import Splats, check_splats
+from invgraphics.training.hooks import FitState, Hook
+
+MOST_COPIES = 51
+"""Most Gaussians that take the place of one at once (the authors' code)."""
+LARGEST_OPACITY = 1 - 1e-6
+GATE_SLOPE = 100.0
+"""Steepness of the sigmoid that lets noise through to transparent Gaussians only."""
+NEGLIGIBLE = 1e-4
+"""Noise is not drawn for Gaussians whose gate is below this."""
+
+
+@dataclass(frozen=True)
+class RelocationConfig:
+    """Relocation under a cap, on a schedule of progress; needs the losses ``opacity`` and ``scale`` beside it.
+
+    Attributes:
+        start: progress at which relocating and growing begins (paper: 500 of 30,000 steps).
+        stop: progress at which it ends (paper: 25,000 of 30,000).
+        every: steps between two rounds.
+        dead: opacity up to which a Gaussian counts as dead.
+        growth: share of new Gaussians per round, until there are ``max_primitives``.
+        max_primitives: cap.
+        noise: standard deviation of the noise on means, per learning rate and covariance; 0 for none.
+    """
+
+    start: float = 1 / 60
+    stop: float = 5 / 6
+    every: int = 100
+    dead: float = 0.005
+    growth: float = 0.05
+    max_primitives: int = 1_000_000
+    noise: float = 5e5
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or self.max_primitives < 1:
+            raise ValueError("'every' and 'max_primitives' must be at least 1.")
+        if not 0 < self.dead < 1 or self.growth < 0 or self.noise < 0:
+            raise ValueError("'dead' must lie between 0 and 1, 'growth' and 'noise' must not be negative.")
+
+    def capped(self, most: int) -> RelocationConfig:
+        """The same, growing to at most ``most`` Gaussians."""
+        return replace(self, max_primitives=most)
+
+    def build(self) -> Hook:
+        """The hook."""
+        return _Relocation(self)
+
+
+class _Relocation(Hook):
+    """Keeps nothing between steps, so it needs no state."""
+
+    def __init__(self, config: RelocationConfig) -> None:
+        self._config = config
+
+    @override
+    def check(self, field: Field, renderer: Renderer) -> None:
+        check_splats("relocation", field)
+
+    @override
+    @torch.no_grad()
+    def after_step(self, state: FitState) -> None:
+        config = self._config
+        if (state.step + 1) % config.every == 0 and config.start <= state.ctx.progress < config.stop:
+            self._relocate(state)
+            self._grow(state)
+        if config.noise:
+            _shake(state, config.noise * state.optimiser.rate_of("field.means"), config.dead)
+
+    def _relocate(self, state: FitState) -> None:
+        """Move dead Gaussians onto living ones."""
+        opacities = torch.sigmoid(cast(Splats, state.field).opacity_logits)
+        dead = (opacities <= self._config.dead).nonzero()[:, 0]
+        if 0 < len(dead) < len(opacities):
+            chances = torch.where(opacities <= self._config.dead, 0.0, opacities)
+            self._copy(state, _draw(chances, len(dead), state), dead)
+
+    def _grow(self, state: FitState) -> None:
+        opacities = torch.sigmoid(cast(Splats, state.field).opacity_logits)
+        n = len(opacities)
+        added = min(self._config.max_primitives, int(n * (1 + self._config.growth))) - n
+        if added > 0:
+            self._copy(state, _draw(opacities, added, state), torch.arange(n, n + added, device=opacities.device))
+
+    def _copy(self, state: FitState, source: Int[Tensor, " k"], target: Int[Tensor, " k"]) -> None:
+        """Put copies of ``source`` into the rows ``target``, which may lie behind the last, and share out what is seen."""
+        field = state.field
+        old = {name: parameter.detach() for name, parameter in field.named_parameters()}
+        n, total = len(old["means"]), max(len(old["means"]), int(target.max()) + 1)
+        new = {name: torch.cat([values, values.new_zeros(total - n, *values.shape[1:])]) for name, values in old.items()}
+        parents, copies = torch.unique(source, return_counts=True)
+        opacity, shrink = shared_out(torch.sigmoid(old["opacity_logits"][parents]), copies + 1)
+        new["opacity_logits"][parents] = torch.logit(opacity.clamp(self._config.dead, LARGEST_OPACITY))
+        new["log_scales"][parents] += shrink.log()[:, None]
+        for values in new.values():
+            values[target] = values[source]
+        cast(Splats, field).replace(new)
+        rows = torch.arange(n, device=source.device)
+        for name, parameter in field.named_parameters():
+            state.optimiser.rechoose(f"field.{name}", cast(nn.Parameter, parameter), rows, total - n)
+            state.optimiser.forget(f"field.{name}", torch.cat([parents, target]))
+
+
+def _draw(chances: Float[Tensor, " n"], count: int, state: FitState) -> Int[Tensor, " k"]:
+    """Rows drawn with replacement by their chances; on the CPU, where the fit's generator lives."""
+    cumulated = chances.double().cpu().cumsum(0)
+    draws = torch.rand(count, generator=state.ctx.generator, dtype=torch.float64) * cumulated[-1]
+    return torch.searchsorted(cumulated, draws, right=True).clamp_max(len(chances) - 1).to(chances.device)
+
+
+def shared_out(opacity: Float[Tensor, " n"], copies: Int[Tensor, " n"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Opacity of each of N Gaussians in one place that look like one of ``opacity``, and the factor on their scales.
+
+    ``(1 - o')^N = 1 - o`` at the centre, and the scale keeps the integral of alpha over a line through it. The paper's double
+    sum over i and k is written as one, over j with the binomials of N.
+
+    Args:
+        opacity: of the one, in [0, 1].
+        copies: N, at least 1; more than `MOST_COPIES` count as so many.
+    """
+    wide, n = opacity.double().clamp_max(LARGEST_OPACITY), copies.double().clamp_max(MOST_COPIES)
+    each = 1 - (1 - wide) ** (1 / n)
+    total, binomial = torch.zeros_like(wide), torch.ones_like(wide)
+    for j in range(1, int(n.max()) + 1 if len(n) else 1):
+        binomial = binomial * (n - j + 1).clamp_min(0.0) / j
+        total += (1 if j % 2 else -1) * binomial * each**j / j**0.5
+    return each.to(opacity), (wide / total).to(opacity)
+
+
+def _shake(state: FitState, strength: float, dead: float) -> None:
+    """Langevin noise on the means, in the shape of each Gaussian, for nearly transparent ones only."""
+    field = cast(Splats, state.field)
+    gate = torch.sigmoid(GATE_SLOPE * (dead - torch.sigmoid(field.opacity_logits)))
+    rows = (gate > NEGLIGIBLE).nonzero()[:, 0]
+    if len(rows) == 0:
+        return
+    axes = quaternion_to_matrix(field.quaternions[rows]) * field.log_scales[rows].exp()[:, None, :]
+    draws = torch.randn(len(rows), 3, generator=state.ctx.generator).to(axes)
+    noise = (axes @ (axes.transpose(1, 2) @ (draws * gate[rows, None])[:, :, None]))[:, :, 0]
+    field.means[rows] += strength * noise

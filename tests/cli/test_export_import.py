@@ -1,0 +1,184 @@
+"""A run leaves as a file and comes back as a run; what a format loses is said."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+import torch
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+from training_fixtures import SMALL
+
+from invgraphics.cli import main
+from invgraphics.core import Scene
+from invgraphics.errors import InputError
+from invgraphics.experiments import EXPORTERS, fitted, imported
+from invgraphics.experiments.export import ExportRequest, export_run
+from invgraphics.experiments.imported import ImportRequest, import_run
+from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.run import fit_run
+from invgraphics.formats.base import read_gaussians, write_gaussians
+from invgraphics.report.reading import read_run
+
+METHOD = "splatting/gaussians"
+
+
+@pytest.fixture(scope="module")
+def run(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "fitted"
+    overrides = tuple(SMALL[METHOD])
+    return fit_run(FitRequest(method=METHOD, scene=str(toy_folder), out=str(out), budget="60steps", overrides=overrides))
+
+
+def _quality(folder: Path) -> dict[str, float]:
+    return {name: entry["mean"] for name, entry in json.loads((folder / "scores.json").read_text())["quality"].items()}
+
+
+@pytest.mark.parametrize(("to", "least"), [("ply", 120.0), ("splat", 50.0), ("spz", 50.0)])  # measured: 157, 57, 55
+def test_there_and_back(run: Path, toy_folder: Path, tmp_path: Path, capsys, to: str, least: float) -> None:
+    file, back = tmp_path / f"model.{to}", tmp_path / "back"
+    assert main.run(["export", str(run), "--to", to, "--out", str(file)]) == main.DONE
+    said = capsys.readouterr().out
+    loss = float(re.search(r"PSNR to the run's own pictures +([\d.]+) dB on average", said).group(1))
+    assert loss > least
+    assert str(file.stat().st_size) in said and said.splitlines()[-1] == str(file)
+    assert [one.name for one in tmp_path.iterdir()] == [file.name]
+
+    assert main.run(["import", str(file), "--scene", str(toy_folder), "--out", str(back)]) == main.DONE
+    assert "test views" in capsys.readouterr().out
+    ours, theirs = _quality(run), _quality(back)
+    assert set(ours) == set(theirs)
+    assert abs(ours["psnr"] - theirs["psnr"]) < {"ply": 1e-4, "splat": 0.1, "spz": 0.1}[to]
+
+
+def test_an_imported_run_is_a_run(run: Path, toy_folder: Path, tmp_path: Path, capsys) -> None:
+    file, back = tmp_path / "model.ply", tmp_path / "back"
+    export_run(ExportRequest(run, "ply", file))
+    words = ["--scene", str(toy_folder), "--out", str(back), "--set", "renderer.dilation=0.2", "--test-views", "2"]
+    assert main.run(["import", str(file), *words]) == main.DONE
+    provenance = json.loads((back / "provenance.json").read_text())
+    assert provenance["imported"]["sha256"] == sha256(file.read_bytes()).hexdigest()
+    assert (provenance["imported"]["format"], provenance["imported"]["sh_degree"]) == ("ply", 1)
+    assert provenance["budget"] == "imported" and "dilation = 0.2" in (back / "recipe.toml").read_text()
+    missing = {one.name for one in run.iterdir()} - {one.name for one in back.iterdir()}
+    assert not missing, "an imported run has the files of a fitted one"
+    assert read_run(back).history[0].step == 0
+
+    scores = (back / "scores.json").read_text()
+    assert main.run(["evaluate", str(back)]) == main.DONE
+    assert json.loads((back / "scores.json").read_text())["quality"] == json.loads(scores)["quality"]
+    command = provenance["command"].replace(str(back), str(tmp_path / "again"))
+    capsys.readouterr()
+    assert main.run(command.split()[1:]) == main.DONE, "the recorded command makes the same run"
+    assert _quality(tmp_path / "again") == _quality(back)
+
+
+def test_reports_show_it_beside_fits(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    export_run(ExportRequest(run, "spz", tmp_path / "model.spz"))
+    back = import_run(
+        ImportRequest(file=str(tmp_path / "model.spz"), scene=str(toy_folder), method=METHOD, out=str(tmp_path / "b"))
+    )
+    assert main.run(["report", str(run), str(back), "--out", str(tmp_path / "page")]) == main.DONE
+    text = (tmp_path / "page" / "index.md").read_text()
+    assert "splatting/gaussians (laptop)" in text and "splatting/gaussians (imported)" in text
+
+
+def test_exports_are_in_the_world(run: Path, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scene whose local frame is half the size of its world, turned and shifted, leaves and comes back."""
+    local = read_gaussians(_exported(run, tmp_path / "local.ply"))[1].gaussians
+    similarity = torch.eye(4)
+    turn = torch.from_numpy(Rotation.random(random_state=4).as_matrix()).float()
+    similarity[:3, :3], similarity[:3, 3] = 2 * turn, torch.tensor([1.0, -2.0, 3.0])
+
+    def moved(open_scene: Callable[..., Scene]) -> Callable[..., Scene]:
+        return lambda *words: replace(open_scene(*words), world_from_local=similarity)
+
+    for module in (fitted, imported):
+        monkeypatch.setattr(module, "open_scene", moved(module.open_scene))
+    world = read_gaussians(_exported(run, tmp_path / "world.ply"))[1].gaussians
+    expected = 2 * local.means @ turn.T + similarity[:3, 3]
+    assert torch.allclose(world.means, expected, atol=1e-5)
+    assert torch.allclose(world.scales, 2 * local.scales, rtol=1e-5)
+    back = import_run(
+        ImportRequest(file=str(tmp_path / "world.ply"), scene=str(toy_folder), method=METHOD, out=str(tmp_path / "b"))
+    )
+    assert _quality(back)["psnr"] == pytest.approx(_quality(run)["psnr"], abs=1e-3)
+
+
+def _exported(run: Path, out: Path, to: str = "ply", **more: str) -> Path:
+    return export_run(ExportRequest(run, to, out, **more)).path
+
+
+def test_axes(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    """SPZ is right, up, back: of a z-up world (x, z, -y), of one that counts as right, down, forward (x, -y, -z)."""
+    x, y, z = read_gaussians(_exported(run, tmp_path / "a.ply"))[1].gaussians.means.unbind(dim=1)
+    for world, expected in (("z-up", [x, z, -y]), ("opencv", [x, -y, -z]), ("opengl", [x, y, z])):
+        file = _exported(run, tmp_path / "a.spz", "spz", world=world)
+        assert torch.allclose(read_gaussians(file)[1].gaussians.means, torch.stack(expected, dim=1), atol=1e-4)
+        request = ImportRequest(file=str(file), scene=str(toy_folder), method=METHOD, out=str(tmp_path / world), world=world)
+        assert abs(_quality(import_run(request))["psnr"] - _quality(run)["psnr"]) < 0.3
+    splats = read_gaussians(tmp_path / "a.spz")[1]
+    write_gaussians(tmp_path / "b.ply", "ply", splats)  # a file that does not say that it is right, up, back
+    request = ImportRequest(file=str(tmp_path / "b.ply"), scene=str(toy_folder), method=METHOD, out=str(tmp_path / "b"))
+    assert _quality(import_run(replace(request, frame="opencv")))["psnr"] == pytest.approx(_quality(run)["psnr"], abs=0.3)
+    turned = import_run(replace(request, frame="opengl", out=str(tmp_path / "c")))
+    assert _quality(turned)["psnr"] < _quality(run)["psnr"] - 0.5
+
+
+def test_the_comment_says_where_a_ply_came_from(run: Path, tmp_path: Path) -> None:
+    comments = PlyData.read(_exported(run, tmp_path / "a.ply")).comments
+    assert len(comments) == 1 and "axes of the data set's world" in comments[0]
+
+
+def test_what_cannot_be_exported(run: Path, toy_folder: Path, tmp_path: Path, capsys) -> None:
+    neural = tmp_path / "neural"
+    overrides = tuple(SMALL["volumetric/hash"])
+    fit_run(FitRequest(method="volumetric/hash", scene=str(toy_folder), out=str(neural), budget="1steps", overrides=overrides))
+    capsys.readouterr()
+    for words, sentence in (
+        ([str(neural), "--to", "ply", "--out", str(tmp_path / "a.ply")], "has no Gaussians to write as ply"),
+        ([str(run), "--to", "obj", "--out", str(tmp_path / "a.obj")], "--to cannot be 'obj'"),
+        ([str(tmp_path), "--to", "ply", "--out", str(tmp_path / "a.ply")], "is not a run"),
+        ([str(run), "--to", "ply", "--out", str(tmp_path / "none" / "a.ply")], "in a folder that exists"),
+        ([str(run), "--to", "spz", "--out", str(tmp_path / "a.spz"), "--world", "up"], "'up' names no axes"),
+    ):
+        assert main.run(["export", *words]) == main.BAD_INPUT
+        said = capsys.readouterr().err.splitlines()
+        assert any(sentence in line for line in said) and len(said) <= main.MOST_LINES
+    assert not list(tmp_path.glob("a.*"))
+
+
+def test_what_cannot_be_imported(run: Path, toy_folder: Path, tmp_path: Path, capsys) -> None:
+    file = _exported(run, tmp_path / "a.ply")
+    broken = tmp_path / "broken.ply"
+    broken.write_bytes(file.read_bytes()[:-9])
+    out = ["--out", str(tmp_path / "b")]
+    scene = ["--scene", str(toy_folder)]
+    capsys.readouterr()
+    for words, sentence in (
+        ([str(broken), *scene, *out], "is cut off"),
+        ([str(tmp_path / "none.ply"), *scene, *out], "There is no file"),
+        ([str(file), *scene, "--out", str(run)], "already holds a run"),
+        ([str(file), *scene, *out, "--method", "volumetric/hash"], "fits no Gaussians"),
+        ([str(file), *scene, *out, "--method", "none/such"], "There is no method"),
+        ([str(file), *scene, *out, "--frame", "RUF"], "no right-handed frame"),
+        ([str(file), "--scene", "no-such-scene", *out], "neither a built-in scene nor"),
+        ([str(file), *scene, *out, "--set", "renderer.none=1"], "none"),
+        ([str(file), *scene, *out, "--protocol", "none"], "protocol"),
+    ):
+        assert main.run(["import", *words]) == main.BAD_INPUT, sentence
+        said = capsys.readouterr().err.splitlines()
+        assert any(sentence in line for line in said) and len(said) <= main.MOST_LINES
+    assert not (tmp_path / "b").exists()
+
+
+def test_a_gaussian_too_far_for_a_format_is_refused(run: Path, tmp_path: Path) -> None:
+    splats = read_gaussians(_exported(run, tmp_path / "a.ply"))[1]
+    far = replace(splats.gaussians, means=splats.gaussians.means + 1e8)
+    with pytest.raises(InputError, match="SPZ holds up to"):
+        write_gaussians(tmp_path / "a.spz", "spz", replace(splats, gaussians=far))
+    assert set(EXPORTERS) == {"ply", "splat", "spz"}

@@ -1,0 +1,79 @@
+"""Gaussians that start from depth maps and from fitted density fields."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from invgraphics.core import Context, Quantity
+from invgraphics.errors import InputError
+from invgraphics.fields.convert import visible_points
+from invgraphics.fields.gaussian import GaussianFieldConfig
+from invgraphics.fields.starting import depth_points
+from invgraphics.testing import TwoBalls, toy_scene
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return toy_scene(views=6, size=32)
+
+
+def surface_distance(points: torch.Tensor) -> torch.Tensor:
+    """Distance to the surface of the nearer ball."""
+    balls = TwoBalls()
+    return ((points[:, None] - balls.centres).norm(dim=-1) - balls.radii).amin(dim=1)
+
+
+def test_points_of_depth_maps_lie_on_the_surface(scene) -> None:
+    points = depth_points(scene, 500)
+    assert len(points) == 500
+    # The balls are fog of mean free path 1/30, and a pixel on the silhouette sees both edges.
+    assert float((surface_distance(points.position).abs() < 0.1).float().mean()) > 0.9
+    field = GaussianFieldConfig(init="depth", max_init=400).build(scene)
+    assert field.primitive_count() == 400
+
+
+def test_scenes_without_depth_are_refused(scene) -> None:
+    bare = scene.with_views(train=tuple(replace(view, depth=None) for view in scene.train))
+    with pytest.raises(InputError, match="no depth maps"):
+        GaussianFieldConfig(init="depth").build(bare)
+
+
+@pytest.mark.parametrize("space", ["box", "contracted"])
+def test_points_are_drawn_where_light_ends(space: str) -> None:
+    """In fog of density 30 the depth behind the surface is exponential, with mean 1/30, along rays through the middle."""
+    scene, field = toy_scene(views=6, size=32, space=space), TwoBalls()
+    points = visible_points(field, scene, 4000)
+    assert len(points) == 4000
+    depth = -surface_distance(points.position)
+    step = 0.01 if space == "box" else 3 * math.log(2e4) / 512  # intervals grow with distance where space is unbounded
+    assert float((depth > -step).float().mean()) > 0.99
+    # Slanted rays enter less deeply: the mean lies below 1/30, and well above 0.
+    assert 0.25 / 30 < float(depth.mean()) < 1.1 / 30
+    balls = TwoBalls()
+    red = (points.position - balls.centres[0]).norm(dim=1) < balls.radii[0] + 0.02
+    assert bool((points.rgb[red, 0] > points.rgb[red, 2]).all())
+    assert 0.4 < float(red.float().mean()) < 0.9  # it is the larger one
+
+
+def test_converted_gaussians_stand_for_the_field(scene) -> None:
+    field = GaussianFieldConfig(init="field", source="somewhere", max_init=300, sh_degree=1).converted(TwoBalls(), scene)
+    gaussians = field.primitives(Quantity.GAUSSIANS, Context(scene.bounds))
+    assert len(gaussians) == 300
+    assert float((surface_distance(gaussians.means).abs() < 0.15).float().mean()) > 0.95
+
+
+def test_empty_and_other_fields_are_refused(scene) -> None:
+    class Nothing(TwoBalls):
+        def query(self, samples, want):
+            values = super().query(samples, want)
+            return replace(values, density=0 * values.density)
+
+    with pytest.raises(InputError, match="shows nothing"):
+        visible_points(Nothing(), scene, 1)
+    with pytest.raises(InputError, match="not density and radiance"):
+        visible_points(GaussianFieldConfig().build(scene), scene, 1)
+    for wrong in ({"init": "field"}, {"source": "somewhere"}):
+        with pytest.raises(ValueError, match="source"):
+            GaussianFieldConfig(**wrong)

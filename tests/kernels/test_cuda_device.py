@@ -1,0 +1,54 @@
+"""On a GPU: the CUDA kernels against the reference in float64 on the CPU. Skipped where there is none."""
+
+from importlib.util import find_spec
+
+import pytest
+import torch
+
+from invgraphics import kernels
+from invgraphics.bench.subject import activated, camera, gaussian_field
+from invgraphics.kernels import reference
+from invgraphics.kernels.types import HashGrid
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+
+
+def compare(function, plain, inputs, tolerance: float) -> None:
+    results = []
+    for run, device, dtype in ((function, "cuda", torch.float32), (plain, "cpu", torch.float64)):
+        leaves = [x.to(device, dtype).requires_grad_() for x in inputs]
+        outputs = run(*leaves)
+        sum(output.square().sum() for output in outputs).backward()
+        results.append([*(output.detach().cpu() for output in outputs), *(leaf.grad.cpu() for leaf in leaves)])
+    for ours, theirs in zip(*results, strict=True):
+        assert (ours - theirs).abs().max() <= tolerance * theirs.abs().max()
+
+
+def test_hash_encoding() -> None:
+    grid = HashGrid(levels=16, log2_size=15)
+    inputs = [torch.rand(5000, 3), torch.randn(grid.entries, 2)]
+    compare(
+        lambda u, t: kernels.hash_encode(u, t, grid)[:1], lambda u, t: reference.hash_encode(u, t, grid)[:1], inputs, 2e-3
+    )  # fp32 coordinates at resolution 2048 leave 1e-4 of a cell
+
+
+def test_compositing() -> None:
+    ray = torch.repeat_interleave(torch.arange(500), torch.randint(0, 90, (500,)))
+    inputs = [torch.rand(len(ray)) ** 6 * 2, torch.randn(len(ray), 4)]
+    compare(
+        lambda d, c: kernels.composite(d, c, ray.cuda(), 500), lambda d, c: reference.composite(d, c, ray, 500), inputs, 1e-5
+    )
+
+
+@pytest.mark.skipif(find_spec("gsplat") is None, reason="gsplat is not installed")
+def test_gsplat_draws_the_same_picture() -> None:
+    primitives, view = activated(gaussian_field(2000)), camera(128)
+    with torch.no_grad():
+        footprints, rgb = reference.splat_project(primitives, view)
+        inputs = [footprints.means2d, footprints.conics, footprints.opacities.clamp_max(0.98), rgb]
+
+    def draw(rasterise, means2d, conics, opacities, features):
+        rest = [x.to(means2d) for x in (footprints.depths, footprints.planes, footprints.radii)]
+        return rasterise(type(footprints)(means2d, conics, opacities, *rest), features, 128, 128)
+
+    compare(lambda *x: draw(kernels.splat_rasterise, *x), lambda *x: draw(reference.splat_rasterise, *x), inputs, 2e-3)

@@ -1,0 +1,129 @@
+"""Rendering options of the splatter, and ellipsoids, against closed forms."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from test_splatting import BOUNDS, F64, Fixed, gaussians
+
+from invgraphics.core import Camera, Context
+from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.renderers.ellipsoids import draw_ellipsoids
+from invgraphics.renderers.splatting import Splatting, SplattingConfig
+
+GEOMETRY = Context(BOUNDS, geometry=True)
+
+
+def render(splats, view, **options):
+    return Splatting(SplattingConfig(**options)).render_image(Fixed(splats), view, GEOMETRY)[0]
+
+
+def sheet(count: int, y: float, opacity: float) -> dict[str, torch.Tensor]:
+    """Many overlapping flat Gaussians in the plane of this y, turned to the camera of `make_camera`."""
+    spots = torch.stack([torch.linspace(-1, 1, count).repeat(count), torch.linspace(-1, 1, count).repeat_interleave(count)], 1)
+    n = count * count
+    return {
+        "means": torch.stack([spots[:, 0], torch.full((n,), y), spots[:, 1]], dim=1).to(F64),
+        "quaternions": torch.tensor([[1.0, 0, 0, 0]], dtype=F64).repeat(n, 1),
+        "scales": torch.tensor([[0.1, 1e-4, 0.1]], dtype=F64).repeat(n, 1),
+        "opacities": torch.full((n,), opacity, dtype=F64),
+        "sh": torch.zeros(n, 1, 3, dtype=F64),
+    }
+
+
+def test_median_depth_ignores_what_is_behind(make_camera: Callable[..., Camera]) -> None:
+    """A sheet that stops three quarters of the light, in front of another: the mean is drawn backwards, the median is not."""
+    view = make_camera(24, 20, 40.0)
+    front, back = sheet(30, -0.5, 0.1), sheet(30, 1.0, 0.9)
+    both = gaussians(1, **{name: torch.cat([front[name], back[name]]) for name in front})
+    rays = view.rays()
+    plane = ((-0.5 - rays.origins[:, 1]) / rays.directions[:, 1]).view(20, 24)
+    middle = (slice(6, 14), slice(7, 17))
+    expected, median = (render(both, view, depth=kind).depth[middle] for kind in ("expected", "median"))
+    torch.testing.assert_close(median, plane[middle], atol=0.03, rtol=0)
+    assert float((expected - plane[middle]).abs().mean()) > float((median - plane[middle]).abs().mean())
+
+
+def test_normals_from_depth_are_those_of_the_plane(make_camera: Callable[..., Camera]) -> None:
+    """Also where the Gaussians are round, and have no shortest axis."""
+    view = make_camera(24, 20, 40.0)
+    round_ones = gaussians(1, **(sheet(30, 0.0, 0.9) | {"scales": torch.full((900, 3), 0.05, dtype=F64)}))
+    for splats in (gaussians(1, **sheet(30, 0.0, 0.9)), round_ones):
+        rendering = render(splats, view, normals="depth")
+        assert rendering.normal is not None
+        middle = rendering.normal[6:14, 7:17]
+        assert float(middle[..., 1].mean()) < -0.98
+        torch.testing.assert_close(middle.norm(dim=-1), torch.ones_like(middle[..., 0]))
+
+
+def test_discs_agree_with_ellipses_where_both_are_small(make_camera: Callable[..., Camera]) -> None:
+    """Flat, seen from afar: EWA's first order suffices, and so little is beyond the filter that both treat alike."""
+    view = make_camera(48, 40, 400.0)
+    splats = gaussians(12, scales=torch.rand(12, 3, dtype=F64) * torch.tensor([0.1, 0.1, 1e-6]) + torch.tensor([0.05, 0.05, 0]))
+    disc, ellipse = (render(splats, view, shape=shape, dilation=1e-3) for shape in ("disc", "ellipsoid"))
+    assert float(disc.alpha.max()) > 0.5
+    assert float((disc.rgb - ellipse.rgb).abs().mean()) < 0.01
+    assert float((disc.rgb - ellipse.rgb).abs().mean()) > 0
+
+
+def test_discs_are_fitted(make_camera: Callable[..., Camera]) -> None:
+    view, splats = make_camera(), gaussians(10)
+    for leaf in (splats.means, splats.scales, splats.quaternions):
+        leaf.requires_grad_()
+    rendering, trace = Splatting(SplattingConfig(shape="disc", dilation=0.5)).render_image(
+        Fixed(splats), view, Context(BOUNDS, training=True)
+    )
+    rendering.rgb.sum().backward()
+    assert bool(splats.means.grad.any()) and bool(splats.quaternions.grad.any())
+    assert bool(trace.screen.gradient.any())
+
+
+def test_far_splats_keep_their_energy(make_camera: Callable[..., Camera]) -> None:
+    """A field seen at a quarter of the size: with compensation the light per solid angle stays, without it grows."""
+    splats = gaussians(30, scales=torch.full((30, 3), 0.01, dtype=F64), opacities=torch.full((30,), 0.9, dtype=F64))
+    light = {}
+    for compensate in (False, True):
+        fine = render(splats, make_camera(160, 144, 200.0), compensate=compensate).alpha.sum() / 200**2
+        coarse = render(splats, make_camera(40, 36, 50.0), compensate=compensate).alpha.sum() / 50**2
+        light[compensate] = float(coarse / fine)
+    assert light[True] == pytest.approx(1.0, abs=0.12)
+    assert light[False] > 1.8
+
+
+def test_ellipsoids_are_met_where_rays_meet_them(make_camera: Callable[..., Camera]) -> None:
+    view = make_camera(30, 26, 40.0)
+    one = gaussians(
+        1,
+        means=torch.tensor([[0.1, 0.2, -0.1]], dtype=F64),
+        scales=torch.tensor([[0.4, 0.1, 0.25]], dtype=F64),
+        opacities=torch.ones(1, dtype=F64),
+    )
+    drawn = draw_ellipsoids(one, view, reach=1.5)
+    rays = view.rays()
+    seen = drawn.alpha.flatten() > 0.5
+    assert 20 < int(seen.sum()) < 600
+    hit = rays.at(drawn.depth.flatten().where(seen, torch.zeros(()).double()))[seen] - one.means
+    local = hit @ quaternion_to_matrix(one.quaternions)[0] / (1.5 * one.scales)
+    torch.testing.assert_close(local.norm(dim=1), torch.ones(int(seen.sum()), dtype=F64))
+    # It is the front, and the normal is the gradient of the quadric there.
+    gradient = (local / one.scales) @ quaternion_to_matrix(one.quaternions)[0].T
+    gradient = torch.nn.functional.normalize(gradient, dim=1)
+    torch.testing.assert_close(drawn.normal.reshape(-1, 3)[seen], gradient)
+    assert bool(((gradient * rays.directions[seen]).sum(dim=1) < 0).all())
+
+
+def test_the_nearest_ellipsoid_hides_the_others(make_camera: Callable[..., Camera]) -> None:
+    view, splats = make_camera(), gaussians(40)
+    everything = draw_ellipsoids(splats, view)
+    nearest = torch.stack(
+        [draw_ellipsoids(type(splats)(*(x[i : i + 1] for x in vars(splats).values())), view).depth for i in range(40)]
+    ).amin(dim=0)
+    torch.testing.assert_close(everything.depth, nearest)
+    assert not draw_ellipsoids(gaussians(0), view).alpha.any()
+
+
+def test_refusals() -> None:
+    with pytest.raises(ValueError, match="receivers"):
+        SplattingConfig(receivers=-1)
+    with pytest.raises(ValueError, match="discs"):
+        SplattingConfig(shape="disc", compensate=True)

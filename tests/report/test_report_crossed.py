@@ -1,0 +1,110 @@
+"""Fit x render on the page: the numbers are those of the files, and a report without renderings shows nothing of it."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+from report_folders import METHODS, SEEDS, VIEWS, truth_frame, write_run
+
+from invgraphics.errors import InputError
+from invgraphics.report.assets import Folder
+from invgraphics.report.build import build_report
+from invgraphics.report.crossed import cross
+from invgraphics.report.reading import read_comparison
+from invgraphics.report.study import build_study_report
+
+OWN, OTHER = METHODS[2], "gaussian-volume/exact:opacity=physical"
+PAIR = {"name": "all that is approximate", "exact": OTHER, "approximate": OWN}
+
+
+def add_renderings(run: Path, method: str, rmse: float) -> None:
+    """A second rendering of a run, made of the same degraded truth."""
+    digest = json.loads((run / "provenance.json").read_text())["truth_sha256"]
+    scores = json.loads((run / "scores.json").read_text())
+    truth = [truth_frame(view) for view in range(len(scores["views"]))]
+    write_run(run / "rendered" / "other", truth, digest, method, scores["seed"], worse=2.0)
+    entries = [{"renderer": OWN, "run": "."}, {"renderer": OTHER, "run": "rendered/other"}]
+    values = [rmse * (1 + 0.1 * view) for view in range(len(truth))]
+    record = {"fitted_by": method, "views": scores["views"], "renderings": entries}
+    record |= {"differences": [{"renderers": [OWN, OTHER], "rmse": values, "largest": values}]}
+    (run / "renderings.json").write_text(json.dumps(record))
+
+
+@pytest.fixture
+def crossed_folder(comparison_folder: Path) -> Path:
+    for seed in SEEDS:
+        add_renderings(comparison_folder / "runs" / "splatting-gaussians" / f"seed-{seed}", OWN, 0.01)
+    return comparison_folder
+
+
+def test_scores_and_differences_are_means_over_seeds_and_views(crossed_folder: Path) -> None:
+    crossed = cross(read_comparison(crossed_folder), [PAIR], Folder(crossed_folder))
+    assert crossed is not None
+    assert (crossed.renderers, crossed.seeds, [row.method for row in crossed.rows]) == ((OWN, OTHER), 2, [OWN])
+    own, other = crossed.rows[0].cells
+    assert own is not None and other is not None
+    runs = [crossed_folder / "runs" / "splatting-gaussians" / f"seed-{seed}" for seed in SEEDS]
+    for cell, place in ((own, "."), (other, "rendered/other")):
+        scores = [json.loads((run / place / "scores.json").read_text())["quality"]["psnr"]["mean"] for run in runs]
+        assert cell.text == f"{sum(scores) / len(scores):.2f}"
+        assert (crossed_folder / cell.picture).is_file()
+    square = sum((0.01 * (1 + 0.1 * view)) ** 2 for view in range(VIEWS)) / VIEWS
+    decibels = f"{-10 * math.log10(square):.1f}"
+    assert (own.own, own.difference, other.own, other.difference) == (True, "", False, decibels)
+    assert own.best and not other.best
+    assert [step.differences for step in crossed.steps] == [(decibels,)]
+
+
+def test_the_page_shows_it(crossed_folder: Path) -> None:
+    page = build_report(crossed_folder).read_text()
+    assert '<section id="crossed">' in page and 'href="#crossed"' in page
+    assert re.findall(r'data-fitted="([^"]+)"', page) == [OWN]
+    assert re.findall(r'data-renderer="([^"]+)"', page) == [OWN, OTHER]
+    assert "its own" in page and "differs: 38." in page
+    assert f"| fitted by | {OWN} | {OTHER} |" in (crossed_folder / "index.md").read_text()
+
+
+def test_without_renderings_there_is_no_section(pristine_comparison: Path, built_report: Path) -> None:
+    assert cross(read_comparison(pristine_comparison), [], Folder(built_report)) is None
+    assert 'id="crossed"' not in (built_report / "index.html").read_text()
+
+
+def test_equal_pictures_are_called_the_same(comparison_folder: Path) -> None:
+    add_renderings(comparison_folder / "runs" / "splatting-gaussians" / "seed-0", OWN, 0.0)
+    crossed = cross(read_comparison(comparison_folder), [PAIR], Folder(comparison_folder))
+    assert crossed is not None and crossed.steps[0].differences == ("same",)
+
+
+def test_a_broken_record_is_explained(crossed_folder: Path) -> None:
+    (crossed_folder / "runs" / "splatting-gaussians" / "seed-0" / "renderings.json").write_text('{"renderings": 3}')
+    with pytest.raises(InputError, match="'renderings' cannot be 3"):
+        cross(read_comparison(crossed_folder), [], Folder(crossed_folder))
+
+
+def test_a_study_shows_approximations_and_analyses(small_study: Path) -> None:
+    table = json.loads((small_study / "study.json").read_text())
+    table |= {"approximations": [PAIR], "analyses": ["one", "not-yet"]}
+    (small_study / "study.json").write_text(json.dumps(table))
+    add_renderings(small_study / table["cells"][0]["run"], METHODS[1], 0.02)
+    curve = {"label": "rendered", "x": [0, 1, 2], "y": [0.1, 0.2, 0.4]}
+    analysis = {"title": "A known case", "sentence": "It is twice as <much>.", "x": "angle", "y": "error", "curves": [curve]}
+    (small_study / "analyses").mkdir()
+    (small_study / "analyses" / "one.json").write_text(json.dumps(analysis | {"logarithmic": True}))
+    page = build_study_report(small_study).read_text()
+    assert 'data-step="all that is approximate"' in page and "<td>34.0</td>" in page
+    assert "It is twice as &lt;much&gt;." in page and 'href="#analyses"' in page
+    figure = (small_study / "figures" / "analysis-one.svg").read_text()
+    assert "rendered" in figure and "error" in figure
+    text = (small_study / "index.md").read_text()
+    assert "Approximations by themselves" in text and "all that is approximate" in text
+
+
+def test_a_broken_analysis_is_explained(small_study: Path) -> None:
+    table = json.loads((small_study / "study.json").read_text()) | {"analyses": ["one"]}
+    (small_study / "study.json").write_text(json.dumps(table))
+    (small_study / "analyses").mkdir()
+    (small_study / "analyses" / "one.json").write_text('{"title": "A"}')
+    with pytest.raises(InputError, match="lacks the key 'sentence'"):
+        build_study_report(small_study)

@@ -1,0 +1,40 @@
+"""A fit and its evaluation on a device other than the CPU, which is pretended: nothing may be left behind on the CPU."""
+
+import pytest
+import torch
+from other_device import Elsewhere, other_device
+
+from invgraphics.experiments.build import build_plan
+from invgraphics.experiments.evaluate import render_view
+from invgraphics.experiments.recorder import Monitor
+from invgraphics.training.budget import Budget
+from invgraphics.training.fit import Fit
+
+METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_fit_and_evaluate_elsewhere(name: str, scene, small) -> None:
+    with other_device() as device:
+        fit = Fit(build_plan(small(name), scene, Budget(steps=12), 0, device))
+        fit.rehearse()
+        fit.run(lambda loss: False)
+        assert fit.steps == 12
+        assert all(isinstance(parameter, Elsewhere) for parameter in fit.plan.field.parameters())
+        picture = render_view(fit.plan.field, fit.plan.renderer, scene.test[0].camera, scene, device)
+        assert Monitor(scene, device).psnr(fit) > 0
+    assert picture.rgb.device.type == picture.depth.device.type == "cpu"
+    assert bool(torch.isfinite(picture.rgb).all())
+    assert float(picture.alpha.max()) > 0
+
+
+def test_the_pretended_device_does_not_mix() -> None:
+    with other_device() as device:
+        there, here = torch.ones(3, device=device), torch.ones(3)
+        with pytest.raises(RuntimeError, match="same device"):
+            there + here
+        with pytest.raises(RuntimeError, match="generator"):
+            torch.rand(3, device=device, generator=torch.Generator())
+        with pytest.raises(Exception, match=r"numpy|meta"):
+            there.numpy()
+        assert (there + here.to(device)).cpu().tolist() == [2, 2, 2]
