@@ -3,11 +3,13 @@
 import invgraphics  # noqa: F401, I001  # before torch, which then reads how long its waiting threads may spin
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
+
+from invgraphics import kernels
 
 pytest_plugins = ["training_fixtures"]
 
@@ -15,6 +17,13 @@ pytest_plugins = ["training_fixtures"]
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _kernels() -> Iterator[None]:
+    """Kernels that a test forces are its own."""
+    yield
+    kernels.use(None)
 
 
 @pytest.fixture

@@ -175,14 +175,15 @@ def crossing(renderer: Renderer, turns: int = TURNS) -> tuple[list[float], list[
 def opacity_convention() -> Analysis:
     """One Gaussian by itself: what alpha a G and alpha 1 - (1 - a)^G differ by."""
     gaps = [opacity_gap(opacity) for opacity in OPACITIES]
-    exact = [opacity_gap_formula(opacity) for opacity in OPACITIES]
+    between = tuple(opacity / 100 for opacity in range(1, 100))
+    exact = tuple(opacity_gap_formula(opacity) for opacity in between)
     named = ", ".join(f"{gaps[OPACITIES.index(a)]:.2g} at a = {a:g}" for a in (0.1, 0.5, 0.9))
     return Analysis(
         title="Opacity: splatted or marched",
         sentence=f"A splat of peak opacity a has alpha a·G, the same Gaussian marched 1 − (1 − a)^G: up to {named}.",
         x="peak opacity a",
         y="largest gap of alpha",
-        curves=(Curve("rendered", OPACITIES, tuple(gaps)), Curve("closed form", OPACITIES, tuple(exact))),
+        curves=(Curve("rendered", OPACITIES, tuple(gaps)), Curve("closed form", between, exact)),
     )
 
 

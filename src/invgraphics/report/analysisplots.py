@@ -45,9 +45,18 @@ def _draw(table: dict[str, Any], source: Path, stem: Path) -> AnalysisPart:
             x, y = need(curve, "x", list, source), need(curve, "y", list, source)
             look = series_style(index)
             marker: dict[str, Any] = {"marker": look.marker, "markersize": 5} if len(x) <= MARKED else {}
-            axes.plot(x, y, color=look.colour, linewidth=1.8, label=need(curve, "label", str, source), **marker)
+            axes.plot(
+                x,
+                y,
+                color=look.colour,
+                zorder=4 - 0.1 * index,
+                linewidth=1.8,
+                label=need(curve, "label", str, source),
+                **marker,
+            )
         if optional(table, "logarithmic", bool, source, False):
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")  # as text: labels are not typeset
         axes.set_xlabel(need(table, "x", str, source))
         axes.set_ylabel(need(table, "y", str, source))
         figure.legend(loc="outside upper left", ncols=1, frameon=False, fontsize=11)
