@@ -117,6 +117,20 @@ def test_jitter_shifts_the_whole_lattice(make_scene: Callable[..., Scene]) -> No
         assert -1e-6 < float(offset[0]) < sampler.length
 
 
+@pytest.mark.parametrize("space", ["box", "contracted"])
+def test_evaluation_may_take_finer_steps(make_scene: Callable[..., Scene], space: str) -> None:
+    """Half the step, or at a distance half its growth; the training steps stay what they are."""
+    scene = make_scene(space)
+    rays, coarse = scene.bounds.clip(scene.train[0].camera.rays())[:20], replace(SMALL, stop="never")
+    fine, ctx = replace(coarse, evaluation_steps=512), context(scene, training=False)
+    long, short = (config.build(scene).sample(rays, None, ctx)[0] for config in (coarse, fine))  # type: ignore[arg-type]
+    assert len(short) == pytest.approx(2 * len(long), rel=0.02)
+    assert float(short.delta[0]) == pytest.approx(float(long.delta[0]) / 2, rel=1e-5)
+    ctx = [context(scene) for _ in range(2)]
+    trained = [config.build(scene).sample(rays, None, c)[0] for config, c in zip((coarse, fine), ctx, strict=True)]  # type: ignore[arg-type]
+    assert torch.equal(trained[0].t0, trained[1].t0)
+
+
 def test_looks_on_schedule_at_as_many_cells_as_allowed(make_scene: Callable[..., Scene]) -> None:
     scene, looks = make_scene(), []
 

@@ -6,15 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Bounds, Context, Quantity, Rays, Samples, Scene, no_grad_density
+from invgraphics.core import Bounds, Context, FieldValues, Quantity, Rays, Samples, Scene, no_grad_density
 from invgraphics.fields.analytic import GaussianBlob, Sphere
+from invgraphics.fields.encodings.hash import HashConfig
+from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.kernels.types import March
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.samplers import StratifiedConfig
-from invgraphics.renderers.termination import in_front, weighty
+from invgraphics.renderers.termination import Look, in_front, weighty
 from invgraphics.renderers.volumetric import UNSEEN, Volumetric
 
 STOPPING = OccupancyConfig(resolution=8, steps_per_diagonal=128, stop="evaluation")
+
+
+def dense(function) -> Look:
+    """Samples to density, as a look."""
+    return lambda samples: FieldValues(density=function(samples))
 
 
 def marched(counts: list[int]) -> tuple[Rays, March]:
@@ -29,7 +36,7 @@ def marched(counts: list[int]) -> tuple[Rays, March]:
 def test_keeps_what_light_reaches(wave: int) -> None:
     """Density 1 everywhere: light e^-k reaches interval k, so that 5 intervals see more than e^-4.5."""
     rays, march = marched([0, 3, 40, 1, 17])
-    samples = in_front(rays, march, lambda s: torch.ones(len(s)), 0.0111, wave)
+    samples = in_front(rays, march, dense(lambda s: torch.ones(len(s))), 0.0111, wave)
     assert torch.bincount(samples.ray, minlength=5).tolist() == [0, 3, 5, 1, 5]
     assert samples.t0.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 0, 0, 1, 2, 3, 4]
     assert samples.density is not None
@@ -38,13 +45,13 @@ def test_keeps_what_light_reaches(wave: int) -> None:
 
 def test_hides_what_is_behind_an_infinite_density_only() -> None:
     rays, march = marched([6])
-    samples = in_front(rays, march, lambda s: torch.where(s.t0 == 3, torch.inf, 0.1), 1e-3, 2)
+    samples = in_front(rays, march, dense(lambda s: torch.where(s.t0 == 3, torch.inf, 0.1)), 1e-3, 2)
     assert samples.t0.tolist() == [0, 1, 2, 3]
 
 
 def test_without_a_limit_everything_is_kept() -> None:
     rays, march = marched([4, 9])
-    samples = in_front(rays, march, lambda s: 50 + s.t0, 0.0, 3)
+    samples = in_front(rays, march, dense(lambda s: 50 + s.t0), 0.0, 3)
     assert torch.equal(samples.t0, march.t0)
     assert torch.equal(samples.ray, march.ray)
     assert samples.density is not None
@@ -54,7 +61,7 @@ def test_without_a_limit_everything_is_kept() -> None:
 def test_few_looks_even_where_nothing_is_opaque() -> None:
     rays, march = marched([600])
     looks = []
-    in_front(rays, march, lambda s: looks.append(len(s)) or torch.zeros(len(s)), 1e-3, 6)
+    in_front(rays, march, dense(lambda s: looks.append(len(s)) or torch.zeros(len(s))), 1e-3, 6)
     assert sum(looks) == 600
     assert len(looks) <= 12
 
@@ -109,7 +116,7 @@ def test_gradients_reach_every_kept_sample(make_scene: Callable[..., Scene]) -> 
     rendering, trace = Volumetric(STOPPING.build(scene)).render_rays(field, scene.train[0].camera.rays(), Context(scene.bounds))
     assert trace.values is not None
     assert trace.values.radiance is not None
-    assert float(trace.values.radiance.min()) > 0
+    assert float(trace.values.radiance.detach().min()) > 0
     rendering.alpha.sum().backward()
     assert field.density.grad is not None
 
@@ -156,3 +163,28 @@ def test_long_marches_go_on_behind_their_limit() -> None:
         assert float(own.t0[0]) == float(rays.near[ray])
         assert float(own.t1[-1]) == float(rays.far[ray])
     assert bool((samples.ray[1:] >= samples.ray[:-1]).all())
+
+
+def test_features_found_on_the_way_spare_the_second_look(make_scene: Callable[..., Scene]) -> None:
+    """A field that hands out features gives the same picture, and is asked about no position twice."""
+    scene, asked = make_scene(), []
+    field = NeuralFieldConfig(
+        HashConfig(levels=3, log2_size=8, base=4, finest=16), layers=1, width=16, skip=-1, geometry_features=4, direction="sh",
+        density_bias=2.0,
+    ).build(scene)  # fmt: skip
+    torch.nn.init.uniform_(field.encoding.table, -1, 1)  # type: ignore[attr-defined]
+    rays, ctx, renderer = scene.train[0].camera.rays(), Context(scene.bounds), Volumetric(STOPPING.build(scene))
+    encode = field.encoding.forward
+    with torch.no_grad():
+        whole, _ = Volumetric(replace(STOPPING, stop="never").build(scene)).render_rays(field, rays, ctx)
+        field.encoding.forward = lambda unit, *rest: (asked.append(len(unit)), encode(unit, *rest))[1]  # type: ignore[method-assign]
+        quick, trace = renderer.render_rays(field, rays, ctx)
+    assert trace.samples is not None
+    assert trace.samples.features is not None
+    assert trace.samples.features.shape == (len(trace.samples), 4)
+    march = sum(asked)
+    assert len(trace.samples) <= march < 2 * len(trace.samples)
+    assert float((quick.rgb - whole.rgb).abs().max()) <= UNSEEN + STOPPING.transmittance
+    again = field.query(trace.samples, Quantity.DENSITY | Quantity.FEATURES)
+    torch.testing.assert_close(trace.samples.density, again.density)
+    torch.testing.assert_close(trace.samples.features, again.features)

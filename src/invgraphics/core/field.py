@@ -181,13 +181,25 @@ class Encoding(nn.Module, ABC):
         """Features at ``unit``; ``covariance`` is in unit coordinates and given only if ``needs_covariance``."""
 
 
-def no_grad_density(field: Field) -> Density:
-    """The field's density as a plain function, outside the graph."""
+class NoGradDensity:
+    """A field's density as a plain function, outside the graph."""
 
-    def density(samples: Samples) -> Float[Tensor, " m"]:
+    def __init__(self, field: Field) -> None:
+        self._field = field
+
+    def __call__(self, samples: Samples) -> Float[Tensor, " m"]:
+        """The density alone."""
         with torch.no_grad():
-            values = field.query(samples, Quantity.DENSITY)
+            values = self._field.query(samples, Quantity.DENSITY)
         assert values.density is not None
         return values.density
 
-    return density
+    def look(self, samples: Samples) -> FieldValues:
+        """The density and, of a field that has some, the features that it would start from to say a colour."""
+        with torch.no_grad():
+            return self._field.query(samples, Quantity.DENSITY | (self._field.provides & Quantity.FEATURES))
+
+
+def no_grad_density(field: Field) -> NoGradDensity:
+    """The field's density as a plain function, outside the graph."""
+    return NoGradDensity(field)

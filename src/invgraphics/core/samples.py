@@ -24,6 +24,7 @@ class Samples:
         radius: pixel footprint of the ray at distance 1.
         view: training-view index of the ray, -1 where there is none.
         density: what the sampler has found the field's density to be, outside the graph; ``None`` where it did not ask.
+        features: what the field told the sampler besides, from which it can say a colour without looking there again.
     """
 
     ray: Int[Tensor, " m"]
@@ -34,19 +35,14 @@ class Samples:
     radius: Float[Tensor, " m"]
     view: Int[Tensor, " m"]
     density: Float[Tensor, " m"] | None = None
+    features: Float[Tensor, "m f"] | None = None
 
     @staticmethod
-    def on(
-        rays: Rays,
-        ray: Int[Tensor, " m"],
-        t0: Float[Tensor, " m"],
-        t1: Float[Tensor, " m"],
-        density: Float[Tensor, " m"] | None = None,
-    ) -> Samples:
-        """Samples from intervals on ``rays``, and their densities where they are known already."""
+    def on(rays: Rays, ray: Int[Tensor, " m"], t0: Float[Tensor, " m"], t1: Float[Tensor, " m"]) -> Samples:
+        """Samples from intervals on ``rays``."""
         direction = rays.directions[ray]
         position = torch.addcmul(rays.origins[ray], ((t0 + t1) / 2)[:, None], direction)
-        return Samples(ray, t0, t1, position, direction, rays.radius[ray], rays.view[ray], density)
+        return Samples(ray, t0, t1, position, direction, rays.radius[ray], rays.view[ray])
 
     @staticmethod
     def at(position: Float[Tensor, "m 3"], direction: Float[Tensor, "m 3"] | None = None) -> Samples:
@@ -61,9 +57,9 @@ class Samples:
         return len(self.t0)
 
     def __getitem__(self, index: slice | Int[Tensor, " k"] | Bool[Tensor, " m"]) -> Samples:
-        always = (field.name for field in fields(self) if field.name != "density")
-        density = None if self.density is None else self.density[index]
-        return Samples(**{name: getattr(self, name)[index] for name in always}, density=density)
+        always = (field.name for field in fields(self) if field.name not in ("density", "features"))
+        density, features = (None if known is None else known[index] for known in (self.density, self.features))
+        return Samples(**{name: getattr(self, name)[index] for name in always}, density=density, features=features)
 
     @property
     def mid(self) -> Float[Tensor, " m"]:

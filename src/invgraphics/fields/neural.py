@@ -35,8 +35,8 @@ INITIAL_RADIUS = 0.5
 """Radius of the sphere that a signed distance function starts as, in half-extents of the box (NeuS)."""
 
 _POINTWISE = {
-    "density": Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL,
-    "sdf": Quantity.SDF | Quantity.RADIANCE | Quantity.NORMAL,
+    "density": Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL | Quantity.FEATURES,
+    "sdf": Quantity.SDF | Quantity.RADIANCE | Quantity.NORMAL | Quantity.FEATURES,
 }
 
 
@@ -99,11 +99,13 @@ class NeuralFieldConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Answers:
-    """What the networks say about one chunk: the geometry network's output, its slope in the encoding, the colour."""
+    """What the networks say about one chunk: the geometry network's output, the colour, the output's slope in the encoding,
+    and what the geometry network hands to the colour network."""
 
     raw: Float[Tensor, " m"]
     radiance: Float[Tensor, "m 3"] | None
     slope: Float[Tensor, "m f"] | None
+    handed: Float[Tensor, "m h"] | None
 
 
 class NeuralField(Field):
@@ -158,8 +160,13 @@ class NeuralField(Field):
 
         Normals are the normalised gradient: of the signed distance, or of minus the density (taken before its activation,
         which is monotone, so that they are defined where the density saturates). They can be had inside ``no_grad``.
+        Features are what the geometry network hands to the colour network; samples that bring them along are not looked at
+        again where only their radiance is wanted.
         """
         training = torch.is_grad_enabled()
+        if want == Quantity.RADIANCE and samples.features is not None:
+            chunks = self._chunks(samples.features, samples.direction)
+            return FieldValues(radiance=torch.cat([self._radiance(*chunk) for chunk in chunks]))
         with_normal = Quantity.NORMAL in want
         with torch.set_grad_enabled(training or with_normal):
             position = samples.position
@@ -174,11 +181,13 @@ class NeuralField(Field):
                 (gradient,) = torch.autograd.grad(features, position, slope, create_graph=training)
                 normal = normalize(gradient if self.config.geometry == "sdf" else -gradient, dim=1)
         radiances = [part.radiance for part in parts if part.radiance is not None]
+        handed = [part.handed for part in parts if part.handed is not None]
         return FieldValues(
             density=self._density(raw, samples.position) if Quantity.DENSITY in want else None,
             sdf=raw * self.bounds.half.mean() if Quantity.SDF in want else None,
             radiance=torch.cat(radiances) if Quantity.RADIANCE in want else None,
             normal=normal,
+            features=torch.cat(handed) if Quantity.FEATURES in want else None,
         )
 
     def _encode(self, samples: Samples, position: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
@@ -203,14 +212,16 @@ class NeuralField(Field):
         if Quantity.NORMAL in want and not training:
             # Starting the chunk's graph here keeps it from growing over all chunks.
             features = features.detach().requires_grad_()
-        outputs = self.geometry_net(features, None if with_colour else 1)
+        outputs = self.geometry_net(features, None if with_colour or Quantity.FEATURES in want else 1)
         raw, slope = outputs[:, 0], None
         if Quantity.NORMAL in want:
             (slope,) = torch.autograd.grad(raw.sum(), features, create_graph=training)
         if not training:
             raw, outputs = raw.detach(), outputs.detach()
         with torch.set_grad_enabled(training):
-            return _Answers(raw, self._radiance(outputs[:, 1:], direction) if with_colour else None, slope)
+            handed = outputs[:, 1:]
+            radiance = self._radiance(handed, direction) if with_colour else None
+            return _Answers(raw, radiance, slope, handed if Quantity.FEATURES in want else None)
 
     def _radiance(self, geometry: Tensor, direction: Tensor) -> Float[Tensor, "m 3"]:
         degree = self.config.direction_degree

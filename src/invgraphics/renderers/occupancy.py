@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from invgraphics import kernels
-from invgraphics.core import Bounds, Context, Rays, Sampler, Samples, Scene, Trace
-from invgraphics.core.field import Density
+from invgraphics.core import Bounds, Context, FieldValues, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.field import Density, NoGradDensity
 from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.samplers import uniform
 from invgraphics.renderers.termination import in_front
@@ -24,6 +24,8 @@ class OccupancyConfig:
     Attributes:
         resolution: cells along each edge of the unit cube.
         steps_per_diagonal: steps that a march across the bounds' diagonal takes.
+        evaluation_steps: the same outside training; ``None`` takes as many. In training the steps are shifted at random, so
+            that a field fitted with long ones is sharper when it is seen with short ones.
         cone: growth of the step with distance; ``None`` means 0 in a box and 4 / ``steps_per_diagonal`` (Instant-NGP's
             1/256) in a contracted space.
         grace: training steps before the first refresh. What is thinner than the threshold before it was ever seen would be
@@ -40,6 +42,7 @@ class OccupancyConfig:
 
     resolution: int = 128
     steps_per_diagonal: int = 1024
+    evaluation_steps: int | None = None
     cone: float | None = None
     grace: int = 0
     decay: float = 0.95
@@ -52,9 +55,10 @@ class OccupancyConfig:
     wave: int = 6
 
     def __post_init__(self) -> None:
-        for key in ("resolution", "steps_per_diagonal", "every", "cells", "wave"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"{key} must be at least 1, not {getattr(self, key)}")
+        for key in ("resolution", "steps_per_diagonal", "evaluation_steps", "every", "cells", "wave"):
+            value = getattr(self, key)
+            if value is not None and value < 1:
+                raise ValueError(f"{key} must be at least 1, not {value}")
         if not 0 <= self.decay <= 1 or not 0 <= self.transmittance < 1:
             raise ValueError(f"decay must be in [0, 1] and transmittance in [0, 1), not {self.decay} and {self.transmittance}")
         if min(self.threshold, self.warmup, self.grace, self.cone or 0) < 0:
@@ -93,13 +97,18 @@ class Occupancy(Sampler):
         """Samples in occupied cells, in front of what is opaque; with their densities where those were asked for."""
         march = self._march(rays, ctx)
         if self.config.stop == "always" or (self.config.stop == "evaluation" and not ctx.training):
-            return in_front(rays, march, density, self.config.transmittance, self.config.wave), ()
+            # Features are of use to the renderer only where it needs no gradients through them.
+            wanted = density.look if isinstance(density, NoGradDensity) and not torch.is_grad_enabled() else None
+            look = wanted or (lambda samples: FieldValues(density=density(samples)))
+            return in_front(rays, march, look, self.config.transmittance, self.config.wave), ()
         return Samples.on(rays, march.ray, march.t0, march.t1), ()
 
     @torch.no_grad()
     def _march(self, rays: Rays, ctx: Context) -> March:
         """March all rays to their ends."""
-        steps = MarchSteps(self.length, self.cone)
+        usual = self.config.steps_per_diagonal
+        finer = 1.0 if ctx.training else usual / (self.config.evaluation_steps or usual)
+        steps = MarchSteps(self.length * finer, self.cone * finer)
         start = rays.near
         if ctx.training:
             # The whole lattice of steps is shifted, so that over many visits every distance gets its turn.

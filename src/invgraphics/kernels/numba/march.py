@@ -102,7 +102,7 @@ def _walk(origin, direction, first, far, occupied, gaps, shift, box, contracted,
                     t0[index(kept)], t1[index(kept)] = t, end
                     kept += 1
                 elif not contracted:
-                    cells, gap = 1, gaps[index(1 + (x >> shift)), index(1 + (y >> shift)), index(1 + (z >> shift))]
+                    cells, gap = 1, np.int64(gaps[index(1 + (x >> shift)), index(1 + (y >> shift)), index(1 + (z >> shift))])
                     if gap > 0:
                         # All blocks less than ``gap`` away are empty too, on every side.
                         cells = (2 * gap - 1) << shift
@@ -115,8 +115,8 @@ def _walk(origin, direction, first, far, occupied, gaps, shift, box, contracted,
                     out = min(out, _way_out(uz, z, cells, cell, pace_z))
                     free = min(middle + out - MARGIN * (end - t), far)
                     if cone == _ZERO:
-                        # To a step or two before the wall; the comparison with ``free`` settles the rest.
-                        leap = np.int64((free - first) * per_step) - 2
+                        # To the step before the one that holds the wall; the comparison with ``free`` settles the rest.
+                        leap = np.int64((free - first) * per_step) - 1
                         if leap > taken + 1:
                             taken = leap - 1
                             end = first + np.float32(leap) * step
@@ -194,7 +194,7 @@ def ray_march(
     box = array(torch.cat([bounds.centre, bounds.half]).float())
     cells = array(occupied)
     shift = max(0, (-(-len(cells) // BLOCKS) - 1).bit_length())
-    gaps = np.empty(3 * (2 - (-len(cells) >> shift),), np.int64)
+    gaps = np.empty(3 * (2 - (-len(cells) >> shift),), np.int8)
     summarise(cells, shift, gaps)
     if bounds.space == "box":
         measure(gaps)
