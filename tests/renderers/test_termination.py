@@ -108,6 +108,30 @@ def test_colours_are_asked_of_few_and_the_picture_stays(make_scene: Callable[...
     assert len(seen.values.density) == len(seen.samples)
 
 
+def test_normals_are_asked_of_few_and_the_picture_stays(make_scene: Callable[..., Scene]) -> None:
+    """Of a sampler that says nothing of the density too: one cheap look, then a normal only where it is seen."""
+    scene, asked = make_scene(), []
+
+    class Spy(Sphere):
+        def query(self, samples: Samples, want: Quantity):
+            asked.append((len(samples), want))
+            return super().query(samples, want)
+
+    field, renderer = Spy(60.0, 0.8), Volumetric(StratifiedConfig(64).build(scene))
+    rays, ctx = scene.train[0].camera.rays(), Context(scene.bounds, training=False, geometry=True)
+    whole, trace = renderer.render_rays(field, rays, ctx)
+    asked.clear()
+    with torch.no_grad():
+        quick, _ = renderer.render_rays(field, rays, ctx)
+    assert trace.samples is not None
+    assert 0 < sum(count for count, want in asked if Quantity.NORMAL in want) < 0.3 * len(trace.samples)
+    assert float((quick.rgb - whole.rgb).detach().abs().max()) <= UNSEEN
+    assert whole.normal is not None
+    assert quick.normal is not None
+    clear = whole.alpha > 0.6
+    torch.testing.assert_close(quick.normal[clear], whole.normal[clear], atol=5e-3, rtol=0)
+
+
 def test_gradients_reach_every_kept_sample(make_scene: Callable[..., Scene]) -> None:
     """Where gradients are wanted the field is asked in full: density found on the way has none."""
     scene = make_scene()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -60,6 +60,9 @@ class Volumetric(RayRenderer):
         """Render n rays; normals are added when ``ctx.geometry`` asks for them and the field has some."""
         samples, levels = self.sampler.sample(ctx.bounds.clip(rays), no_grad_density(field), ctx)
         want = self.requires | (field.provides & Quantity.NORMAL if ctx.geometry else Quantity.NONE)
+        if Quantity.NORMAL in want and samples.density is None and not torch.is_grad_enabled():
+            # A normal costs several looks at the density, which few samples deserve.
+            samples = replace(samples, density=query(field, samples, Quantity.DENSITY, ctx.chunk).density)
         if samples.density is not None and not torch.is_grad_enabled():
             values = _seen(field, samples, len(rays), want, ctx.chunk)
         else:
