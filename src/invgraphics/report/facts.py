@@ -119,6 +119,7 @@ def _run_facts(run: Run) -> dict[str, str]:
         "code_version": "code version",
         "resize": "resampling filter",
         "budget": "budget",
+        "test_poses": "test poses",
     }
     facts = {label: _text(run.provenance[key]) for key, label in names.items() if run.provenance.get(key)}
     for key, value in run.environment.items():

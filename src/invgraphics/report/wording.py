@@ -81,9 +81,11 @@ _NAMES: dict[str, tuple[str, int]] = {
     "depth_rmse_smooth": ("Depth RMSE off edges", 3),
     "normal_deg": ("Normal error", 1),
     "alpha_iou": ("Alpha IoU", 3),
+    "pose_rotation_deg": ("Pose rotation, median", 2),
+    "pose_translation_percent": ("Pose position, median", 2),
 }
 
-_GEOMETRY = ("depth_", "normal_", "alpha_")
+_GEOMETRY = ("depth_", "normal_", "alpha_", "pose_")
 
 _UNITS = {"deg": "°", "degrees": "°", "degree": "°", "world units": "units"}
 
