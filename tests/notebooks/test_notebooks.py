@@ -18,6 +18,8 @@ SMALL = {
     "02-volume-rendering-integral": "size, counts = 32, [4, 8, 16, 32, 64, 128]",
     "03-fit-a-nerf": "views, size, steps, curve_steps = 16, 24, 150, 200",
     "07-gaussians-and-ewa": "draws = 100_000",
+    "08-fit-gaussians": "views, size, steps, flat_steps, starts = 12, 32, 200, 150, 3",
+    "09-the-same-gaussians-two-ways": "size, turns = 72, 21",
     "11-design-an-ablation": "size, views, steps, seeds, studies = 24, 8, 40, [0, 1], 100",
 }
 
@@ -132,6 +134,62 @@ def _ewa(out: _Printed) -> None:
     assert out.numbers("differs from V_hat + 0.3 I by")[0] < 1e-9
 
 
+def _splatting(out: _Printed) -> None:
+    points, random = (out.numbers(f"{name}: PSNR")[0] for name in ("surface points", "random"))
+    assert points > random + 0.5
+    narrow, wide = (out.numbers(f"sigma {sigma}: the target is felt within")[0] for sigma in ("0.08", "0.4"))
+    assert narrow < wide < 1.9
+    near, far = (out.numbers(f"start {name}: missed")[0] for name in ("near the truth", "random"))
+    assert near == 0
+    assert far > 0
+    final = [out.numbers(f"final, {name}: PSNR", "with") for name in ("random", "random, grown")]
+    assert final[0][1] == 400
+    assert final[1][1] != 400
+    kept, cloned, split, _, after = _first_round(out)
+    assert after == kept + 2 * cloned + 2 * split
+    assert out.numbers("time-lapse:") == (31,)
+
+
+def _first_round(out: _Printed) -> tuple[int, ...]:
+    """Numbers of the first round of density control."""
+    found = re.search(r"round at step \d+: (\d+) kept, (\d+) cloned, (\d+) split, (\d+) pruned, (\d+) afterwards", out)
+    assert found
+    return tuple(map(int, found.groups()))
+
+
+def _two_ways(out: _Printed) -> None:
+    for ray in "AB":
+        splatted, integrated = out.numbers(f"ray {ray}: left at the end", "splatted,")
+        assert splatted == pytest.approx(integrated, abs=2e-4)
+    for opacity, gap in (("0.1", 0.0013), ("0.5", 0.043), ("0.9", 0.24)):
+        rendered, formula = out.numbers(f"opacity a = {opacity}: gap", "rendered,")
+        assert rendered == pytest.approx(formula, abs=2e-4)
+        assert formula == pytest.approx(gap, rel=0.04)
+    on_axis, off_axis = (
+        out.numbers(f"projection, {angle}° off axis: error of alpha", "grows with power")[1] for angle in (0, 45)
+    )
+    assert on_axis == pytest.approx(2, abs=0.15)
+    assert off_axis == pytest.approx(1, abs=0.15)
+    centre, ray, exact = (
+        out.numbers(f"order, {name}: red changes by at most")[0]
+        for name in ("sorted by centre", "sorted along each ray", "integrated")
+    )
+    assert centre > 0.1
+    assert max(ray, exact) < 0.02
+    assert out.numbers("overlap, one after the other: weights", "and") == pytest.approx((0.6, 0.24), abs=1e-3)
+    assert out.numbers("overlap, integrated: weights", "and") == pytest.approx((0.42, 0.42), abs=1e-3)
+    for name in ("projection", "order", "opacity", "overlap"):
+        assert _step(out, name) < out.numbers("splat against integral: RMS difference")[0] * 1.5
+    assert out.numbers("optical depth from the end over that from the side:") == pytest.approx((5,), abs=0.01)
+
+
+def _step(out: _Printed, name: str) -> float:
+    """RMS change of the picture when one approximation is undone."""
+    found = re.search(rf"step, {name}[^\n]*RMS ([\d.]+)", out)
+    assert found
+    return float(found[1])
+
+
 def _ablation(out: _Printed) -> None:
     assert out.numbers("failed fits:") == (0,)
     assert out.numbers("design:", "combinations x", "seeds =") == (4, 2, 8)
@@ -145,7 +203,7 @@ def _ablation(out: _Printed) -> None:
 
 
 HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
-    zip(sorted(SMALL), (_cameras, _integral, _nerf, _ewa, _ablation), strict=True)
+    zip(sorted(SMALL), (_cameras, _integral, _nerf, _ewa, _splatting, _two_ways, _ablation), strict=True)
 )
 
 

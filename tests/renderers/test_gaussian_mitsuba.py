@@ -44,10 +44,10 @@ class ByEntry(GaussianSorted):
         super().__init__(GaussianSortedConfig("splat"))
         self.opacities = opacities
 
-    def _order(self, encounters: Encounters, rays: Rays, axis: torch.Tensor | None) -> torch.Tensor:
+    def order(self, encounters: Encounters, rays: Rays, axis: torch.Tensor | None) -> torch.Tensor:
         squared = -2 * torch.log(-torch.expm1(-encounters.depth) / self.opacities[encounters.gaussian])
         entry = encounters.t - encounters.sigma * (25 - squared.clamp(0, 25)).sqrt()
-        return super()._order(replace(encounters, t=entry), rays, axis)
+        return super().order(replace(encounters, t=entry), rays, axis)
 
 
 def ours(given: Gaussians, camera: Camera, renderer: GaussianSorted) -> np.ndarray:

@@ -74,7 +74,7 @@ def forbid_rendering(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("a rendering process was started")
 
-    monkeypatch.setattr(maker.subprocess, "Popen", refuse)
+    monkeypatch.setattr(subprocess, "Popen", refuse)
 
 
 def test_folder_has_what_it_promises(rendered):

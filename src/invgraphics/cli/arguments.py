@@ -39,6 +39,8 @@ class Shared:
     """How many test views are scored, evenly spaced."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
     """Most Gaussians a method may make; short for --set max_primitives=N."""
+    optimise: Annotated[str, arg(metavar="poses")] = ""
+    """Fit the training cameras' poses too; short for --set training.poses.optimise=true."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
     """Where to compute."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
@@ -57,11 +59,15 @@ class Shared:
             InputError: one of them cannot be read.
         """
         Budget.parse(self.budget)
-        cap = self.max_primitives
+        short = () if self.max_primitives is None else (f"max_primitives={self.max_primitives}",)
+        if self.optimise:
+            if self.optimise != "poses":
+                raise InputError(f"--optimise cannot be '{self.optimise}'.", "Expected: poses.")
+            short = ("training.poses.optimise=true", *short)
         return {
             "budget": self.budget,
             "preset": self.preset,
-            "overrides": tuple(self.overrides) + (() if cap is None else (f"max_primitives={cap}",)),
+            "overrides": tuple(self.overrides) + short,
             "size": None if self.size is None else parse_size(self.size),
             "test_views": parse_views(self.test_views),
             "device": self.device,

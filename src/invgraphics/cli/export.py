@@ -17,13 +17,14 @@ from invgraphics.errors import InputError
 class Export:
     """Write a run's model, in the coordinates of the data set's world, as a file that other programs read.
 
-    The file is read back and rendered from the run's test cameras, to say what it lost.
+    Files of Gaussians are read back and rendered from the run's test cameras, to say what they lost.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a run."""
     to: Annotated[str, arg(metavar="NAME")]
-    """What to write: ply (3DGS's own, without loss), splat (32 bytes per Gaussian, no view dependence), or spz (smallest)."""
+    """What to write: of Gaussians ply (3DGS's own, without loss), splat (32 bytes per Gaussian, no view dependence) or spz
+    (smallest); of any model mesh, a surface with coloured vertices as PLY."""
     out: Annotated[Path, arg(metavar="FILE")]
     """The file to write; one that exists is replaced."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
@@ -31,6 +32,10 @@ class Export:
     world: Annotated[str, arg(metavar="opencv|opengl|z-up|RDF")] = "opencv"
     """Where the world's +x, +y, +z point, for formats that want certain axes (spz: right, up, back): opencv is right, down,
     forward; opengl right, up, back; z-up right, forward, up. Built-in and Blender scenes are z-up."""
+    level: Annotated[float | None, arg(metavar="X", help_behavior_hint="(default: alpha 1/2 in 1% of the scene)")] = None
+    """For mesh: the density per local unit (or the signed distance) of the surface; Gaussians have none."""
+    resolution: Annotated[int, arg(metavar="N")] = 192
+    """For mesh: voxels along the longest edge of the scene's box."""
 
     def run(self) -> int:
         """Write; print facts about the file."""
@@ -44,7 +49,9 @@ class Export:
 
         from invgraphics.experiments.export import ExportRequest, export_run
 
-        exported = export_run(ExportRequest(self.folder, self.to, self.out, self.scene, self.world))
+        exported = export_run(
+            ExportRequest(self.folder, self.to, self.out, self.scene, self.world, self.level, self.resolution)
+        )
         show_table(f"Exported {self.folder} as {self.to}", ("fact", "value"), exported.facts.items())
         print(exported.path)
         return 0

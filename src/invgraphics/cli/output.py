@@ -34,5 +34,7 @@ def show_scores(scores: Mapping[str, Any]) -> None:
     ]
     title = f"{scores['method']} on {scores['scene']}, {len(scores['views'])} test views, protocol {scores['protocol']}"
     show_table(title, ("metric", "mean", "unit", "better"), rows)
+    if "test_poses" in scores:
+        print(f"Test poses: {scores['test_poses']}. Pose errors are medians over the training views.")
     for name, why in scores["skipped"].items():
         print(f"{name}: {why}")

@@ -130,21 +130,36 @@ def quaternion_to_matrix(quaternion: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def se3_exp(twist: Float[Tensor, 6]) -> Pose:
-    """Exponential of a twist (rotation vector, translation): the rigid motion it generates, smooth at zero."""
-    skew = twist.new_zeros(4, 4)
-    generators = _generators(twist)
-    skew = skew + torch.einsum("k,kij->ij", twist, generators)
-    return torch.linalg.matrix_exp(skew)
+def se3_exp(twist: Float[Tensor, "*n 6"]) -> Float[Tensor, "*n 4 4"]:
+    """Exponential of twists (rotation vector, translation): the rigid motions they generate, smooth at zero.
+
+    Rodrigues' closed form: ``R = I + a W + b W²`` and ``t = (I + b W + c W²) v`` with W the cross product with the rotation
+    vector, ``a = sin θ / θ``, ``b = (1 - cos θ) / θ²``, ``c = (θ - sin θ) / θ³``.
+    """
+    turn, shift = twist[..., :3], twist[..., 3:]
+    squared = turn.square().sum(dim=-1)[..., None, None]
+    small = squared < 1e-2
+    # Where the closed form would be 0 / 0 (or lose its digits), five terms of the series are exact.
+    theta = torch.where(small, 1.0, squared).sqrt()
+    a = torch.where(small, _series(squared, 1), theta.sin() / theta)
+    b = torch.where(small, _series(squared, 2), 2 * (theta / 2).sin().square() / theta.square())
+    c = torch.where(small, _series(squared, 3), (theta - theta.sin()) / theta**3)
+    x, y, z = turn.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=twist.dtype, device=twist.device)
+    rotation = eye + a * cross + b * (cross @ cross)
+    moved = (eye + b * cross + c * (cross @ cross)) @ shift[..., None]
+    bottom = twist.new_tensor([[0.0, 0.0, 0.0, 1.0]]).expand(*twist.shape[:-1], 1, 4)
+    return torch.cat([torch.cat([rotation, moved], dim=-1), bottom], dim=-2)
 
 
-def _generators(like: Tensor) -> Float[Tensor, "6 4 4"]:
-    basis = like.new_zeros(6, 4, 4)
-    for axis, (i, j) in enumerate([(2, 1), (0, 2), (1, 0)]):
-        basis[axis, i, j], basis[axis, j, i] = 1.0, -1.0
-    for axis in range(3):
-        basis[3 + axis, axis, 3] = 1.0
-    return basis
+def _series(squared: Tensor, first: int) -> Tensor:
+    """``∑ (-x²)^k / (2k + first)!`` for k = 0 .. 4."""
+    total = torch.zeros_like(squared)
+    for k in reversed(range(5)):
+        total = 1 / math.factorial(2 * k + first) - squared * total
+    return total
 
 
 def focal_from_fov(fov: float, width: int) -> float:

@@ -4,5 +4,10 @@ RECIPES: dict[str, str] = {}
 """Methods that plug-ins bring, name ``renderer/recipe`` -> object holding the recipe's TOML text; our own are files."""
 
 _GAUSSIANS = "invgraphics.experiments.export:export_gaussians"
-EXPORTERS = {"ply": _GAUSSIANS, "splat": _GAUSSIANS, "spz": _GAUSSIANS}
+EXPORTERS = {
+    "ply": _GAUSSIANS,
+    "splat": _GAUSSIANS,
+    "spz": _GAUSSIANS,
+    "mesh": "invgraphics.experiments.mesh_export:export_mesh",
+}
 """What a run's model can be exported to, and the function that does it (see `invgraphics.experiments.export`)."""

@@ -8,13 +8,15 @@ import torch
 
 from invgraphics import kernels
 from invgraphics.config import fill
-from invgraphics.core import Field, Renderer, Scene, check
+from invgraphics.core import Field, RayRenderer, Renderer, Scene, check
 from invgraphics.errors import InputError
 from invgraphics.experiments.recipe import Method, assign
 from invgraphics.experiments.request import DATA, Settings
+from invgraphics.experiments.schema import Recipe
 from invgraphics.scenes.corrupt import TrainingData
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Plan
+from invgraphics.training.poses import make_poses, windows
 
 
 def device_of(name: str | None) -> torch.device:
@@ -49,6 +51,10 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -
     field: Field = method.recipe.field.build(scene)
     renderer: Renderer = method.recipe.renderer.build(scene)
     check(field, renderer)
+    training = method.recipe.training
+    if training is not None and training.poses is not None and training.poses.optimise:
+        for encoding in windows(field, renderer):
+            encoding.add_window()
     return field.to(device), renderer.to(device)
 
 
@@ -56,18 +62,28 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
     """Everything a fit is made of."""
     recipe = method.recipe
     field, renderer = build_model(method, scene, seed, device)
+    poses = make_poses(recipe.training, scene)
     return Plan(
         field=field,
         renderer=renderer,
         scene=scene,
         losses=[loss.build() for loss in recipe.losses],
         hooks=[hook.build() for hook in recipe.hooks],
-        optimiser=recipe.optimiser,
-        batches=recipe.batches,
+        optimiser=recipe.optimiser
+        if poses is None
+        else poses.config.optimiser(recipe.optimiser, _seen(recipe, renderer, scene)),
+        batches=recipe.batches if poses is None else poses.config.batches(recipe.batches),
         budget=budget,
         seed=seed,
         device=device,
+        poses=None if poses is None else poses.to(device),
     )
+
+
+def _seen(recipe: Recipe, renderer: Renderer, scene: Scene) -> float:
+    """Share of the training views that one step sees."""
+    views = len(scene.train)
+    return min(recipe.batches.views, views) / views if isinstance(renderer, RayRenderer) else 1 / views
 
 
 def use_kernels(name: str | None) -> None:

@@ -17,6 +17,7 @@ from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.base import INTERRUPTED
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.recipe import load_method
 from invgraphics.experiments.recorder import Cadence
 from invgraphics.experiments.renderings import check_eyes
@@ -90,6 +91,7 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
     protocol = protocol_named(request.protocol)
     camera = scene.test[0].camera
     names, budget = ", ".join(request.methods), Budget.parse(request.budget)
+    notes = {protocol_note(load_method(name, request.preset, request.recipe_overrides)) for name in request.methods} - {""}
     return {
         "schema": 1,
         "scene": scene.name,
@@ -106,7 +108,7 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
         "command": request.shell(),
         "baselines": baseline_scores(scene, protocol),
         "noise_ceiling": scene.noise_ceiling,
-        "protocol": asdict(protocol),
+        "protocol": asdict(protocol) | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
         "scene_info": {
             "train": len(scene.train),
             "val": len(scene.val),

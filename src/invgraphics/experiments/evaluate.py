@@ -15,10 +15,12 @@ from invgraphics.core import Camera, Context, Field, Renderer, Rendering, Scene,
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.recipe import Method
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
+from invgraphics.training.poses import Poses
 
 
 def render_view(
@@ -50,22 +52,29 @@ def evaluate(
     protocol: str,
     costs: dict[str, Any],
     method: Method,
+    poses: Poses | None = None,
 ) -> dict[str, Any]:
-    """Render, keep and score all test views of ``scene``; writes ``test/`` and the scores file, returns the scores."""
+    """Render, keep and score all test views of ``scene``; writes ``test/`` and the scores file, returns the scores.
+
+    Where the fit has refined its training poses, test poses are aligned and refined first (see `experiments.posed`).
+    """
     rules = protocol_named(protocol)
     field, renderer = model
     device = next(field.parameters()).device
     (folder.root / "test").mkdir(exist_ok=True)
     scores, seconds = [], []
+    posed = None if poses is None else PosedEvaluation(poses, scene, model)
     with Reporter(f"{method.name} evaluation") as reporter:
         render_view(field, renderer, scene.test[0].camera.resized(16, 16), scene, device)  # first use pays for allocation
         for index, view in enumerate(scene.test):
+            camera = view.camera if posed is None else posed.camera(view)
             # Timed as a viewer would ask for it: colour, alpha and depth. Normals are rendered apart, for the scores only.
             began = time.perf_counter()
-            picture = render_view(field, renderer, view.camera, scene, device, geometry=False)
+            picture = render_view(field, renderer, camera, scene, device, geometry=False)
             seconds.append(time.perf_counter() - began)
             if view.normal is not None:
-                picture = render_view(field, renderer, view.camera, scene, device)
+                picture = render_view(field, renderer, camera, scene, device)
+            picture = picture if posed is None else posed.as_seen(picture, camera, view)
             _save_view(folder.root / "test" / f"{index:04d}", picture, scene)
             scores.append(score(picture, view, scene, rules))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
@@ -87,9 +96,11 @@ def evaluate(
             "parameters": parameter_count(model),
             "primitives": field.primitive_count(),
         },
-        "quality": quality,
+        "quality": quality if posed is None else quality | posed.quality(),
         "skipped": skipped,
     }
+    if posed is not None:
+        result["test_poses"] = protocol_note(method)
     folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)
     return result
 
@@ -115,7 +126,8 @@ def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> dict[str, 
 def _evaluate_fitted(fitted: Fitted, protocol: str) -> dict[str, Any]:
     fit = fitted.source.read_json("fit.json")
     costs = {"fit_seconds": fit["seconds"], "steps": fit["steps"], "peak_memory_bytes": fit.get("peak_memory_bytes")}
-    return evaluate(fitted.folder, fitted.scene, (fitted.field, fitted.renderer), protocol, costs, fitted.method)
+    model = fitted.field, fitted.renderer
+    return evaluate(fitted.folder, fitted.scene, model, protocol, costs, fitted.method, fitted.poses)
 
 
 def _save_view(stem: Path, picture: Rendering, scene: Scene) -> None:

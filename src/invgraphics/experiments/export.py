@@ -20,6 +20,9 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.transformed import move_gaussians
 from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
 
+RESOLUTION, RESOLUTIONS = 192, (8, 1024)
+"""Voxels along a mesh's longest edge: usual, fewest and most (4 bytes for each of their cube)."""
+
 
 @dataclass(frozen=True)
 class ExportRequest:
@@ -31,6 +34,8 @@ class ExportRequest:
         out: the file.
         scene: another copy of the run's scene.
         world: how the axes of the data set's world point, for formats that want certain axes.
+        level: density or signed distance of a mesh's surface; ``None`` for the default.
+        resolution: voxels along the longest edge that a mesh is made from.
     """
 
     run: Path
@@ -38,6 +43,13 @@ class ExportRequest:
     out: Path
     scene: str | None = None
     world: str = WORLD
+    level: float | None = None
+    resolution: int = RESOLUTION
+
+    def __post_init__(self) -> None:
+        low, high = RESOLUTIONS
+        if not low <= self.resolution <= high:
+            raise InputError(f"--resolution cannot be {self.resolution}.", f"Expected a number of voxels, {low} to {high}.")
 
 
 @dataclass(frozen=True)
@@ -79,7 +91,7 @@ def export_run(request: ExportRequest) -> Exported:
     out = request.out
     if not out.absolute().parent.is_dir() or out.is_dir():
         raise InputError(f"--out cannot be '{out}': expected a file in a folder that exists.")
-    return plugins.load("exporters", request.to)(open_fitted(request.run, request.scene), request)
+    return plugins.load("exporters", request.to)(open_fitted(request.run, request.scene).in_its_frame(), request)
 
 
 def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:

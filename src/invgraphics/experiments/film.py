@@ -64,7 +64,7 @@ def film(request: FilmRequest) -> Path:
     """
     if not request.out.absolute().parent.is_dir():
         raise InputError(f"The folder of '{request.out}' does not exist.", "Choose another --out.")
-    fitted = open_fitted(request.run, request.scene)
+    fitted = open_fitted(request.run, request.scene).in_its_frame()
     if request.path == "timelapse":
         total, pictures = _timelapse(fitted, request)
     else:

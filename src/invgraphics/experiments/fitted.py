@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -11,9 +11,11 @@ from invgraphics.core import Field, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
 from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.posed import optimised, scene_of_fit
 from invgraphics.experiments.recipe import Method, resolve
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training import checkpoint
+from invgraphics.training.poses import Poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,7 @@ class Fitted:
         renderer: fitted as well, where it has parameters.
         device: where both are.
         source: the folder that holds the checkpoint: the run itself, or the run that a rendering shows.
+        poses: of the training views as the fit saw them, where it refined them.
     """
 
     folder: RunFolder
@@ -37,6 +40,11 @@ class Fitted:
     renderer: Renderer
     device: torch.device
     source: RunFolder
+    poses: Poses | None = None
+
+    def in_its_frame(self) -> Fitted:
+        """The same with the scene where the fit has it: a fit that refines poses may drift from those that it was given."""
+        return self if self.poses is None else replace(self, scene=scene_of_fit(self.poses, self.scene))
 
 
 def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
@@ -65,9 +73,11 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     shown = provenance.get("fitted_run")
     source = folder if shown is None else RunFolder(folder.root / shown)
     state = checkpoint.load(source.checkpoint, device)
+    config = optimised(method)
     try:
+        poses = Poses.restored(config, state["poses"]).to(device) if config is not None and "poses" in state else None
         field.load_state_dict(state.get("field", {}))
         renderer.load_state_dict(state.get("renderer", {}) if shown is None else {})
     except RuntimeError as error:
         raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
-    return Fitted(folder, method, scene, field, renderer, device, source)
+    return Fitted(folder, method, scene, field, renderer, device, source, poses)

@@ -15,6 +15,7 @@ from torch import Tensor
 from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.posed import carried, into_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.training import checkpoint
 from invgraphics.training.fit import Fit
@@ -66,8 +67,11 @@ class Monitor:
         ctx = Context(self._bounds, progress=fit.progress)
         background = self._scene.background.to(self._device)
         errors = []
+        poses = fit.plan.poses
+        drift = None if poses is None else into_fit(poses, self._scene)
         for view, flat in zip(self._views, self._pixels, strict=True):
-            prediction = self._predict(fit, view.camera, flat, ctx, background)
+            camera = view.camera if drift is None else carried(view.camera, drift)
+            prediction = self._predict(fit, camera, flat, ctx, background)
             errors.append((prediction.clamp(0, 1).cpu() - view.over(self._scene.background, flat)).square().mean())
         return -10 * math.log10(max(float(torch.stack(errors).mean()), 1e-10))
 

@@ -23,6 +23,7 @@ from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_tr
 from invgraphics.experiments.executors.local import WITH_PARENT
 from invgraphics.experiments.folder import RunFolder, write_json
 from invgraphics.experiments.identity import TruthDigest, identify
+from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.recorder import Cadence, Recorder
 from invgraphics.experiments.renderings import check_eyes, render_missing
 from invgraphics.experiments.request import FitRequest
@@ -111,8 +112,8 @@ def _evaluate(
     costs = {"fit_seconds": spent["seconds"], "steps": spent["steps"], "peak_memory_bytes": spent["peak_memory_bytes"]}
     model = (fit.plan.field, fit.plan.renderer)
     if request.protocol != "default":
-        evaluate(folder, scene, model, request.protocol, costs, method)
-    evaluate(folder, scene, model, "default", costs, method)
+        evaluate(folder, scene, model, request.protocol, costs, method, fit.plan.poses)
+    evaluate(folder, scene, model, "default", costs, method, fit.plan.poses)
 
 
 def describe(
@@ -162,7 +163,8 @@ def describe(
         "options": {"size": request.size, "test_views": request.test_views},
         "device": str(device),
     }
-    folder.write_json("provenance.json", provenance | dict(origin or {}))
+    note = protocol_note(method)
+    folder.write_json("provenance.json", provenance | ({"test_poses": note} if note else {}) | dict(origin or {}))
 
 
 def _relative(target: Path, start: Path) -> tuple[str, ...]:

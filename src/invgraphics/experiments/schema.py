@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from invgraphics.config import Slot
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.optimiser import OptimiserConfig
+from invgraphics.training.poses import TrainingConfig
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class Recipe:
         hooks: what happens between steps.
         optimiser: Adam's settings and parameter groups.
         batches: size of a step.
+        training: what else the fit finds out, such as the cameras' poses; ``None`` for nothing.
         max_primitives: most explicit primitives, of fields and hooks that make some; ``None`` leaves it to their own settings.
     """
 
@@ -35,6 +37,7 @@ class Recipe:
     paper: str = ""
     hooks: tuple[Annotated[Any, Slot("hooks")], ...] = ()
     batches: BatchConfig = default(default_factory=BatchConfig)
+    training: TrainingConfig | None = None
     max_primitives: int | None = None
 
     def __post_init__(self) -> None:

@@ -34,7 +34,8 @@ def hash_encode(
         jacobian: whether to return d features / d unit as well.
 
     Returns:
-        Features (m, levels * f), differentiable in ``table`` and ``unit``; and the Jacobian, differentiable in ``table``.
+        Features (m, levels * f), differentiable in ``table`` and ``unit``, the gradient along ``unit`` once more in ``table``;
+        and the Jacobian, differentiable in ``table``.
     """
     return choose("hash_encode", unit)(unit, table, grid, jacobian)
 

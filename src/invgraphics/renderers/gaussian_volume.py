@@ -155,13 +155,13 @@ class GaussianSorted(GaussianRays):
                 ((limit - t) / sigma).clamp(-SURE, SURE) for limit in (near, far.minimum((t + SURE * sigma).detach()))
             )
             depth = depth * (phi(end) - phi(start))
-        order = self._order(encounters, rays, axis)
+        order = self.order(encounters, rays, axis)
         ordered, _, _ = kernels.composite(depth[order], t.new_zeros(len(t), 0), encounters.ray, len(rays))
         weights = ordered[order.argsort()]
         return weights, weights * t.clamp(near, far) if far_too else None
 
     @torch.no_grad()
-    def _order(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None) -> Int[Tensor, " p"]:
+    def order(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None) -> Int[Tensor, " p"]:
         """Encounters by ray, then front to back."""
         key = encounters.t
         if self.config.order == "centre":

@@ -89,9 +89,7 @@ class Hierarchical(Sampler):
     def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Samples of the second pass, and the first pass's trace if it has a field of its own to train."""
         hit = hitting(rays)
-        spacing = strata(rays[hit], self.config.coarse, ctx)
-        coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds))
-        trace = self._first_pass(coarse, len(rays), density)
+        spacing, trace = self.first_pass(rays, density, ctx)
         assert trace.weights is not None
         with torch.no_grad():
             weights = trace.weights.reshape(len(hit), self.config.coarse)
@@ -99,15 +97,19 @@ class Hierarchical(Sampler):
         both = torch.cat([spacing, drawn], dim=1).sort(dim=1).values
         return pack(rays, hit, from_spacing(both, ctx.bounds)), () if self.proposal is None else (trace,)
 
-    def _first_pass(self, coarse: Samples, rays: int, density: Density) -> Trace:
+    def first_pass(self, rays: Rays, density: Density, ctx: Context) -> tuple[Float[Tensor, "k edges"], Trace]:
+        """Edges of the coarse strata in spacing coordinates, for the rays that meet the bounds, and what they weigh."""
+        hit = hitting(rays)
+        spacing = strata(rays[hit], self.config.coarse, ctx)
+        coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds))
         if self.proposal is None:
             values, sigma = None, density(coarse)
         else:
             values = self.proposal.query(coarse, self.proposal.provides & (Quantity.DENSITY | Quantity.RADIANCE))
             assert values.density is not None
             sigma = values.density
-        weights, _, _ = kernels.composite(sigma * coarse.delta, sigma[:, None], coarse.ray, rays)
-        return Trace(coarse, values, weights, rays=rays)
+        weights, _, _ = kernels.composite(sigma * coarse.delta, sigma[:, None], coarse.ray, len(rays))
+        return spacing, Trace(coarse, values, weights, rays=len(rays))
 
 
 def hitting(rays: Rays) -> Int[Tensor, " k"]:

@@ -69,7 +69,7 @@ class Splatting(Renderer):
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
         """Render every pixel. Depth is left at infinity in training, unless ``ctx.geometry`` asks for it."""
         gaussians: Gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
-        footprints, rgb = self._project(gaussians, camera)
+        footprints, rgb = self.project(gaussians, camera)
         features = [rgb]
         if ctx.geometry or not ctx.training:
             features.append(_distance_coefficients(footprints))
@@ -83,7 +83,7 @@ class Splatting(Renderer):
         screen = Screen(footprints.means2d, footprints.radii, *size, footprints.pull, gaussians.opacities, gaussians.scales)
         return rendering, Trace(screen=screen, rays=alpha.numel())
 
-    def _project(self, gaussians: Gaussians, camera: Camera) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+    def project(self, gaussians: Gaussians, camera: Camera) -> tuple[Footprints, Float[Tensor, "n 3"]]:
         """Footprints, which record what pulls them where something learns, and colours."""
         config = self.config
         if config.shape == "disc":

@@ -51,7 +51,7 @@ def draw_ray(folder: Path) -> Path:
     close = close_up(ray, whole)
     with canvas(*SIZE) as (figure, first):
         first.remove()
-        figure.get_layout_engine().set(h_pad=0.03, hspace=0.0, w_pad=0.06)  # pyright: ignore[reportOptionalMemberAccess]
+        figure.set_layout_engine("constrained", h_pad=0.03, hspace=0.0, w_pad=0.06)
         heights = (1.0 if close else 0.02, 0.35, 3.4, 1.2, 0.35)
         grid = figure.add_gridspec(len(heights), 2, width_ratios=(3.5, 1), height_ratios=heights)
         strip = figure.add_subplot(grid[1, 0])
@@ -101,13 +101,13 @@ def _nearest_colours(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
     at, t = _cells(axes), ray.columns["t"]
     if not len(t):
         return np.zeros((CELLS, 4))
-    order = t.argsort(kind="stable")
-    borders = (t[order][1:] + t[order][:-1]) / 2
-    which = order[np.searchsorted(borders, at)]
-    there = np.ones(CELLS)
     if ray.kind == "samples":
-        slack = 1e-4 * (at[-1] - at[0])
-        there = (at >= ray.columns["begin"][which] - slack) & (at <= ray.columns["end"][which] + slack)
+        which = (np.searchsorted(ray.columns["begin"], at, side="right") - 1).clip(min=0)
+        there = (at >= ray.columns["begin"][which]) & (at <= ray.columns["end"][which])
+    else:
+        order = t.argsort(kind="stable")
+        which = order[np.searchsorted((t[order][1:] + t[order][:-1]) / 2, at)]
+        there = (at >= ray.columns["begin"].min()) & (at <= ray.columns["end"].max())
     return np.concatenate([ray.shown(ray.rgb[which]), np.asarray(there, float)[:, None]], axis=1)
 
 
@@ -132,11 +132,6 @@ def _overview(axes: Axes, ray: Ray, whole: tuple[float, float], close: tuple[flo
     _light(axes, ray)
     axes.set(ylim=(-0.02, 1.06), yticks=[0, 1])
     axes.set_ylabel("whole ray", rotation=0, ha="right", va="center", labelpad=8)
-    for corner in (0.0, 1.0):
-        at = close[int(corner)]
-        line = {"arrowstyle": "-", "color": MUTED.light, "linewidth": 0.8}
-        figure_place = (corner, 0.0)
-        axes.annotate("", (at, -0.02), figure_place, textcoords=axes.transAxes, arrowprops=line, annotation_clip=False)
 
 
 def _strip(axes: Axes, colours: Float[ndarray, "cells 4"], name: str) -> None:
@@ -167,7 +162,7 @@ def _shares(axes: Axes, ray: Ray) -> None:
         axes.vlines(t, 0, columns["weight"], color=filled, linewidth=4.2, label="weight T·α", zorder=3)
     for index, earlier in enumerate(optional(ray.facts, "passes", list, ray.source, [])):
         edges, weight = [*earlier["t0"], earlier["t1"][-1]], np.array(earlier["weight"], float)
-        axes.stairs(weight, edges, color=PASS, linewidth=1.4, zorder=3.5, label=f"weights of pass {index + 1}")
+        axes.stairs(weight, edges, color=PASS, linewidth=1.4, zorder=3.5, label=f"weights of pass {index + 1}, coarser")
     _light(axes, ray)
     axes.set_ylim(0, 1.06)
     axes.set_ylabel("share of the light")

@@ -140,7 +140,8 @@ def _disturbed(view: View, index: int, scene: Scene, data: TrainingData, seed: i
         pose = view.camera.cam_to_world.double().clone()
         pose[:3, :3] = pose[:3, :3] @ turn
         pose[:3, 3] += shift * scene.extent * data.pose_noise / 100
-        view = replace(view, camera=view.camera.moved(pose.float()), depth=None, normal=None)
+        wrong = view.camera.moved(pose.float())
+        view = replace(view, camera=wrong, depth=None, normal=None, undisturbed=view.true_pose)
     if data.size is not None:
         view = _resized(view, data.size)
     if data.exposure:

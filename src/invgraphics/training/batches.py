@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from invgraphics.core import Batch, Camera, Rays, Scene, View
@@ -20,7 +21,7 @@ class BatchConfig:
         rays: rays of a step, for ray renderers. With ``samples`` set it is only the start.
         views: most views that one step's rays come from.
         samples: target number of samples per step: the ray count follows what is kept (Instant-NGP); 0 keeps ``rays``.
-        resolution: image scale of each phase of the fit, for image renderers; the last should be 1.
+        resolution: image scale of each phase of the fit; the last should be 1.
         until: progress at which each phase but the last ends; one fewer than ``resolution``.
     """
 
@@ -43,12 +44,32 @@ class BatchConfig:
         return self.resolution[sum(progress >= end for end in self.until)]
 
 
+class RefinedCameras(Protocol):
+    """Training cameras that are fitted too (`invgraphics.training.poses.Poses`)."""
+
+    def cameras(self, views: Int[Tensor, " k"]) -> list[Camera]:
+        """Of some views, differentiable."""
+        ...
+
+    def camera(self, view: int) -> Camera:
+        """Of one view, differentiable."""
+        ...
+
+
 class Batches:
     """Draws what each step compares; all randomness comes from the generator it is given."""
 
     MAX_RAYS = 1 << 16
 
-    def __init__(self, config: BatchConfig, scene: Scene, generator: torch.Generator, device: torch.device) -> None:
+    def __init__(
+        self,
+        config: BatchConfig,
+        scene: Scene,
+        generator: torch.Generator,
+        device: torch.device,
+        refined: RefinedCameras | None = None,
+    ) -> None:
+        self._refined = refined
         self._config, self._scene, self._generator, self._device = config, scene, generator, device
         self._order = torch.zeros(0, dtype=torch.int64)
         self._rays = config.rays
@@ -60,20 +81,28 @@ class Batches:
             return torch.rand(3, generator=self._generator)
         return self._scene.background
 
-    def rays(self) -> tuple[Rays, Batch]:
-        """Random rays of up to ``views`` random training views."""
+    def rays(self, progress: float = 1.0) -> tuple[Rays, Batch]:
+        """Random rays of up to ``views`` random training views, at the image scale of this point of the fit."""
         background = self.background()
         train, config = self._scene.train, self._config
         count = min(config.views, len(train), self._rays)
         chosen = torch.randperm(len(train), generator=self._generator)[:count]
         shares = [self._rays // count + (i < self._rays % count) for i in range(count)]
-        views = [train[int(view)] for view in chosen]
+        scale = config.scale_at(progress)
+        views = [self._scaled(int(view), scale) for view in chosen]
         flat = [self._pixels_of(view, share) for view, share in zip(views, shares, strict=True)]
         which = torch.repeat_interleave(torch.arange(count), torch.tensor(shares))
         wide = torch.tensor([view.camera.width for view in views])[which]
         index = torch.cat(flat)
         pixels = torch.stack([index % wide, index // wide], dim=1) + 0.5
-        rays = rays_through([view.camera for view in views], which, pixels, chosen[which])
+        if self._refined is None:
+            rays = rays_through([view.camera for view in views], which, pixels, chosen[which])
+        else:
+            # The cameras are where the parameters are, and so must be what meets them.
+            which, pixels, chosen = (values.to(self._device) for values in (which, pixels, chosen))
+            refined = self._refined.cameras(chosen)
+            cameras = [camera.resized(*size_of(view)) for camera, view in zip(refined, views, strict=True)]
+            rays = rays_through(cameras, which, pixels, chosen[which])
         batch = Batch(*_seen(views, flat, background), background)
         return rays.to(self._device), batch.to(self._device)
 
@@ -98,7 +127,8 @@ class Batches:
         index, self._order = int(self._order[0]), self._order[1:]
         view = self._scaled(index, self._config.scale_at(progress))
         batch = Batch(view.over(background), view.opacity(), background, index)
-        return view.camera.to(self._device), batch.to(self._device)
+        camera = view.camera if self._refined is None else self._refined.camera(index).resized(*size_of(view))
+        return camera.to(self._device), batch.to(self._device)
 
     def _scaled(self, index: int, scale: float) -> View:
         """A training view at a fraction of its size, area-averaged; kept for the phase, as bytes."""
@@ -109,14 +139,7 @@ class Batches:
         key = (index, scale)
         if key not in self._small:
             width, height = (max(1, round(edge * scale)) for edge in (view.camera.width, view.camera.height))
-            alpha = view.opacity()[..., None]
-            stacked = torch.cat([view.colour() * alpha, alpha], dim=-1).permute(2, 0, 1)[None]
-            shrunk = torch.nn.functional.interpolate(stacked, (height, width), mode="area")[0].permute(1, 2, 0)
-            straight = shrunk[..., :3] / shrunk[..., 3:].clamp_min(1e-6)
-            image = (straight.clamp(0, 1) * 255).round().to(torch.uint8) if view.image.dtype == torch.uint8 else straight
-            small_alpha = None if view.alpha is None else shrunk[..., 3]
-            camera = view.camera.resized(width, height)
-            self._small[key] = replace(view, camera=camera, image=image, alpha=small_alpha, depth=None, normal=None, mask=None)
+            self._small[key] = scaled_view(view, width, height)
         return self._small[key]
 
     def state(self) -> dict[str, Tensor]:
@@ -126,6 +149,26 @@ class Batches:
     def load(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state`."""
         self._order, self._rays = state["order"], int(state["rays"])
+
+
+def size_of(view: View) -> tuple[int, int]:
+    """Width and height in pixels."""
+    return view.camera.width, view.camera.height
+
+
+def scaled_view(view: View, width: int, height: int) -> View:
+    """A view at another size, area-averaged without its geometry; bytes stay bytes, and a pixel counts if all of it did."""
+    alpha = view.opacity()[..., None]
+    stacked = torch.cat([view.colour() * alpha, alpha], dim=-1).permute(2, 0, 1)[None]
+    shrunk = torch.nn.functional.interpolate(stacked, (height, width), mode="area")[0].permute(1, 2, 0)
+    straight = shrunk[..., :3] / shrunk[..., 3:].clamp_min(1e-6)
+    image = (straight.clamp(0, 1) * 255).round().to(torch.uint8) if view.image.dtype == torch.uint8 else straight
+    small_alpha = None if view.alpha is None else shrunk[..., 3]
+    mask = view.mask
+    if mask is not None:
+        mask = torch.nn.functional.interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0] > 1 - 1e-6
+    camera = view.camera.resized(width, height)
+    return replace(view, camera=camera, image=image, alpha=small_alpha, depth=None, normal=None, mask=mask)
 
 
 def _seen(views: list[View], flat: list[Tensor], background: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dataclasses import field as default
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from invgraphics.core import Batch, Context, Field, RayRenderer, Renderer, Rendering, Scene, Trace, check
 from invgraphics.errors import NumericalError
@@ -17,6 +17,7 @@ from invgraphics.training.budget import Budget
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
 from invgraphics.training.losses import Loss
 from invgraphics.training.optimiser import Optimiser, OptimiserConfig
+from invgraphics.training.poses import Poses, windows
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Plan:
         budget: when to stop.
         seed: of all randomness during the fit.
         device: where tensors live.
+        poses: of the training cameras, where they are fitted too.
     """
 
     field: Field
@@ -46,6 +48,15 @@ class Plan:
     budget: Budget
     seed: int = 0
     device: torch.device = default(default_factory=lambda: torch.device("cpu"))
+    poses: Poses | None = None
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """Everything with parameters, by the names that begin theirs."""
+        named: dict[str, nn.Module] = {"field": self.field, "renderer": self.renderer}
+        if self.poses is not None:
+            named["poses"] = self.poses
+        return named
 
 
 class Fit:
@@ -60,13 +71,14 @@ class Fit:
         self.seconds = 0.0
         self._bounds = plan.scene.bounds.to(plan.device)
         self._generator = torch.Generator().manual_seed(plan.seed)
-        self._batches = Batches(plan.batches, plan.scene, self._generator, plan.device)
+        self._batches = Batches(plan.batches, plan.scene, self._generator, plan.device, plan.poses)
+        self._windows = [] if plan.poses is None else windows(plan.field, plan.renderer)
         self._optimiser = self._make_optimiser()
 
     def _make_optimiser(self) -> Optimiser:
         parameters = {
             f"{owner}.{name}": parameter
-            for owner, module in (("field", self.plan.field), ("renderer", self.plan.renderer))
+            for owner, module in self.plan.modules.items()
             for name, parameter in module.named_parameters()
             if parameter.requires_grad
         }
@@ -91,6 +103,7 @@ class Fit:
         plan, ctx = self.plan, self.context()
         state = FitState(plan.field, plan.renderer, self._optimiser, plan.scene, ctx, self.steps)
         self._optimiser.set_progress(ctx.progress)
+        self._open_windows(ctx.progress)
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
@@ -114,10 +127,15 @@ class Fit:
         self.seconds += time.perf_counter() - began
         return value
 
+    def _open_windows(self, progress: float) -> None:
+        for encoding in self._windows:
+            if encoding.detail is not None and self.plan.poses is not None:
+                encoding.detail.fill_(self.plan.poses.config.detail(progress))
+
     def _render(self, ctx: Context) -> tuple[Rendering, Trace, Batch]:
         renderer, fitted = self.plan.renderer, self.plan.field
         if isinstance(renderer, RayRenderer):
-            rays, batch = self._batches.rays()
+            rays, batch = self._batches.rays(ctx.progress)
             rendering, trace = renderer.render_rays(fitted, rays, ctx)
             self._batches.observe(len(rays), 0 if trace.samples is None else len(trace.samples))
         else:
@@ -129,7 +147,7 @@ class Fit:
         """The first tensor that is not finite, in the order in which a reader would look."""
         candidates: dict[str, Tensor] = {
             f"{owner}.{name}": parameter
-            for owner, module in (("field", self.plan.field), ("renderer", self.plan.renderer))
+            for owner, module in self.plan.modules.items()
             for name, parameter in module.named_parameters()
         }
         candidates |= {"rendering.rgb": rendering.rgb, "rendering.alpha": rendering.alpha}
@@ -152,8 +170,7 @@ class Fit:
     def state(self) -> dict[str, dict[str, Tensor]]:
         """Every tensor of the fit, by section. Contains no clock reading."""
         return {
-            "field": dict(self.plan.field.state_dict()),
-            "renderer": dict(self.plan.renderer.state_dict()),
+            **{owner: dict(module.state_dict()) for owner, module in self.plan.modules.items()},
             "optimiser": self._optimiser.state(),
             "hooks": prefixed(self.plan.hooks),
             "batches": self._batches.state(),
@@ -163,8 +180,8 @@ class Fit:
 
     def load(self, state: dict[str, dict[str, Tensor]], seconds: float) -> None:
         """Go on from a `state`; ``seconds`` is the optimisation time already spent."""
-        self.plan.field.load_state_dict(state.get("field", {}))
-        self.plan.renderer.load_state_dict(state.get("renderer", {}))
+        for owner, module in self.plan.modules.items():
+            module.load_state_dict(state.get(owner, {}))
         self._optimiser = self._make_optimiser()
         self._optimiser.load(state.get("optimiser", {}))
         load_prefixed(self.plan.hooks, state.get("hooks", {}))

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core.field import Encoding
+from invgraphics.fields.encodings.window import Windowed
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class FrequencyConfig:
         return FrequencyEncoding(self)
 
 
-class FrequencyEncoding(Encoding):
+class FrequencyEncoding(Windowed):
     """Frequencies of the unit cube's coordinates, mapped to [-1, 1] first.
 
     Attributes:
@@ -42,13 +42,18 @@ class FrequencyEncoding(Encoding):
     """
 
     def __init__(self, config: FrequencyConfig) -> None:
-        super().__init__()
+        super().__init__(levels=config.octaves, always=0 if config.include_input else 1)
         self.config = config
         self.width = frequency_width(config.octaves, config.include_input)
 
     def forward(self, unit: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"] | None = None) -> Float[Tensor, "m f"]:
         """Features of ``2 * unit - 1``; ``covariance`` is not used."""
-        return frequencies(2 * unit - 1, self.config.octaves, self.config.include_input)
+        features = frequencies(2 * unit - 1, self.config.octaves, self.config.include_input)
+        weights = self.level_weights()
+        if weights is None:
+            return features
+        octaves = weights.to(features.dtype).repeat_interleave(3).repeat(2)
+        return features * torch.cat([octaves.new_ones(self.width - len(octaves)), octaves])
 
 
 def frequency_width(octaves: int, include_input: bool = True) -> int:

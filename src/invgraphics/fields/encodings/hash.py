@@ -9,11 +9,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics import kernels
-from invgraphics.core.field import Encoding
+from invgraphics.fields.encodings.window import Windowed
 from invgraphics.kernels.types import HashGrid
 
 INITIAL_RANGE = 1e-4
 """Table entries start uniformly within +- this (Instant-NGP, §4)."""
+
+COARSE_LEVELS = 2
+"""Levels that a coarse-to-fine window never holds back: without any there would be nothing to see."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class HashConfig:
         return HashEncoding(HashGrid(self.levels, self.features, self.log2_size, self.base, self.finest))
 
 
-class HashEncoding(Encoding):
+class HashEncoding(Windowed):
     """Trilinear look-ups on all levels.
 
     Attributes:
@@ -56,7 +59,7 @@ class HashEncoding(Encoding):
     """
 
     def __init__(self, grid: HashGrid) -> None:
-        super().__init__()
+        super().__init__(levels=grid.levels, always=COARSE_LEVELS)
         self.grid = grid
         self.width = grid.levels * grid.features
         self.table = nn.Parameter(torch.empty(grid.entries, grid.features).uniform_(-INITIAL_RANGE, INITIAL_RANGE))
@@ -64,14 +67,10 @@ class HashEncoding(Encoding):
     def forward(self, unit: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"] | None = None) -> Float[Tensor, "m f"]:
         """Features at ``unit``; ``covariance`` is not used.
 
-        Where a gradient with respect to ``unit`` is wanted, that gradient is itself differentiable in the table (a loss on
-        normals needs it). Its own derivative with respect to ``unit`` is taken as zero: within a cell only the mixed second
-        derivatives of a trilinear function are not zero, and the fast kernels do not offer them.
+        The gradient with respect to ``unit`` is itself differentiable in the table (a loss on normals needs it). The compiled
+        kernels take its derivative with respect to ``unit`` as zero: within a cell only the mixed second derivatives of a
+        trilinear function are not.
         """
-        if not (unit.requires_grad and torch.is_grad_enabled()):
-            return kernels.hash_encode(unit, self.table, self.grid)[0]
-        fixed = unit.detach()
-        features, jacobian = kernels.hash_encode(fixed, self.table, self.grid, jacobian=True)
-        assert jacobian is not None
-        # First-order expansion about the point itself: adds zero to the value and the Jacobian to the graph.
-        return features + torch.einsum("mfa,ma->mf", jacobian, unit - fixed)
+        features, _ = kernels.hash_encode(unit, self.table, self.grid)
+        weights = self.level_weights()
+        return features if weights is None else features * weights.repeat_interleave(self.grid.features)

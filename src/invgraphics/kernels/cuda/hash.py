@@ -131,27 +131,60 @@ class _Encode(torch.autograd.Function):
         unit, table = unit.contiguous(), table.contiguous()
         features, levels = table.shape[1], _levels(grid, table.device)
         out = table.new_empty(len(unit), grid.levels * features)
-        ctx.sizes = (len(unit), grid.levels, features, at_least_2(features), BLOCK)
         if len(unit):
+            sizes = (len(unit), grid.levels, features, at_least_2(features), BLOCK)
             with on_device_of(table):
-                encode[(blocks(len(unit), BLOCK), grid.levels)](unit, table, levels, out, *ctx.sizes)
-        ctx.save_for_backward(unit, table, levels)
+                encode[(blocks(len(unit), BLOCK), grid.levels)](unit, table, levels, out, *sizes)
+        ctx.save_for_backward(unit, table)
+        ctx.grid = grid
         return out
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        unit, table = ctx.saved_tensors
+        gradient = grad_outputs[0].contiguous()
+        to_unit = _Slope.apply(unit, table, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
+        to_table = _Scatter.apply(unit, gradient, table.shape, ctx.grid) if ctx.needs_input_grad[1] else None
+        return to_unit, to_table, None
+
+
+class _Slope(torch.autograd.Function):
+    """Gradient along the positions; its own derivatives in table and cotangent are left to the reference."""
+
+    @staticmethod
+    def forward(ctx: Any, unit: Tensor, table: Tensor, gradient: Tensor, grid: HashGrid) -> Tensor:
+        ctx.save_for_backward(unit, table, gradient)
+        ctx.grid, to_unit, features = grid, torch.zeros_like(unit), table.shape[1]
+        if len(unit):
+            sizes = (len(unit), grid.levels, features, at_least_2(features), BLOCK)
+            with on_device_of(table):
+                locate_back[(blocks(len(unit), BLOCK),)](unit, table, gradient, _levels(grid, table.device), to_unit, *sizes)
+        return to_unit
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        unit, table, levels = ctx.saved_tensors
-        gradient, along, count = grad_outputs[0].contiguous(), blocks(len(unit), BLOCK), ctx.sizes[1]
-        to_unit = torch.zeros_like(unit) if ctx.needs_input_grad[0] else None
-        to_table = torch.zeros_like(table) if ctx.needs_input_grad[1] else None
+        unit, table, gradient = (tensor.detach() for tensor in ctx.saved_tensors)
+        with torch.enable_grad():
+            table, gradient = table.requires_grad_(), gradient.requires_grad_()
+            _, jacobian = reference.hash_encode(unit, table, ctx.grid, jacobian=True)
+            assert jacobian is not None
+            to_unit = torch.einsum("mfa,mf->ma", jacobian, gradient)
+            return None, *torch.autograd.grad(to_unit, [table, gradient], grad_outputs[0]), None
+
+
+class _Scatter(torch.autograd.Function):
+    """Gradient along the table; nothing needs its derivative, so it has none."""
+
+    @staticmethod
+    def forward(ctx: Any, unit: Tensor, gradient: Tensor, shape: torch.Size, grid: HashGrid) -> Tensor:
+        to_table, features = gradient.new_zeros(shape), shape[1]
         if len(unit):
-            with on_device_of(table):
-                if to_unit is not None:
-                    locate_back[(along,)](unit, table, gradient, levels, to_unit, *ctx.sizes)
-                if to_table is not None:
-                    encode_back[(along, count)](unit, gradient, levels, to_table, *ctx.sizes)
-        return to_unit, to_table, None
+            sizes = (len(unit), grid.levels, features, at_least_2(features), BLOCK)
+            with on_device_of(gradient):
+                along = blocks(len(unit), BLOCK)
+                encode_back[(along, grid.levels)](unit, gradient, _levels(grid, unit.device), to_table, *sizes)
+        return to_table
 
 
 def hash_encode(

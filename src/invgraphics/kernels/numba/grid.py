@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.kernels.numba.hash import axis, slopes, weights_of
+from invgraphics.kernels.numba.hash_cells import axis, weights_of
+from invgraphics.kernels.numba.hash_slope import slopes
 from invgraphics.kernels.numba.runtime import array, index, inlined, once_differentiable, parallel, prange, share, threads
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)

@@ -103,13 +103,19 @@ class _Announcement(event.Listener):
         module = getattr(getattr(dispatcher, "py_func", None), "__module__", "")
         if not self.said and module.startswith(PACKAGE):
             self.said = True
-            print("compiling kernels, once, about 20 s", file=sys.stderr, flush=True)
+            print("compiling kernels, once, about half a minute", file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
         pass
 
 
-event.register("numba:compile", _Announcement())
+_announcement = _Announcement()
+event.register("numba:compile", _announcement)
+
+
+def compiling() -> bool:
+    """Whether this process has had to compile something that was not cached."""
+    return _announcement.said
 
 
 @inlined

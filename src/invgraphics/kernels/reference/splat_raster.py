@@ -59,7 +59,7 @@ def splat_rasterise(
     columns = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
 
     def paint(splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p c"]:
-        return _composite(_responses(footprints, splats, pixels), columns[splats], receivers)
+        return _composite(responses_at(footprints, splats, pixels), columns[splats], receivers)
 
     image = over_tiles(footprints, (width, height), tile or TILE, paint)
     return image[..., :-1], image[..., -1]
@@ -70,7 +70,7 @@ def splat_median(footprints: Footprints, width: int, height: int, tile: int | No
     """See `invgraphics.kernels.splat_median`."""
 
     def paint(splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p 1"]:
-        after = torch.cumprod(1 - _alphas(_responses(footprints, splats, pixels)), dim=1)
+        after = torch.cumprod(1 - visible_alphas(responses_at(footprints, splats, pixels)), dim=1)
         offset = pixels[:, None] - footprints.means2d[splats]
         distance = footprints.planes[splats, 0] + (offset * footprints.planes[splats, 1:]).sum(dim=2)
         # A last column, which every pixel reaches, stands for those that stay transparent.
@@ -120,7 +120,7 @@ class _GatherAbsolute(torch.autograd.Function):
         return grad_outputs[0], grad_outputs[0].abs().sum(dim=0)
 
 
-def _responses(footprints: Footprints, splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p k"]:
+def responses_at(footprints: Footprints, splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p k"]:
     """``opacity * exp(-q / 2)`` of each splat at each pixel centre."""
     offset = pixels[:, None] - footprints.means2d[splats]
     if footprints.pull is not None:
@@ -140,22 +140,22 @@ def _responses(footprints: Footprints, splats: Int[Tensor, " k"], pixels: Float[
     return footprints.opacities[splats] * torch.exp(-0.5 * q)
 
 
-def _alphas(responses: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+def visible_alphas(responses: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
     """Responses below the visible are skipped, those near 1 clamped."""
     return torch.where(responses < ALPHA_MIN, 0.0, responses.clamp_max(ALPHA_MAX))
 
 
 def _composite(responses: Float[Tensor, "p k"], features: Float[Tensor, "k c"], receivers: int) -> Float[Tensor, "p c"]:
     """Blend splats front to back: sum over i of T_i alpha_i f_i, T_i = product over j < i of (1 - alpha_j)."""
-    alpha = _alphas(responses)
+    alpha = visible_alphas(responses)
     if not receivers:
-        return _weights(alpha) @ features
+        return blending_weights(alpha) @ features
     receives = torch.cumsum(alpha > 0, dim=1) <= receivers
-    weights = _weights(torch.where(receives, alpha, alpha.detach()))
+    weights = blending_weights(torch.where(receives, alpha, alpha.detach()))
     return torch.where(receives, weights, 0.0) @ features + torch.where(receives, 0.0, weights) @ features.detach()
 
 
-def _weights(alpha: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
+def blending_weights(alpha: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
     """T_i alpha_i. The transmittance never grows again, so once it would fall too low all later splats are left out as well."""
     after = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)

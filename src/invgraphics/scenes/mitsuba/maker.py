@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import tempfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import IO
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.mitsuba import cache, llvm
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.spec import Counts, locate, read
-
-Progress = Callable[[int, int, str], None]
+from invgraphics.scenes.process import Progress, run_worker
 
 
 def make(
@@ -94,41 +87,11 @@ def _make(job: Job, folder: Path, progress: Progress) -> None:
 
 
 def _run(job: Job, partial: Path, progress: Progress) -> None:
-    command = [sys.executable, "-P", "-m", "invgraphics.scenes.mitsuba.render", str(partial)]
-    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
-        process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=complaints, text=True, env=llvm.status().environment()
-        )
-        try:
-            failure = _follow(process, progress)
-            status = process.wait()
-        finally:
-            if process.poll() is None:
-                process.terminate()
-                process.wait()
-        if status:
-            raise failure or _explain(job, status, complaints)
-
-
-def _follow(process: subprocess.Popen[str], progress: Progress) -> InputError | None:
-    """Pass progress on until the process closes its output; what it said went wrong, if it did."""
-    failure = None
-    for line in process.stdout or ():
-        word, _, rest = line.rstrip("\n").partition(" ")
-        if word == "progress":
-            done, total, what = rest.split(" ", 2)
-            progress(int(done), int(total), what)
-        elif word == "error":
-            failure = InputError(*json.loads(rest))
-    return failure
-
-
-def _explain(job: Job, status: int, complaints: IO[str]) -> InputError:
-    """Why a rendering process failed that could not say so itself."""
-    scene = f"The scene '{job.spec.name}' could not be rendered"
-    if status < 0:
-        killed = signal.Signals(-status).name
-        return InputError(f"{scene}: its process died of {killed}.", "If memory ran out, make it smaller (--size, --spp).")
-    complaints.seek(0)
-    last = next((line.strip() for line in reversed(complaints.read().splitlines()) if line.strip()), f"exit status {status}")
-    return InputError(f"{scene}: {last}")
+    run_worker(
+        "invgraphics.scenes.mitsuba.render",
+        partial,
+        progress,
+        subject=f"The scene '{job.spec.name}' could not be rendered",
+        remedy="If memory ran out, make it smaller (--size, --spp).",
+        environment=llvm.status().environment(),
+    )

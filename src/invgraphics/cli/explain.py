@@ -1,0 +1,107 @@
+"""``invgraphics explain``: everything along one ray."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.output import show_table
+from invgraphics.errors import InputError
+
+if TYPE_CHECKING:
+    from invgraphics.experiments.explaining import Explanation
+
+ROWS = 24
+"""Contributions that are printed, those that weigh most; the file has all."""
+NOUNS = {"samples": "samples", "splats": "splats", "gaussians": "Gaussians"}
+
+
+@dataclass(frozen=True)
+class Explain:
+    """Take one pixel apart: what its ray meets, how much light each thing adds, and how much it leaves for the next.
+
+    Writes a figure (ray.png, ray.svg), a table (ray.csv) and the numbers of both (ray.json).
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a run."""
+    view: Annotated[int, arg(metavar="N")]
+    """Index of the view, from 0."""
+    pixel: Annotated[str, arg(metavar="COLUMN,ROW")]
+    """The pixel, counted from 0 from the upper left corner."""
+    split: Literal["test", "train"] = "test"
+    """Whose views are counted."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: RUN/explained/...)")] = None
+    """Where to write."""
+    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    """Another copy of the scene, for instance where the data set has moved."""
+
+    def run(self) -> int:
+        """Write; print the table and the figure's path."""
+        pixel = parse_pixel(self.pixel)
+        if not (self.folder / "recipe.toml").is_file():
+            raise InputError(
+                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
+            )
+
+        from invgraphics.experiments.explaining import ExplainRequest, explain
+        from invgraphics.report.rayplot import draw_ray
+
+        explanation = explain(ExplainRequest(self.folder, self.view, pixel, self.split, self.out, self.scene))
+        figure = draw_ray(explanation.folder)
+        show_contributions(explanation)
+        for sentence in sentences(explanation):
+            print(sentence)
+        print(figure)
+        return 0
+
+
+def parse_pixel(text: str) -> tuple[int, int]:
+    """Read ``40,71``: column and row.
+
+    Raises:
+        InputError: anything else.
+    """
+    found = re.fullmatch(r"\s*(\d+)\s*,\s*(\d+)\s*", text)
+    if not found:
+        raise InputError(f"--pixel cannot be '{text}'.", "Expected COLUMN,ROW from the upper left corner, for instance 40,71.")
+    return int(found[1]), int(found[2])
+
+
+def show_contributions(explanation: Explanation) -> None:
+    """Print the contributions that weigh most, in the order in which they are composited."""
+    found = explanation.contributions
+    heaviest = sorted(found.weight.argsort(descending=True)[:ROWS].tolist())
+    names = ["distance", "from", "to", "alpha", "T", "weight", "red", "green", "blue"]
+    columns = [found.t, found.begin, found.end, found.alpha, found.transmittance, found.weight, *found.rgb.T]
+    if found.density is not None:
+        names.insert(3, "density")
+        columns.insert(3, found.density)
+    rows = [[str(index), *(f"{float(column[index]):.4g}" for column in columns)] for index in heaviest]
+    facts = explanation.facts
+    what = f"pixel {facts['pixel']['column']},{facts['pixel']['row']} of {facts['split']} view {facts['view']}"
+    shown = "" if len(rows) == len(found) else f", the {len(rows)} heaviest"
+    show_table(f"{facts['method']}, {what}: {len(found)} {NOUNS[found.kind]}{shown}", ["", *names], rows)
+
+
+def sentences(explanation: Explanation) -> list[str]:
+    """What the numbers add up to."""
+    found, pixel = explanation.contributions, explanation.facts["pixel"]
+    background, through = explanation.facts["background"], 1 - found.opacity
+    difference = float((explanation.rendered - explanation.composited).abs().max())
+    told = [
+        f"Σ T·α·colour = {_colour(found.colour.tolist())}, and {through:.4f} of the background {_colour(background)}",
+        f"add up to {_colour(explanation.composited.tolist())}; the renderer's picture has "
+        f"{_colour(explanation.rendered.tolist())} (largest difference {difference:.1e}), the truth {_colour(pixel['true'])}.",
+    ]
+    depths = {"mean": pixel["expected"], "median": pixel["median"], "true": pixel["true_depth"]}
+    known = [f"{name} {value:.4g}" for name, value in depths.items() if value is not None]
+    return [*told, f"Depth: {', '.join(known)}."] if known else told
+
+
+def _colour(values: list[float]) -> str:
+    return f"({', '.join(f'{value:.3f}' for value in values)})"

@@ -1,0 +1,114 @@
+"""``invgraphics import-photos``: a folder of photographs becomes a scene, camera poses included."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.output import show_table
+from invgraphics.errors import InputError
+
+_MOST_FILES = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportPhotos:
+    """Find out where photographs were taken and what they show (structure from motion), and write a scene that fits can use.
+
+    The folder of the scene gets straight pictures, poses and points in COLMAP's format, quality.json, and a plot of cameras and
+    points. An interrupted import goes on when the same command is given again.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="DIR")]
+    """A folder of photographs; or a data set, whose pictures are taken without its poses."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: scenes/DIR)")] = None
+    """Folder of the scene, new or empty."""
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Which pairs are compared: all of them, or each photograph with those near it in name order; auto: all, up to 200
+    photographs."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """How poses are found: one photograph after the other, or all at once (GLOMAP)."""
+    lens: Literal["pinhole", "radial", "opencv", "fisheye"] = "radial"
+    """What distortion is estimated and removed."""
+    single_camera: bool = False
+    """All photographs share one set of intrinsics (default: those of one size and one EXIF lens do)."""
+    camera_per_photo: bool = False
+    """Each photograph has intrinsics of its own."""
+    max_size: Annotated[int, arg(metavar="PIXELS")] = 1600
+    """Longest side that pictures are reduced to."""
+    truth: Annotated[Path | None, arg(metavar="SCENE", help_behavior_hint="(default: the data set that DIR lies in)")] = None
+    """A data set with the true poses of these photographs, to score the recovered ones."""
+    seed: int = 0
+    """Seed of all random choices."""
+
+    def run(self) -> int:
+        """Reconstruct; print the quality and where the scene lies."""
+        if self.single_camera and self.camera_per_photo:
+            raise InputError("--single-camera and --camera-per-photo exclude each other.")
+        if self.truth is not None and not self.truth.exists():
+            raise InputError(f"There is no data set '{self.truth}'.")
+        out = self.out or Path("scenes") / (self.folder.resolve().name or "photos")
+
+        from invgraphics.experiments.photos import import_photos
+        from invgraphics.experiments.progress import Reporter
+        from invgraphics.scenes.photos import PhotoJob
+
+        job = PhotoJob(
+            folder=str(self.folder),
+            matching=self.matching,
+            mapper=self.mapper,
+            lens=self.lens,
+            cameras="single" if self.single_camera else "per-photo" if self.camera_per_photo else "auto",
+            max_size=self.max_size,
+            seed=self.seed,
+        )
+        with Reporter(f"importing {self.folder.name}") as reporter:
+            quality = import_photos(
+                job, out, self.truth, progress=lambda done, total, what: reporter.show(done / max(total, 1), what)
+            )
+        show_quality(quality)
+        if not quality["usable"]:
+            sentence, remedy = quality["refusal"]
+            kept = f" What could be placed is kept in {out}." if quality["registered"] else ""
+            raise InputError(sentence, remedy + kept)
+        print(out)
+        return 0
+
+
+def show_quality(quality: Mapping[str, Any]) -> None:
+    """Print how well the photographs could be put together, and what was left out."""
+    show_table("Structure from motion", ("what", "found"), list(_rows(quality)))
+    for kind, files in (("left out", quality["skipped"]), ("not placed", quality["unplaced"])):
+        for name, why in list(files.items())[:_MOST_FILES]:
+            print(f"{kind}: {name}: {why}")
+        if len(files) > _MOST_FILES:
+            print(f"{kind}: {len(files) - _MOST_FILES} more, see quality.json")
+    suspicion = quality["suspicion"]
+    if suspicion is not None and suspicion["suspicious"]:
+        print(f"SUSPICIOUS: {suspicion['sentence']}")
+
+
+def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    pieces = "".join(f", a separate piece of {count}" for count in quality["other_pieces"])
+    yield "photographs placed", f"{quality['registered']} of {quality['used']}{pieces}"
+    if quality["registered"]:
+        yield "points", f"{quality['points']}, each in {quality['track_length']:.1f} photographs"
+        yield "reprojection error", f"{quality['reprojection_error_px']:.2f} px"
+        models = Counter(lens["model"] for lens in quality["lenses"])
+        lenses = ", ".join(f"{count} {model}" for model, count in models.items())
+        yield "cameras", f"{lenses}; distortion moves pixels by up to {quality['bend_px']:.1f} px"
+    if quality["suspicion"] is not None:
+        found = quality["suspicion"]
+        yield "pairs against poses", f"{found['contradicting']} of {found['pairs']} contradict them"
+    if "truth" in quality:
+        truth = quality["truth"]
+        turn, shift = truth["rotation_degrees"], truth["translation_per_cent"]
+        yield "rotation error", f"{turn['median']:.3f}° median, {turn['max']:.3f}° largest ({truth['cameras']} cameras)"
+        yield "translation error", f"{shift['median']:.3f} % of the scene's extent median, {shift['max']:.3f} % largest"
+        yield "truth", truth["source"]
+    yield "time", ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in quality["seconds"].items())

@@ -1,0 +1,68 @@
+"""``invgraphics locate``: where a photograph of a fitted scene was taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from invgraphics.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Locate:
+    """Find a photograph's pose by gradient descent through a fitted scene.
+
+    The most promising of several starts are followed from coarse to fine pictures, and the one with the smallest difference
+    wins. Writes the pose as JSON and, beside it, photograph, picture and difference as PNG.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a run."""
+    photo: Annotated[Positional[Path], arg(metavar="PHOTO")]
+    """The photograph; it is cropped to the shape of the scene's pictures, unless --fov is given."""
+    near: Annotated[str | None, arg(metavar="VIEW", help_behavior_hint="(default: compares all)")] = None
+    """Start at this training view: its number or name."""
+    start: Literal["views", "random"] = "views"
+    """Start at training views, or at random poses around them."""
+    starts: Annotated[int, arg(metavar="N")] = 4
+    """How many of the most promising starts are followed."""
+    steps: Annotated[int, arg(metavar="N")] = 300
+    """Steps of gradient descent of each start that is followed to the end."""
+    fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: the scene's lens)")] = None
+    """Horizontal field of view of the photograph."""
+    seed: int = 0
+    """Seed of random starts."""
+    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    """Another copy of the scene, for instance where the data set has moved."""
+    out: Annotated[Path | None, arg(metavar="FILE.json", help_behavior_hint="(default: PHOTO-located.json)")] = None
+    """File to write."""
+
+    def run(self) -> int:
+        """Search; print the pose, the loss, and the error where the pose is known."""
+        if not (self.folder / "recipe.toml").is_file():
+            raise InputError(
+                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
+            )
+        out = Path(f"{self.photo.stem}-located.json") if self.out is None else self.out
+        if out.suffix != ".json":
+            raise InputError(f"--out cannot be '{out}'.", "Expected a file name that ends in .json.")
+
+        from invgraphics.experiments.locating import LocateRequest, locate
+
+        options = (self.near, self.start, self.starts, self.steps, self.fov, self.scene, self.seed)
+        found = locate(LocateRequest(self.folder, self.photo, out, *options))
+        print("camera to world, OpenCV axes:")
+        for row in found["cam_to_world"]:
+            print("  " + "  ".join(f"{value:9.5f}" for value in row))
+        print(f"mean squared difference {found['loss']:.6f}, {found['psnr']:.2f} dB")
+        if "error" in found:
+            error = found["error"]
+            print(
+                f"the photograph is test view '{found['test_view']}': off by {error['rotation_deg']:.3f} degrees"
+                f" and {error['translation_percent']:.3f} per cent of the scene"
+            )
+        print(out)
+        return 0

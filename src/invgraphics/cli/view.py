@@ -1,0 +1,74 @@
+"""``invgraphics view``: a window into a run, in a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics.cli.arguments import SMALLEST
+from invgraphics.errors import InputError
+
+
+@dataclass(frozen=True)
+class View:
+    """Look around in a run, or in two of one scene side by side, in a browser: coarse while moving, fine when still.
+
+    Shows prediction, truth, error, depth and normals, and the photographs where they were taken. Ctrl-C ends it.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a run."""
+    other: Annotated[Positional[Path | None], arg(metavar="RUN2", help_behavior_hint="(default: none)")] = None
+    """Another run of the same scene, to compare."""
+    live: bool = False
+    """Follow a fit that runs in another process: wait for its first checkpoint, and show each newer one when it is written
+    (fit --checkpoint-every 5s writes them more often)."""
+    view: Annotated[int, arg(metavar="N")] = 0
+    """Test view to start at."""
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address to listen at. The default is reachable from this machine only; 0.0.0.0 lets everyone in who can reach it."""
+    port: Annotated[int, arg(metavar="N")] = 8080
+    """Port to listen at; 0 for any that is free."""
+    max_size: Annotated[int, arg(metavar="N")] = 800
+    """Most pixels along the pictures' longer side."""
+    open: bool = True
+    """Open the page in a browser, where there is a screen."""
+    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    """Another copy of the scene, for instance where the data set has moved."""
+
+    def run(self) -> int:
+        """Serve until Ctrl-C."""
+        if self.max_size < SMALLEST:
+            raise InputError(f"--max-size cannot be {self.max_size}.", f"Expected {SMALLEST} pixels or more.")
+
+        from invgraphics.viewer.view import ViewRequest, is_loopback, open_viewer
+
+        runs = (self.folder,) if self.other is None else (self.folder, self.other)
+        request = ViewRequest(runs, self.live, self.view, self.host, self.port, self.max_size, self.scene)
+        with open_viewer(request, _say) as viewer:
+            host = self.host if is_loopback(self.host) else "localhost"
+            url = f"http://{f'[{host}]' if ':' in host else host}:{viewer.port}"
+            if not is_loopback(self.host):
+                _say(f"Everyone who can reach port {viewer.port} of this machine can look at these runs.")
+            print(f"Looking at {' and '.join(map(str, runs))}: {url} (Ctrl-C ends)", flush=True)
+            if self.open and _has_screen():
+                webbrowser.open(url)
+            with contextlib.suppress(KeyboardInterrupt):
+                viewer.watch(self.live)
+        return 0
+
+
+def _has_screen() -> bool:
+    """Whether a browser would have a window; on a bare terminal a text browser would take it over."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _say(sentence: str) -> None:
+    print(sentence, file=sys.stderr, flush=True)

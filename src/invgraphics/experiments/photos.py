@@ -1,0 +1,111 @@
+"""Photographs become a scene, and where their true poses are known the recovered ones are scored against them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Scene
+from invgraphics.core.transforms import apply_similarity
+from invgraphics.errors import InputError
+from invgraphics.metrics.poses import pose_errors
+from invgraphics.scenes.open import SceneOptions, find_loader
+from invgraphics.scenes.photos import PhotoJob, reconstruct
+from invgraphics.scenes.photos.job import QUALITY
+from invgraphics.scenes.process import Progress
+
+_LEAST = 3  # cameras: with two, a similarity explains everything
+
+
+def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress: Progress | None = None) -> dict[str, Any]:
+    """Reconstruct, and compare with known poses.
+
+    Args:
+        job: which photographs, and how.
+        out: folder of the scene.
+        truth: a data set with the true poses of these photographs, told by their file names. Without it, the folder of the
+            photographs and the one above are looked at for one.
+        progress: called with (done, in all, what is being done).
+
+    Returns:
+        The content of ``out``/quality.json, with ``truth`` if poses could be compared.
+
+    Raises:
+        InputError: see `invgraphics.scenes.photos.reconstruct`; or ``truth`` does not know these photographs.
+    """
+    if truth is not None:
+        find_loader(truth)  # refuses before the work what it would refuse after it
+    quality = reconstruct(job, out, progress)
+    quality.pop("truth", None)
+    if truth is not None:
+        quality["truth"] = compare(job.path, quality, truth)
+    else:
+        quality |= _found_truth(job.path, quality)
+    partial = out / f"{QUALITY}.partial"
+    partial.write_text(json.dumps(quality, indent=1), encoding="utf-8")
+    partial.replace(out / QUALITY)
+    return quality
+
+
+def compare(folder: Path, quality: dict[str, Any], truth: Path) -> dict[str, Any]:
+    """Errors of the recovered cameras after a similarity alignment.
+
+    Args:
+        folder: of the photographs.
+        quality: report of their reconstruction.
+        truth: data set with poses.
+
+    Returns:
+        ``source``, and the summary of `invgraphics.metrics.poses.PoseErrors`.
+
+    Raises:
+        InputError: the data set cannot be read, or has fewer than three of the photographs.
+    """
+    known = true_poses(find_loader(truth).load(truth, SceneOptions(test_views=None)))
+    estimated, true = [], []
+    for camera in quality["cameras"]:
+        pose = _lookup(known, folder, camera["source"])
+        if pose is not None:
+            estimated.append(torch.tensor(camera["cam_to_world"], dtype=torch.float64))
+            true.append(pose)
+    if len(true) < _LEAST:
+        raise InputError(
+            f"{truth} knows the poses of {len(true)} of the {len(quality['cameras'])} placed photographs of {folder}.",
+            "Photographs are told by their file names, for instance 0001.jpg, or train/0001.png where splits share names.",
+        )
+    errors = pose_errors(torch.stack(estimated), torch.stack(true))
+    return {"source": str(truth), **errors.summary()}
+
+
+def true_poses(scene: Scene) -> dict[str, Float[Tensor, "4 4"] | None]:
+    """World poses of a scene's views by name without suffix, alone and after the split; ``None`` where two share one."""
+    world = scene.world_from_local.double()
+    known: dict[str, Float[Tensor, "4 4"] | None] = {}
+    for split in ("train", "val", "test"):
+        for view in getattr(scene, split):
+            pose = apply_similarity(world, view.camera.cam_to_world.double())
+            name = Path(view.name).stem
+            for label in {name, f"{split}/{name}", f"{split}-{name}"}:
+                known[label] = None if label in known else pose
+    return known
+
+
+def _lookup(known: dict[str, Float[Tensor, "4 4"] | None], folder: Path, source: str) -> Float[Tensor, "4 4"] | None:
+    name = Path(source).stem
+    pose = known.get(f"{folder.resolve().name}/{name}")
+    return pose if pose is not None else known.get(name)
+
+
+def _found_truth(folder: Path, quality: dict[str, Any]) -> dict[str, Any]:
+    """A comparison with a data set that the photographs lie in, if they do."""
+    for place in (folder, folder.resolve().parent):
+        try:
+            return {"truth": compare(folder, quality, place)}
+        except InputError:
+            continue
+    return {}

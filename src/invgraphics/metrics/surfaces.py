@@ -1,0 +1,67 @@
+"""How far two surfaces are apart, from points on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class SurfaceDistance:
+    """Mean distances between points of two surfaces, in their units.
+
+    Attributes:
+        accuracy: from the prediction to the truth: what is there should be right.
+        completeness: from the truth to the prediction: what should be there is.
+    """
+
+    accuracy: float
+    completeness: float
+
+    @property
+    def chamfer(self) -> float:
+        """Mean of both (not squared)."""
+        return (self.accuracy + self.completeness) / 2
+
+
+def surface_distance(
+    predicted: Float[Tensor, "n 3"], true: Float[Tensor, "m 3"], must: Float[Tensor, "k 3"] | None = None
+) -> SurfaceDistance:
+    """Compare points sampled on two surfaces by nearest neighbours.
+
+    Args:
+        predicted: points of the prediction.
+        true: points of the truth, all of it.
+        must: points of the truth that can be asked for, for instance those that were seen; ``None`` for all.
+    """
+    from scipy.spatial import KDTree
+
+    ours, theirs, asked = (points.double().cpu().numpy() for points in (predicted, true, true if must is None else must))
+    accuracy, _ = KDTree(theirs).query(ours)
+    completeness, _ = KDTree(ours).query(asked)
+    return SurfaceDistance(float(accuracy.mean()), float(completeness.mean()))
+
+
+def points_on(
+    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], count: int, generator: torch.Generator
+) -> Float[Tensor, "count 3"]:
+    """Uniform random points on a triangle mesh.
+
+    Args:
+        vertices: places.
+        faces: corners; triangles are drawn by area.
+        count: points wanted.
+        generator: source of randomness.
+    """
+    a, b, c = vertices.double()[faces].unbind(dim=1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=1)
+    # torch.multinomial takes at most 2^24 classes.
+    cumulative = area.cumsum(0)
+    chosen = torch.searchsorted(cumulative, torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1])
+    chosen = chosen.clamp_max(len(faces) - 1)
+    u, v = torch.rand(2, count, 1, generator=generator, dtype=torch.float64)
+    u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
+    return (a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]).to(vertices.dtype)

@@ -1,0 +1,86 @@
+"""What a person asks for, and the hash that tells whether a folder already holds the answer."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal, get_args
+
+from invgraphics.config import fill
+from invgraphics.errors import InputError
+
+SCHEMA = 1
+QUALITY, TOP_VIEW = "quality.json", "top-view.png"
+"""What is written beside ``images`` and ``sparse``; the first is written last, and means that the folder is whole."""
+
+Matching = Literal["auto", "exhaustive", "sequential"]
+Mapper = Literal["incremental", "global"]
+Lens = Literal["pinhole", "radial", "opencv", "fisheye"]
+Cameras = Literal["auto", "single", "per-photo"]
+
+MODELS: dict[Lens, str] = {
+    "pinhole": "SIMPLE_PINHOLE",
+    "radial": "SIMPLE_RADIAL",
+    "opencv": "OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+}
+"""COLMAP's camera models by our names."""
+
+EXHAUSTIVE = 200
+"""Most photographs of which every pair is matched when nothing else is asked for: 20 thousand pairs."""
+
+
+@dataclass(frozen=True)
+class PhotoJob:
+    """One reconstruction.
+
+    Attributes:
+        folder: of the photographs; or a data set that `invgraphics.scenes.open` knows, whose pictures (not poses) are taken.
+        matching: which pairs are compared: all, each with those near it in name order, or ``auto`` by their number.
+        mapper: COLMAP's incremental mapper, or its global one (GLOMAP).
+        lens: what distortion is estimated; data sets are straight already.
+        cameras: photographs of one size and one EXIF lens share their intrinsics, or all do, or none.
+        max_size: longest side that pictures are reduced to, pixels.
+        seed: of all random choices.
+    """
+
+    folder: str
+    matching: Matching = "auto"
+    mapper: Mapper = "incremental"
+    lens: Lens = "radial"
+    cameras: Cameras = "auto"
+    max_size: int = 1600
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, known in (("matching", Matching), ("mapper", Mapper), ("lens", Lens), ("cameras", Cameras)):
+            if getattr(self, name) not in get_args(known):
+                raise InputError(f"'{name}' cannot be '{getattr(self, name)}'.", f"Expected: {', '.join(get_args(known))}.")
+        if self.max_size < 64:
+            raise InputError(f"The largest size cannot be {self.max_size} pixels.", "Expected: at least 64.")
+        if self.seed < 0:
+            raise InputError(f"The seed cannot be {self.seed}.", "Expected: 0 or more.")
+
+    @property
+    def path(self) -> Path:
+        """The folder."""
+        return Path(self.folder)
+
+    def text(self) -> str:
+        """As JSON."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @staticmethod
+    def parse(text: str) -> PhotoJob:
+        """Inverse of `text`."""
+        return fill(PhotoJob, json.loads(text))
+
+    def key(self) -> str:
+        """Hash of the settings, the photographs' names, sizes and dates, and the library's version."""
+        files = sorted(path for path in self.path.rglob("*") if path.is_file())
+        listing = [(path.relative_to(self.path).as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+        content = [SCHEMA, self.text(), listing, version("pycolmap")]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

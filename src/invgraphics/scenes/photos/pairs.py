@@ -1,0 +1,80 @@
+"""What is known about pairs of photographs: the verified matches in COLMAP's data base, as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from invgraphics.scenes.photos.prepare import Prepared
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two photographs that show the same thing, as far as their matches tell.
+
+    Attributes:
+        first: index of one photograph.
+        second: index of the other.
+        points: matched places in both, pixels.
+    """
+
+    first: int
+    second: int
+    points: tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]
+
+    def __len__(self) -> int:
+        return len(self.points[0])
+
+    @property
+    def motion(self) -> float:
+        """Median distance in pixels between the places of a match."""
+        return float(np.median(np.linalg.norm(self.points[0] - self.points[1], axis=1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What features and matches there are, before any pose.
+
+    Attributes:
+        features: number in each photograph.
+        pairs: those that COLMAP's two-view verification accepts.
+    """
+
+    features: tuple[int, ...]
+    pairs: tuple[Pair, ...]
+
+    def partners(self, index: int) -> int:
+        """Photographs that one photograph overlaps with."""
+        return sum(index in (pair.first, pair.second) for pair in self.pairs)
+
+
+def read_evidence(path: Path, photos: Sequence[Prepared]) -> Evidence:
+    """Read the data base."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as database:
+        ids = [database.read_image_with_name(photo.name).image_id for photo in photos]
+        places = [np.asarray(database.read_keypoints(image))[:, :2] for image in ids]
+        index = {image: number for number, image in enumerate(ids)}
+        pairs = []
+        for first, second, geometry in _verified(database):
+            i, j = index[first], index[second]
+            matches = np.asarray(geometry.inlier_matches)
+            pairs.append(Pair(i, j, (places[i][matches[:, 0]], places[j][matches[:, 1]])))
+    return Evidence(tuple(len(place) for place in places), tuple(sorted(pairs, key=lambda pair: (pair.first, pair.second))))
+
+
+def _verified(database: Any) -> list[tuple[int, int, Any]]:
+    import pycolmap
+
+    found = []
+    ids, geometries = database.read_two_view_geometries()
+    for pair_id, geometry in zip(ids, geometries, strict=True):
+        if len(geometry.inlier_matches):
+            found.append((*pycolmap.pair_id_to_image_pair(pair_id), geometry))
+    return found

@@ -1,0 +1,90 @@
+"""How well the photographs could be put together, and why some or all could not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from invgraphics.scenes.photos.pairs import Evidence
+from invgraphics.scenes.photos.prepare import Prepared
+
+LEAST, SHARE = 3, 0.5
+"""A scene is usable when at least so many photographs, and this share of them, could be placed."""
+
+FEW_FEATURES = 200
+"""A sharp photograph of a textured scene has thousands of SIFT features; below this one there is little to hold on to."""
+
+NO_MOTION = 0.01
+"""Median motion of matches, as a share of the longest side, below which a pair shows no parallax worth the name."""
+
+ADVICE = "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."
+
+
+def describe(model: Any, photos: Sequence[Prepared]) -> dict[str, Any]:
+    """Figures of a reconstruction (before its lens is removed): counts, errors in pixels, cameras and lenses."""
+    placed = {image.name: image for image in model.images.values() if image.has_pose}
+    cameras = []
+    for photo in photos:
+        if photo.name in placed:
+            image = placed[photo.name]
+            pose = np.eye(4)
+            pose[:3] = image.cam_from_world().inverse().matrix()
+            entry = {"name": photo.name, "source": photo.source, "points": image.num_points3D, "cam_to_world": pose.tolist()}
+            cameras.append(entry)
+    return {
+        "registered": len(cameras),
+        "points": model.num_points3D(),
+        "reprojection_error_px": float(model.compute_mean_reprojection_error()),
+        "track_length": float(model.compute_mean_track_length()),
+        "observations_per_photo": float(model.compute_mean_observations_per_reg_image()),
+        "lenses": [
+            {"model": camera.model_name, "params": list(map(float, camera.params)), "size": [camera.width, camera.height]}
+            for camera in model.cameras.values()
+        ],
+        "cameras": cameras,
+    }
+
+
+NOTHING: dict[str, Any] = {
+    "registered": 0, "points": 0, "reprojection_error_px": None, "track_length": None, "observations_per_photo": None,
+    "lenses": [], "cameras": [],
+}  # fmt: skip
+"""`describe` where no two photographs could be placed."""
+
+
+def unplaced(photos: Sequence[Prepared], evidence: Evidence, placed: set[str]) -> dict[str, str]:
+    """Why each photograph that has no pose has none, by its own name."""
+    reasons = {}
+    for index, photo in enumerate(photos):
+        if photo.name in placed:
+            continue
+        features, partners = evidence.features[index], evidence.partners(index)
+        if features < FEW_FEATURES:
+            reasons[photo.source] = f"only {features} features: blurred, or it shows something bare"
+        elif not partners:
+            reasons[photo.source] = "shares nothing with any other photograph"
+        else:
+            reasons[photo.source] = f"its matches with {partners} others do not fit the rest"
+    return reasons
+
+
+def refusal(photos: Sequence[Prepared], evidence: Evidence, registered: int) -> tuple[str, str] | None:
+    """What to tell a person when too few photographs could be placed, and what to do; ``None`` where enough could."""
+    if registered >= max(LEAST, SHARE * len(photos)):
+        return None
+    what = f"Only {registered} of {len(photos)} photographs could be placed" if registered else "No photograph could be placed"
+    longest = max(max(photo.width, photo.height) for photo in photos)
+    features = float(np.median(evidence.features))
+    motions = [pair.motion for pair in evidence.pairs]
+    if features < FEW_FEATURES:
+        remedy = "Take sharp photographs of something with texture, in better light; or give a larger --max-size."
+        return f"{what}: they show too little to recognise ({features:.0f} features each, blurred or bare).", remedy
+    if motions and float(np.median(motions)) < NO_MOTION * longest:
+        remedy = "Step sideways between photographs: depth cannot be seen from one place."
+        return f"{what}: they are taken from one and the same place.", remedy
+    if len(evidence.pairs) < len(photos) - 1:
+        return f"{what}: they hardly overlap ({len(evidence.pairs)} pairs of them show a common part).", ADVICE
+    remedy = "Try --mapper global, --lens opencv or --matching exhaustive; or take more photographs between those there are."
+    return f"{what}: their matches do not fit together.", remedy

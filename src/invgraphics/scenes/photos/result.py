@@ -1,0 +1,95 @@
+"""The scene that is left behind: straight pictures, and the COLMAP model of the pinholes that took them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from invgraphics.core import Camera
+from invgraphics.scenes.images import make_view, read_pixels
+from invgraphics.scenes.lens import Lens, Straight, straighten
+from invgraphics.scenes.photos.prepare import PHOTOS, Prepared
+from invgraphics.scenes.process import Progress
+
+STRAIGHT = 0.25
+"""A lens that moves no pixel farther than this many pixels is taken for a pinhole: resampling would cost more than it mends."""
+
+
+def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path, progress: Progress) -> float:
+    """Write ``images`` and ``sparse/0`` for the photographs that ``model`` places; the model itself is changed on the way.
+
+    Returns:
+        The largest distance that a lens moves a pixel of its picture.
+    """
+    (result / "images").mkdir(parents=True, exist_ok=True)
+    lenses = {camera_id: _lens(camera) for camera_id, camera in model.cameras.items()}
+    bends = {camera_id: bend(lens) for camera_id, lens in lenses.items()}
+    by_name = {image.name: image for image in model.images.values() if image.has_pose}
+    kept = [photo for photo in photos if photo.name in by_name]
+    for index, photo in enumerate(kept):
+        progress(index, len(kept), f"straightening {photo.name}")
+        image = by_name[photo.name]
+        lens = lenses[image.camera_id] if bends[image.camera_id] > STRAIGHT else None
+        _write_picture(work / PHOTOS / photo.name, result / "images" / photo.name, lens)
+    for camera_id, camera in model.cameras.items():
+        straight = straighten(lenses[camera_id]) if bends[camera_id] > STRAIGHT else None
+        if straight is not None:
+            for image in model.images.values():
+                if image.camera_id == camera_id:
+                    _move_points(image, camera, straight)
+        _make_pinhole(camera, straight)
+    (result / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+    model.write(str(result / "sparse" / "0"))
+    return max(bends.values(), default=0.0)
+
+
+def bend(lens: Lens) -> float:
+    """The largest distance in pixels between where a point of the picture's border is and where a pinhole would have it."""
+    if lens.is_pinhole():
+        return 0.0
+    camera = lens.colmap()
+    x, y = np.linspace(0, lens.width, 33), np.linspace(0, lens.height, 33)
+    border = np.array([[u, v] for u in x for v in y])
+    plane = camera.cam_from_img(border)
+    straight = plane * (camera.focal_length_x, camera.focal_length_y) + (camera.principal_point_x, camera.principal_point_y)
+    return float(np.linalg.norm(straight - border, axis=1).max())
+
+
+def _lens(camera: Any) -> Lens:
+    return Lens(camera.model_name, tuple(float(value) for value in camera.params), camera.width, camera.height)
+
+
+def _write_picture(source: Path, target: Path, lens: Lens | None) -> None:
+    from PIL import Image
+
+    if lens is None:
+        target.write_bytes(source.read_bytes())
+        return
+    pixels = read_pixels(source)
+    unit = torch.ones(2, dtype=torch.float64)  # replaced by the lens's own
+    camera = Camera(torch.eye(4, dtype=torch.float64), unit, unit, lens.width, lens.height)
+    view = make_view(camera, pixels, source.name, lens=lens)
+    alpha = [] if view.alpha is None else [view.alpha[..., None].numpy()]
+    Image.fromarray(np.concatenate([view.image.numpy(), *alpha], axis=-1)).save(target, compress_level=1)
+
+
+def _move_points(image: Any, camera: Any, straight: Straight) -> None:
+    """The features of a picture, where its straightened copy shows them."""
+    if image.num_points2D() == 0:
+        return
+    plane = camera.cam_from_img(np.array([point.xy for point in image.points2D]))
+    for point, xy in zip(image.points2D, plane * straight.focal + straight.centre, strict=True):
+        point.xy = xy
+
+
+def _make_pinhole(camera: Any, straight: Straight | None) -> None:
+    import pycolmap
+
+    focal = (camera.focal_length_x, camera.focal_length_y) if straight is None else straight.focal
+    centre = (camera.principal_point_x, camera.principal_point_y) if straight is None else straight.centre
+    camera.model = pycolmap.CameraModelId.PINHOLE
+    camera.params = [*focal, *centre]

@@ -1,0 +1,126 @@
+"""One photograph's pose, by gradient descent through a scene that is fitted already (iNeRF, Yen-Chen et al. 2021)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from invgraphics.core import Batch, Camera, Context, Field, RayRenderer, Renderer, Scene, View
+from invgraphics.training.batches import scaled_view
+from invgraphics.training.poses import motion_about, pivot_depth
+
+Model = tuple[Field, Renderer]
+
+
+@dataclass(frozen=True)
+class Descent:
+    """How a pose is searched for.
+
+    Attributes:
+        steps: of Adam.
+        lr: learning rate at the start: radians, and shares of the scene's extent.
+        final: at the end.
+        scale: image scale.
+        rays: random pixels of a step, for renderers of rays; others take the whole picture.
+    """
+
+    steps: int
+    lr: float = 2e-3
+    final: float = 2e-4
+    scale: float = 1.0
+    rays: int = 1024
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step, log-linear."""
+        return self.lr * (self.final / self.lr) ** (step / max(self.steps - 1, 1))
+
+
+def descend(model: Model, view: View, scene: Scene, descent: Descent) -> Camera:
+    """The camera that, starting from the view's, shows what its photograph shows; a rigid motion in its own frame away.
+
+    Args:
+        model: fitted field and renderer; neither is changed.
+        view: photograph, and where the search starts.
+        scene: for its bounds, extent and background.
+        descent: how far and how fast. The pixels of all steps are drawn from one fixed seed.
+    """
+    field, renderer = model
+    device = _device(model)
+    small = _at_scale(view, descent.scale)
+    twist = torch.zeros(6, device=device, requires_grad=True)
+    reach = torch.tensor([1.0] * 3 + [scene.extent] * 3, device=device)
+    adam = torch.optim.Adam([twist], lr=descent.lr)
+    generator = torch.Generator().manual_seed(0)
+    ctx = Context(scene.bounds.to(device), training=False)
+    start = small.camera.to(device)
+    pivot = pivot_depth(start, scene)
+    with _fixed(field, renderer):
+        for step in range(descent.steps):
+            adam.param_groups[0]["lr"] = descent.rate(step)
+            camera = start.moved(start.cam_to_world @ motion_about(twist * reach, pivot))
+            colour, target = _compared(model, camera, (small, scene), ctx, (descent.rays, generator))
+            loss = (colour - target).square().mean()
+            adam.zero_grad()
+            loss.backward()
+            adam.step()
+    with torch.no_grad():
+        pose = start.cam_to_world @ motion_about(twist * reach, pivot)
+        return view.camera.moved(pose.to(view.camera.cam_to_world))
+
+
+@torch.no_grad()
+def difference(model: Model, view: View, scene: Scene, scale: float = 1.0) -> float:
+    """Mean squared difference between a photograph and what its camera shows, colours in front of the scene's background."""
+    field, renderer = model
+    device = _device(model)
+    small = _at_scale(view, scale)
+    picture, _ = renderer.render_image(field, small.camera.to(device), Context(scene.bounds.to(device)))
+    counted = torch.ones_like(small.opacity(), dtype=torch.bool) if small.mask is None else small.mask
+    error = (picture.over(scene.background.to(device)).cpu() - small.over(scene.background)).square()
+    return float(error[counted].mean())
+
+
+def _at_scale(view: View, scale: float) -> View:
+    width, height = (max(1, round(edge * scale)) for edge in (view.camera.width, view.camera.height))
+    return view if (width, height) == (view.camera.width, view.camera.height) else scaled_view(view, width, height)
+
+
+def _compared(
+    model: Model, camera: Camera, truth: tuple[View, Scene], ctx: Context, draw: tuple[int, torch.Generator]
+) -> tuple[Tensor, Tensor]:
+    """Colours seen and photographed at the pixels of one step."""
+    field, renderer = model
+    view, scene = truth
+    background = scene.background.to(camera.focal.device)
+    batch = Batch(view.over(scene.background), view.opacity(), background)
+    valid = torch.arange(batch.alpha.numel()) if view.mask is None else view.mask.reshape(-1).nonzero()[:, 0]
+    if isinstance(renderer, RayRenderer):
+        flat = valid[torch.randint(len(valid), (min(draw[0], len(valid)),), generator=draw[1])]
+        pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
+        picture, _ = renderer.render_rays(field, camera.rays(pixels.to(background)), ctx)
+        return picture.over(background), batch.target.reshape(-1, 3)[flat].to(background)
+    picture, _ = renderer.render_image(field, camera, ctx)
+    where = valid.to(background.device)
+    return picture.over(background).reshape(-1, 3)[where], batch.target.to(background).reshape(-1, 3)[where]
+
+
+def _device(model: Model) -> torch.device:
+    parameter: Tensor | None = next(model[0].parameters(), None)
+    return torch.device("cpu") if parameter is None else parameter.device
+
+
+@contextmanager
+def _fixed(*modules: nn.Module) -> Iterator[None]:
+    """Without gradients towards the modules' parameters, which saves computing them."""
+    learning = [parameter for module in modules for parameter in module.parameters() if parameter.requires_grad]
+    for parameter in learning:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learning:
+            parameter.requires_grad_(True)

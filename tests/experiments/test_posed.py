@@ -1,0 +1,36 @@
+"""The frame of a fit that refined its poses: what drifted with it lands where the fit has it, and the world stays."""
+
+from dataclasses import replace
+
+import torch
+
+from invgraphics.core import Scene
+from invgraphics.core.transforms import apply_similarity, se3_exp
+from invgraphics.experiments.posed import scene_of_fit
+from invgraphics.metrics.poses import Similarity
+from invgraphics.training.poses import Poses, PosesConfig
+
+
+def test_a_scene_follows_its_fit(scene: Scene) -> None:
+    motion = se3_exp(torch.tensor([0.1, -0.2, 0.05, 0.3, 0.1, -0.2], dtype=torch.float64))
+    drift = Similarity(1.25, motion[:3, :3], motion[:3, 3])
+    first = scene.test[0]
+    depth, normal = torch.full(first.image.shape[:2], 2.0), torch.zeros_like(first.image, dtype=torch.float32)
+    normal[..., 2] = 1.0
+    scene = replace(scene, test=(replace(first, depth=depth, normal=normal), *scene.test[1:]))
+    poses = Poses.of(PosesConfig(), scene)
+    poses.given.copy_(drift.poses(poses.reference))
+    seen = scene_of_fit(poses, scene)
+    for split in ("train", "test"):
+        for before, after in zip(getattr(scene, split), getattr(seen, split), strict=True):
+            expected = drift.poses(before.camera.cam_to_world).float()
+            torch.testing.assert_close(after.camera.cam_to_world.float(), expected, atol=1e-4, rtol=0)
+            worlds = [
+                apply_similarity(s.world_from_local.double(), v.camera.cam_to_world.double())
+                for s, v in ((scene, before), (seen, after))
+            ]
+            torch.testing.assert_close(*worlds, atol=1e-4, rtol=0)
+    assert seen.test[0].depth is not None
+    torch.testing.assert_close(seen.test[0].depth, 1.25 * depth, atol=1e-4, rtol=0)
+    assert seen.test[0].normal is not None
+    torch.testing.assert_close(seen.test[0].normal[0, 0].double(), motion[:3, 2], atol=1e-4, rtol=0)

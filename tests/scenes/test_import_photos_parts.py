@@ -1,0 +1,210 @@
+"""The stages of an import on their own: working copies, pairs, lens removal, and the process that does the work."""
+
+import json
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dots import save
+from PIL import Image
+
+from invgraphics.errors import InputError
+from invgraphics.scenes.lens import Lens
+from invgraphics.scenes.photos import PhotoJob
+from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
+from invgraphics.scenes.photos.prepare import Preparation, natural, prepare
+from invgraphics.scenes.photos.result import bend, write_scene
+from invgraphics.scenes.photos.sfm import pairs
+from invgraphics.scenes.process import run_worker
+
+
+def quiet(done: int, total: int, what: str) -> None:
+    assert 0 <= done <= total
+    assert what
+
+
+def noise(seed: int, width: int, height: int, channels: int = 3) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
+
+
+def prepared(folder: Path, tmp_path: Path, **options) -> Preparation:
+    work = tmp_path / "work"
+    work.mkdir(exist_ok=True)
+    preparation = prepare(PhotoJob(str(folder), **options), work, quiet)
+    preparation.write(tmp_path / "p.json")
+    assert Preparation.read(tmp_path / "p.json") == preparation
+    return preparation
+
+
+def test_copies_are_upright_reduced_and_grouped(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    for index in range(3):
+        save(noise(index, 200, 100), folder / f"IMG_{9 + index}.png")
+    exif = Image.Exif()
+    exif[0x0112] = 8  # counter-clockwise
+    turned = noise(3, 200, 100)
+    Image.fromarray(turned).save(folder / "IMG_12.png", exif=exif)
+    preparation = prepared(folder, tmp_path, max_size=100)
+    assert [photo.name for photo in preparation.photos] == ["IMG_9.png", "IMG_10.png", "IMG_11.png", "IMG_12.png"]
+    assert [(photo.width, photo.height) for photo in preparation.photos] == [(100, 50)] * 3 + [(50, 100)]
+    assert len({photo.group for photo in preparation.photos}) == 2
+    small = np.array(Image.open(tmp_path / "work/photos/IMG_12.png"))
+    averaged = np.rot90(turned).reshape(100, 2, 50, 2, 3).mean(axis=(1, 3))
+    assert np.abs(small - averaged).max() <= 0.51
+    separate = prepared(folder, tmp_path, cameras="per-photo")
+    assert len({photo.group for photo in separate.photos}) == 4
+
+
+def test_transparent_parts_are_masked_and_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    for index in range(2):
+        picture = noise(index, 64, 64, 4)
+        picture[..., 3] = np.where(np.arange(64) < 20, 0, 255)
+        save(picture, folder / f"{index}.png")
+    preparation = prepared(folder, tmp_path)
+    assert all(photo.masked for photo in preparation.photos)
+    mask = np.array(Image.open(tmp_path / "work/masks/0.png.png"))
+    np.testing.assert_array_equal(mask, np.broadcast_to(np.where(np.arange(64) < 20, 0, 255), (64, 64)))
+    assert np.array(Image.open(tmp_path / "work/photos/0.png")).shape == (64, 64, 4)
+
+
+def test_exif_focal_length_is_known(tmp_path: Path) -> None:
+    """24 mm on 35 mm film at a 3:2 picture: 24/36 of the width."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 24
+    for index in range(2):
+        Image.fromarray(noise(index, 300, 200)).save(folder / f"{index}.jpg", exif=exif)
+    Image.fromarray(noise(2, 300, 200)).save(folder / "2.jpg")
+    photos = prepared(folder, tmp_path, max_size=150).photos
+    assert photos[0].focal == pytest.approx(24 / 36 * 150, rel=0.05)
+    assert photos[2].focal is None
+    assert photos[0].group == photos[1].group != photos[2].group
+
+
+def test_the_pictures_of_a_data_set_are_taken_as_fits_see_them(tmp_path: Path) -> None:
+    """Straight, with the calibrated camera, and told apart by their own names."""
+    table = {"fl_x": 90.0, "fl_y": 90.0, "cx": 50.0, "cy": 42.0, "w": 96, "h": 80, "camera_model": "PINHOLE", "frames": []}
+    for index in range(9):
+        save(noise(index, 96, 80), tmp_path / f"set/images/{index}.png")
+        table["frames"].append({"file_path": f"images/{index}.png", "transform_matrix": np.diag([1.0, 1, 1, 1]).tolist()})
+        table["frames"][-1]["transform_matrix"][0][3] = float(index)
+    (tmp_path / "set/transforms.json").write_text(json.dumps(table))
+    photos = prepared(tmp_path / "set", tmp_path).photos
+    assert [photo.source for photo in photos] == [f"{index}.png" for index in range(9)]
+    assert {(photo.focal, photo.centre) for photo in photos} == {(90.0, (50.0, 42.0))}
+    for index in range(9):
+        copy = np.array(Image.open(tmp_path / f"work/photos/{index}.png"))
+        np.testing.assert_array_equal(copy, noise(index, 96, 80))
+
+
+def test_names_are_told_apart(tmp_path: Path) -> None:
+    for index, name in enumerate(["my photo.png", "my photo.jpg", "other.png"]):
+        save(noise(index, 64, 64), tmp_path / "photos" / name)
+    names = [photo.name for photo in prepared(tmp_path / "photos", tmp_path).photos]
+    assert names == ["my_photo.jpg.png", "my_photo.png.png", "other.png.png"]
+
+
+def test_numbers_in_names_count_as_numbers() -> None:
+    assert sorted(["b10", "B9", "a2b11", "a2b3"], key=natural) == ["a2b3", "a2b11", "B9", "b10"]
+
+
+def test_pairs() -> None:
+    assert len(pairs(200, "auto")) == 200 * 199 // 2
+    near = pairs(300, "auto")
+    assert near == pairs(300, "sequential")
+    assert {j - i for i, j in near} == {*range(1, 11), 16, 32, 64, 128, 256}
+    assert all(0 <= i < j < 300 for i, j in near)
+    assert len(pairs(300, "exhaustive")) == 300 * 299 // 2
+
+
+def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None:
+    """COLMAP's own synthetic scene through a bent lens: afterwards a plain pinhole explains the same observations."""
+    import pycolmap
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 4, 60
+    options.camera_width, options.camera_height = 160, 120
+    options.camera_model_id = pycolmap.CameraModelId.SIMPLE_RADIAL
+    options.camera_params = [150.0, 80.0, 60.0, -0.1]
+    model = pycolmap.synthesize_dataset(options)
+    folder = tmp_path / "photos"
+    for number, image in enumerate(model.images.values()):
+        image.name = f"{number}.png"
+        save(noise(number, 160, 120), folder / image.name)
+    preparation = prepared(folder, tmp_path)
+    moved = write_scene(model, preparation.photos, tmp_path / "work", tmp_path / "result", quiet)
+    # The corner is at radius 100/150 of the focal length: x k r³ f.
+    assert moved == pytest.approx(150 * 0.1 * (100 / 150) ** 3, rel=0.5)
+    written = pycolmap.Reconstruction(str(tmp_path / "result/sparse/0"))
+    assert {camera.model_name for camera in written.cameras.values()} == {"PINHOLE"}
+    errors = []
+    for image in written.images.values():
+        for point in image.points2D:
+            if point.has_point3D():
+                errors.append(np.linalg.norm(image.project_point(written.points3D[point.point3D_id].xyz) - point.xy))
+    assert len(errors) > 100
+    assert max(errors) < 0.02
+    assert Image.open(tmp_path / "result/images/0.png").size == (160, 120)
+
+
+def test_how_much_a_lens_bends() -> None:
+    assert bend(Lens("PINHOLE", (100.0, 100.0, 50.0, 50.0), 100, 100)) == 0
+    assert bend(Lens("SIMPLE_RADIAL", (100.0, 50.0, 50.0, 1e-4), 100, 100)) == pytest.approx(100 * 1e-4 * 0.5**1.5, rel=0.01)
+
+
+def test_settings_are_checked() -> None:
+    for wrong in ({"matching": "all"}, {"lens": "bent"}, {"max_size": 10}, {"seed": -1}):
+        with pytest.raises(InputError, match="cannot be"):
+            PhotoJob("photos", **wrong)
+
+
+def test_a_worker_that_is_killed_is_a_sentence(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "executable", _script(tmp_path, "echo 'progress 1 2 working'; kill -9 $$"))
+    told = []
+    with pytest.raises(InputError, match=r"It failed: its process died of SIGKILL") as caught:
+        run_worker("some.module", tmp_path, lambda *step: told.append(step), "It failed", "Try again.")
+    assert caught.value.remedy == "Try again."
+    assert told == [(1, 2, "working")]
+
+
+def test_a_worker_that_fails_is_quoted(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "executable", _script(tmp_path, "echo Traceback >&2; echo 'ValueError: why' >&2; exit 1"))
+    with pytest.raises(InputError, match="It failed: ValueError: why"):
+        run_worker("some.module", tmp_path, quiet, "It failed", "")
+    monkeypatch.setattr(sys, "executable", _script(tmp_path, """echo 'error ["What", "Do"]'; exit 1"""))
+    with pytest.raises(InputError, match="What\nDo"):
+        run_worker("some.module", tmp_path, quiet, "It failed", "")
+
+
+def _script(folder: Path, body: str) -> str:
+    path = folder / "worker"
+    path.write_text(f"#!/bin/sh\n{body}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+def test_an_interrupted_import_is_gone_on_with(tmp_path: Path, monkeypatch) -> None:
+    """Working copies of the first attempt are used; those of another request are not."""
+    for index in range(3):
+        save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
+    job, out = PhotoJob(str(tmp_path / "photos")), tmp_path / "out"
+    started = []
+
+    def interrupted(*args, **kwargs):
+        started.append((out / WORK / JOB).read_text())
+        (out / WORK / "left").write_text("something")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", interrupted)
+    left = []
+    for request in (job, job, PhotoJob(str(tmp_path / "photos"), seed=1)):
+        left.append((out / WORK / "left").exists())
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(request, out)
+    assert [first == second for first, second in pairwise(started)] == [True, False]
+    assert left == [False, True, True]

@@ -1,0 +1,290 @@
+"""Poses that are fitted too: the exponential map, gradients through every family of renderers, windows, recovery, resuming."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from invgraphics import kernels
+from invgraphics.core import Bounds, Context, Field, FieldValues, Quantity, Samples, Scene, View
+from invgraphics.core.colour import quantise
+from invgraphics.core.transforms import se3_exp
+from invgraphics.experiments.build import build_model, build_plan
+from invgraphics.fields.encodings.frequency import FrequencyConfig
+from invgraphics.fields.encodings.hash import HashConfig
+from invgraphics.kernels import reference
+from invgraphics.kernels.types import HashGrid
+from invgraphics.metrics.poses import pose_errors
+from invgraphics.renderers.samplers import StratifiedConfig
+from invgraphics.renderers.volumetric import VolumetricConfig
+from invgraphics.scenes.corrupt import TrainingData, corrupt
+from invgraphics.testing import toy_cameras
+from invgraphics.training import checkpoint
+from invgraphics.training.batches import BatchConfig
+from invgraphics.training.budget import Budget
+from invgraphics.training.fit import Fit, Plan
+from invgraphics.training.localise import Descent, descend
+from invgraphics.training.losses import PhotometricConfig
+from invgraphics.training.optimiser import OptimiserConfig
+from invgraphics.training.poses import Poses, PosesConfig, motion_about, windows
+
+CPU = torch.device("cpu")
+ON = "training.poses.optimise=true"
+METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
+
+
+def same(a: dict, b: dict) -> bool:
+    return a.keys() == b.keys() and all(
+        a[part].keys() == b[part].keys() and all(torch.equal(a[part][name], b[part][name]) for name in a[part]) for part in a
+    )
+
+
+class Blobs(Field):
+    """Soft coloured blobs, which a pose can be read from; nothing to learn."""
+
+    provides = Quantity.DENSITY | Quantity.RADIANCE
+
+    def __init__(self) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(3)
+        self.centres, self.colours = (
+            torch.randn(7, 3, generator=generator) * 0.45,
+            torch.rand(7, 3, generator=generator),
+        )
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        share = torch.exp(-(samples.position[:, None] - self.centres).square().sum(dim=2) / 0.08) + 1e-9
+        return FieldValues(density=6 * share.sum(dim=1), radiance=share @ self.colours / share.sum(dim=1, keepdim=True))
+
+
+@pytest.fixture(scope="module")
+def blobs() -> Scene:
+    """Six photographs of the blobs, and one to test."""
+    bounds = Bounds(-torch.ones(3), torch.ones(3))
+    scene = Scene("blobs", (), (), torch.zeros(3), bounds)
+    renderer, field = VolumetricConfig(StratifiedConfig(48)).build(scene), Blobs()
+    views = []
+    for index, camera in enumerate(toy_cameras(7, 20)):
+        picture, _ = renderer.render_image(field, camera, Context(bounds))
+        views.append(View(camera, quantise(picture.over(torch.zeros(3))), f"view{index}"))
+    return scene.with_views(train=tuple(views[:6]), test=tuple(views[6:]))
+
+
+def test_exponential_map_is_that_of_the_matrix() -> None:
+    generator = torch.Generator().manual_seed(0)
+    twists = torch.randn(40, 6, generator=generator, dtype=torch.float64)
+    lengths = torch.tensor([0.0, 1e-9, 1e-4, 0.0999, 0.1001, 1.0, 3.1, 7.0], dtype=torch.float64).repeat(5)
+    twists[:, :3] *= (lengths / twists[:, :3].norm(dim=1))[:, None]
+    x, y, z = twists[:, :3].unbind(dim=1)
+    generators = torch.zeros(40, 4, 4, dtype=torch.float64)
+    generators[:, 2, 1], generators[:, 0, 2], generators[:, 1, 0] = x, y, z
+    generators[:, 1, 2], generators[:, 2, 0], generators[:, 0, 1] = -x, -y, -z
+    generators[:, :3, 3] = twists[:, 3:]
+    torch.testing.assert_close(se3_exp(twists), torch.linalg.matrix_exp(generators), atol=1e-13, rtol=1e-12)
+    torch.testing.assert_close(se3_exp(twists[0]), se3_exp(twists)[0])
+    for place in (0, 2, 4, 5):
+        assert torch.autograd.gradcheck(se3_exp, twists[place].clone().requires_grad_())
+
+
+def test_zero_residuals_are_the_given_poses_and_rows_do_not_mix(blobs: Scene) -> None:
+    poses = Poses.of(PosesConfig(), blobs)
+    for index, view in enumerate(blobs.train):
+        torch.testing.assert_close(poses.camera(index).cam_to_world, view.camera.cam_to_world, atol=1e-6, rtol=0)
+    poses.camera(2).position.sum().backward()
+    assert [shift.grad is not None for shift in poses.translation] == [False, False, True, False, False, False]
+
+
+RENDERERS = {
+    "hash": ("volumetric/hash", ["renderer.sampler.type=stratified", "renderer.sampler.count=24"]),
+    "frequency": ("volumetric/nerf", ["renderer.sampler.type=stratified", "renderer.sampler.count=24"]),
+    "splatting": ("splatting/gaussians", []),
+    "exact": ("gaussian-volume/exact", ["field.count=60", "field.max_init=60"]),
+    "sorted": ("gaussian-volume/sorted", ["field.count=60", "field.max_init=60"]),
+}
+
+
+def liven(field: Field) -> None:
+    """Make an unfitted field show something everywhere."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for name, parameter in field.named_parameters():
+            if name.endswith(("table", "sh_dc")):
+                parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.5)
+            if name.endswith("log_scales"):
+                parameter.clamp_(min=-2.0)
+
+
+@pytest.mark.parametrize("family", RENDERERS)
+def test_gradients_of_a_pose(family: str, scene: Scene, small: Callable) -> None:
+    """Through the field's positions and directions, against finite differences in float64."""
+    name, settings = RENDERERS[family]
+    field, renderer = build_model(small(name, *settings), scene, 0, CPU)
+    liven(field)
+    field, renderer = field.double(), renderer.double()
+    camera = scene.train[0].camera.resized(8, 8).to(torch.float64)
+    ctx = Context(scene.bounds.to(torch.float64))
+    cotangent = torch.rand(8, 8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+
+    def shown(twist: Tensor) -> Tensor:
+        picture, _ = renderer.render_image(field, camera.moved(camera.cam_to_world @ se3_exp(twist)), ctx)
+        return (picture.rgb * cotangent).sum()
+
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(shown(twist), twist)
+    step, numeric = 1e-8, []  # less than the distance to any edge of a cell
+    with torch.no_grad():
+        for axis in torch.eye(6, dtype=torch.float64):
+            numeric.append((shown(step * axis) - shown(-step * axis)) / (2 * step))
+    assert float(gradient.abs().max()) > 1e-3
+    torch.testing.assert_close(gradient, torch.stack(numeric), atol=2e-4 * float(gradient.abs().max()), rtol=2e-3)
+
+
+@pytest.mark.parametrize("stop", ["always", "evaluation"])
+def test_marching_keeps_the_gradients_of_positions(stop: str, scene: Scene, small: Callable) -> None:
+    """The same samples with and without early termination pull at the pose alike, from the compiled kernels."""
+    gradients = []
+    for how in (stop, "never"):
+        settings = [f"renderer.sampler.stop={how}", "renderer.sampler.transmittance=0.0"]
+        field, renderer = build_model(small("volumetric/hash", *settings), scene, 0, CPU)
+        liven(field)
+        twist = torch.zeros(6, requires_grad=True)
+        camera = scene.train[0].camera
+        moved = camera.moved(camera.cam_to_world @ se3_exp(twist))
+        picture, _ = renderer.render_image(field, moved, Context(scene.bounds))
+        gradients.append(torch.autograd.grad(picture.rgb.square().sum(), twist)[0])
+    assert float(gradients[0].abs().min()) > 0
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-4, atol=1e-4 * float(gradients[1].abs().max()))
+
+
+def test_a_loss_on_slopes_reaches_the_table_through_the_compiled_kernel() -> None:
+    grid = HashGrid(levels=4, features=3, log2_size=8, base=2, finest=40)
+    generator = torch.Generator().manual_seed(0)
+    points, table = torch.rand(60, 3, generator=generator) * 1.2 - 0.1, torch.randn(grid.entries, 3, generator=generator)
+    cotangent, weight = torch.randn(60, 12, generator=generator), torch.randn(60, 3, generator=generator)
+    results = []
+    for encode, dtype in ((kernels.hash_encode, torch.float32), (reference.hash_encode, torch.float64)):
+        unit, entries, given = (x.to(dtype).clone().requires_grad_() for x in (points, table, cotangent))
+        features, _ = encode(unit, entries, grid)
+        (slope,) = torch.autograd.grad(features, unit, given, create_graph=True)
+        results.append([slope, *torch.autograd.grad((slope * weight.to(dtype)).sum(), [entries, given])])
+    for ours, true in zip(*([part.detach() for part in parts] for parts in results), strict=True):
+        assert float((ours - true).abs().max()) <= 1e-4 * float(true.abs().max())
+
+
+def test_motions_turn_about_their_pivot() -> None:
+    twist = torch.randn(4, 6, dtype=torch.float64)
+    depth = torch.rand(4, dtype=torch.float64) + 1
+    motion = motion_about(twist, depth)
+    pivot = torch.tensor([[0.0, 0.0, 0.0, 1.0]]).double().repeat(4, 1)
+    pivot[:, 2] = depth
+    origin = torch.tensor([0.0, 0.0, 0.0, 1.0]).double()
+    moved = (motion @ pivot[:, :, None])[:, :, 0]
+    torch.testing.assert_close(moved - pivot, se3_exp(twist) @ origin - origin)
+    torch.testing.assert_close(motion[:, :, :3], se3_exp(twist)[:, :, :3])
+
+
+def test_window_opens_from_coarse_to_fine() -> None:
+    config = PosesConfig(window=(0.2, 0.6))
+    assert [config.detail(progress) for progress in (0.0, 0.2, 0.6, 1.0)] == [0.0, 0.0, 1.0, 1.0]
+    assert config.detail(0.4) == pytest.approx(0.5)
+    points = torch.rand(5, 3)
+    for settings in (FrequencyConfig(octaves=4), HashConfig(levels=5, log2_size=8, finest=64)):
+        encoding = settings.build()
+        assert not any("detail" in key for key in encoding.state_dict())
+        plain = encoding(points)
+        encoding.add_window()
+        assert torch.equal(encoding(points), plain)
+        assert encoding.detail is not None
+        encoding.detail.fill_(0.4)
+        reached = encoding.always + 0.4 * (encoding.levels - encoding.always)
+        expected = [(1 - math.cos(math.pi * min(max(reached - k, 0), 1))) / 2 for k in range(encoding.levels)]
+        weights = encoding.level_weights()
+        assert weights is not None
+        assert weights.tolist() == pytest.approx(expected, abs=1e-6)
+        encoding.detail.fill_(0.0)
+        assert int((encoding(points) - plain).abs().gt(0).any(dim=0).sum()) > 0
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_without_poses_nothing_is_different(name: str, scene: Scene, small: Callable) -> None:
+    plain = small(name)
+    assert "training" not in plain.table
+    fits = []
+    for method in (plain, small(name, "training.poses.optimise=false")):
+        fit = Fit(build_plan(method, scene, Budget(steps=6), 0, CPU))
+        fit.run(lambda loss: False)
+        assert "poses" not in fit.state()
+        fits.append(fit.state())
+    assert same(*fits)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_resumed_with_poses_equals_uninterrupted(name: str, scene: Scene, small: Callable, tmp_path) -> None:
+    shown = corrupt(scene, TrainingData(pose_noise=2.0), 0)
+
+    def fresh() -> Fit:
+        return Fit(build_plan(small(name, ON), shown, Budget(steps=24), 0, CPU))
+
+    whole, first, second = fresh(), fresh(), fresh()
+    whole.run(lambda loss: False)
+    first.run(lambda loss: first.steps == 11)
+    checkpoint.save(tmp_path / checkpoint.NAME, first.state())
+    torch.manual_seed(99)
+    second.load(checkpoint.load(tmp_path / checkpoint.NAME), seconds=1.0)
+    second.run(lambda loss: False)
+    assert same(whole.state(), second.state())
+    assert whole.plan.poses is not None
+    assert all(bool(turn.any()) for turn in whole.plan.poses.rotation)
+    opened = [encoding.detail for encoding in windows(whole.plan.field, whole.plan.renderer)]
+    assert all(detail is not None and float(detail) == 1.0 for detail in opened)
+    assert bool(opened) == name.startswith("volumetric")
+
+
+def test_poses_come_back(blobs: Scene) -> None:
+    """Known field, 4 degrees and 4 per cent of error."""
+    shown = corrupt(blobs, TrainingData(pose_noise=4.0), 1)
+    config = PosesConfig(rotation_lr=3e-2, translation_lr=1e-2, window=(0.0, 0.0), rotation_warmup=0.0, translation_warmup=0.0)
+    poses = Poses.of(config, shown)
+    plan = Plan(
+        field=Blobs(),
+        renderer=VolumetricConfig(StratifiedConfig(32)).build(shown),
+        scene=shown,
+        losses=[PhotometricConfig().build()],
+        hooks=[],
+        optimiser=config.optimiser(OptimiserConfig(), seen=1.0),
+        batches=BatchConfig(rays=1200, views=6),
+        budget=Budget(steps=250),
+        poses=poses,
+    )
+    before = pose_errors(poses().detach(), poses.reference, blobs.extent)
+    Fit(plan).run(lambda loss: False)
+    after = pose_errors(poses().detach(), poses.reference, blobs.extent)
+    assert float(before.rotation_degrees.median()) > 2
+    assert float(after.rotation_degrees.median()) < 0.25 * float(before.rotation_degrees.median())
+    assert float(after.translation_per_cent.median()) < 0.4 * float(before.translation_per_cent.median())
+
+
+def test_a_photograph_finds_its_pose(blobs: Scene) -> None:
+    view = blobs.test[0]
+    wrong = view.camera.moved(view.camera.cam_to_world @ se3_exp(torch.tensor([0.08, -0.06, 0.1, 0.1, -0.1, 0.15])))
+    model = (Blobs(), VolumetricConfig(StratifiedConfig(32)).build(blobs))
+    misplaced = View(wrong, view.image, view.name)
+    found = descend(model, misplaced, blobs, Descent(steps=150, lr=2e-2, final=5e-4, rays=300))
+    error = (found.cam_to_world - view.camera.cam_to_world).norm()
+    assert float(error) < 0.15 * float((wrong.cam_to_world - view.camera.cam_to_world).norm())
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"window": (0.5, 0.1)}, "window"),
+        ({"rotation_lr": 0.0}, "learning rates"),
+        ({"test_steps": -1}, "test_steps"),
+        ({"resolution": (0.5, 2.0)}, "resolution"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings: dict, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        PosesConfig(**settings)

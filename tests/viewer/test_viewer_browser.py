@@ -1,0 +1,254 @@
+"""The viewer in a real browser, without a graphics card: it connects, shows every family's pictures, and obeys its controls."""
+
+import io
+import itertools
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from invgraphics.training import checkpoint
+
+viser = pytest.importorskip("viser")
+
+from invgraphics.viewer.cameras import Mount  # noqa: E402
+from invgraphics.viewer.server import Viewer  # noqa: E402
+from invgraphics.viewer.view import ViewRequest, open_viewer  # noqa: E402
+
+pytestmark = pytest.mark.browser
+
+ARGUMENTS = [
+    "--headless",
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+KNOWN = ("THREE.Clock: This module has been deprecated",)
+"""Warnings of viser's own page."""
+PATIENCE = 60_000
+WINDOW = {"width": 900, "height": 520}
+METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("there is no Chromium on this machine")
+    with playwright.sync_playwright() as driver:
+        instance = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+        yield instance
+        instance.close()
+
+
+class Watcher:
+    """A page with a viewer, and what it complained about."""
+
+    def __init__(self, page: Any, viewer: Viewer, shots: Path) -> None:
+        self.page, self.viewer, self.shots = page, viewer, shots
+        self.complaints: list[str] = []
+        self.requests: set[str] = set()
+        page.on("console", lambda message: self._heard(message.type, message.text))
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("request", lambda request: self.requests.add(request.url.removeprefix("blob:")))
+        page.goto(f"http://127.0.0.1:{viewer.port}")
+        self.rest()
+        # Viser says that there is no graphics card, in front of the picture.
+        page.add_style_tag(content=".mantine-Notification-root { visibility: hidden }")
+
+    def _heard(self, kind: str, text: str) -> None:
+        if kind in ("warning", "error") and not text.startswith(KNOWN):
+            self.complaints.append(text)
+
+    def rest(self) -> None:
+        """Wait until the finest picture is there and the browser shows the same thing for a while."""
+        text, before = "document.body.innerText", np.zeros(0)
+        for _ in range(100):
+            done = f"({text}.includes(' pixels') || {text}.includes('Drawn by')) && !{text}.includes('getting finer')"
+            self.page.wait_for_function(done, timeout=PATIENCE)
+            now = self.canvas()
+            if np.array_equal(now, before):
+                return
+            before = now
+            self.page.wait_for_timeout(500)
+        raise AssertionError("the picture does not come to rest")
+
+    def choose(self, label: str, option: str) -> None:
+        box = self.page.locator(f"xpath=//*[text()='{label}']/following::input[@role='combobox'][1]")
+        box.click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+        self.page.wait_for_timeout(100)
+        self.rest()
+
+    def tick(self, label: str) -> None:
+        self.page.locator(f"xpath=//*[text()='{label}']/following::input[@type='checkbox'][1]").click()
+        self.page.mouse.move(250, 250)  # its hint would cover others
+        self.page.wait_for_timeout(800)
+        self.rest()
+
+    def value(self, label: str) -> str:
+        return self.page.locator(f"xpath=//*[text()='{label}']/following::input[@role='combobox'][1]").input_value()
+
+    def canvas(self, name: str = "") -> np.ndarray:
+        """What the browser shows of the scene, float colours 0 to 255; kept as a file if it gets a name."""
+        box = self.page.locator("canvas").first.bounding_box()
+        panel = self.page.locator("xpath=//*[text()='Show']").bounding_box()
+        clip = box | {"width": min(box["width"], panel["x"] - box["x"] - 15)}
+        shot = self.page.screenshot(clip=clip)
+        if name:
+            self.page.screenshot(path=self.shots / f"{name}.png")
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(float)
+
+    def turn(self) -> None:
+        """Drag the scene around."""
+        self.page.mouse.move(250, 250)
+        self.page.mouse.down()
+        self.page.mouse.move(330, 280, steps=6)
+        self.page.mouse.up()
+        self.page.wait_for_timeout(800)
+        self.rest()
+
+
+@pytest.fixture
+def watch(browser: Any, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
+    opened: list[Any] = []
+
+    def start(*runs: Path) -> Watcher:
+        viewer = open_viewer(ViewRequest(runs, port=0, longest=160), print)
+        opened.append(viewer.stop)
+        context = browser.new_context(viewport=WINDOW)
+        opened.append(context.close)
+        return Watcher(context.new_page(), viewer, tmp_path)
+
+    yield start
+    for close in reversed(opened):
+        close()
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.abs(a - b).mean())
+
+
+def _at_photograph(watcher: Watcher, picture: np.ndarray) -> float:
+    """Mean difference, 0 to 255, between what the window shows of a photograph's camera and ``picture``."""
+    seen = watcher.canvas()
+    height, width = seen.shape[:2]
+    mount = Mount.of(watcher.viewer._subjects[0].scene.test[0].camera, width / height)
+    scale = height / mount.height
+    left, top = round(mount.left * scale), round(mount.top * scale)
+    side = round(mount.camera.width * scale)
+    part = Image.fromarray(seen[top : top + side, left : left + side].astype(np.uint8))
+    small = np.asarray(part.resize((mount.camera.width, mount.camera.height), Image.Resampling.BOX)).astype(float)
+    return _apart(small[2:-2, 2:-2], picture[2:-2, 2:-2])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_family_is_shown_and_every_choice_changes_the_picture(watch: Any, runs: dict[str, Path], method: str) -> None:
+    run = runs[method]
+    watcher = watch(run)
+    family = method.split("/")[1]
+    assert watcher.value("View") == "test 0: r_0"
+    prediction = np.asarray(Image.open(run / "test" / "0000.png")).astype(float)
+    truth = run / json.loads((run / "provenance.json").read_text())["truth"] / "0000.png"
+    shown = {"prediction": watcher.canvas(f"{family}-prediction")}
+    assert _at_photograph(watcher, prediction) < 4, "the very picture that was scored"
+    for choice in ("truth", "error", "depth", "normal"):
+        watcher.choose("Show", choice)
+        shown[choice] = watcher.canvas(f"{family}-{choice}")
+        if choice == "truth":
+            assert _at_photograph(watcher, np.asarray(Image.open(truth)).astype(float)) < 4
+    watcher.choose("Show", "prediction")
+    assert _apart(watcher.canvas(), shown["prediction"]) < 1
+    for (one, picture), (other, another) in itertools.combinations(shown.items(), 2):
+        assert _apart(picture, another) > 1, (one, other)
+    assert watcher.complaints == []
+    assert all(url.startswith(f"http://127.0.0.1:{watcher.viewer.port}") for url in watcher.requests), "nothing from elsewhere"
+
+
+def test_turning_leaves_the_photograph_and_truth_comes_back_to_one(watch: Any, runs: dict[str, Path]) -> None:
+    watcher = watch(runs["splatting/gaussians"])
+    watcher.choose("Show", "truth")
+    truth = watcher.canvas()
+    watcher.turn()
+    assert watcher.value("View") == "anywhere"
+    assert watcher.page.get_by_text("the truth is known at photographs only").count() == 1
+    free = watcher.canvas("turned")
+    assert _apart(free, truth) > 1
+    watcher.choose("Show", "depth")
+    assert _apart(watcher.canvas("turned-depth"), free) > 3
+    watcher.choose("Show", "truth")
+    assert watcher.value("View").startswith(("test", "train")), "truth goes to the nearest photograph"
+    assert _apart(watcher.canvas(), free) > 1
+    assert watcher.complaints == []
+
+
+def test_cameras_and_splats_of_the_browser(watch: Any, runs: dict[str, Path]) -> None:
+    watcher = watch(runs["splatting/gaussians"])
+    watcher.turn()
+    plain = watcher.canvas()
+    watcher.tick("Splats drawn by the browser")
+    splats = watcher.canvas("splats")
+    assert watcher.page.get_by_text("Drawn by the browser: colours").count() == 1
+    background = np.abs(splats - 255).max(axis=-1) < 8
+    assert 0.2 < background.mean() < 0.95, "splats before the white background"
+    assert _apart(splats, plain) < 20, "the same place, near enough"
+    watcher.tick("Splats drawn by the browser")
+    assert _apart(watcher.canvas(), plain) < 1
+    watcher.page.mouse.move(250, 250)
+    for _ in range(8):
+        watcher.page.mouse.wheel(0, 200)
+        watcher.page.wait_for_timeout(50)
+    watcher.page.wait_for_timeout(800)
+    watcher.rest()
+    far = watcher.canvas()
+    watcher.tick("Cameras")
+    assert _apart(watcher.canvas("cameras"), far) > 1
+    watcher.tick("Cameras")
+    assert _apart(watcher.canvas(), far) < 0.5
+    assert watcher.complaints == []
+
+
+def test_two_runs(watch: Any, runs: dict[str, Path]) -> None:
+    watcher = watch(runs["volumetric/hash"], runs["splatting/gaussians"])
+    shown = {"split": watcher.canvas("split")}
+    for layout in ("side by side", "first", "second"):
+        watcher.choose("Runs", layout)
+        shown[layout] = watcher.canvas(layout.replace(" ", "-"))
+    middle = shown["split"].shape[1] // 2
+    assert _apart(shown["split"][:, : middle - 12], shown["first"][:, : middle - 12]) < 1.5
+    assert _apart(shown["split"][:, middle + 12 :], shown["second"][:, middle + 12 :]) < 1.5
+    assert _apart(shown["first"], shown["second"]) > 0.5
+    assert _apart(shown["side by side"], shown["first"]) > 3
+    assert watcher.complaints == []
+
+
+def test_a_fit_is_followed(watch: Any, runs: dict[str, Path], tmp_path: Path) -> None:
+    run = Path(shutil.copytree(runs["splatting/gaussians"], tmp_path / "run"))
+    watcher = watch(run)
+    before = watcher.canvas()
+    state = checkpoint.load(run / checkpoint.NAME)
+    state["field"]["means"][:, 2] += 0.4
+    checkpoint.save(run / checkpoint.NAME, state)
+    (run / "fit.json").write_text('{"steps": 12345, "seconds": 6.0}')
+    watcher.viewer.look_for_news()
+    watcher.page.get_by_text("step 12,345").wait_for(timeout=PATIENCE)
+    watcher.page.wait_for_timeout(500)
+    watcher.rest()
+    assert _apart(watcher.canvas("followed"), before) > 2
+    (run / checkpoint.NAME).write_bytes(b"broken")
+    watcher.viewer.look_for_news()
+    watcher.page.get_by_text("is not a readable checkpoint").wait_for(state="attached", timeout=PATIENCE)
+    assert _apart(watcher.canvas()[120:], watcher.canvas()[120:]) < 1
+    assert watcher.complaints == []

@@ -1,0 +1,94 @@
+"""What cannot be looked at gets a sentence, before anything is loaded or served."""
+
+import importlib.util
+import shutil
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+from training_fixtures import SMALL
+
+from invgraphics.cli import main, view
+from invgraphics.errors import InputError
+from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.run import fit_run
+from invgraphics.training import checkpoint
+from invgraphics.viewer.subject import open_subject
+from invgraphics.viewer.view import ViewRequest, check_place, is_loopback, open_viewer
+
+
+def _refused(words: list[str], sentence: str, capsys) -> None:
+    assert main.run(["view", *words]) == main.BAD_INPUT
+    said = capsys.readouterr().err.splitlines()
+    assert any(sentence in line for line in said) and len(said) <= main.MOST_LINES, said
+
+
+def test_bad_arguments(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
+    run = str(runs["volumetric/hash"])
+    _refused([str(tmp_path)], "is not a run", capsys)
+    _refused([run, str(tmp_path / "none")], "is not a run", capsys)
+    _refused([run, "--view", "99", "--port", "0"], "--view cannot be 99", capsys)
+    _refused([run, "--max-size", "2"], "--max-size cannot be 2", capsys)
+    _refused([run, "--port", "70000"], "--port cannot be 70000", capsys)
+    _refused([run, "--host", "no.such.host.invalid"], "--host cannot be 'no.such.host.invalid'", capsys)
+    _refused([run, "--host", "192.0.2.1"], "--host cannot be '192.0.2.1'", capsys)  # an address of nobody (RFC 5737)
+
+
+def test_a_port_in_use(runs: dict[str, Path], capsys) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen(1)
+        port = taken.getsockname()[1]
+        _refused([str(runs["volumetric/hash"]), "--port", str(port)], f"Port {port} at 127.0.0.1 is in use", capsys)
+    check_place("127.0.0.1", port)
+
+
+def test_without_viser(runs: dict[str, Path], monkeypatch, capsys) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "viser" else find(name))
+    _refused([str(runs["volumetric/hash"])], "needs viser, which is not installed", capsys)
+
+
+def test_a_run_without_checkpoint_is_refused_or_awaited(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
+    run = Path(shutil.copytree(runs["volumetric/hash"], tmp_path / "run"))
+    (run / checkpoint.NAME).rename(tmp_path / "later")
+    _refused([str(run), "--port", "0"], "has no checkpoint yet", capsys)
+    said = []
+    timer = threading.Timer(0.3, lambda: (tmp_path / "later").rename(run / checkpoint.NAME))
+    timer.start()
+    assert open_subject(run, None, live=True, say=said.append).steps == 150
+    assert len(said) == 1 and "Waiting for a fit" in said[0]
+
+
+def test_runs_of_different_scenes(runs: dict[str, Path], toy_folder: Path, tmp_path: Path) -> None:
+    method = "splatting/gaussians"
+    request = FitRequest(
+        method=method, scene=str(toy_folder), out=str(tmp_path / "b"), budget="1steps", overrides=tuple(SMALL[method])
+    )
+    with pytest.raises(InputError, match="different scenes"):
+        open_viewer(ViewRequest((runs[method], fit_run(request)), port=0), print)
+
+
+def test_a_checkpoint_of_another_recipe(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
+    run = Path(shutil.copytree(runs["volumetric/hash"], tmp_path / "run"))
+    subject = open_subject(run, None, live=False, say=print)
+    shutil.copy(runs["volumetric/nerf"] / checkpoint.NAME, run / checkpoint.NAME)
+    assert subject.changed()
+    with pytest.raises(InputError, match="has become another run"):
+        subject.refresh()
+    assert not subject.changed(), "said once"
+
+
+@pytest.mark.parametrize(("host", "answer"), [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False)])
+def test_loopback(host: str, answer: bool) -> None:
+    assert is_loopback(host) is answer
+
+
+def test_the_page_is_opened_where_there_is_a_screen_only(monkeypatch) -> None:
+    monkeypatch.setattr(view.sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert not view._has_screen()
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert view._has_screen()
