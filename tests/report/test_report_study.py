@@ -150,6 +150,17 @@ def test_heat_map_averages_over_what_all_fields_share(built_study: Path) -> None
         assert value == pytest.approx(means[place])
 
 
+def test_no_heat_map_of_factors_that_were_never_combined(built_study: Path) -> None:
+    """One factor at a time: a cross of fields through the base."""
+    study = read_study(built_study)
+    down, across = study.factors[0], study.factors[1]
+    psnr = quality_quantity("psnr", next(o.run for o in study.observations()).quality["psnr"])
+    base = next(iter(study.observations())).levels
+    cross = [o for o in study.observations() if any(o.levels[f.path] == base[f.path] for f in (down, across))]
+    assert len({(o.levels[down.path], o.levels[across.path]) for o in cross}) == len(down.levels) + len(across.levels) - 1
+    assert heat_map((down, across), psnr, cross) is None
+
+
 def bare_study(root: Path, factors: dict[str, list[Any]], psnr_of: Callable[[dict[str, Any]], Any], **other: Any) -> Path:
     """A study of scores without pictures, to be read and compared only."""
     cells = study_cells(other.pop("scenes", STUDY_SCENES), other.pop("methods", METHODS[:1]), STUDY_SEEDS, factors)

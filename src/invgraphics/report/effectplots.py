@@ -123,8 +123,9 @@ def heat_map(pair: tuple[Factor, Factor], quantity: Quantity, observations: Sequ
         others = tuple(sorted((key, level) for key, level in levels.items() if key not in (down.path, across.path)))
         place = (levels.get(down.path, ""), levels.get(across.path, ""))
         cells.setdefault(place, {})[(observation.scene, observation.run.seed, others)] = value
-    if len({row for row, _ in cells}) < 2 or len({column for _, column in cells}) < 2:
-        return None
+    rows, columns = ({place[axis] for place in cells} for axis in (0, 1))
+    if min(len(rows), len(columns)) < 2 or len(cells) < len(rows) + len(columns):
+        return None  # a cross through one field, as one factor at a time makes it, combines nothing
     common = set.intersection(*(set(found) for found in cells.values()))
     values = {
         place: statistics.fmean(v for k, v in found.items() if not common or k in common) for place, found in cells.items()
