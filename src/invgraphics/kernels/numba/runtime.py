@@ -96,13 +96,15 @@ class _Announcement(event.Listener):
     """Says once that kernels are being compiled; Numba's event comes only when its cache on disk has no match."""
 
     def __init__(self) -> None:
-        self.said = False
+        self.compiled = 0
 
     def on_start(self, event: Any) -> None:
         dispatcher = (event.data or {}).get("dispatcher")
         module = getattr(getattr(dispatcher, "py_func", None), "__module__", "")
-        if not self.said and module.startswith(PACKAGE):
-            self.said = True
+        if not module.startswith(PACKAGE):
+            return
+        self.compiled += 1
+        if self.compiled == 1:
             print("compiling kernels, once, about half a minute", file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
@@ -113,9 +115,9 @@ _announcement = _Announcement()
 event.register("numba:compile", _announcement)
 
 
-def compiling() -> bool:
-    """Whether this process has had to compile something that was not cached."""
-    return _announcement.said
+def compilations() -> int:
+    """How many kernels this process has had to compile because they were not cached."""
+    return _announcement.compiled
 
 
 @inlined

@@ -20,7 +20,7 @@ from invgraphics.kernels.numba.hash import hash_encode
 from invgraphics.kernels.numba.march import ray_march
 from invgraphics.kernels.numba.projecting import splat_project
 from invgraphics.kernels.numba.rasterising import splat_rasterise
-from invgraphics.kernels.numba.runtime import compiling, split_by_work
+from invgraphics.kernels.numba.runtime import compilations, split_by_work
 from invgraphics.kernels.numba.ssim import ssim
 from invgraphics.kernels.types import HashGrid, MarchSteps
 
@@ -32,9 +32,10 @@ def warm_up() -> float:
     """
     began = perf_counter()
     # The smallest kernel tells whether there is a cache.
+    before = compilations()
     split_by_work(np.zeros(1, np.int64), 1, np.zeros(1, np.int64))
     work = [sys.executable, "-P", "-c", f"import {__name__} as warming; warming.splats()"]
-    helper = subprocess.Popen(work, stderr=subprocess.DEVNULL) if compiling() else None
+    helper = subprocess.Popen(work, stderr=subprocess.DEVNULL) if compilations() > before else None
     try:
         _pictures()
         _samples()
