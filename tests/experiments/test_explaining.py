@@ -39,7 +39,7 @@ def runs(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     for method in METHODS:
         small = SMALL.get(method, [item for item in SMALL["splatting/gaussians"] if not item.startswith("hooks")])
         out = str(root / method.replace("/", "-"))
-        request = FitRequest(method=method, scene=str(toy_folder), out=out, budget="15steps", overrides=tuple(small))
+        request = FitRequest(method=method, scene=str(toy_folder), out=out, budget="4steps", overrides=tuple(small))
         found[method] = fit_run(request)
     return found
 
@@ -95,6 +95,36 @@ def test_two_splats_by_hand() -> None:
     assert np.trapezoid(density, t) == pytest.approx(-math.log(0.1), rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    "renderer",
+    [
+        Splatting(SplattingConfig(shape="disc", dilation=0.5)),
+        Splatting(SplattingConfig(dilation=0.1, compensate=True)),
+        Splatting(SplattingConfig(receivers=3)),
+        GaussianSorted(GaussianSortedConfig("splat", "centre")),
+        GaussianSorted(GaussianSortedConfig("physical", "ray")),
+        GaussianExact(GaussianExactConfig("physical")),
+    ],
+    ids=lambda renderer: str(renderer.config)[:60],
+)
+def test_every_way_to_show_gaussians_adds_up(renderer) -> None:
+    """A cloud so dense that splatting stops before its end."""
+    generator = torch.Generator().manual_seed(1)
+    means = torch.rand(400, 3, generator=generator) * 1.6 - 0.8 + torch.tensor([0.0, 0.0, 3.0])
+    some = round_ones(means, torch.full((400,), 0.1), torch.full((400,), 0.6), torch.rand(400, 3, generator=generator))
+    turned = torch.randn(400, 4, generator=generator).double()
+    scales = 0.05 + 0.2 * torch.rand(400, 3, generator=generator).double()
+    field = field_of(type(some)(some.means, turned, scales, some.opacities, some.sh)).float()
+    with torch.no_grad():
+        picture, _ = renderer.render_image(field, HEAD_ON, CTX)
+    for column, row in ((10, 10), (3, 7), (20, 0)):
+        found = along_ray(field, renderer, HEAD_ON, (column, row), CTX)
+        assert found.colour.tolist() == pytest.approx(picture.rgb[row, column].tolist(), abs=2e-5)
+        assert found.opacity == pytest.approx(float(picture.alpha[row, column]), abs=2e-5)
+        assert bool((found.alpha > 0).all())
+    assert len(found) > 3
+
+
 @pytest.mark.parametrize("sampler", ["stratified", "hierarchical"])
 def test_a_ball_of_fog_in_closed_form(sampler: str) -> None:
     """Density 3 over a chord of length 1 from distance 1.5: T = exp(-3 (t - 1.5)) inside."""
@@ -108,6 +138,9 @@ def test_a_ball_of_fog_in_closed_form(sampler: str) -> None:
     t, light = found.profile.t.numpy(), found.profile.transmittance.numpy()
     at = np.array([1.0, 1.75, 2.0, 2.25, 2.8])
     assert np.interp(at, t, light) == pytest.approx(np.exp(-3 * (at - 1.5).clip(0, 1)), abs=1e-2)
+    assert np.interp(found.end[:-1].numpy(), t, light) == pytest.approx(found.transmittance[1:].numpy(), abs=1e-5)
+    halfway = found.transmittance * (1 - found.alpha).sqrt()
+    assert np.interp(found.t.numpy(), t, light) == pytest.approx(halfway.numpy(), abs=2e-3)
     assert found.median_depth == pytest.approx(1.5 + math.log(2) / 3, abs=1e-2)
     inside = (found.begin > 1.51) & (found.end < 2.49)
     assert found.density[inside].unique().tolist() == [3.0]

@@ -109,6 +109,29 @@ def test_names_are_told_apart(tmp_path: Path) -> None:
     assert names == ["my_photo.jpg.png", "my_photo.png.png", "other.png.png"]
 
 
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ({"a.txt": b"x"}, "no photograph"),
+        ({"a.heic": b"\0\0\0\x18ftypheic"}, "decodes HEIC"),
+        ({"a.jpg": b"broken", "b.jpg": b"broken too"}, "cannot be read as a picture"),
+    ],
+)
+def test_folders_without_photographs(content: dict[str, bytes], expected: str, tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    for name, data in content.items():
+        (tmp_path / "photos" / name).write_bytes(data)
+    with pytest.raises(InputError, match=expected):
+        prepared(tmp_path / "photos", tmp_path)
+
+
+def test_one_camera_cannot_have_two_sizes(tmp_path: Path) -> None:
+    save(noise(0, 64, 48), tmp_path / "photos/a.png")
+    save(noise(1, 48, 64), tmp_path / "photos/b.png")
+    with pytest.raises(InputError, match="48x64, 64x48"):
+        prepared(tmp_path / "photos", tmp_path, cameras="single")
+
+
 def test_numbers_in_names_count_as_numbers() -> None:
     assert sorted(["b10", "B9", "a2b11", "a2b3"], key=natural) == ["a2b3", "a2b11", "B9", "b10"]
 

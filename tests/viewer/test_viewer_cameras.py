@@ -89,14 +89,14 @@ def test_limits() -> None:
 def test_standing_at_a_photograph_is_noticed_and_leaving_too() -> None:
     pose = _lopsided().cam_to_world
     here = Gaze(pose, 1.0, 1.0)
-    assert here.sees_from(pose, 1e-3)
+    assert here.sees_from(pose, 1e-3, 1e-3)
     aside = pose.clone()
     aside[0, 3] += 2e-3
-    assert not here.sees_from(aside, 1e-3)
+    assert not here.sees_from(aside, 1e-3, 1.0) and here.sees_from(aside, 3e-3, 1e-3)
     angle = 3e-3
     turn = torch.tensor([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     turned = rigid(pose[:3, :3] @ turn, pose[:3, 3])
-    assert not here.sees_from(turned, 1e-3) and here.sees_from(turned, 4e-3)
+    assert not here.sees_from(turned, 1.0, 1e-3) and here.sees_from(turned, 1e-3, 4e-3)
 
 
 def test_the_nearest_photograph() -> None:

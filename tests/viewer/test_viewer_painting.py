@@ -24,7 +24,7 @@ METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians")
 
 @pytest.fixture(scope="module")
 def subjects(runs: dict[str, Path]) -> dict[str, Subject]:
-    return {method: Subject(open_fitted(run), None) for method, run in runs.items()}
+    return {method: Subject(open_fitted(run)) for method, run in runs.items()}
 
 
 def _painted(order: Order, *subjects: Subject, pixels: float = LEAST):
@@ -159,7 +159,7 @@ def test_a_second_run_in_another_frame_shows_the_same_place(subjects: dict[str, 
     """The same fit in a frame that is turned, moved and three times as large."""
     first = subjects["volumetric/hash"]
     similarity = torch.tensor([[0.0, -3, 0, 1], [3, 0, 0, 2], [0, 0, 3, -1], [0, 0, 0, 1.0]])
-    other = Subject(replace(first.fitted, scene=replace(first.scene, world_from_local=similarity)), None)
+    other = Subject(replace(first.fitted, scene=replace(first.scene, world_from_local=similarity)))
     camera = first.scene.test[0].camera
     placed = other.placed(camera, first.scene)
     points = torch.rand(20, 3) - 0.5
@@ -184,5 +184,9 @@ def test_a_newer_checkpoint_is_noticed_and_shown(runs: dict[str, Path], tmp_path
     assert not subject.changed() and subject.facts()["fit"] == "step 120, 9.5 s"
     assert subject.facts()["primitives"] == f"{keep:,}"
     assert (_composited(subject, subject.scene.test[0].camera) != before).any()
+    (run / "scores.json").unlink()
+    assert subject.changed()
+    subject.refresh()
+    assert subject.facts()["test views"] == "not scored yet" and not subject.changed()
     (run / checkpoint.NAME).unlink()
     assert not subject.changed(), "a fit that starts again removes the file first"

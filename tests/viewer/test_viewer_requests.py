@@ -1,9 +1,16 @@
 """What cannot be looked at gets a sentence, before anything is loaded or served."""
 
+import contextlib
 import importlib.util
+import re
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import threading
+import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -92,3 +99,32 @@ def test_the_page_is_opened_where_there_is_a_screen_only(monkeypatch) -> None:
     assert not view._has_screen()
     monkeypatch.setenv("DISPLAY", ":0")
     assert view._has_screen()
+
+
+@contextlib.contextmanager
+def ended(process: subprocess.Popen) -> Iterator[None]:
+    """Whatever happens, the process ends."""
+    try:
+        yield
+    finally:
+        process.kill()
+
+
+def test_the_command_serves_this_machine_until_it_is_interrupted(runs: dict[str, Path]) -> None:
+    words = [sys.executable, "-m", "invgraphics", "view", str(runs["volumetric/hash"]), "--port", "0", "--no-open"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process, ended(process):
+        line = process.stdout.readline()
+        port = int(re.search(r"http://127.0.0.1:(\d+) \(Ctrl-C ends\)", line).group(1))
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as page:
+            assert b"<title>" in page.read()
+        # Linux answers at all of 127.0.0.0/8, so this is another address of this machine.
+        with socket.socket() as other, pytest.raises(ConnectionRefusedError):
+            other.connect(("127.0.0.2", port))
+        process.send_signal(signal.SIGTERM)  # like Ctrl-C, which a shell in the background ignores
+        said, complained = process.communicate(timeout=60)
+        assert (process.returncode, said, complained) == (main.DONE, "", "")
+
+
+def test_nobody_can_ask_to_open_it_to_the_internet(runs: dict[str, Path]) -> None:
+    with open_viewer(ViewRequest((runs["volumetric/hash"],), port=0), print) as viewer:
+        assert viewer._server.request_share_url() is None and viewer._server._share_tunnel is None

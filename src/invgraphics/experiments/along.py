@@ -115,8 +115,8 @@ class Contributions:
 
     @property
     def expected_depth(self) -> float:
-        """Mean distance of the light, Σ w t / Σ w."""
-        return float((self.weight * self.t).sum() / self.weight.sum()) if len(self) else math.inf
+        """Mean distance of the light, Σ w t / Σ w; infinite where there is none."""
+        return float((self.weight * self.t).sum()) / self.opacity if self.opacity > 0 else math.inf
 
     @property
     def median_depth(self) -> float:
@@ -263,6 +263,7 @@ def _gaussians(gaussians: Gaussians, renderer: GaussianExact | GaussianSorted, c
     axis = camera.cam_to_world[:3, 2]
     weight, _ = renderer.weigh(met, rays, axis, False)
     order = renderer.order(met, rays, axis) if isinstance(renderer, GaussianSorted) else met.t.argsort(stable=True)
+    order = order[met.depth[order] > 0]  # what splatters do not see is on the ray all the same
     t, sigma, depth, weight = (values[order] for values in (met.t, met.sigma, met.depth, weight))
     rgb, every = colours(primitives, met)[order], torch.ones_like(order, dtype=torch.bool)
     marched, profile = _marched(t, sigma, depth, rays), None

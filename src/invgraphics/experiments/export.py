@@ -20,8 +20,8 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.transformed import move_gaussians
 from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
 
-RESOLUTION, RESOLUTIONS = 192, (8, 1024)
-"""Voxels along a mesh's longest edge: usual, fewest and most (4 bytes for each of their cube)."""
+RESOLUTION, RESOLUTIONS = 192, (8, 512)
+"""Voxels along a mesh's longest edge: usual, fewest and most (for which fused pictures take 6 GB of memory)."""
 
 
 @dataclass(frozen=True)

@@ -95,10 +95,9 @@ def _against_truth(surface: Surface, scene: Scene) -> dict[str, str]:
     """
     if scene.mesh is None or not any(view.depth is not None for view in scene.train):
         return {}
-    state = torch.random.get_rng_state()
-    torch.manual_seed(0)
-    seen = depth_points(scene, POINTS).position
-    torch.random.set_rng_state(state)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        seen = depth_points(scene, POINTS).position
     generator = torch.Generator().manual_seed(0)
     ours = points_on(surface.vertices, surface.faces, POINTS, generator)
     true = torch.cat([points_on(scene.mesh.vertices, scene.mesh.faces, POINTS, generator), seen])

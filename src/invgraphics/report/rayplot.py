@@ -151,7 +151,9 @@ def _shares(axes: Axes, ray: Ray) -> None:
     columns, filled = ray.columns, ray.shown(ray.rgb)
     begin, end, t = columns["begin"], columns["end"], columns["t"]
     edge = {"edgecolor": MUTED.light, "linewidth": 0.5}
-    if ray.kind == "samples":
+    if not len(t):
+        axes.text(0.5, 0.5, "nothing on this ray: it shows the background", ha="center", transform=axes.transAxes)
+    elif ray.kind == "samples":
         axes.bar(begin, columns["alpha"], end - begin, align="edge", facecolor="none", **edge, label="α")
         axes.bar(begin, columns["weight"], end - begin, align="edge", color=filled, **edge, label="weight T·α", zorder=3)
         _gaps(axes, ray)
@@ -166,7 +168,10 @@ def _shares(axes: Axes, ray: Ray) -> None:
     _light(axes, ray)
     axes.set_ylim(0, 1.06)
     axes.set_ylabel("share of the light")
-    axes.legend(loc="upper right", bbox_to_anchor=(1.0, 0.93), frameon=True, framealpha=0.85, edgecolor="none", fontsize=10.5)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            loc="upper right", bbox_to_anchor=(1.0, 0.93), frameon=True, framealpha=0.85, edgecolor="none", fontsize=10.5
+        )
 
 
 def _light(axes: Axes, ray: Ray) -> None:
@@ -243,6 +248,7 @@ def _pictures(figure: Canvas, places: Any, ray: Ray, folder: Path) -> None:
         swatch.set_facecolor(tuple(shown))
         swatch.set(xticks=[], yticks=[])
         swatch.grid(False)
+        swatch.spines[:].set_visible(True)
         ink = INK.light if shown @ LUMINANCE > 0.5 else PAGE.light
         values = ", ".join(f"{value:.3f}" for value in colour)
         swatch.text(0.5, 0.5, values, color=ink, ha="center", va="center", transform=swatch.transAxes, fontsize=11.5)
@@ -254,8 +260,8 @@ def _cross_hair(axes: Axes, picture: UInt8[ndarray, "h w 3"], ray: Ray) -> None:
     x, y, gap = ray.pixel["column"] + 0.5, ray.pixel["row"] + 0.5, max(width, height) / 28
     for tone, thickness in ((PAGE.light, 3.2), (SERIES[1].light, 1.4)):
         style: dict[str, Any] = {"color": tone, "linewidth": thickness}
-        axes.plot([0, x - gap, np.nan, x + gap, width], [y] * 5, **style)
-        axes.plot([x] * 5, [0, y - gap, np.nan, y + gap, height], **style)
+        axes.plot([0, max(x - gap, 0), np.nan, min(x + gap, width), width], [y] * 5, **style)
+        axes.plot([x] * 5, [0, max(y - gap, 0), np.nan, min(y + gap, height), height], **style)
     axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     axes.grid(False)
     for spine in axes.spines.values():

@@ -47,10 +47,10 @@ class Gaze:
         focal = torch.tensor([width / 2 / (tangent * self.aspect), height / 2 / tangent])
         return Camera(self.pose, focal, torch.tensor([width / 2, height / 2]), width, height)
 
-    def sees_from(self, pose: Float[Tensor, "4 4"], tolerance: float) -> bool:
-        """Whether the browser stands at ``pose``, within ``tolerance``: local units, and radians."""
-        turn = (self.pose[:3, :3] - pose[:3, :3]).norm() / math.sqrt(2)
-        return float((self.pose[:3, 3] - pose[:3, 3]).norm()) <= tolerance and float(turn) <= tolerance
+    def sees_from(self, pose: Float[Tensor, "4 4"], reach: float, angle: float) -> bool:
+        """Whether the browser stands at ``pose``: within ``reach`` (local units), and ``angle`` (radians)."""
+        turn = float((self.pose[:3, :3] - pose[:3, :3]).norm()) / math.sqrt(2)
+        return float((self.pose[:3, 3] - pose[:3, 3]).norm()) <= reach and turn <= angle
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from invgraphics.viewer.subject import Subject
 THUMBNAIL = 96
 """Pixels along the longest side of a photograph in its camera."""
 FRUSTUM_SIZE = 0.04
-"""Length of a camera's pyramid, of the scene's extent."""
+"""Size of a camera's pyramid, of the scene's extent; viser takes a third of its sides' product as the size cubed."""
 TEST_COLOUR, TRAIN_COLOUR = (213, 94, 0), (0, 114, 178)
 LARGEST_HALF = 3e4
 """Largest variance that is sent; half precision, in which the browser keeps them, ends at 65504."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 NEAR_ENOUGH = 1e-3
 """How far from a photograph's camera a browser may be to count as standing there: radians, and of the scene's extent."""
-ARRIVAL = 2.0
+ARRIVAL = 10.0
 """Seconds within which a browser that is sent to a photograph gets there."""
 
 RENDERING = "Rendering …"
@@ -104,7 +104,8 @@ class Session:
 
     def complain(self, sentence: str) -> None:
         """Show what went wrong; called by the rendering thread."""
-        self._client.add_notification("The picture could not be made", sentence, color="red")
+        if not self._gone:
+            self._client.add_notification("The picture could not be made", sentence, color="red")
 
     @property
     def _scene(self) -> Scene:
@@ -133,7 +134,7 @@ class Session:
     async def _moved(self, _: CameraHandle) -> None:
         if self._standing is not None:
             pose = self._stage.views[self._standing][1].camera.cam_to_world
-            there = self._gaze.sees_from(pose, NEAR_ENOUGH * max(1.0, self._scene.extent))
+            there = self._gaze.sees_from(pose, NEAR_ENOUGH * self._scene.extent, NEAR_ENOUGH)
             self._arrived = self._arrived or there
             if not there and (self._arrived or time.monotonic() > self._deadline):
                 self._standing = None

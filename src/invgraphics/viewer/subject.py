@@ -18,6 +18,8 @@ from invgraphics.experiments.folder import RunFolder
 from invgraphics.training import checkpoint
 
 Stamp = tuple[int, int, int]
+Stamps = tuple[Stamp | None, Stamp | None]
+"""Of a run's checkpoint and scores."""
 POLL = 0.5
 """Seconds between two looks at a checkpoint file."""
 
@@ -27,12 +29,12 @@ class Subject:
 
     Args:
         fitted: the opened run.
-        stamp: of the checkpoint, taken before it was read.
+        stamps: of its files, taken before they were read; ``None`` for those of now.
     """
 
-    def __init__(self, fitted: Fitted, stamp: Stamp | None) -> None:
+    def __init__(self, fitted: Fitted, stamps: Stamps | None = None) -> None:
         self.fitted = fitted
-        self._stamp = stamp
+        self._stamps = stamps or stamps_of(fitted.folder, fitted.source)
         self.steps, self.seconds = self._progress()
 
     @property
@@ -77,9 +79,9 @@ class Subject:
         ]
 
     def changed(self) -> bool:
-        """Whether the fit has written a checkpoint that is not loaded; any thread may ask."""
-        stamp = stamp_of(self.fitted.source.checkpoint)
-        return stamp is not None and stamp != self._stamp
+        """Whether the fit has written a checkpoint or scores that are not shown; any thread may ask."""
+        stamps = stamps_of(self.fitted.folder, self.fitted.source)
+        return stamps[0] is not None and stamps != self._stamps
 
     def refresh(self) -> None:
         """Load the newest checkpoint.
@@ -87,12 +89,12 @@ class Subject:
         Raises:
             InputError: it is not readable, or does not fit the recipe that this run had when it was opened.
         """
-        self._stamp = stamp_of(self.fitted.source.checkpoint)  # first: a file that comes meanwhile is news again
         fitted = self.fitted
+        self._stamps = stamps_of(fitted.folder, fitted.source)  # first: a file that comes meanwhile is news again
         state = checkpoint.load(fitted.source.checkpoint, fitted.device)
         try:
             fitted.field.load_state_dict(state.get("field", {}))
-            fitted.renderer.load_state_dict(state.get("renderer", {}))
+            fitted.renderer.load_state_dict(state.get("renderer", {}) if fitted.source is fitted.folder else {})
         except RuntimeError as error:
             raise InputError(f"{fitted.source.root} has become another run.", "Start the viewer again.") from error
         self.steps, self.seconds = self._progress()
@@ -124,8 +126,12 @@ def _scores(folder: RunFolder) -> str:
     return ", ".join(words.format(quality[name]["mean"]) for name, words in said.items() if name in quality)
 
 
-def stamp_of(path: Path) -> Stamp | None:
-    """What tells two versions of a file apart; ``None`` if there is none."""
+def stamps_of(folder: RunFolder, source: RunFolder) -> Stamps:
+    """What tells two states of a run apart: its checkpoint, in ``source``, and its scores; ``None`` for what is not there."""
+    return _stamp(source.checkpoint), _stamp(folder.root / "scores.json")
+
+
+def _stamp(path: Path) -> Stamp | None:
     try:
         found = path.stat()
     except OSError:
@@ -152,8 +158,8 @@ def open_subject(run: Path, scene: str | None, live: bool, say: Callable[[str], 
         say(f"Waiting for a fit to write its first checkpoint to {run} (`fit --checkpoint-every 5s` does so sooner).")
     while missing_part(run):
         time.sleep(POLL)
-    stamp = stamp_of(_source(run).checkpoint)
-    return Subject(open_fitted(run, scene).in_its_frame(), stamp)
+    stamps = stamps_of(RunFolder(run), _source(run))
+    return Subject(open_fitted(run, scene).in_its_frame(), stamps)
 
 
 def missing_part(run: Path) -> tuple[str, str] | None:

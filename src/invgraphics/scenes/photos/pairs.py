@@ -58,9 +58,10 @@ def read_evidence(path: Path, photos: Sequence[Prepared]) -> Evidence:
     import pycolmap
 
     with pycolmap.Database.open(path) as database:
-        ids = [database.read_image_with_name(photo.name).image_id for photo in photos]
-        places = [np.asarray(database.read_keypoints(image))[:, :2] for image in ids]
-        index = {image: number for number, image in enumerate(ids)}
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        numbers = [ids[photo.name] for photo in photos]
+        places = [np.asarray(database.read_keypoints(image))[:, :2] for image in numbers]
+        index = {image: position for position, image in enumerate(numbers)}
         pairs = []
         for first, second, geometry in _verified(database):
             i, j = index[first], index[second]

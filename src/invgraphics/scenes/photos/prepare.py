@@ -249,7 +249,7 @@ def _reason(name: str, error: InputError) -> str:
 def _check(job: PhotoJob, photos: list[Prepared], skipped: dict[str, str]) -> None:
     """Refuse what no reconstruction can come of."""
     if len(photos) < 2:
-        what = "no photograph" if not photos else f"only one photograph, {photos[0].source}"
+        what = "no photograph" if not photos else f"only one photograph ({photos[0].source})"
         reasons = [f"{name}: {why}" for name, why in skipped.items()]
         remedy = (
             "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."

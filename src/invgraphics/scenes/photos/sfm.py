@@ -23,27 +23,34 @@ _PAIRS = 100  # pairs matched between two lines of progress
 _SMALLEST_MODEL = 3
 
 
-def extract(job: PhotoJob, photos: Sequence[Prepared], work: Path, progress: Progress) -> None:
-    """Enter cameras and photographs into a data base, and SIFT features of those that have none yet."""
+def enter(job: PhotoJob, photos: Sequence[Prepared], work: Path) -> None:
+    """Write cameras and photographs into a data base, in order: threads that extract features would number them by chance."""
     import pycolmap
 
-    masked = any(photo.masked for photo in photos)  # there is a mask for each, but reading them takes time
+    path = work / DATABASE
+    with pycolmap.Database.open(path) as database:
+        if database.num_images() == len(photos):
+            return
+        database.clear_all_tables()  # what an interrupted call has begun
     groups: dict[str, list[Prepared]] = {}
     for photo in photos:
         groups.setdefault(photo.group, []).append(photo)
-    done = 0
     for members in groups.values():
-        for start in range(0, len(members), _CHUNK):
-            names = [photo.name for photo in members[start : start + _CHUNK]]
-            progress(done, len(photos), f"features of {names[0]}")
-            if start == 0:
-                reader, mode = _reader(job, members), pycolmap.CameraMode.SINGLE
-            else:  # of the same camera as the group's first
-                with pycolmap.Database.open(work / DATABASE) as database:
-                    reader.existing_camera_id = database.read_image_with_name(members[0].name).camera_id
-            reader.mask_path = str(work / MASKS) if masked else ""
-            pycolmap.extract_features(work / DATABASE, work / PHOTOS, names, mode, reader)
-            done += len(names)
+        names = [photo.name for photo in members]
+        pycolmap.import_images(path, work / PHOTOS, pycolmap.CameraMode.SINGLE, names, _reader(job, members))
+
+
+def extract(photos: Sequence[Prepared], work: Path, progress: Progress) -> None:
+    """Add the SIFT features of photographs that have none yet to the data base."""
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions()
+    if any(photo.masked for photo in photos):  # there is a mask for each, but reading them takes time
+        reader.mask_path = str(work / MASKS)
+    for start in range(0, len(photos), _CHUNK):
+        names = [photo.name for photo in photos[start : start + _CHUNK]]
+        progress(start, len(photos), f"features of {names[0]}")
+        pycolmap.extract_features(work / DATABASE, work / PHOTOS, names, pycolmap.CameraMode.AUTO, reader)
 
 
 def _reader(job: PhotoJob, members: Sequence[Prepared]) -> Any:
@@ -52,7 +59,7 @@ def _reader(job: PhotoJob, members: Sequence[Prepared]) -> Any:
 
     data_set = members[0].centre is not None
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = MODELS["pinhole"] if data_set else MODELS[job.lens]
+    reader.camera_model = "PINHOLE" if data_set else MODELS[job.lens]
     focals = [photo.focal for photo in members if photo.focal is not None]
     if focals:
         width, height = members[0].width, members[0].height

@@ -46,9 +46,9 @@ def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[
     placed = {image.name: image for image in model.images.values() if image.has_pose}
     asked: list[tuple[float, Pair]] = []
     for pair in evidence.pairs:
-        names = photos[pair.first].name, photos[pair.second].name
-        if len(pair) >= MATCHES and all(name in placed for name in names):
-            asked.append((explained(*(placed[name] for name in names), pair), pair))
+        first, second = (placed.get(photos[index].name) for index in (pair.first, pair.second))
+        if len(pair) >= MATCHES and first is not None and second is not None:
+            asked.append((explained(first, second, pair), pair))
     contradicting = sorted((share, pair.first, pair.second, len(pair)) for share, pair in asked if share < EXPLAINED)
     worst = [
         {"photos": [photos[first].source, photos[second].source], "matches": matches, "explained": share}
