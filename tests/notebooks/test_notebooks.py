@@ -20,6 +20,7 @@ SMALL = {
     "07-gaussians-and-ewa": "draws = 100_000",
     "08-fit-gaussians": "views, size, steps, flat_steps, starts = 12, 32, 200, 150, 3",
     "09-the-same-gaussians-two-ways": "size, turns = 72, 21",
+    "10-from-photos-to-a-scene": "size, steps, levels = 48, 300, [0.0, 5.0]",
     "11-design-an-ablation": "size, views, steps, seeds, studies = 24, 8, 40, [0, 1], 100",
 }
 
@@ -190,6 +191,24 @@ def _step(out: _Printed, name: str) -> float:
     return float(found[1])
 
 
+def _photos(out: _Printed) -> None:
+    placed, taken = out.numbers("SfM: placed", "of")
+    assert placed > 0.9 * taken
+    assert out.numbers("SfM: mean reprojection error")[0] < 1
+    assert out.numbers("epipolar lines:", "median distance")[1] < 1
+    turn, shift = out.numbers("SfM: median rotation error", "position")
+    assert turn < 0.5
+    assert shift < 0.5
+    exact, found, wrong = (out.numbers(f"poses {name}: PSNR")[0] for name in ("0° / 0 %", "SfM", "5° / 5 %"))
+    assert found > exact - 1
+    assert wrong < exact - 2
+    began, ended = out.numbers("refinement: median rotation error", "at the start,")
+    assert ended < began / 3
+    given, refined = (out.numbers(f"{name} poses: PSNR")[0] for name in ("given", "refined"))
+    assert refined > given + 1
+    assert out.numbers("located: off by")[0] < 1, "per cent of the extent"
+
+
 def _ablation(out: _Printed) -> None:
     assert out.numbers("failed fits:") == (0,)
     assert out.numbers("design:", "combinations x", "seeds =") == (4, 2, 8)
@@ -203,7 +222,7 @@ def _ablation(out: _Printed) -> None:
 
 
 HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
-    zip(sorted(SMALL), (_cameras, _integral, _nerf, _ewa, _splatting, _two_ways, _ablation), strict=True)
+    zip(sorted(SMALL), (_cameras, _integral, _nerf, _ewa, _splatting, _two_ways, _photos, _ablation), strict=True)
 )
 
 

@@ -153,6 +153,25 @@ def test_memory_fades_where_it_looked(make_scene: Callable[..., Scene]) -> None:
     torch.testing.assert_close(sampler.ema, before * SMALL.decay**5)
 
 
+def test_a_wire_is_kept_by_the_patience_of_a_late_fit(make_scene: Callable[..., Scene]) -> None:
+    """A ball that fills a twenty-fifth of its cells: most random looks find nothing there."""
+    scene, wire = make_scene(), Sphere(400.0, 0.08)  # a cell is 0.19 wide, and eight of them meet here
+    config = replace(SMALL, warmup=10**6, decay=0.98, early_decay=0.5)
+    sampler = config.build(scene)
+    middle = slice(7, 9)
+    kept = {}
+    for progress in (0.0, 1.0):
+        ctx, present = replace(context(scene), progress=progress), []
+        for _ in range(400):
+            sampler.update(no_grad_density(wire), ctx)
+            present.append(float(sampler.occupied[middle, middle, middle].float().mean()))
+        kept[progress] = sum(present[200:]) / 200
+    assert kept[0.0] < 0.6
+    assert kept[1.0] > 0.85
+    assert [round(config.decay_at(share), 3) for share in (0.0, 0.25, 0.5, 1.0)] == [0.5, 0.9, 0.98, 0.98]
+    assert SMALL.decay_at(0.0) == SMALL.decay
+
+
 def test_steps_grow_in_a_contracted_space(make_scene: Callable[..., Scene]) -> None:
     scene = make_scene("contracted")
     sampler, rays = SMALL.build(scene), scene.bounds.clip(scene.train[0].camera.rays())
@@ -183,6 +202,8 @@ def test_nothing_is_culled_before_the_field_was_fitted_at_all(make_scene: Callab
 
 
 def test_refusals() -> None:
+    with pytest.raises(ValueError, match="early_decay"):
+        OccupancyConfig(early_decay=1.0)
     with pytest.raises(ValueError, match="resolution must be at least 1"):
         OccupancyConfig(resolution=0)
     with pytest.raises(ValueError, match="transmittance"):

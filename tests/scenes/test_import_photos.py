@@ -92,6 +92,12 @@ def test_the_same_request_is_answered_at_once(imported, box_photos: Path, monkey
     assert reconstruct(PhotoJob(str(box_photos), lens="pinhole"), out) == quality
 
 
+def test_another_folders_scene_is_not_overwritten(imported, tmp_path: Path) -> None:
+    save(np.zeros((64, 64, 3), np.uint8), tmp_path / "a.png")
+    with pytest.raises(InputError, match="holds the scene of"):
+        reconstruct(PhotoJob(str(tmp_path)), imported[0])
+
+
 def test_another_folder_gets_the_same_bits(imported, box_photos: Path, tmp_path: Path) -> None:
     again = reconstruct(PhotoJob(str(box_photos), lens="pinhole"), tmp_path / "again")
     assert again["cameras"] == imported[1]["cameras"]

@@ -113,13 +113,14 @@ def test_names_are_told_apart(tmp_path: Path) -> None:
     ("content", "expected"),
     [
         ({"a.txt": b"x"}, "no photograph"),
+        ({"below/a.png": b"x"}, "photographs in .*below: name that folder"),
         ({"a.heic": b"\0\0\0\x18ftypheic"}, "decodes HEIC"),
         ({"a.jpg": b"broken", "b.jpg": b"broken too"}, "cannot be read as a picture"),
     ],
 )
 def test_folders_without_photographs(content: dict[str, bytes], expected: str, tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
     for name, data in content.items():
+        (tmp_path / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "photos" / name).write_bytes(data)
     with pytest.raises(InputError, match=expected):
         prepared(tmp_path / "photos", tmp_path)

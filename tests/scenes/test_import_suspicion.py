@@ -69,6 +69,17 @@ def test_a_folded_reconstruction_is_suspicious() -> None:
     assert found["worst"][0]["photos"][0] in NAMES
 
 
+def test_a_few_mistakes_in_a_scene_that_holds_something_twice_are_not_heard() -> None:
+    """They are verified and contradict the poses, but with fewer matches than those that tell the truth."""
+    honest = [matches(i, j, 200) for i in range(8) for j in range(i + 1, 8)]
+    mixed = [
+        matches(pair.first, pair.second, 60, seen_as=(pair.second + 3) % 8) if n % 5 == 0 else pair
+        for n, pair in enumerate(honest)
+    ]
+    found = examine(model_of(EYES), PHOTOS, Evidence((100,) * 8, tuple(mixed)))
+    assert (found["pairs"], found["contradicting"], found["suspicious"]) == (22, 0, False)
+
+
 def test_weak_pairs_and_photographs_without_a_pose_are_no_witnesses() -> None:
     evidence = Evidence((100,) * 8, (matches(0, 4, MATCHES - 1, seen_as=1), matches(0, 7, seen_as=2)))
     found = examine(model_of(EYES[:7]), PHOTOS, evidence)

@@ -104,7 +104,7 @@ def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "cameras", f"{lenses}; distortion moves pixels by up to {quality['bend_px']:.1f} px"
     if quality["suspicion"] is not None:
         found = quality["suspicion"]
-        yield "pairs against poses", f"{found['contradicting']} of {found['pairs']} contradict them"
+        yield "pairs against poses", f"{found['contradicting']} of the {found['pairs']} best matched contradict them"
     if "truth" in quality:
         truth = quality["truth"]
         turn, shift = truth["rotation_degrees"], truth["translation_per_cent"]

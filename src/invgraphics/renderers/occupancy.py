@@ -31,6 +31,8 @@ class OccupancyConfig:
         grace: training steps before the first refresh. What is thinner than the threshold before it was ever seen would be
             culled, never be sampled, and never grow.
         decay: what a cell's memory is multiplied with when the cell is looked at again.
+        early_decay: the same at the start; its distance from 1 falls to that of ``decay`` by half of the fit. Fog must be
+            forgotten quickly, but one look at a random point finds a wire only now and then. ``None``: ``decay`` throughout.
         threshold: least optical depth of a step that counts as occupied; the grid's mean, where that is smaller.
         warmup: training steps during which a refresh looks at all cells.
         every: training steps between two refreshes.
@@ -46,6 +48,7 @@ class OccupancyConfig:
     cone: float | None = None
     grace: int = 0
     decay: float = 0.95
+    early_decay: float | None = None
     threshold: float = 0.01
     warmup: int = 256
     every: int = 16
@@ -59,10 +62,19 @@ class OccupancyConfig:
             value = getattr(self, key)
             if value is not None and value < 1:
                 raise ValueError(f"{key} must be at least 1, not {value}")
+        if not 0 <= (0.5 if self.early_decay is None else self.early_decay) < 1:
+            raise ValueError(f"early_decay must be in [0, 1), not {self.early_decay}")
         if not 0 <= self.decay <= 1 or not 0 <= self.transmittance < 1:
             raise ValueError(f"decay must be in [0, 1] and transmittance in [0, 1), not {self.decay} and {self.transmittance}")
         if min(self.threshold, self.warmup, self.grace, self.cone or 0) < 0:
             raise ValueError("threshold, warmup, grace and cone must not be negative")
+
+    def decay_at(self, progress: float) -> float:
+        """The decay at a point of the fit."""
+        if self.early_decay is None:
+            return self.decay
+        share = min(1.0, 2 * progress)
+        return 1 - (1 - self.early_decay) ** (1 - share) * (1 - self.decay) ** share
 
     def build(self, scene: Scene) -> Occupancy:
         """The sampler, every cell occupied."""
@@ -152,8 +164,8 @@ class Occupancy(Sampler):
         for part in cells.split(ctx.chunk):
             thickness = self._thickness(part, density, ctx).to(fresh.dtype)
             fresh.scatter_reduce_(0, part, thickness, reduce="amax")
-        fresh = fresh.view_as(self.ema)
-        self.ema.copy_(torch.where(fresh < 0, self.ema, torch.maximum(self.ema * self.config.decay, fresh)))
+        fresh, decay = fresh.view_as(self.ema), self.config.decay_at(ctx.progress)
+        self.ema.copy_(torch.where(fresh < 0, self.ema, torch.maximum(self.ema * decay, fresh)))
         # The mean of equal float32 numbers must not exceed them, or an even fog would vanish: sum in float64.
         mean = float(self.ema.mean(dtype=torch.float64))
         self.occupied.copy_(self.ema >= min(self.config.threshold, mean))

@@ -11,51 +11,82 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.hash_cells import CHUNK, UNIT, ZERO, blend, corners, rows_of, spread, weights_of
+from invgraphics.kernels.numba.hash_cells import BLOCK, CHUNK, UNIT, ZERO, at_vertices, blend, locate, spread
 from invgraphics.kernels.numba.hash_slope import locate_back, rise, rise_back
-from invgraphics.kernels.numba.runtime import array, index, once_differentiable, parallel, prange, share, threads
+from invgraphics.kernels.numba.runtime import array, index, inlined, once_differentiable, parallel, prange, share, threads
 from invgraphics.kernels.types import HashGrid
 
+TWO = index(2)
+
+
+@inlined
+def _gather(table, rows, weights, block, column, width, out):
+    """Features of the points of a block. The usual two have a loop of their own: an inner one over features costs as much."""
+    first, count = block
+    if width == TWO:
+        for point in range(count):
+            n = index(point)
+            r, w = at_vertices(rows, n), at_vertices(weights, n)
+            low, high = blend(table, r, w, index(0)), blend(table, r, w, UNIT)
+            out[first + n, column] = low
+            out[first + n, column + UNIT] = high
+    else:
+        for point in range(count):
+            n = index(point)
+            r, w = at_vertices(rows, n), at_vertices(weights, n)
+            for feature in range(width):
+                out[first + n, column + index(feature)] = blend(table, r, w, index(feature))
+
+
+@inlined
+def _scatter(gradient, rows, weights, block, column, width, to_table):
+    """The transpose of `_gather`."""
+    first, count = block
+    if width == TWO:
+        for point in range(count):
+            n = index(point)
+            r, w = at_vertices(rows, n), at_vertices(weights, n)
+            low, high = gradient[first + n, column], gradient[first + n, column + UNIT]
+            spread(to_table, r, w, index(0), low)
+            spread(to_table, r, w, UNIT, high)
+    else:
+        for point in range(count):
+            n = index(point)
+            r, w = at_vertices(rows, n), at_vertices(weights, n)
+            for feature in range(width):
+                spread(to_table, r, w, index(feature), gradient[first + n, column + index(feature)])
+
 
 @parallel
-def encode(unit, table, width, cells, offsets, masks, jobs, out):
-    """Features of all levels at each point; ``table`` is flat. Features go in pairs, which keeps the usual two unrolled."""
+def encode(planes, table, width, cells, offsets, masks, jobs, out):
+    """Features of all levels at each point; ``table`` is flat."""
+    x, y, z = planes[0], planes[1], planes[2]
     for job in prange(jobs):
-        begin, end = share(len(unit), jobs, job), share(len(unit), jobs, job + 1)
+        rows, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        begin, end = share(len(x), jobs, job), share(len(x), jobs, job + 1)
         for chunk in range(begin, end, CHUNK):
-            for level in range(len(cells)):
-                offset, mask, edge = index(offsets[level]), masks[level], cells[level]
-                column = index(level) * width
-                for number in range(chunk, min(chunk + CHUNK, end)):
-                    i = index(number)
-                    entries, f = corners(unit[i], edge, mask)
-                    w, r = weights_of(f), rows_of(entries, offset, width)
-                    for pair in range(width >> UNIT):
-                        k = index(pair + pair)
-                        out[i, column + k] = blend(table, r, w, k)
-                        out[i, column + k + UNIT] = blend(table, r, w, k + UNIT)
-                    if width & UNIT:
-                        out[i, column + width - UNIT] = blend(table, r, w, width - UNIT)
+            until = min(chunk + CHUNK, end)
+            for number in range(len(cells)):
+                level, column = (cells[number], offsets[number], masks[number]), index(number) * width
+                for first in range(chunk, until, BLOCK):
+                    block = index(first), min(BLOCK, until - first)
+                    locate(x, y, z, block, level, width, rows, weights)
+                    _gather(table, rows, weights, block, column, width, out)
 
 
 @parallel
-def encode_back(unit, gradient, width, cells, offsets, masks, jobs, to_table):
+def encode_back(planes, gradient, width, cells, offsets, masks, jobs, to_table):
     """Gradient along the table. Each job owns every ``jobs``-th level, so no entry is written by two of them."""
+    x, y, z = planes[0], planes[1], planes[2]
     for job in prange(jobs):
-        for level in range(job, len(cells), jobs):
-            offset, mask, edge = index(offsets[level]), masks[level], cells[level]
-            column = index(level) * width
-            to_table[offset * width : index(offsets[level + 1]) * width] = ZERO
-            for number in range(len(unit)):
-                i = index(number)
-                entries, f = corners(unit[i], edge, mask)
-                w, r = weights_of(f), rows_of(entries, offset, width)
-                for pair in range(width >> UNIT):
-                    k = index(pair + pair)
-                    spread(to_table, r, w, k, gradient[i, column + k])
-                    spread(to_table, r, w, k + UNIT, gradient[i, column + k + UNIT])
-                if width & UNIT:
-                    spread(to_table, r, w, width - UNIT, gradient[i, column + width - UNIT])
+        rows, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        for number in range(job, len(cells), jobs):
+            level, column = (cells[number], offsets[number], masks[number]), index(number) * width
+            to_table[index(offsets[number]) * width : index(offsets[number + 1]) * width] = ZERO
+            for first in range(0, len(x), BLOCK):
+                block = index(first), min(BLOCK, len(x) - first)
+                locate(x, y, z, block, level, width, rows, weights)
+                _scatter(gradient, rows, weights, block, column, width, to_table)
 
 
 @cache
@@ -66,6 +97,11 @@ def _levels(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return cells, np.array(grid.offsets, np.int64), np.where(hashed, 2**grid.log2_size - 1, 0).astype(np.uint64)
 
 
+def _planes(unit: Tensor) -> np.ndarray:
+    """One array for each axis, which vector registers can be filled from."""
+    return array(unit.T)
+
+
 class _Encode(torch.autograd.Function):
     """Differentiable in positions and table."""
 
@@ -73,7 +109,7 @@ class _Encode(torch.autograd.Function):
     def forward(ctx: Any, unit: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
         width = table.shape[1]
         out = unit.new_empty(len(unit), grid.levels * width)
-        encode(array(unit), array(table).reshape(-1), index(width), *_levels(grid), threads(), out.numpy())
+        encode(_planes(unit), array(table).reshape(-1), index(width), *_levels(grid), threads(), out.numpy())
         ctx.save_for_backward(unit, table)
         ctx.grid = grid
         return out
@@ -121,7 +157,7 @@ class _Scatter(torch.autograd.Function):
     def forward(ctx: Any, unit: Tensor, gradient: Tensor, shape: torch.Size, grid: HashGrid) -> Tensor:
         to_table = torch.empty(shape)
         flat = to_table.numpy().reshape(-1)
-        encode_back(array(unit), array(gradient), index(shape[1]), *_levels(grid), threads(), flat)
+        encode_back(_planes(unit), array(gradient), index(shape[1]), *_levels(grid), threads(), flat)
         return to_table
 
 

@@ -37,6 +37,8 @@ serial = _njit(cache=True, nogil=True, fastmath=FASTMATH)
 """Decorator of kernels that one thread runs."""
 inlined = _njit(fastmath=FASTMATH, forceinline=True, no_cpython_wrapper=True)
 """Decorator of functions that kernels call; they are cached as part of those."""
+ordered = _njit(fastmath=FASTMATH - {"reassoc"}, forceinline=True, no_cpython_wrapper=True)
+"""`inlined`, with sums added up as they are written: rearranged, they become one chain whose links wait for each other."""
 exact_parallel = _njit(parallel=True, cache=True, nogil=True)
 exact = _njit(forceinline=True, no_cpython_wrapper=True)
 """`parallel` and `inlined` in plain IEEE arithmetic."""

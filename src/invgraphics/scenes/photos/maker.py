@@ -78,7 +78,10 @@ def _check_target(job: PhotoJob, out: Path) -> None:
         raise InputError(f"{out} lies inside the folder of the photographs.", "Choose an --out beside it.")
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file.", "Name a new or empty folder.")
-    if not out.exists() or not any(out.iterdir()) or (out / WORK).is_dir() or read_quality(out) is not None:
+    quality = read_quality(out)
+    if quality is not None and Path(quality["job"]["folder"]).resolve() != job.path.resolve():
+        raise InputError(f"{out} holds the scene of {quality['job']['folder']}.", "Choose a new or empty folder.")
+    if quality is not None or not out.exists() or not any(out.iterdir()) or (out / WORK).is_dir():
         return
     raise InputError(f"{out} already exists and holds something else.", "Choose a new or empty folder.")
 

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import UInt8
@@ -26,6 +26,8 @@ PHONE = (".heic", ".heif", ".avif")
 
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 """Sensor data: what Pillow finds in some of them is a thumbnail."""
+
+ADVICE = "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."
 
 _FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length is a mistake
 _OPAQUE = 128
@@ -249,16 +251,20 @@ def _reason(name: str, error: InputError) -> str:
 def _check(job: PhotoJob, photos: list[Prepared], skipped: dict[str, str]) -> None:
     """Refuse what no reconstruction can come of."""
     if len(photos) < 2:
-        what = "no photograph" if not photos else f"only one photograph ({photos[0].source})"
-        reasons = [f"{name}: {why}" for name, why in skipped.items()]
-        remedy = (
-            "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."
-        )
-        if reasons:
-            more = f" ({len(reasons)} files are left out)" if len(reasons) > 1 else ""
-            raise InputError(f"{job.folder} has {what} that can be used; {reasons[0]}{more}.", remedy)
-        raise InputError(f"{job.folder} has {what}.", remedy)
+        _refuse(job.path, photos, skipped)
     sizes = {(photo.width, photo.height) for photo in photos}
     if job.cameras == "single" and len(sizes) > 1:
         shown = ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
         raise InputError(f"One camera cannot have taken pictures of {shown} pixels.", "Leave out --single-camera.")
+
+
+def _refuse(folder: Path, photos: list[Prepared], skipped: dict[str, str]) -> NoReturn:
+    what = f"only one photograph ({photos[0].source})" if photos else "no photograph"
+    if skipped:
+        name, why = next(iter(skipped.items()))
+        more = f" ({len(skipped)} files are left out)" if len(skipped) > 1 else ""
+        raise InputError(f"{folder} has {what} that can be used; {name}: {why}{more}.", ADVICE)
+    below = next((path for path in sorted(folder.iterdir()) if image_files(path)), None)
+    raise InputError(
+        f"{folder} has {what}.", ADVICE if below is None else f"There are photographs in {below}: name that folder."
+    )

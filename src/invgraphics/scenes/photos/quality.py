@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from invgraphics.scenes.photos.pairs import Evidence
-from invgraphics.scenes.photos.prepare import Prepared
+from invgraphics.scenes.photos.prepare import ADVICE, Prepared
 
 LEAST, SHARE = 3, 0.5
 """A scene is usable when at least so many photographs, and this share of them, could be placed."""
@@ -18,8 +18,6 @@ FEW_FEATURES = 200
 
 NO_MOTION = 0.01
 """Median motion of matches, as a share of the longest side, below which a pair shows no parallax worth the name."""
-
-ADVICE = "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."
 
 
 def describe(model: Any, photos: Sequence[Prepared]) -> dict[str, Any]:

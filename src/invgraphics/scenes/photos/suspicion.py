@@ -3,8 +3,10 @@
 Where a scene looks alike in different places, structure from motion can fold it: every photograph is placed, the reprojection
 error is small (what contradicts is dropped as an outlier), and cameras stand on the wrong side. But each pair of photographs is
 matched and verified on its own, before any reconstruction: pairs whose many verified matches lie off the epipolar lines
-of the reconstructed poses are witnesses against it. Comparing rotations of two-view geometries with the reconstruction, or
-going around triplets of them, tells less: small planar overlaps leave the rotation of honest pairs ambiguous.
+of the reconstructed poses are witnesses against it. Only the best matched quarter of the pairs is heard: real scenes hold a few
+things twice, and pairs that mistake one for the other are verified, yet they are weak unless the whole scene repeats.
+Comparing rotations of two-view geometries with the reconstruction, or going around triplets of them, tells less: small planar
+overlaps leave the rotation of honest pairs ambiguous.
 """
 
 from __future__ import annotations
@@ -21,6 +23,9 @@ from invgraphics.scenes.photos.prepare import Prepared
 MATCHES = 30
 """Pairs with fewer verified matches are no witnesses: chance can bring so many onto one geometry."""
 
+STRONG = 0.75
+"""Quantile of the numbers of matches from which a pair is heard."""
+
 NEAR = 4.0
 """Pixels from its epipolar line at which a match still counts as explained: the tolerance of COLMAP's verification."""
 
@@ -28,7 +33,10 @@ EXPLAINED = 0.5
 """A pair of which the poses explain a smaller share of the matches contradicts them."""
 
 SUSPICIOUS = 0.03
-"""Share of contradicting pairs from which a reconstruction is suspicious."""
+"""Share of contradicting pairs from which a reconstruction is suspicious.
+
+Measured: none where the poses were right (a textured scene, a box with unique pictures, and fifty photographs of a room, of whose
+verified pairs 19 % are wrong); 7 and 13 % where a box with the same picture on all its sides was folded."""
 
 
 def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[str, Any]:
@@ -40,7 +48,7 @@ def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[
         evidence: verified matches.
 
     Returns:
-        ``pairs`` that were asked, ``contradicting`` ones, their ``share``, ``suspicious``, a ``sentence`` for a person, and the
+        ``pairs`` that were heard, ``contradicting`` ones, their ``share``, ``suspicious``, a ``sentence`` for a person, and the
         ``worst`` pairs.
     """
     placed = {image.name: image for image in model.images.values() if image.has_pose}
@@ -49,6 +57,8 @@ def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[
         first, second = (placed.get(photos[index].name) for index in (pair.first, pair.second))
         if len(pair) >= MATCHES and first is not None and second is not None:
             asked.append((explained(first, second, pair), pair))
+    enough = np.quantile([len(pair) for _, pair in asked], STRONG, method="lower") if asked else 0
+    asked = [(share, pair) for share, pair in asked if len(pair) >= enough]
     contradicting = sorted((share, pair.first, pair.second, len(pair)) for share, pair in asked if share < EXPLAINED)
     worst = [
         {"photos": [photos[first].source, photos[second].source], "matches": matches, "explained": share}
@@ -68,12 +78,12 @@ def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[
 
 def _sentence(share: float, contradicting: int, asked: int, worst: Sequence[dict[str, Any]]) -> str:
     if share < SUSPICIOUS:
-        return f"{contradicting} of {asked} pairs of photographs contradict the poses"
+        return f"{contradicting} of the {asked} best matched pairs of photographs contradict the poses"
     first, second = worst[0]["photos"]
     return (
-        f"{contradicting} of {asked} pairs of photographs contradict the poses ({100 * share:.0f} %), such as {first} and "
-        f"{second}: parts that look alike may have been taken for one. Look at top-view.png; photographs that show more of the "
-        "surroundings, or leaving out those that show repeated parts alone, help."
+        f"{contradicting} of the {asked} best matched pairs of photographs contradict the poses ({100 * share:.0f} %), such as "
+        f"{first} and {second}: parts that look alike may have been taken for one. Look at top-view.png; photographs that show "
+        "more of the surroundings, or leaving out those that show repeated parts alone, help."
     )
 
 
