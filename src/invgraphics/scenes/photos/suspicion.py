@@ -35,8 +35,8 @@ EXPLAINED = 0.5
 SUSPICIOUS = 0.03
 """Share of contradicting pairs from which a reconstruction is suspicious.
 
-Measured: none where the poses were right (a textured scene, a box with unique pictures, and fifty photographs of a room, of whose
-verified pairs 19 % are wrong); 7 and 13 % where a box with the same picture on all its sides was folded."""
+Measured: none where the poses were right (a textured scene, a box with unique pictures, and fifty photographs of a room, 19 %
+of whose verified pairs are wrong); 7 and 13 % where a box with the same picture on all its sides was folded."""
 
 
 def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[str, Any]:
