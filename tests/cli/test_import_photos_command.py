@@ -9,7 +9,7 @@ from invgraphics.cli.arguments import parse
 from invgraphics.cli.import_photos import ImportPhotos
 
 LENS = {"model": "SIMPLE_RADIAL", "params": [1.0, 2.0, 3.0, 0.1], "size": [4, 5]}
-HONEST = {"pairs": 100, "contradicting": 1, "share": 0.01, "suspicious": False, "sentence": "1 of 100"}
+HONEST = {"pairs": 100, "contradicting": 1, "share": 0.01, "suspicious": False, "sentence": "1 of the 100"}
 QUALITY = {
     "registered": 9, "used": 10, "points": 1234, "track_length": 4.25, "reprojection_error_px": 0.512, "bend_px": 1.25,
     "lenses": [LENS, LENS], "other_pieces": [], "suspicion": HONEST, "usable": True, "refusal": None,
@@ -37,7 +37,7 @@ def test_figures_are_printed_and_the_folder_last(given, capsys, tmp_path) -> Non
     truth |= {name: {"median": 0.25, "mean": 1.0, "max": 2.5} for name in ("rotation_degrees", "translation_per_cent")}
     assert run(QUALITY | {"truth": truth}) == main.DONE
     text = capsys.readouterr().out
-    for expected in ("9 of 10", "1234", "4.2", "0.51 px", "2 SIMPLE_RADIAL", "1 of 100", "0.250°", "2.500 %", "matches 3 s"):
+    for expected in ("9 of 10", "1234", "4.2", "0.51 px", "2 SIMPLE_RADIAL", "1 of the 100", "0.250°", "2.500 %", "matches 3 s"):
         assert expected in text
     assert "left out: a.heic: nothing here decodes HEIC" in text
     assert "not placed: b.jpg: blurred" in text
