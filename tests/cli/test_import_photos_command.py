@@ -37,7 +37,17 @@ def test_figures_are_printed_and_the_folder_last(given, capsys, tmp_path) -> Non
     truth |= {name: {"median": 0.25, "mean": 1.0, "max": 2.5} for name in ("rotation_degrees", "translation_per_cent")}
     assert run(QUALITY | {"truth": truth}) == main.DONE
     text = capsys.readouterr().out
-    for expected in ("9 of 10", "1234", "4.2", "0.51 px", "2 SIMPLE_RADIAL", "1 of the 100", "0.250°", "2.500 %", "matches 3 s"):
+    for expected in (
+        "9 of 10",
+        "1234",
+        "4.2",
+        "0.51 px",
+        "2 SIMPLE_RADIAL",
+        "1 of the 100",
+        "0.250°",
+        "2.500 %",
+        "matches 3 s",
+    ):
         assert expected in text
     assert "left out: a.heic: nothing here decodes HEIC" in text
     assert "not placed: b.jpg: blurred" in text
