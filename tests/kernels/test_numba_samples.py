@@ -59,6 +59,15 @@ def test_hash_encoding_of_nothing_and_of_bad_numbers():
     numba.hash_encode(bad, table, grid)[0].sum().backward()
 
 
+def test_a_table_whose_rows_32_bits_cannot_number_comes_from_the_reference():
+    grid = HashGrid(levels=2, features=2, log2_size=31, base=2, finest=4096)
+    assert grid.entries * grid.features > 1 << 32
+    row = torch.tensor([[0.25, -0.5]])
+    table = row.expand(grid.entries, 2)  # all rows are the same memory
+    features, _ = numba.hash_encode(POINTS, table, grid)
+    assert torch.allclose(features, row.repeat(len(POINTS), 2))
+
+
 def test_jacobian_comes_from_the_reference():
     grid = HashGrid(levels=2, log2_size=6, base=2, finest=32)
     table = torch.randn(grid.entries, 2)

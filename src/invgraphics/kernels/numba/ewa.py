@@ -16,6 +16,28 @@ _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 _NEAR, _MARGIN, _THIN = np.float32(NEAR), np.float32(MARGIN), np.float32(ILL_CONDITIONED)
 _TINY, _EPSILON = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
 _NORM_MIN, _FADE_MIN = np.float32(1e-12), np.float32(FADE_MIN)
+_NOTHING = _ZERO, _ZERO, _ZERO
+
+
+@inlined
+def three(values, i):
+    """The i-th row, as a tuple: a slice of an array counts references, with calls that no register outlives."""
+    return values[i, 0], values[i, 1], values[i, 2]
+
+
+@inlined
+def four(values, i):
+    """The same of four columns."""
+    return values[i, 0], values[i, 1], values[i, 2], values[i, 3]
+
+
+@inlined
+def camera_of(view):
+    """The flat camera as a tuple."""
+    return (
+        view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11],
+        view[12], view[13], view[14], view[15], view[16], view[17],
+    )  # fmt: skip
 
 
 @inlined
@@ -157,8 +179,8 @@ def _radius(view, u, v, xx, xy, yy, opacity):
 
 
 @inlined
-def _write_footprint(view, dilation, compensate, mean, q, scales, opacity, mean2d, conic, plane):
-    """Write the footprint of a primitive in front of the camera, unless it is culled; returns its radius and its fade."""
+def _footprint(view, dilation, compensate, mean, q, scales, opacity):
+    """Radius, fade, centre, conic and plane of a primitive in front of the camera; all but the fade are 0 if it is culled."""
     _, root = scaled_axes(view, q, scales)
     x, y, _, _ = screen_axes(view, mean, root)
     xx, xy, yy, det = covariance(x, y, dilation)
@@ -169,47 +191,43 @@ def _write_footprint(view, dilation, compensate, mean, q, scales, opacity, mean2
         fade, _, _, _, _ = fade_of(x, y, dilation)
     radius = _radius(view, u, v, xx, xy, yy, opacity * fade)
     if radius > _ZERO:
-        mean2d[0], mean2d[1] = u, v
-        conic[0], conic[1], conic[2] = yy / det, -xy / det, xx / det
-        plane[0], plane[1], plane[2] = _plane(mean, x, y, root, dilation)
-    return radius, fade
-
-
-@inlined
-def _write_colour(offset, distance, sh, weights, rgb):
-    """Write the colour towards the camera, from which the primitive is ``offset`` away."""
-    distance = max(distance, _NORM_MIN)
-    harmonics((offset[0] / distance, offset[1] / distance, offset[2] / distance), sh.shape[0], weights)
-    for channel in range(3):
-        c = index(channel)
-        colour = _HALF
-        for number in range(sh.shape[0]):
-            colour += weights[index(number)] * sh[index(number), c]
-        rgb[c] = max(colour, _ZERO)
+        return radius, fade, (u, v), (yy / det, -xy / det, xx / det), _plane(mean, x, y, root, dilation)
+    return _ZERO, fade, (_ZERO, _ZERO), _NOTHING, _NOTHING
 
 
 @parallel
 def project(
-    view, dilation, compensate, means, quaternions, scales, opacities, sh, jobs,
+    flat, dilation, compensate, means, quaternions, scales, opacities, sh, jobs,
     means2d, conics, depths, planes, radii, rgb, fades,
 ):  # fmt: skip
     """Footprints and colours; those of culled primitives are set to something harmless."""
     n = len(means)
     for job in prange(jobs):
         weights = np.empty(16, np.float32)
+        view = camera_of(flat)
         for number in range(share(n, jobs, job), share(n, jobs, job + 1)):
             i = index(number)
-            offset, mean = camera_point(view, means[i])
-            depths[i] = mean[2]
-            radius, fade = _ZERO, _ONE
+            offset, mean = camera_point(view, three(means, i))
+            radius, fade, centre, conic, plane = _ZERO, _ONE, (_ZERO, _ZERO), _NOTHING, _NOTHING
             if mean[2] > _NEAR:
-                q, _ = normalised(quaternions[i])
-                radius, fade = _write_footprint(
-                    view, dilation, compensate, mean, q, scales[i], opacities[i], means2d[i], conics[i], planes[i]
+                q, _ = normalised(four(quaternions, i))
+                radius, fade, centre, conic, plane = _footprint(
+                    view, dilation, compensate, mean, q, three(scales, i), opacities[i]
                 )
-            radii[i], fades[i] = radius, fade
+            red = green = blue = _ZERO
             if radius > _ZERO:
-                _write_colour(offset, planes[i, 0], sh[i], weights, rgb[i])
+                distance = max(plane[0], _NORM_MIN)
+                harmonics((offset[0] / distance, offset[1] / distance, offset[2] / distance), weights)
+                red = green = blue = _HALF
+                for band in range(sh.shape[1]):
+                    k = index(band)
+                    red += weights[k] * sh[i, k, 0]
+                    green += weights[k] * sh[i, k, 1]
+                    blue += weights[k] * sh[i, k, 2]
             else:
-                means2d[i, :], planes[i, :], rgb[i, :] = _ZERO, _ZERO, _ZERO
-                conics[i, 0], conics[i, 1], conics[i, 2] = _ONE, _ZERO, _ONE
+                conic = _ONE, _ZERO, _ONE
+            depths[i], radii[i], fades[i] = mean[2], radius, fade
+            means2d[i, 0], means2d[i, 1] = centre
+            conics[i, 0], conics[i, 1], conics[i, 2] = conic
+            planes[i, 0], planes[i, 1], planes[i, 2] = plane
+            rgb[i, 0], rgb[i, 1], rgb[i, 2] = max(red, _ZERO), max(green, _ZERO), max(blue, _ZERO)

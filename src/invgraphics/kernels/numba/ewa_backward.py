@@ -6,16 +6,19 @@ import numpy as np
 
 from invgraphics.kernels.numba.ewa import (
     FOCAL,
+    camera_of,
     camera_point,
     column,
     dot,
     fade_of,
+    four,
     matrix_of,
     normalised,
     rotation_of,
     scaled_axes,
     scaled_columns,
     screen_axes,
+    three,
 )
 from invgraphics.kernels.numba.harmonics import harmonics, harmonics_gradient
 from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, share
@@ -89,21 +92,20 @@ def _to_quaternion(q, norm, m):
 
 
 @inlined
-def _through_colour(offset, sh, colour, to_colour, to_sh, weights, along):
+def _through_colour(offset, sh, i, colour, to_colour, to_sh, weights, along):
     """Write the gradients along the coefficients; returns the gradient along the offset from the camera."""
-    count = sh.shape[0]
     distance = np.sqrt(dot(offset, offset))
     d = (offset[0] / distance, offset[1] / distance, offset[2] / distance)
     # Colours are cut off at zero.
     red = to_colour[0] if colour[0] > _ZERO else _ZERO
     green = to_colour[1] if colour[1] > _ZERO else _ZERO
     blue = to_colour[2] if colour[2] > _ZERO else _ZERO
-    harmonics(d, count, weights)
-    for number in range(count):
+    harmonics(d, weights)
+    for number in range(sh.shape[1]):
         k = index(number)
-        to_sh[k, 0], to_sh[k, 1], to_sh[k, 2] = weights[k] * red, weights[k] * green, weights[k] * blue
-        along[k] = sh[k, 0] * red + sh[k, 1] * green + sh[k, 2] * blue
-    g = harmonics_gradient(d, count, along)
+        to_sh[i, k, 0], to_sh[i, k, 1], to_sh[i, k, 2] = weights[k] * red, weights[k] * green, weights[k] * blue
+        along[k] = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
+    g = harmonics_gradient(d, along)
     radial = dot(g, d)
     return (g[0] - d[0] * radial) / distance, (g[1] - d[1] * radial) / distance, (g[2] - d[2] * radial) / distance
 
@@ -120,46 +122,59 @@ def _product(a, b):
 
 
 @inlined
-def _add_pose(pose, offset, turned, to_turn, to_mean, to_world_mean):
-    """Add a primitive's share of the gradient along the camera's rotation (row by row) and position."""
-    for i in range(3):
-        for j in range(3):
-            pose[3 * i + j] += offset[i] * to_mean[j] + dot(turned[i], to_turn[j])
-        pose[9 + i] -= to_world_mean[i]
+def _through_pose(offset, turned, to_turn, to_mean, to_world_mean):
+    """A primitive's share of the gradient along the camera's rotation (row by row) and position."""
+    (x, y, z), (a, b, c), (p, q, r) = offset, to_mean, turned
+    u, v, w = to_turn
+    return (
+        x * a + dot(p, u), x * b + dot(p, v), x * c + dot(p, w),
+        y * a + dot(q, u), y * b + dot(q, v), y * c + dot(q, w),
+        z * a + dot(r, u), z * b + dot(r, v), z * c + dot(r, w),
+        -to_world_mean[0], -to_world_mean[1], -to_world_mean[2],
+    )  # fmt: skip
 
 
 @parallel
 def project_back(
-    view, dilation, means, quaternions, scales, sh, radii, conics, rgb,
+    flat, dilation, means, quaternions, scales, sh, radii, conics, rgb,
     to_means2d, to_conics, to_depths, to_rgb, to_fades,
     to_means, to_quaternions, to_scales, to_sh, pose,
 ):  # fmt: skip
     """Write the gradients along the primitives and, per job, along the camera's pose."""
     n, jobs = sh.shape[0], pose.shape[0]
     for job in prange(jobs):
-        weights, along = np.empty(16, np.float32), np.empty(16, np.float32)
-        own = pose[job]
-        own[:] = 0.0
+        weights, along = np.empty(16, np.float32), np.zeros(16, np.float32)
+        view = camera_of(flat)
+        rotation = rotation_of(view)
+        pose[job, :] = 0.0
         for number in range(share(n, jobs, job), share(n, jobs, job + 1)):
             i = index(number)
             if radii[i] > _ZERO:
-                offset, mean = camera_point(view, means[i])
-                q, norm = normalised(quaternions[i])
-                turn, root = scaled_axes(view, q, scales[i])
+                offset, mean = camera_point(view, three(means, i))
+                q, norm = normalised(four(quaternions, i))
+                s = three(scales, i)
+                turn, root = scaled_axes(view, q, s)
+                to_mean2d = to_means2d[i, 0], to_means2d[i, 1]
                 to_mean, to_root = _through_screen(
-                    view, dilation, mean, root, conics[i], to_conics[i], to_means2d[i], to_fades[i]
+                    view, dilation, mean, root, three(conics, i), three(to_conics, i), to_mean2d, to_fades[i]
                 )
                 to_mean = (to_mean[0], to_mean[1], to_mean[2] + to_depths[i])
-                to_turn = scaled_columns(to_root, scales[i])
-                rotation = rotation_of(view)
+                to_turn = scaled_columns(to_root, s)
                 w, x, y, z = _to_quaternion(q, norm, _product(rotation, to_turn))
                 to_quaternions[i, 0], to_quaternions[i, 1], to_quaternions[i, 2], to_quaternions[i, 3] = w, x, y, z
                 for k in range(3):
                     to_scales[i, k] = dot(column(to_root, k), column(turn, k))
-                colour = _through_colour(offset, sh[i], rgb[i], to_rgb[i], to_sh[i], weights, along)
+                colour = _through_colour(offset, sh, i, three(rgb, i), three(to_rgb, i), to_sh, weights, along)
                 a, b, c = dot(rotation[0], to_mean), dot(rotation[1], to_mean), dot(rotation[2], to_mean)
                 world = (a + colour[0], b + colour[1], c + colour[2])
                 to_means[i, 0], to_means[i, 1], to_means[i, 2] = world
-                _add_pose(own, offset, matrix_of(q), to_turn, to_mean, world)
+                shares = _through_pose(offset, matrix_of(q), to_turn, to_mean, world)
+                for k in range(12):
+                    pose[job, k] += shares[k]
             else:
-                to_means[i, :], to_quaternions[i, :], to_scales[i, :], to_sh[i, :, :] = _ZERO, _ZERO, _ZERO, _ZERO
+                to_means[i, 0], to_means[i, 1], to_means[i, 2] = _ZERO, _ZERO, _ZERO
+                to_scales[i, 0], to_scales[i, 1], to_scales[i, 2] = _ZERO, _ZERO, _ZERO
+                to_quaternions[i, 0], to_quaternions[i, 1] = _ZERO, _ZERO
+                to_quaternions[i, 2], to_quaternions[i, 3] = _ZERO, _ZERO
+                for k in range(sh.shape[1]):
+                    to_sh[i, index(k), 0], to_sh[i, index(k), 1], to_sh[i, index(k), 2] = _ZERO, _ZERO, _ZERO

@@ -13,17 +13,23 @@ from invgraphics.kernels.numba.raster import BLOCK, HALF_LOG2E, LANES, block_col
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
-# What a block holds for each of its pixels, LANES values each: transmittance, weight of the current footprint, the loss's
-# derivative along what is still to be composited, gradient of alpha, gradient along the current footprint's features beyond
-# the first three, gradients of the picture's channels.
-_T, _WEIGHT, _BEHIND, _ALPHA, _ALONG, _PICTURE = (index(slot) * LANES for slot in range(6))
+# What a block holds for each of its pixels, LANES values each: transmittance, the loss's derivative along what is still to be
+# composited, gradient of alpha, gradient along the current footprint's features beyond the first three, gradients of the
+# picture's channels.
+_T, _BEHIND, _ALPHA, _ALONG, _PICTURE = (index(slot) * LANES for slot in range(5))
 
 # What is summed per footprint, before the features: v = dL/dalpha alpha times 1, x, y, x², x y, y².
 MOMENTS = 6
 FIRST_SUMS = MOMENTS + 3
 """Sums that are kept lane by lane while a footprint is on a tile: adding lanes up once is cheaper than for every block."""
+HALF = LANES // index(2)
+"""Lanes of those sums: the pixels of half a block."""
+_DOWN = np.float32(BLOCK // 2)
+"""Pixels from the upper half of a block to the lower."""
 PULLS = 2
 """Further sums, behind those of the features, where absolute gradients are wanted."""
+_V, _WEIGHT, _ROOM = (index(FIRST_SUMS + PULLS) * HALF + index(slot) * LANES for slot in range(3))
+"""Behind those lanes: v and weight that the current footprint has in each pixel of the current block."""
 
 # What few fits need must not slow down the others. A switch is a tuple whose length says whether it is on: Numba compiles the
 # kernel anew for each length, and LLVM drops the code of what is off.
@@ -57,8 +63,8 @@ def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_
 
 
 @inlined
-def _unblend(state, lanes, base, rows, r, dx0, dy0, rank, absolute, receivers):
-    """Repeat one footprint's blending onto one block and add to its sums, lane by lane.
+def _unblend(state, lanes, base, rows, r, dx0, dy0, rank, receivers):
+    """Repeat one footprint's blending onto one block: what it has there is left behind the lanes.
 
     With ``receivers`` on, ``rank`` is where the block counts the footprints that each of its pixels has seen.
     """
@@ -93,21 +99,40 @@ def _unblend(state, lanes, base, rows, r, dx0, dy0, rank, absolute, receivers):
             state[rank + lane] = seen
             v = v if seen <= receivers[0] else _ZERO
             weight = weight if seen <= receivers[0] else _ZERO
-        state[base + _WEIGHT + lane] = weight
-        vx = v * dx
-        vy = v * dy
-        lanes[lane] += v
-        lanes[LANES + lane] += vx
-        lanes[index(2) * LANES + lane] += vy
-        lanes[index(3) * LANES + lane] += vx * dx
-        lanes[index(4) * LANES + lane] += vx * dy
-        lanes[index(5) * LANES + lane] += vy * dy
-        lanes[index(6) * LANES + lane] += weight * g_red
-        lanes[index(7) * LANES + lane] += weight * g_green
-        lanes[index(8) * LANES + lane] += weight * g_blue
+        lanes[_WEIGHT + lane] = weight
+        lanes[_V + lane] = v
+
+
+@inlined
+def _sum(state, lanes, half, base, rows, r, dx0, dy0, absolute):
+    """Add what the footprint has on the block to its sums, lane by lane, the upper half and the lower to the same ones.
+
+    ``half`` is `HALF` where the compiler cannot see it: it would unroll the loop, and then find no vectors in it.
+    """
+    for lane in range(half):
+        dx = dx0 + np.float32(lane & index(3))
+        dy = dy0 + np.float32(lane >> index(2))
+        below = dy + _DOWN
+        v, w = lanes[_V + lane], lanes[_V + HALF + lane]
+        both, vy, wy = v + w, v * dy, w * below
+        y = vy + wy
+        lanes[lane] += both
+        lanes[HALF + lane] += both * dx
+        lanes[index(2) * HALF + lane] += y
+        lanes[index(3) * HALF + lane] += both * dx * dx
+        lanes[index(4) * HALF + lane] += y * dx
+        lanes[index(5) * HALF + lane] += vy * dy + wy * below
+        first, second = lanes[_WEIGHT + lane], lanes[_WEIGHT + HALF + lane]
+        at = base + _PICTURE + lane
+        lanes[index(6) * HALF + lane] += first * state[at] + second * state[at + HALF]
+        lanes[index(7) * HALF + lane] += first * state[at + LANES] + second * state[at + LANES + HALF]
+        at += index(2) * LANES
+        lanes[index(8) * HALF + lane] += first * state[at] + second * state[at + HALF]
         if len(absolute) == ON:
-            lanes[index(9) * LANES + lane] += abs(rows[r, CONIC_XX] * vx + rows[r, CONIC_XY] * vy)
-            lanes[index(10) * LANES + lane] += abs(rows[r, CONIC_XY] * vx + rows[r, CONIC_YY] * vy)
+            xx, xy, yy = rows[r, CONIC_XX], rows[r, CONIC_XY], rows[r, CONIC_YY]
+            vx, wx = v * dx, w * dx
+            lanes[index(9) * HALF + lane] += abs(xx * vx + xy * vy) + abs(xx * wx + xy * wy)
+            lanes[index(10) * HALF + lane] += abs(xy * vx + yy * vy) + abs(xy * wx + yy * wy)
 
 
 @inlined
@@ -123,24 +148,24 @@ def _look_along(state, base, rows, r, triples):
 
 
 @inlined
-def _sum_further(state, base, sums, r, triples):
+def _sum_further(state, lanes, base, sums, r, triples):
     """Gradients of the features beyond the first three."""
     for k in range(3, 3 * triples):
         channel = _PICTURE + index(k) * LANES
         total = _ZERO
         for lane in range(LANES):
-            total += state[base + _WEIGHT + lane] * state[base + channel + lane]
+            total += lanes[_WEIGHT + lane] * state[base + channel + lane]
         sums[r, index(MOMENTS + k)] += total
 
 
 @inlined
-def _add_up(lanes, sums, r, absolute):
+def _add_up(lanes, half, sums, r, absolute):
     """Move a footprint's sums from the lanes, which are cleared, to its row."""
     for k in range(FIRST_SUMS + (PULLS if len(absolute) == ON else 0)):
         total = _ZERO
-        for lane in range(LANES):
-            total += lanes[index(k) * LANES + lane]
-            lanes[index(k) * LANES + lane] = _ZERO
+        for lane in range(half):
+            total += lanes[index(k) * HALF + lane]
+            lanes[index(k) * HALF + lane] = _ZERO
         to = k if k < FIRST_SUMS else sums.shape[1] - PULLS + k - FIRST_SUMS
         sums[r, index(to)] += total
 
@@ -150,7 +175,8 @@ def _walk_tile(
     rows, entries, first, last, x0, y0, edge, triples, state, lanes, stride, ends, sums, absolute, receivers
 ):  # fmt: skip
     """Walk a tile's footprints front to back and add what each of them receives to ``sums``."""
-    ox, oy, half = np.float32(x0), np.float32(y0), np.float32(0.5)
+    ox, oy, middle = np.float32(x0), np.float32(y0), np.float32(0.5)
+    half = index(len(lanes) // (_ROOM // HALF))
     for entry in range(first, last):
         r = index(entries[index(entry)])
         visited = False
@@ -161,16 +187,17 @@ def _walk_tile(
                 block = index(j * edge + i)
                 if entry < ends[block]:
                     base = block * stride
-                    dx = ox + np.float32(i * BLOCK) + half - rows[r, MEAN_X]
-                    dy = oy + np.float32(j * BLOCK) + half - rows[r, MEAN_Y]
+                    dx = ox + np.float32(i * BLOCK) + middle - rows[r, MEAN_X]
+                    dy = oy + np.float32(j * BLOCK) + middle - rows[r, MEAN_Y]
                     if triples > 1:
                         _look_along(state, base, rows, r, triples)
                     visited = True
-                    _unblend(state, lanes, base, rows, r, dx, dy, base + stride - LANES, absolute, receivers)
+                    _unblend(state, lanes, base, rows, r, dx, dy, base + stride - LANES, receivers)
+                    _sum(state, lanes, half, base, rows, r, dx, dy, absolute)
                     if triples > 1:
-                        _sum_further(state, base, sums, r, triples)
+                        _sum_further(state, lanes, base, sums, r, triples)
         if visited:
-            _add_up(lanes, sums, r, absolute)
+            _add_up(lanes, half, sums, r, absolute)
 
 
 @parallel
@@ -187,7 +214,7 @@ def walk_back(
     for job in prange(len(bounds) - 1):
         state = np.empty(index(edge * edge) * stride, np.float32)
         own = sums[job]
-        lanes = np.zeros(index(FIRST_SUMS + PULLS) * LANES, np.float32)
+        lanes = np.zeros(_ROOM, np.float32)
         own[:] = _ZERO
         for tile in range(bounds[job], bounds[job + 1]):
             if starts[tile] < starts[tile + 1]:
