@@ -131,6 +131,23 @@ def test_evaluation_may_take_finer_steps(make_scene: Callable[..., Scene], space
     assert torch.equal(trained[0].t0, trained[1].t0)
 
 
+def test_training_may_begin_with_longer_steps(make_scene: Callable[..., Scene]) -> None:
+    """A quarter of the steps at first, half of them by an eighth of the fit; and what a cell holds counts per step."""
+    scene = make_scene()
+    rays, config = scene.bounds.clip(scene.train[0].camera.rays())[:20], replace(SMALL, stop="never", early_steps=64)
+    sampler, lengths = config.build(scene), []
+    for progress in (0.0, 0.125, 0.25, 1.0):
+        ctx = replace(context(scene), progress=progress)
+        samples, _ = sampler.sample(rays, None, ctx)  # type: ignore[arg-type]
+        sampler.update(lambda samples: torch.ones(len(samples)), ctx)
+        lengths.append(float(samples.delta[0]) / sampler.length)
+        if progress == 0:
+            assert float(sampler.ema.max()) == pytest.approx(4 * sampler.length, rel=1e-5)
+    assert lengths == pytest.approx([4, 2, 1, 1], rel=1e-4)
+    seen, _ = sampler.sample(rays, None, context(scene, training=False))  # type: ignore[arg-type]
+    assert float(seen.delta[0]) == pytest.approx(sampler.length, rel=1e-5)
+
+
 def test_looks_on_schedule_at_as_many_cells_as_allowed(make_scene: Callable[..., Scene]) -> None:
     scene, looks = make_scene(), []
 

@@ -26,6 +26,9 @@ class OccupancyConfig:
         steps_per_diagonal: steps that a march across the bounds' diagonal takes.
         evaluation_steps: the same outside training; ``None`` takes as many. In training the steps are shifted at random, so
             that a field fitted with long ones is sharper when it is seen with short ones.
+        early_steps: the same at the start of training; the number moves to ``steps_per_diagonal`` over the first quarter of the
+            fit. While there is fog, few long steps tell as much as many short ones, and more rays can be afforded. ``None``:
+            no change.
         cone: growth of the step with distance; ``None`` means 0 in a box and 4 / ``steps_per_diagonal`` (Instant-NGP's
             1/256) in a contracted space.
         grace: training steps before the first refresh. What is thinner than the threshold before it was ever seen would be
@@ -45,6 +48,7 @@ class OccupancyConfig:
     resolution: int = 128
     steps_per_diagonal: int = 1024
     evaluation_steps: int | None = None
+    early_steps: int | None = None
     cone: float | None = None
     grace: int = 0
     decay: float = 0.95
@@ -58,7 +62,7 @@ class OccupancyConfig:
     wave: int = 6
 
     def __post_init__(self) -> None:
-        for key in ("resolution", "steps_per_diagonal", "evaluation_steps", "every", "cells", "wave"):
+        for key in ("resolution", "steps_per_diagonal", "evaluation_steps", "early_steps", "every", "cells", "wave"):
             value = getattr(self, key)
             if value is not None and value < 1:
                 raise ValueError(f"{key} must be at least 1, not {value}")
@@ -75,6 +79,11 @@ class OccupancyConfig:
             return self.decay
         share = min(1.0, 2 * progress)
         return 1 - (1 - self.early_decay) ** (1 - share) * (1 - self.decay) ** share
+
+    def steps_at(self, progress: float) -> float:
+        """Training steps across the diagonal at a point of the fit."""
+        early = self.early_steps or self.steps_per_diagonal
+        return early * (self.steps_per_diagonal / early) ** min(1.0, 4 * progress)
 
     def build(self, scene: Scene) -> Occupancy:
         """The sampler, every cell occupied."""
@@ -115,16 +124,20 @@ class Occupancy(Sampler):
             return in_front(rays, march, look, self.config.transmittance, self.config.wave), ()
         return Samples.on(rays, march.ray, march.t0, march.t1), ()
 
+    def _steps(self, ctx: Context) -> MarchSteps:
+        """How long steps are now."""
+        usual = self.config.steps_per_diagonal
+        now = self.config.steps_at(ctx.progress) if ctx.training else self.config.evaluation_steps or usual
+        return MarchSteps(self.length * usual / now, self.cone * usual / now)
+
     @torch.no_grad()
     def _march(self, rays: Rays, ctx: Context) -> March:
         """March all rays to their ends."""
-        usual = self.config.steps_per_diagonal
-        finer = 1.0 if ctx.training else usual / (self.config.evaluation_steps or usual)
-        steps = MarchSteps(self.length * finer, self.cone * finer)
+        steps = self._steps(ctx)
         start = rays.near
         if ctx.training:
             # The whole lattice of steps is shifted, so that over many visits every distance gets its turn.
-            start = start + uniform((len(rays),), ctx, like=start) * (self.cone * start).clamp_min(self.length)
+            start = start + uniform((len(rays),), ctx, like=start) * (steps.cone * start).clamp_min(steps.step)
         march = kernels.ray_march(rays, self.occupied, ctx.bounds, steps, start)
         parts = [march]
         going = torch.nonzero(march.resume < rays.far)[:, 0]
@@ -179,8 +192,8 @@ class Occupancy(Sampler):
         corner = torch.stack(torch.unravel_index(cells, self.ema.shape), dim=1)
         unit = (corner + uniform((len(cells), 3), ctx, like=self.ema)) / self.config.resolution
         position = ctx.bounds.from_unit(unit.to(ctx.bounds.lo.dtype))
-        distance = (position - ctx.bounds.centre).norm(dim=1)
-        return density(Samples.at(position)) * (self.cone * distance).clamp_min(self.length)
+        distance, steps = (position - ctx.bounds.centre).norm(dim=1), self._steps(ctx)
+        return density(Samples.at(position)) * (steps.cone * distance).clamp_min(steps.step)
 
 
 def _joined(parts: list[March]) -> March:

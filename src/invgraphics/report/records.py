@@ -47,7 +47,7 @@ class Run:
         folder: where it lies.
         method: ``renderer/recipe``; a report may extend it to tell variants apart.
         seed: random seed of the fit.
-        preset: size of the recipe, ``laptop`` or ``paper``.
+        preset: size of the recipe, for instance ``laptop`` or ``paper``.
         scene: name of the scene.
         protocol: name of the scoring protocol.
         views: names of the test views; view i has its pictures in ``test/%04d``.
@@ -101,7 +101,7 @@ class Comparison:
         runs: the cells that succeeded.
         failures: the cells that did not.
         budget: what every fit was given, ``60s`` or ``5000steps``; empty where fits had different budgets.
-        preset: ``laptop`` or ``paper``; empty where fits differ.
+        preset: for instance ``laptop`` or ``paper``; empty where fits differ.
         size: width and height of the test pictures, px.
         summaries: method -> what it is, one line.
         command: reproduces the whole comparison; empty where there is none.

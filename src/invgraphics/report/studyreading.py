@@ -61,7 +61,7 @@ class Study:
         methods: likewise.
         seeds: likewise.
         budget: of every fit; empty where it is a factor.
-        preset: ``laptop`` or ``paper``.
+        preset: for instance ``laptop`` or ``paper``.
         size: width and height of the test pictures, px, or as written.
         protocol: how scores were made.
         command: reproduces the study.
