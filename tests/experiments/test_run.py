@@ -17,7 +17,9 @@ from PIL import Image
 from training_fixtures import SMALL
 
 from invgraphics.errors import InputError
+from invgraphics.experiments import evaluate
 from invgraphics.experiments.evaluate import evaluate_run
+from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.training.checkpoint import NAME, load
@@ -75,6 +77,29 @@ def test_scores_can_be_recomputed_from_the_saved_pictures(run: Path) -> None:
 def test_evaluating_again_gives_the_same_scores(run: Path) -> None:
     before = json.loads((run / "scores.json").read_text())["quality"]
     assert evaluate_run(run)["quality"] == before
+
+
+@pytest.mark.parametrize(("normals", "colour_only", "whole"), [(True, 2, 3), (False, 3, 0)])
+def test_timing_costs_few_pictures_more_where_normals_are_scored(
+    run: Path, monkeypatch: pytest.MonkeyPatch, normals: bool, colour_only: int, whole: int
+) -> None:
+    """Normals make a picture dearer than a viewer's, so a picture without them is timed beside it, for some views."""
+    fitted, asked, plain = open_fitted(run), [], evaluate.render_view
+
+    def counted(field, renderer, camera, scene, device, geometry=True):
+        if camera.width == fitted.scene.test[0].camera.width:
+            asked.append(geometry)
+        return plain(field, renderer, camera, scene, device, geometry)
+
+    monkeypatch.setattr(evaluate, "render_view", counted)
+    monkeypatch.setattr(evaluate, "TIMED", 2)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    views = tuple(replace(view, normal=up.expand(*view.image.shape) if normals else None) for view in fitted.scene.test)
+    scores = evaluate.evaluate(
+        fitted.folder, replace(fitted.scene, test=views), (fitted.field, fitted.renderer), "float", {}, fitted.method
+    )
+    assert (asked.count(False), asked.count(True)) == (colour_only, whole)
+    assert scores["cost"]["render_fps"] > 0
 
 
 def test_same_seed_gives_the_same_bits(run: Path, toy_folder: Path, tmp_path: Path) -> None:

@@ -112,14 +112,12 @@ def _picture(
     """A picture for scoring, and the seconds that one takes as a viewer would ask for it: colour, alpha and depth."""
     field, renderer = model
     device = next(field.parameters()).device
-    seconds: list[float] = []
-    if timed or not normals:
-        began = time.perf_counter()
-        picture = render_view(field, renderer, camera, scene, device, geometry=False)
-        seconds.append(time.perf_counter() - began)
-        if not normals:
-            return picture, seconds
-    return render_view(field, renderer, camera, scene, device), seconds
+    if normals and not timed:
+        return render_view(field, renderer, camera, scene, device), []
+    began = time.perf_counter()
+    picture = render_view(field, renderer, camera, scene, device, geometry=False)
+    seconds = [time.perf_counter() - began]
+    return (render_view(field, renderer, camera, scene, device) if normals else picture), seconds
 
 
 def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> dict[str, Any]:

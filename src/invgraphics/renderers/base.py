@@ -19,7 +19,7 @@ def picture(
     distance: Float[Tensor, "*p"],
     normal: Float[Tensor, "*p 3"] | None,
     far: Float[Tensor, "*p"],
-    directions: Float[Tensor, "*p 3"],
+    directions: Float[Tensor, "*p 3"] | None = None,
 ) -> Rendering:
     """Turn weighted sums into a picture.
 
@@ -29,11 +29,12 @@ def picture(
         distance: sum of w * t.
         normal: sum of w * normal, if wanted.
         far: depth of pixels that see nothing.
-        directions: unit ray directions, which tell a normal's front from its back.
+        directions: unit ray directions, which tell a normal's front from its back; needed where there are normals.
     """
     seen = alpha >= SEEN
     depth = torch.where(seen, distance / alpha.clamp_min(SEEN), far)
     if normal is not None:
+        assert directions is not None
         unit = normalize(normal, dim=-1)
         unit = torch.where((unit * directions).sum(dim=-1, keepdim=True) > 0, -unit, unit)
         normal = torch.where(seen[..., None], unit, 0.0)

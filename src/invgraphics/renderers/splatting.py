@@ -103,14 +103,15 @@ class Splatting(Renderer):
         far = torch.full_like(alpha, torch.inf)
         if sums.shape[2] == 3:
             return Rendering(sums, alpha, far)
-        homogeneous = torch.nn.functional.pad(camera.pixel_centres(), (0, 1), value=1.0)
-        distance = (sums[..., 3:6] * homogeneous).sum(dim=2)
-        normal = sums[..., 6:] if sums.shape[2] > 6 else None
-        directions = camera.rays().directions.view(*alpha.shape, 3)
+        x, y = (torch.arange(count, device=sums.device, dtype=sums.dtype) + 0.5 for count in (camera.width, camera.height))
+        distance = sums[..., 3] * x + sums[..., 4] * y[:, None] + sums[..., 5]
         if self.config.depth == "median":
             median = kernels.splat_median(footprints, camera.width, camera.height, self.config.tile)
             distance = torch.where(torch.isfinite(median), median * alpha, distance)
-        if normal is not None and self.config.normals == "depth":
+        if sums.shape[2] == 6:
+            return picture(sums[..., :3], alpha, distance, None, far)
+        normal, directions = sums[..., 6:], camera.rays().directions.view(*alpha.shape, 3)
+        if self.config.normals == "depth":
             normal = _slope(distance / alpha.clamp_min(SEEN), alpha >= SEEN, directions)
         return picture(sums[..., :3], alpha, distance, normal, far, directions)
 
