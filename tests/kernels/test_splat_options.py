@@ -75,9 +75,9 @@ def test_compensation_gradients_by_finite_differences() -> None:
 
 
 def test_numba_compensation_equals_reference() -> None:
-    results = []
+    results, gaussians = [], cloud(200, 4)
     for kernels, dtype in ((numba, torch.float32), (reference, F64)):
-        primitives, eye, leaves = leaves_of(cloud_once, camera(), dtype)
+        primitives, eye, leaves = leaves_of(gaussians, camera(), dtype)
         footprints, rgb = kernels.splat_project(primitives, eye, 0.3, True)
         image, alpha = kernels.splat_rasterise(footprints, rgb, 72, 56)
         probe = torch.linspace(-1, 1, 72).to(dtype)
@@ -85,9 +85,6 @@ def test_numba_compensation_equals_reference() -> None:
         results.append(([image.detach(), alpha.detach()], [leaf.grad for leaf in leaves]))
     assert_close(results[0][0], results[1][0])
     assert_close(results[0][1], results[1][1], 1e-4)
-
-
-cloud_once = cloud(200, 4)
 
 
 def probe_of(height: int, width: int) -> torch.Tensor:
