@@ -9,14 +9,13 @@ from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, 
 from invgraphics.kernels.reference.splat_project import ILL_CONDITIONED, MARGIN, NEAR
 from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN
 
-# A camera as a flat array: rotation to the world row by row, position, focal lengths, principal point, width, height.
+# A camera as a flat tuple: rotation to the world row by row, position, focal lengths, principal point, width, height.
 ROTATION, POSITION, FOCAL, CENTRE, SIZE, VIEW = 0, 9, 12, 14, 16, 18
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 _NEAR, _MARGIN, _THIN = np.float32(NEAR), np.float32(MARGIN), np.float32(ILL_CONDITIONED)
 _TINY, _EPSILON = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
 _NORM_MIN, _FADE_MIN = np.float32(1e-12), np.float32(FADE_MIN)
-_NOTHING = _ZERO, _ZERO, _ZERO
 
 
 @inlined
@@ -29,15 +28,6 @@ def three(values, i):
 def four(values, i):
     """The same of four columns."""
     return values[i, 0], values[i, 1], values[i, 2], values[i, 3]
-
-
-@inlined
-def camera_of(view):
-    """The flat camera as a tuple."""
-    return (
-        view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11],
-        view[12], view[13], view[14], view[15], view[16], view[17],
-    )  # fmt: skip
 
 
 @inlined
@@ -180,7 +170,7 @@ def _radius(view, u, v, xx, xy, yy, opacity):
 
 @inlined
 def _footprint(view, dilation, compensate, mean, q, scales, opacity):
-    """Radius, fade, centre, conic and plane of a primitive in front of the camera; all but the fade are 0 if it is culled."""
+    """Radius, fade, centre, conic and plane of a primitive in front of the camera; the radius is 0 if it is culled."""
     _, root = scaled_axes(view, q, scales)
     x, y, _, _ = screen_axes(view, mean, root)
     xx, xy, yy, det = covariance(x, y, dilation)
@@ -192,23 +182,23 @@ def _footprint(view, dilation, compensate, mean, q, scales, opacity):
     radius = _radius(view, u, v, xx, xy, yy, opacity * fade)
     if radius > _ZERO:
         return radius, fade, (u, v), (yy / det, -xy / det, xx / det), _plane(mean, x, y, root, dilation)
-    return _ZERO, fade, (_ZERO, _ZERO), _NOTHING, _NOTHING
+    return _ZERO, fade, (_ZERO, _ZERO), (_ONE, _ZERO, _ONE), (_ZERO, _ZERO, _ZERO)
 
 
 @parallel
 def project(
-    flat, dilation, compensate, means, quaternions, scales, opacities, sh, jobs,
+    view, dilation, compensate, means, quaternions, scales, opacities, sh, jobs,
     means2d, conics, depths, planes, radii, rgb, fades,
 ):  # fmt: skip
     """Footprints and colours; those of culled primitives are set to something harmless."""
     n = len(means)
     for job in prange(jobs):
         weights = np.empty(16, np.float32)
-        view = camera_of(flat)
         for number in range(share(n, jobs, job), share(n, jobs, job + 1)):
             i = index(number)
             offset, mean = camera_point(view, three(means, i))
-            radius, fade, centre, conic, plane = _ZERO, _ONE, (_ZERO, _ZERO), _NOTHING, _NOTHING
+            radius, fade = _ZERO, _ONE
+            centre, conic, plane = (_ZERO, _ZERO), (_ONE, _ZERO, _ONE), (_ZERO, _ZERO, _ZERO)
             if mean[2] > _NEAR:
                 q, _ = normalised(four(quaternions, i))
                 radius, fade, centre, conic, plane = _footprint(
@@ -224,8 +214,6 @@ def project(
                     red += weights[k] * sh[i, k, 0]
                     green += weights[k] * sh[i, k, 1]
                     blue += weights[k] * sh[i, k, 2]
-            else:
-                conic = _ONE, _ZERO, _ONE
             depths[i], radii[i], fades[i] = mean[2], radius, fade
             means2d[i, 0], means2d[i, 1] = centre
             conics[i, 0], conics[i, 1], conics[i, 2] = conic

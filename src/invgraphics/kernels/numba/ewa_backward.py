@@ -6,7 +6,6 @@ import numpy as np
 
 from invgraphics.kernels.numba.ewa import (
     FOCAL,
-    camera_of,
     camera_point,
     column,
     dot,
@@ -136,7 +135,7 @@ def _through_pose(offset, turned, to_turn, to_mean, to_world_mean):
 
 @parallel
 def project_back(
-    flat, dilation, means, quaternions, scales, sh, radii, conics, rgb,
+    view, dilation, means, quaternions, scales, sh, radii, conics, rgb,
     to_means2d, to_conics, to_depths, to_rgb, to_fades,
     to_means, to_quaternions, to_scales, to_sh, pose,
 ):  # fmt: skip
@@ -144,7 +143,6 @@ def project_back(
     n, jobs = sh.shape[0], pose.shape[0]
     for job in prange(jobs):
         weights, along = np.empty(16, np.float32), np.zeros(16, np.float32)
-        view = camera_of(flat)
         rotation = rotation_of(view)
         pose[job, :] = 0.0
         for number in range(share(n, jobs, job), share(n, jobs, job + 1)):

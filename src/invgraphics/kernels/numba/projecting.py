@@ -66,14 +66,14 @@ class _Project(torch.autograd.Function):
         return (*results, None, None, None, None)
 
 
-def _flat(camera: Camera) -> np.ndarray:
+def _flat(camera: Camera) -> tuple[np.float32, ...]:
     """The camera as `project` reads it."""
     view = np.empty(VIEW, np.float32)
     pose = array(camera.cam_to_world)
     view[:POSITION], view[POSITION:FOCAL] = pose[:3, :3].reshape(-1), pose[:3, 3]
     view[FOCAL:CENTRE], view[CENTRE:SIZE] = array(camera.focal), array(camera.centre)
     view[SIZE:] = camera.width, camera.height
-    return view
+    return tuple(view)
 
 
 def _pose_gradient(jobs: np.ndarray, pose: Tensor) -> Tensor:
