@@ -48,6 +48,17 @@ def test_hash_encoding(grid):
     assert_equal(lambda u, t: numba.hash_encode(u, t, grid), lambda u, t: reference.hash_encode(u, t, grid), [unit, table])
 
 
+def test_a_position_just_below_a_vertex_lies_in_the_cell_below():
+    """Its product with the number of cells is rounded up to the vertex; the derivative along it tells the cells apart."""
+    grid = HashGrid(levels=1, features=2, log2_size=12, base=4093, finest=4093)
+    unit = (torch.arange(1, 4093) / torch.tensor(4093.0, dtype=torch.float64)).float()[:, None].expand(-1, 3)
+    assert ((unit * 4093).floor() > (unit.double() * 4093).floor()).sum() > 1000
+    assert_equal(
+        lambda u, t: numba.hash_encode(u, t, grid), lambda u, t: reference.hash_encode(u, t, grid),
+        [unit, torch.randn(grid.entries, 2)],
+    )  # fmt: skip
+
+
 def test_hash_encoding_of_nothing_and_of_bad_numbers():
     grid = HashGrid(levels=2, log2_size=6, base=2, finest=32)
     table = torch.randn(grid.entries, 2, requires_grad=True)

@@ -11,48 +11,46 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.hash_cells import BLOCK, CHUNK, UNIT, ZERO, at_vertices, blend, locate, spread
+from invgraphics.kernels.numba.hash_cells import BLOCK, CHUNK, ZERO, at_vertices, blend, locate, rows_of, spread
 from invgraphics.kernels.numba.hash_slope import locate_back, rise, rise_back
+from invgraphics.kernels.numba.instructions import blend_pair, spread_pair
 from invgraphics.kernels.numba.runtime import array, index, inlined, once_differentiable, parallel, prange, share, threads
 from invgraphics.kernels.types import HashGrid
 
-TWO = index(2)
+UNIT, TWO = index(1), index(2)
 
 
 @inlined
-def _gather(table, rows, weights, block, column, width, out):
-    """Features of the points of a block. The usual two have a loop of their own: an inner one over features costs as much."""
+def _gather(table, entries, weights, block, column, width, out):
+    """Features of the points of a block; the usual two are read together."""
     first, count = block
     if width == TWO:
         for point in range(count):
             n = index(point)
-            r, w = at_vertices(rows, n), at_vertices(weights, n)
-            low, high = blend(table, r, w, index(0)), blend(table, r, w, UNIT)
+            low, high = blend_pair(table, at_vertices(entries, n), at_vertices(weights, n))
             out[first + n, column] = low
             out[first + n, column + UNIT] = high
     else:
         for point in range(count):
             n = index(point)
-            r, w = at_vertices(rows, n), at_vertices(weights, n)
+            r, w = rows_of(at_vertices(entries, n), index(0), width), at_vertices(weights, n)
             for feature in range(width):
                 out[first + n, column + index(feature)] = blend(table, r, w, index(feature))
 
 
 @inlined
-def _scatter(gradient, rows, weights, block, column, width, to_table):
+def _scatter(gradient, entries, weights, block, column, width, to_table):
     """The transpose of `_gather`."""
     first, count = block
     if width == TWO:
         for point in range(count):
             n = index(point)
-            r, w = at_vertices(rows, n), at_vertices(weights, n)
             low, high = gradient[first + n, column], gradient[first + n, column + UNIT]
-            spread(to_table, r, w, index(0), low)
-            spread(to_table, r, w, UNIT, high)
+            spread_pair(to_table, at_vertices(entries, n), at_vertices(weights, n), low, high)
     else:
         for point in range(count):
             n = index(point)
-            r, w = at_vertices(rows, n), at_vertices(weights, n)
+            r, w = rows_of(at_vertices(entries, n), index(0), width), at_vertices(weights, n)
             for feature in range(width):
                 spread(to_table, r, w, index(feature), gradient[first + n, column + index(feature)])
 
@@ -62,7 +60,7 @@ def encode(planes, table, width, cells, offsets, masks, jobs, out):
     """Features of all levels at each point; ``table`` is flat."""
     x, y, z = planes[0], planes[1], planes[2]
     for job in prange(jobs):
-        rows, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
         begin, end = share(len(x), jobs, job), share(len(x), jobs, job + 1)
         for chunk in range(begin, end, CHUNK):
             until = min(chunk + CHUNK, end)
@@ -70,8 +68,8 @@ def encode(planes, table, width, cells, offsets, masks, jobs, out):
                 level, column = (cells[number], offsets[number], masks[number]), index(number) * width
                 for first in range(chunk, until, BLOCK):
                     block = index(first), min(BLOCK, until - first)
-                    locate(x, y, z, block, level, width, rows, weights)
-                    _gather(table, rows, weights, block, column, width, out)
+                    locate(x, y, z, block, level, entries, weights)
+                    _gather(table, entries, weights, block, column, width, out)
 
 
 @parallel
@@ -79,14 +77,14 @@ def encode_back(planes, gradient, width, cells, offsets, masks, jobs, to_table):
     """Gradient along the table. Each job owns every ``jobs``-th level, so no entry is written by two of them."""
     x, y, z = planes[0], planes[1], planes[2]
     for job in prange(jobs):
-        rows, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
         for number in range(job, len(cells), jobs):
             level, column = (cells[number], offsets[number], masks[number]), index(number) * width
             to_table[index(offsets[number]) * width : index(offsets[number + 1]) * width] = ZERO
             for first in range(0, len(x), BLOCK):
                 block = index(first), min(BLOCK, len(x) - first)
-                locate(x, y, z, block, level, width, rows, weights)
-                _scatter(gradient, rows, weights, block, column, width, to_table)
+                locate(x, y, z, block, level, entries, weights)
+                _scatter(gradient, entries, weights, block, column, width, to_table)
 
 
 @cache

@@ -4,51 +4,57 @@ from __future__ import annotations
 
 import numpy as np
 
+from invgraphics.kernels.numba.instructions import fma
 from invgraphics.kernels.numba.runtime import index, inlined, ordered
 from invgraphics.kernels.reference.hash import PRIMES
 
-CHUNK = 1024
+CHUNK = 4096
 """Points that are taken through a level before the next one, so that the level's entries stay in the cache."""
 BLOCK = 128
 """Points whose entries and weights are found together, several at a time in vector registers, before the table is read."""
 
 _PRIME_Y, _PRIME_Z = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-UNIT = index(1)
+_u32, _NEXT = np.uint32, np.uint32(1)
 _V1, _V2, _V3, _V4, _V5, _V6, _V7 = (index(BLOCK * vertex) for vertex in range(1, 8))
 
 
 @inlined
 def axis(coordinate, cells):
-    """Lower vertex along one axis and the fraction beyond it; in float64, as fine levels leave float32 few digits."""
-    position = np.float64(coordinate) * np.float64(cells)
-    position = position if position > 0.0 else 0.0
-    position = min(position, np.float64(cells))
+    """Lower vertex along one axis and the fraction beyond it, which is rounded only once: fine levels leave it few digits."""
+    inside = min(coordinate if coordinate > ZERO else ZERO, ONE)
+    edge = np.float32(cells)
     # Through signed 32-bit integers: processors convert nothing else quickly. The last vertex belongs to the last cell.
-    lower = max(min(np.int32(position), np.int32(cells - 1)), np.int32(0))
-    return np.uint32(lower), np.float32(position - np.float64(lower))
+    lower = max(min(np.int32(inside * edge), np.int32(cells - 1)), np.int32(0))
+    fraction = fma(inside, edge, -np.float32(lower))
+    # The product may have been rounded up to the next vertex.
+    over = fraction < ZERO
+    lower, fraction = (lower - np.int32(1), fraction + ONE) if over else (lower, fraction)
+    return np.uint32(lower), fraction
+
+
+# Numba widens what two 32-bit integers make to 64 bits; every step says that it stays narrow, or vectors hold half as many.
 
 
 @inlined
 def _stored(x, y, z, cells):
     """Entries of the 8 vertices of a cell (x fastest) on a level that holds them all."""
-    edge = np.uint32(cells + 1)
-    a = x + edge * (y + edge * z)
-    b, c = a + edge, a + edge * edge
-    d = b + edge * edge
-    return a, a + UNIT, b, b + UNIT, c, c + UNIT, d, d + UNIT
+    edge = _u32(cells + 1)
+    plane = _u32(edge * edge)
+    a = _u32(x + _u32(edge * y) + _u32(plane * z))
+    b, c, d = _u32(a + edge), _u32(a + plane), _u32(a + edge + plane)
+    return a, _u32(a + _NEXT), b, _u32(b + _NEXT), c, _u32(c + _NEXT), d, _u32(d + _NEXT)
 
 
 @inlined
 def _hashed(x, y, z, mask):
     """Entries of the 8 vertices of a cell (x fastest) on a level whose vertices share entries."""
-    y0, z0 = y * _PRIME_Y, z * _PRIME_Z
-    y1, z1 = y0 + _PRIME_Y, z0 + _PRIME_Z
-    a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
-    u = x + UNIT
+    y0, z0, u = _u32(y * _PRIME_Y), _u32(z * _PRIME_Z), _u32(x + _NEXT)
+    y1, z1 = _u32(y0 + _PRIME_Y), _u32(z0 + _PRIME_Z)
+    a, b, c, d = _u32(y0 ^ z0), _u32(y1 ^ z0), _u32(y0 ^ z1), _u32(y1 ^ z1)
     return (
-        (x ^ a) & mask, (u ^ a) & mask, (x ^ b) & mask, (u ^ b) & mask,
-        (x ^ c) & mask, (u ^ c) & mask, (x ^ d) & mask, (u ^ d) & mask,
+        _u32(_u32(x ^ a) & mask), _u32(_u32(u ^ a) & mask), _u32(_u32(x ^ b) & mask), _u32(_u32(u ^ b) & mask),
+        _u32(_u32(x ^ c) & mask), _u32(_u32(u ^ c) & mask), _u32(_u32(x ^ d) & mask), _u32(_u32(u ^ d) & mask),
     )  # fmt: skip
 
 
@@ -58,7 +64,7 @@ def corners(point, cells, mask):
     x, fx = axis(point[0], cells)
     y, fy = axis(point[1], cells)
     z, fz = axis(point[2], cells)
-    entries = _stored(x, y, z, cells) if mask == 0 else _hashed(x, y, z, mask)
+    entries = _stored(x, y, z, cells) if mask == 0 else _hashed(x, y, z, _u32(mask))
     return entries, (fx, fy, fz)
 
 
@@ -88,26 +94,34 @@ def _put(values, n, v):
 
 
 @inlined
-def locate(x, y, z, block, level, width, rows, weights):
-    """Rows in the flat table and weights of the vertices around the points of a block: vertex by vertex, `BLOCK` points each.
+def _from(offset, e):
+    """The level's entries, counted from the beginning of the table."""
+    return (
+        _u32(offset + e[0]), _u32(offset + e[1]), _u32(offset + e[2]), _u32(offset + e[3]),
+        _u32(offset + e[4]), _u32(offset + e[5]), _u32(offset + e[6]), _u32(offset + e[7]),
+    )  # fmt: skip
+
+
+@inlined
+def locate(x, y, z, block, level, entries, weights):
+    """Entries and weights of the vertices around the points of a block: vertex by vertex, `BLOCK` points each.
 
     ``block`` is the first point and the number of points, ``level`` the cells along an edge, the first entry and the mask.
     """
     first, count = block
-    cells, offset, mask = level[0], np.uint32(level[1]), np.uint32(level[2])
-    wide = np.uint32(width)
+    cells, offset, mask = level[0], _u32(level[1]), _u32(level[2])
     # One loop for each kind of level, so that neither holds a branch.
     if mask == 0:
         for number in range(count):
             n = index(number)
             (i, a), (j, b), (k, c) = axis(x[first + n], cells), axis(y[first + n], cells), axis(z[first + n], cells)
-            _put(rows, n, rows_of(_stored(i, j, k, cells), offset, wide))
+            _put(entries, n, _from(offset, _stored(i, j, k, cells)))
             _put(weights, n, weights_of((a, b, c)))
     else:
         for number in range(count):
             n = index(number)
             (i, a), (j, b), (k, c) = axis(x[first + n], cells), axis(y[first + n], cells), axis(z[first + n], cells)
-            _put(rows, n, rows_of(_hashed(i, j, k, mask), offset, wide))
+            _put(entries, n, _from(offset, _hashed(i, j, k, mask)))
             _put(weights, n, weights_of((a, b, c)))
 
 

@@ -1,0 +1,81 @@
+"""Instructions that Numba has no words for: one rounding for a product and a sum, and two features at a time.
+
+A table of two features per entry holds both in eight consecutive bytes, which one instruction reads or writes. Numba leaves
+LLVM's search for such pairs off, so they are written out here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import extending
+from numba.core import cgutils, types
+
+# Drops the first parameter, in a way that no checker can follow.
+_intrinsic: Any = extending.intrinsic
+
+_PAIR = ir.VectorType(ir.FloatType(), 2)
+_FLAGS = ("contract", "nsz")
+
+
+def _places(context: Any, builder: Any, table_type: Any, table: Any, entries: Any) -> list[Any]:
+    """Pointers to the pairs of these entries of a flat float32 array."""
+    data = context.make_array(table_type)(context, builder, table).data
+    pairs = builder.bitcast(data, _PAIR.as_pointer())
+    return [builder.gep(pairs, [builder.zext(e, ir.IntType(64))]) for e in cgutils.unpack_tuple(builder, entries)]
+
+
+def _both(builder: Any, low: Any, high: Any) -> Any:
+    """The pair (low, high)."""
+    pair = builder.insert_element(ir.Constant(_PAIR, ir.Undefined), low, ir.Constant(ir.IntType(32), 0))
+    return builder.insert_element(pair, high, ir.Constant(ir.IntType(32), 1))
+
+
+def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    return builder.fadd(builder.fmul(a, b, flags=_FLAGS), c, flags=_FLAGS)
+
+
+@_intrinsic
+def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """``a b + c``, rounded once (float32)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fma(*arguments)
+
+    return types.float32(types.float32, types.float32, types.float32), generate
+
+
+@_intrinsic
+def blend_pair(typing: Any, table: Any, entries: Any, weights: Any) -> Any:
+    """Weighted sum of both features of 8 entries (uint32) of a flat table."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        places = _places(context, builder, signature.args[0], arguments[0], arguments[1])
+        scales = [_both(builder, w, w) for w in cgutils.unpack_tuple(builder, arguments[2])]
+        pairs = [builder.load(place, align=4) for place in places]
+        # Two chains: one would wait for itself, more take registers.
+        sums = [builder.fmul(pair, scale, flags=_FLAGS) for pair, scale in zip(pairs[:2], scales[:2], strict=True)]
+        for n, (pair, scale) in enumerate(zip(pairs[2:], scales[2:], strict=True)):
+            sums[n % 2] = _multiply_add(builder, pair, scale, sums[n % 2])
+        total = builder.fadd(*sums, flags=_FLAGS)
+        found = [builder.extract_element(total, ir.Constant(ir.IntType(32), k)) for k in range(2)]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    return types.UniTuple(types.float32, 2)(table, entries, weights), generate
+
+
+@_intrinsic
+def spread_pair(typing: Any, table: Any, entries: Any, weights: Any, low: Any, high: Any) -> Any:
+    """Add a gradient of both features of 8 entries; the transpose of `blend_pair`."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        gradient = _both(builder, arguments[3], arguments[4])
+        places = _places(context, builder, signature.args[0], arguments[0], arguments[1])
+        for place, w in zip(places, cgutils.unpack_tuple(builder, arguments[2]), strict=True):
+            # One after the other: vertices that share an entry add to it in turn.
+            old = builder.load(place, align=4)
+            builder.store(_multiply_add(builder, _both(builder, w, w), gradient, old), place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(table, entries, weights, low, high), generate
