@@ -15,9 +15,12 @@ from invgraphics.kernels.types import ALPHA_MIN, Bins, Footprints
 RADIX_BITS = 11
 RADIX_PASSES = 3
 
-# A packed row: what rasterising a footprint needs, followed by its features.
-MEAN_X, MEAN_Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, WIDEST, HIGHEST, SHEAR, ASPECT, FEATURES = range(11)
+# A packed row: what rasterising a footprint needs, followed by its features. Its response over (x, y) from the mean is
+# opacity 2^(POWER_XX x² + POWER_XY x y + POWER_YY y²).
+MEAN_X, MEAN_Y, POWER_XX, POWER_XY, POWER_YY, OPACITY, WIDEST, HIGHEST, SHEAR, ASPECT, FEATURES = range(11)
 
+HALF_LOG2E = np.float32(-0.5 / np.log(2.0))
+"""Turns exp(-q / 2) into 2^(HALF_LOG2E q)."""
 SLACK = np.float32(0.01)
 """Pixels by which ellipses are widened when blocks are chosen, so that rounding never loses a visible pixel."""
 LARGEST = 1e9
@@ -94,12 +97,6 @@ def _tiles(low, high, tile, count):
 
 
 @inlined
-def half_span(row, r, y):
-    """Half the ellipse's width at height ``y`` over its centre, and the offset of that chord's middle."""
-    return row[r, ASPECT] * np.sqrt(max(row[r, HIGHEST] * row[r, HIGHEST] - y * y, np.float32(0.0))), row[r, SHEAR] * y
-
-
-@inlined
 def _drawable(x, y, xx, yy, det):
     """Whether a footprint is finite and a proper ellipse; written so that NaN says no."""
     inside = abs(x) < LARGEST and abs(y) < LARGEST
@@ -115,7 +112,8 @@ def _pack(order, means, conics, opacities, features, rows, jobs):
             i = index(order[r])
             a, b, c, opacity = conics[i, 0], conics[i, 1], conics[i, 2], opacities[i]
             rows[r, MEAN_X], rows[r, MEAN_Y] = means[i, 0], means[i, 1]
-            rows[r, CONIC_XX], rows[r, CONIC_XY], rows[r, CONIC_YY], rows[r, OPACITY] = a, b, c, opacity
+            rows[r, POWER_XX], rows[r, POWER_XY] = HALF_LOG2E * a, (HALF_LOG2E + HALF_LOG2E) * b
+            rows[r, POWER_YY], rows[r, OPACITY] = HALF_LOG2E * c, opacity
             rows[r, HIGHEST] = np.float32(-1.0)
             # In float64: a c - b² cancels for thin footprints.
             det = np.float64(a) * np.float64(c) - np.float64(b) * np.float64(b)
@@ -132,11 +130,21 @@ def _pack(order, means, conics, opacities, features, rows, jobs):
 
 
 @inlined
-def chord(rows, r, low, high):
-    """Leftmost and rightmost point, relative to the centre, of the ellipse between two heights over its centre."""
-    right, left = min(max(rows[r, WIDEST], low), high), min(max(-rows[r, WIDEST], low), high)
-    width_right, middle_right = half_span(rows, r, right)
-    width_left, middle_left = half_span(rows, r, left)
+def _half_span(shape, y):
+    """Half the ellipse's width at height ``y`` over its centre, and the offset of that chord's middle."""
+    _, highest, shear, aspect = shape
+    return aspect * np.sqrt(max(highest * highest - y * y, np.float32(0.0))), shear * y
+
+
+@inlined
+def chord(shape, low, high):
+    """Leftmost and rightmost point, relative to the centre, of the ellipse between two heights over its centre.
+
+    ``shape`` is what `_pack` wrote to the columns from WIDEST to ASPECT.
+    """
+    right, left = min(max(shape[0], low), high), min(max(-shape[0], low), high)
+    width_right, middle_right = _half_span(shape, right)
+    width_left, middle_left = _half_span(shape, left)
     return middle_left - width_left - SLACK, middle_right + width_right + SLACK
 
 
@@ -151,7 +159,8 @@ def _tile_rows(rows, r, tile, count):
 def _tile_columns(rows, r, y, tile, count):
     """Tiles of tile row ``y`` that the ellipse touches (between the first and the last pixel centre)."""
     low = y * tile + np.float32(0.5) - rows[r, MEAN_Y]
-    left, right = chord(rows, r, low, low + tile - np.float32(1.0))
+    shape = rows[r, WIDEST], rows[r, HIGHEST], rows[r, SHEAR], rows[r, ASPECT]
+    left, right = chord(shape, low, low + tile - np.float32(1.0))
     x, half = rows[r, MEAN_X], np.float32(0.5)
     return _tiles(x + left + half, x + right - half, tile, count)
 

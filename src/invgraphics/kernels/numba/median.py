@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.binning import CONIC_XX, CONIC_XY, CONIC_YY, FEATURES, MEAN_X, MEAN_Y, OPACITY
-from invgraphics.kernels.numba.raster import BLOCK, HALF_LOG2E, LANES, block_columns, block_rows
+from invgraphics.kernels.numba.binning import FEATURES, MEAN_X, MEAN_Y, OPACITY, POWER_XX, POWER_XY, POWER_YY
+from invgraphics.kernels.numba.raster import AHEAD, BLOCK, LANES, measure, span
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN
 
@@ -16,9 +16,7 @@ _ONE, _ZERO, _HALF = np.float32(1.0), np.float32(0.0), np.float32(0.5)
 @inlined
 def _hide(transmittance, distance, base, rows, r, dx0, dy0):
     """Lower the transmittance of one block; where it crosses 1/2, note the footprint's distance. Returns the open pixels."""
-    xx = rows[r, CONIC_XX] * HALF_LOG2E
-    xy = rows[r, CONIC_XY] * (HALF_LOG2E + HALF_LOG2E)
-    yy = rows[r, CONIC_YY] * HALF_LOG2E
+    xx, xy, yy = rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]
     still_open = _ZERO
     for lane in range(LANES):
         dx = dx0 + np.float32(lane & index(3))
@@ -35,24 +33,27 @@ def _hide(transmittance, distance, base, rows, r, dx0, dy0):
 
 
 @inlined
-def _walk(rows, entries, first, last, x0, y0, edge, transmittance, distance):
+def _walk(rows, entries, first, last, x0, y0, edge, transmittance, distance, spans):
     """Walk a tile's footprints front to back until no pixel is open."""
     ox, oy = np.float32(x0), np.float32(y0)
     blocks = edge * edge
-    for entry in range(first, last):
-        r = index(entries[index(entry)])
-        top, bottom = block_rows(rows, r, oy, edge)
-        for j in range(top, bottom + 1):
-            left, right = block_columns(rows, r, ox, oy, j, edge)
-            for i in range(left, right + 1):
-                base = index(j * edge + i) * LANES
-                # A block whose pixels have all crossed is marked on its first pixel.
-                if transmittance[base] >= _ZERO:
-                    dx = ox + np.float32(i * BLOCK) + _HALF - rows[r, MEAN_X]
-                    dy = oy + np.float32(j * BLOCK) + _HALF - rows[r, MEAN_Y]
-                    if _hide(transmittance, distance, base, rows, r, dx, dy) == _ZERO:
-                        transmittance[base] = -_ONE
-                        blocks -= 1
+    for begin in range(first, last, AHEAD):
+        end = min(begin + AHEAD, last)
+        measure(rows, entries, begin, end, ox, oy, edge, spans)
+        for entry in range(begin, end):
+            r, n = index(entries[index(entry)]), index(entry - begin)
+            top, bottom = span(spans[n, edge])
+            for j in range(top, bottom + 1):
+                left, right = span(spans[n, index(j)])
+                for i in range(left, right + 1):
+                    base = index(j * edge + i) * LANES
+                    # A block whose pixels have all crossed is marked on its first pixel.
+                    if transmittance[base] >= _ZERO:
+                        dx = ox + np.float32(i * BLOCK) + _HALF - rows[r, MEAN_X]
+                        dy = oy + np.float32(j * BLOCK) + _HALF - rows[r, MEAN_Y]
+                        if _hide(transmittance, distance, base, rows, r, dx, dy) == _ZERO:
+                            transmittance[base] = -_ONE
+                            blocks -= 1
         if blocks == 0:
             break
 
@@ -67,11 +68,12 @@ def median(rows, entries, starts, bounds, edge, columns, depth):
     for job in prange(len(bounds) - 1):
         transmittance = np.empty(index(edge * edge) * LANES, np.float32)
         distance = np.empty(index(edge * edge) * LANES, np.float32)
+        spans = np.empty((AHEAD, edge + 1), np.int32)
         for tile in range(bounds[job], bounds[job + 1]):
             x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
             transmittance[:] = _ONE
             distance[:] = np.inf
-            _walk(rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, transmittance, distance)
+            _walk(rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, transmittance, distance, spans)
             for y in range(y0, min(y0 + edge * BLOCK, height)):
                 for x in range(x0, min(x0 + edge * BLOCK, width)):
                     block = (y - y0) // BLOCK * edge + (x - x0) // BLOCK

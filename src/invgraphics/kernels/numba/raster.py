@@ -9,14 +9,17 @@ from __future__ import annotations
 import numpy as np
 
 from invgraphics.kernels.numba.binning import (
-    CONIC_XX,
-    CONIC_XY,
-    CONIC_YY,
+    ASPECT,
     FEATURES,
     HIGHEST,
     MEAN_X,
     MEAN_Y,
     OPACITY,
+    POWER_XX,
+    POWER_XY,
+    POWER_YY,
+    SHEAR,
+    WIDEST,
     chord,
 )
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange
@@ -25,8 +28,8 @@ from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 BLOCK = 4
 """Edge of a block in pixels."""
 LANES = index(BLOCK * BLOCK)
-HALF_LOG2E = np.float32(-0.5 / np.log(2.0))
-"""Turns exp(-q / 2) into 2^(HALF_LOG2E q)."""
+AHEAD = 16
+"""Footprints whose blocks are found before the first of them is drawn."""
 
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
 _STOP = np.float32(TRANSMITTANCE_MIN)
@@ -34,26 +37,38 @@ _ONE, _ZERO = np.float32(1.0), np.float32(0.0)
 
 
 @inlined
-def block_rows(rows, r, y0, edge):
-    """First and last row of blocks, in the tile whose first pixel row is ``y0``, that the ellipse touches."""
-    top = (rows[r, MEAN_Y] - rows[r, HIGHEST] - y0 - np.float32(BLOCK - 0.5)) / np.float32(BLOCK)
-    bottom = (rows[r, MEAN_Y] + rows[r, HIGHEST] - y0 - np.float32(0.5)) / np.float32(BLOCK)
-    first = np.int32(np.ceil(min(max(top, _ZERO), np.float32(edge))))
-    last = np.int32(np.floor(max(min(bottom, np.float32(edge - 1)), -_ONE)))
-    return first, last
+def _pair(first, last, edge):
+    """The whole numbers from ``first`` to ``last``, clipped to a tile, as one; `span` takes them apart."""
+    low = np.int32(np.ceil(min(max(first, _ZERO), np.float32(edge))))
+    high = np.int32(np.floor(max(min(last, np.float32(edge - 1)), -_ONE)))
+    return np.int32(np.int32(high << np.int32(16)) | low)
 
 
 @inlined
-def block_columns(rows, r, x0, y0, j, edge):
-    """First and last block of block row ``j`` that the ellipse touches."""
-    low = y0 + np.float32(j * BLOCK) + np.float32(0.5) - rows[r, MEAN_Y]
-    left, right = chord(rows, r, low, low + np.float32(BLOCK - 1))
-    offset = rows[r, MEAN_X] - x0
-    first = (offset + left - np.float32(BLOCK - 0.5)) / np.float32(BLOCK)
-    last = (offset + right - np.float32(0.5)) / np.float32(BLOCK)
-    first = np.int32(np.ceil(min(max(first, _ZERO), np.float32(edge))))
-    last = np.int32(np.floor(max(min(last, np.float32(edge - 1)), -_ONE)))
-    return first, last
+def span(pair):
+    """First and last block; none if they are the wrong way round."""
+    return pair & np.int32(0xFFFF), pair >> np.int32(16)
+
+
+@inlined
+def measure(rows, entries, begin, end, x0, y0, edge, spans):
+    """Find which blocks of a tile a few footprints touch before any of them is drawn.
+
+    Otherwise a processor would guess how long every row is, and wait for its square roots to learn that it was wrong.
+
+    ``spans`` (`AHEAD`, edge + 1) receives the rows of blocks, and the blocks of each row.
+    """
+    quarter = np.float32(1.0 / BLOCK)
+    first, last = np.float32(0.5 - BLOCK) * quarter, np.float32(-0.5) * quarter
+    for entry in range(begin, end):
+        r, n = index(entries[index(entry)]), index(entry - begin)
+        x, y, highest = (rows[r, MEAN_X] - x0) * quarter, rows[r, MEAN_Y] - y0, rows[r, HIGHEST]
+        spans[n, edge] = _pair((y - highest) * quarter + first, (y + highest) * quarter + last, edge)
+        shape = rows[r, WIDEST], highest, rows[r, SHEAR], rows[r, ASPECT]
+        for number in range(edge):
+            low = np.float32(np.int32(number)) * np.float32(BLOCK) + np.float32(0.5) - y
+            left, right = chord(shape, low, low + np.float32(BLOCK - 1))
+            spans[n, index(number)] = _pair(x + left * quarter + first, x + right * quarter + last, edge)
 
 
 @inlined
@@ -76,17 +91,15 @@ def open_tile(state, alive, x0, y0, edge, width, height, stride):
 @inlined
 def _blend(state, base, rows, r, dx0, dy0, triples):
     """Composite one footprint onto one block; returns how many of its pixels are unfinished (as a float: it vectorises)."""
-    xx = rows[r, CONIC_XX] * HALF_LOG2E
-    xy = rows[r, CONIC_XY] * (HALF_LOG2E + HALF_LOG2E)
-    yy = rows[r, CONIC_YY] * HALF_LOG2E
+    xx, xy, yy = rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]
     opacity = rows[r, OPACITY]
     red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
     unfinished = _ZERO
     for lane in range(LANES):
         dx = dx0 + np.float32(lane & index(3))
         dy = dy0 + np.float32(lane >> index(2))
-        alpha = min(opacity * exp2(xx * dx * dx + xy * dx * dy + yy * dy * dy), _ALPHA_MAX)
-        alpha = alpha if alpha >= _ALPHA_MIN else _ZERO
+        response = opacity * exp2(xx * dx * dx + xy * dx * dy + yy * dy * dy)
+        alpha = min(response if response >= _ALPHA_MIN else _ZERO, _ALPHA_MAX)
         transmittance = state[base + lane]
         weight = transmittance * alpha
         after = transmittance - weight
@@ -116,27 +129,30 @@ def _blend_more(state, base, to, rows, r, k):
 
 
 @inlined
-def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, ends, live):
+def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, spans, ends, live):
     """Walk a tile's footprints front to back until all its pixels are finished; returns the number of blocks visited."""
     stride = LANES * index(2 + 3 * triples)
     half = np.float32(0.5)
     ox, oy = np.float32(x0), np.float32(y0)
     visits = 0
-    for entry in range(first, last):
-        r = index(entries[index(entry)])
-        top, bottom = block_rows(rows, r, oy, edge)
-        for j in range(top, bottom + 1):
-            left, right = block_columns(rows, r, ox, oy, j, edge)
-            for i in range(left, right + 1):
-                block = index(j * edge + i)
-                if alive[block]:
-                    visits += 1
-                    dx = ox + np.float32(i * BLOCK) + half - rows[r, MEAN_X]
-                    dy = oy + np.float32(j * BLOCK) + half - rows[r, MEAN_Y]
-                    if _blend(state, block * stride, rows, r, dx, dy, triples) == 0:
-                        alive[block] = False
-                        ends[block] = entry + 1
-                        live -= 1
+    for begin in range(first, last, AHEAD):
+        end = min(begin + AHEAD, last)
+        measure(rows, entries, begin, end, ox, oy, edge, spans)
+        for entry in range(begin, end):
+            r, n = index(entries[index(entry)]), index(entry - begin)
+            top, bottom = span(spans[n, edge])
+            for j in range(top, bottom + 1):
+                left, right = span(spans[n, index(j)])
+                for i in range(left, right + 1):
+                    block = index(j * edge + i)
+                    if alive[block]:
+                        visits += 1
+                        dx = ox + np.float32(i * BLOCK) + half - rows[r, MEAN_X]
+                        dy = oy + np.float32(j * BLOCK) + half - rows[r, MEAN_Y]
+                        if _blend(state, block * stride, rows, r, dx, dy, triples) == 0:
+                            alive[block] = False
+                            ends[block] = entry + 1
+                            live -= 1
         if live == 0:
             break
     return visits
@@ -177,11 +193,13 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, ends, 
     stride = LANES * index(2 + 3 * triples)
     for job in prange(len(bounds) - 1):
         state = np.empty(index(edge * edge) * stride, np.float32)
-        alive = np.empty(edge * edge, np.bool_)
+        alive, spans = np.empty(edge * edge, np.bool_), np.empty((AHEAD, edge + 1), np.int32)
         for tile in range(bounds[job], bounds[job + 1]):
             x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
             live = open_tile(state, alive, x0, y0, edge, width, height, stride)
             first, last = starts[tile], starts[tile + 1]
             ends[tile, :] = last
-            work[tile] = _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, ends[tile], live)
+            work[tile] = _composite_tile(
+                rows, entries, first, last, x0, y0, edge, triples, state, alive, spans, ends[tile], live
+            )
             _write_tile(state, x0, y0, edge, stride, image, alpha)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.binning import CONIC_XX, CONIC_XY, CONIC_YY, FEATURES, MEAN_X, MEAN_Y, OPACITY
-from invgraphics.kernels.numba.raster import BLOCK, HALF_LOG2E, LANES, block_columns, block_rows
+from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, MEAN_X, MEAN_Y, OPACITY, POWER_XX, POWER_XY, POWER_YY
+from invgraphics.kernels.numba.raster import AHEAD, BLOCK, LANES, measure, span
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
@@ -37,7 +37,14 @@ OFF, ON = 1, 2
 
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
 _STOP = np.float32(TRANSMITTANCE_MIN)
-_ONE, _ZERO = np.float32(1.0), np.float32(0.0)
+_ONE, _HALF, _ZERO = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+_TO_CONIC = _ONE / HALF_LOG2E
+
+
+@inlined
+def conic(rows, r):
+    """The inverse covariance that the footprint came with."""
+    return rows[r, POWER_XX] * _TO_CONIC, rows[r, POWER_XY] * (_HALF * _TO_CONIC), rows[r, POWER_YY] * _TO_CONIC
 
 
 @inlined
@@ -68,17 +75,15 @@ def _unblend(state, lanes, base, rows, r, dx0, dy0, rank, receivers):
 
     With ``receivers`` on, ``rank`` is where the block counts the footprints that each of its pixels has seen.
     """
-    xx = rows[r, CONIC_XX] * HALF_LOG2E
-    xy = rows[r, CONIC_XY] * (HALF_LOG2E + HALF_LOG2E)
-    yy = rows[r, CONIC_YY] * HALF_LOG2E
+    xx, xy, yy = rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]
     opacity = rows[r, OPACITY]
     red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
     for lane in range(LANES):
         dx = dx0 + np.float32(lane & index(3))
         dy = dy0 + np.float32(lane >> index(2))
         response = opacity * exp2(xx * dx * dx + xy * dx * dy + yy * dy * dy)
+        response = response if response >= _ALPHA_MIN else _ZERO
         alpha = min(response, _ALPHA_MAX)
-        alpha = alpha if alpha >= _ALPHA_MIN else _ZERO
         transmittance = state[base + lane]
         weight = transmittance * alpha
         after = transmittance - weight
@@ -93,7 +98,8 @@ def _unblend(state, lanes, base, rows, r, dx0, dy0, rank, receivers):
         state[base + lane] = after if goes_on else -abs(transmittance)
         # alpha raises its own contribution and hides what is behind; where it is clamped or skipped it does not change.
         v = response * (transmittance * along - behind / (_ONE - alpha))
-        v = v if goes_on and alpha > _ZERO and alpha < _ALPHA_MAX else _ZERO
+        v = v if goes_on else _ZERO
+        v = v if response < _ALPHA_MAX else _ZERO
         if len(receivers) == ON:
             seen = state[rank + lane] + (_ONE if alpha > _ZERO else _ZERO)
             state[rank + lane] = seen
@@ -129,7 +135,7 @@ def _sum(state, lanes, half, base, rows, r, dx0, dy0, absolute):
         at += index(2) * LANES
         lanes[index(8) * HALF + lane] += first * state[at] + second * state[at + HALF]
         if len(absolute) == ON:
-            xx, xy, yy = rows[r, CONIC_XX], rows[r, CONIC_XY], rows[r, CONIC_YY]
+            xx, xy, yy = conic(rows, r)
             vx, wx = v * dx, w * dx
             lanes[index(9) * HALF + lane] += abs(xx * vx + xy * vy) + abs(xx * wx + xy * wy)
             lanes[index(10) * HALF + lane] += abs(xy * vx + yy * vy) + abs(xy * wx + yy * wy)
@@ -172,32 +178,34 @@ def _add_up(lanes, half, sums, r, absolute):
 
 @inlined
 def _walk_tile(
-    rows, entries, first, last, x0, y0, edge, triples, state, lanes, stride, ends, sums, absolute, receivers
+    rows, entries, first, last, x0, y0, edge, triples, state, lanes, stride, spans, ends, sums, absolute, receivers
 ):  # fmt: skip
     """Walk a tile's footprints front to back and add what each of them receives to ``sums``."""
-    ox, oy, middle = np.float32(x0), np.float32(y0), np.float32(0.5)
+    ox, oy = np.float32(x0), np.float32(y0)
     half = index(len(lanes) // (_ROOM // HALF))
-    for entry in range(first, last):
-        r = index(entries[index(entry)])
-        visited = False
-        top, bottom = block_rows(rows, r, oy, edge)
-        for j in range(top, bottom + 1):
-            left, right = block_columns(rows, r, ox, oy, j, edge)
-            for i in range(left, right + 1):
-                block = index(j * edge + i)
-                if entry < ends[block]:
-                    base = block * stride
-                    dx = ox + np.float32(i * BLOCK) + middle - rows[r, MEAN_X]
-                    dy = oy + np.float32(j * BLOCK) + middle - rows[r, MEAN_Y]
-                    if triples > 1:
-                        _look_along(state, base, rows, r, triples)
-                    visited = True
-                    _unblend(state, lanes, base, rows, r, dx, dy, base + stride - LANES, receivers)
-                    _sum(state, lanes, half, base, rows, r, dx, dy, absolute)
-                    if triples > 1:
-                        _sum_further(state, lanes, base, sums, r, triples)
-        if visited:
-            _add_up(lanes, half, sums, r, absolute)
+    for begin in range(first, last, AHEAD):
+        end = min(begin + AHEAD, last)
+        measure(rows, entries, begin, end, ox, oy, edge, spans)
+        for entry in range(begin, end):
+            r, n, visited = index(entries[index(entry)]), index(entry - begin), False
+            top, bottom = span(spans[n, edge])
+            for j in range(top, bottom + 1):
+                left, right = span(spans[n, index(j)])
+                for i in range(left, right + 1):
+                    block = index(j * edge + i)
+                    if entry < ends[block]:
+                        base = block * stride
+                        dx = ox + np.float32(i * BLOCK) + _HALF - rows[r, MEAN_X]
+                        dy = oy + np.float32(j * BLOCK) + _HALF - rows[r, MEAN_Y]
+                        if triples > 1:
+                            _look_along(state, base, rows, r, triples)
+                        visited = True
+                        _unblend(state, lanes, base, rows, r, dx, dy, base + stride - LANES, receivers)
+                        _sum(state, lanes, half, base, rows, r, dx, dy, absolute)
+                        if triples > 1:
+                            _sum_further(state, lanes, base, sums, r, triples)
+            if visited:
+                _add_up(lanes, half, sums, r, absolute)
 
 
 @parallel
@@ -214,15 +222,15 @@ def walk_back(
     for job in prange(len(bounds) - 1):
         state = np.empty(index(edge * edge) * stride, np.float32)
         own = sums[job]
-        lanes = np.zeros(_ROOM, np.float32)
+        lanes, spans = np.zeros(_ROOM, np.float32), np.empty((AHEAD, edge + 1), np.int32)
         own[:] = _ZERO
         for tile in range(bounds[job], bounds[job + 1]):
             if starts[tile] < starts[tile + 1]:
                 x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
                 _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient)
                 _walk_tile(
-                    rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, triples, state, lanes, stride, ends[tile], own,
-                    absolute, receivers,
+                    rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, triples, state, lanes, stride, spans,
+                    ends[tile], own, absolute, receivers,
                 )  # fmt: skip
 
 
@@ -240,10 +248,10 @@ def gather(order, rows, sums, means, conics, opacities, features, pulls):
                 for k in range(sums.shape[2]):
                     sums[0, r, k] += sums[other, r, k]
             s = sums[0, r]
-            xx, xy, yy = rows[r, CONIC_XX], rows[r, CONIC_XY], rows[r, CONIC_YY]
+            xx, xy, yy = conic(rows, r)
             # response = opacity exp(-q / 2), q = xx dx² + 2 xy dx dy + yy dy², (dx, dy) = pixel - mean.
             means[i, 0], means[i, 1] = xx * s[1] + xy * s[2], xy * s[1] + yy * s[2]
-            conics[i, 0], conics[i, 1], conics[i, 2] = np.float32(-0.5) * s[3], -s[4], np.float32(-0.5) * s[5]
+            conics[i, 0], conics[i, 1], conics[i, 2] = -_HALF * s[3], -s[4], -_HALF * s[5]
             opacities[i] = s[0] / rows[r, OPACITY] if s[0] != _ZERO else _ZERO
             for k in range(features.shape[1]):
                 features[i, k] = s[MOMENTS + k]
