@@ -1,5 +1,6 @@
 """The occupancy grid: what it forgets, when it looks, and that skipping and stopping leave the picture alone."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 
 from invgraphics.core import Context, Field, Quantity, Samples, Scene, no_grad_density
+from invgraphics.experiments.recipe import load_method
 from invgraphics.fields.analytic import GaussianBlob, Sphere
 from invgraphics.renderers.occupancy import Occupancy, OccupancyConfig
 from invgraphics.renderers.volumetric import Volumetric
@@ -216,6 +218,21 @@ def test_nothing_is_culled_before_the_field_was_fitted_at_all(make_scene: Callab
     thick = lambda samples: (samples.position[:, 0] > 0).float() * 100  # noqa: E731
     sampler.update(thick, ctx)
     assert 0.3 < float(sampler.occupied.float().mean()) < 0.7
+
+
+def test_the_long_preset_gives_up_nothing_as_thick_as_the_fog_it_starts_with(make_scene: Callable[..., Scene]) -> None:
+    """A cable that few rays have met is no denser than the fog was when its surroundings are long clear or opaque."""
+    scene, recipe = make_scene(), load_method("volumetric/hash", "long").recipe
+    fog = math.exp(recipe.field.density_bias)
+    sampler = recipe.renderer.sampler.build(scene)
+    # The cable lies along z, in empty space; the ball makes the grid's mean large, so that it is not the threshold.
+    ball, cable = Sphere(40.0, 0.6), lambda p: fog * ((p[:, :2] - 1.0).norm(dim=1) < 0.1)
+    for _ in range(sampler.config.grace + 2 * sampler.config.every + 1):
+        sampler.update(lambda samples: ball.density_at(samples.position) + cable(samples.position), context(scene))
+    centres = (torch.stack(torch.meshgrid(*[torch.arange(64)] * 3, indexing="ij"), dim=-1) + 0.5) / 64
+    position = scene.bounds.from_unit(centres).reshape(-1, 3)
+    assert float(sampler.occupied.float().mean()) < 0.1
+    assert bool(sampler.occupied.flatten()[(position[:, :2] - 1.0).norm(dim=1) < 0.05].all())
 
 
 def test_refusals() -> None:
