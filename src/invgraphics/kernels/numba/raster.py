@@ -82,9 +82,11 @@ def open_tile(state, alive, x0, y0, edge, width, height, stride):
             alive[block] = inside
             live += inside
             state[block * stride : (block + index(1)) * stride] = _ZERO
+            right, below = np.int32(width - x0 - i * BLOCK), np.int32(height - y0 - j * BLOCK)
             for lane in range(BLOCK * BLOCK):
-                x, y = x0 + i * BLOCK + lane % BLOCK, y0 + j * BLOCK + lane // BLOCK
-                state[block * stride + index(lane)] = _ONE if x < width and y < height else -_ONE
+                # No branch: vector registers hold a whole row of a block.
+                outside = (np.int32(lane % BLOCK) >= right) | (np.int32(lane // BLOCK) >= below)
+                state[block * stride + index(lane)] = -_ONE if outside else _ONE
     return live
 
 
@@ -162,14 +164,20 @@ def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, al
 def _write_tile(state, x0, y0, edge, stride, image, alpha):
     """Copy a tile's sums into the picture."""
     height, width, channels = image.shape
-    for y in range(y0, min(y0 + edge * BLOCK, height)):
-        for x in range(x0, min(x0 + edge * BLOCK, width)):
-            block = index((y - y0) // BLOCK * edge + (x - x0) // BLOCK)
-            lane = index((y - y0) % BLOCK * BLOCK + (x - x0) % BLOCK)
-            at = block * stride + lane
-            alpha[index(y), index(x)] = _ONE - abs(state[at])
-            for k in range(channels):
-                image[index(y), index(x), index(k)] = state[at + index(2 + k) * LANES]
+    for block in range(edge * edge):
+        left, top = x0 + block % edge * BLOCK, y0 + block // edge * BLOCK
+        for row in range(min(BLOCK, height - top)):
+            for column in range(min(BLOCK, width - left)):
+                y, x = index(top + row), index(left + column)
+                at = index(block) * stride + index(row * BLOCK + column)
+                alpha[y, x] = _ONE - abs(state[at])
+                if channels == 3:
+                    image[y, x, index(0)] = state[at + index(2) * LANES]
+                    image[y, x, index(1)] = state[at + index(3) * LANES]
+                    image[y, x, index(2)] = state[at + index(4) * LANES]
+                else:
+                    for k in range(channels):
+                        image[y, x, index(k)] = state[at + index(2 + k) * LANES]
 
 
 @parallel

@@ -48,23 +48,34 @@ def conic(rows, r):
 
 
 @inlined
+def _hand_over(state, at, image, gradient, y, x, k):
+    """Copy a channel's gradient to its pixel's place; returns the loss's derivative along the whole channel."""
+    state[at + _PICTURE + k * LANES] = gradient[y, x, k]
+    return gradient[y, x, k] * image[y, x, k]
+
+
+@inlined
 def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient):
     """Load a tile's gradients, and the derivative along the whole of each pixel."""
     height, width, channels = image.shape
     state[:] = _ZERO
     for block in range(edge * edge):
         left, top = x0 + block % edge * BLOCK, y0 + block // edge * BLOCK
-        for lane in range(BLOCK * BLOCK):
-            x, y = index(left + lane % BLOCK), index(top + lane // BLOCK)
-            at = index(block) * stride + index(lane)
-            # Pixels outside the image count as finished.
-            state[at] = -_ONE
-            if x < width and y < height:
+        base = index(block) * stride
+        # Pixels outside the image count as finished.
+        state[base : base + LANES] = -_ONE
+        for row in range(min(BLOCK, height - top)):
+            for column in range(min(BLOCK, width - left)):
+                y, x, at = index(top + row), index(left + column), base + index(row * BLOCK + column)
                 gradient = alpha_gradient[y, x]
                 behind = gradient * alpha[y, x]
-                for k in range(channels):
-                    behind += image_gradient[y, x, index(k)] * image[y, x, index(k)]
-                    state[at + _PICTURE + index(k) * LANES] = image_gradient[y, x, index(k)]
+                if channels == 3:
+                    behind += _hand_over(state, at, image, image_gradient, y, x, index(0))
+                    behind += _hand_over(state, at, image, image_gradient, y, x, index(1))
+                    behind += _hand_over(state, at, image, image_gradient, y, x, index(2))
+                else:
+                    for k in range(channels):
+                        behind += _hand_over(state, at, image, image_gradient, y, x, index(k))
                 state[at + _T], state[at + _BEHIND] = _ONE, behind
                 state[at + _ALPHA], state[at + _ALONG] = gradient, gradient
 
