@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,15 @@ def test_more_jobs_than_cores_are_refused() -> None:
         LocalExecutor(Resources(jobs=cores() + 1))
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C as at a terminal: jobs that a script puts into the background inherit that it is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_stops_the_fit_with_a_checkpoint(request_for, tmp_path: Path) -> None:
     """The signal comes while the executor waits, and to this process alone, as from `kill -INT`."""
     run = tmp_path / "runs" / "long"
