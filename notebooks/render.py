@@ -41,7 +41,9 @@ def execute(path: Path, parameters: str = "", folder: Path | None = None, timeou
         places = [i for i, cell in enumerate(notebook.cells) if "parameters" in tags(cell)]
         notebook.cells.insert(places[0] + 1, nbformat.v4.new_code_cell(parameters))
     resources = {"metadata": {"path": str(folder or path.parent)}}
-    NotebookClient(notebook, timeout=timeout, kernel_name="python3", resources=resources).execute()
+    client = NotebookClient(notebook, timeout=timeout, kernel_name="python3", resources=resources)
+    client.widget_registry = {}  # it answers a widget's output while it waits for the cell, and so can miss the cell's end
+    client.execute()
     return notebook
 
 
