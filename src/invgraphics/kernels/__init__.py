@@ -130,7 +130,7 @@ def splat_rasterise(
         features: what to sum, per footprint (colour, depth coefficients, normals).
         width: image width in pixels.
         height: image height in pixels.
-        tile: edge of a tile in pixels; ``None`` for the implementation's own.
+        tile: edge of a tile in pixels (Numba: in fours, 32 at most); ``None`` for the implementation's own.
         receivers: how many footprints of each pixel, counted from the front, receive its gradient; 0 for all.
 
     Returns:

@@ -32,7 +32,7 @@ class SplattingConfig:
             pulls do not cancel.
         receivers: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
             limited bandwidth uses 10).
-        tile: edge of a tile in pixels; ``None`` leaves it to the kernel.
+        tile: edge of a tile in pixels (Numba takes 32 at most); ``None`` leaves it to the kernel.
     """
 
     shape: Literal["ellipsoid", "disc"] = "ellipsoid"

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.kernels.numba.instructions import prefetch
 from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, prange, scratch, serial, share, threads
 from invgraphics.kernels.types import ALPHA_MIN, Bins, Footprints
 
@@ -23,9 +24,9 @@ HALF_LOG2E = np.float32(-0.5 / np.log(2.0))
 """Turns exp(-q / 2) into 2^(HALF_LOG2E q)."""
 SLACK = np.float32(0.01)
 """Pixels by which ellipses are widened when blocks are chosen, so that rounding never loses a visible pixel."""
-LARGEST = 1e9
+LARGEST = np.float32(1e9)
 """Coordinates and extents beyond this, in pixels, are taken for numerical failures and skipped."""
-SMALLEST = 1e-18
+SMALLEST = np.float32(1e-18)
 """Entries of conics below this belong to footprints wider than ``LARGEST``."""
 
 
@@ -100,15 +101,20 @@ def _tiles(low, high, tile, count):
 def _drawable(x, y, xx, yy, det):
     """Whether a footprint is finite and a proper ellipse; written so that NaN says no."""
     inside = abs(x) < LARGEST and abs(y) < LARGEST
-    regular = xx > SMALLEST and yy > SMALLEST and max(xx, yy) < LARGEST * max(det, 0.0) * LARGEST
-    return inside and regular and max(xx, yy) < 1 / SMALLEST
+    regular = xx > SMALLEST and yy > SMALLEST and max(xx, yy) < LARGEST * max(det, np.float32(0.0)) * LARGEST
+    return inside and regular and max(xx, yy) < np.float32(1.0) / SMALLEST
 
 
 @parallel
 def _pack(order, means, conics, opacities, features, rows, jobs):
     """Gather footprints front to back; those that cannot be drawn get an ellipse of negative height."""
+    two = np.float32(2.0)
     for job in prange(jobs):
         for r in range(share(len(order), jobs, job), share(len(order), jobs, job + 1)):
+            ahead = index(order[min(r + 8, len(order) - 1)])
+            prefetch(means, ahead)
+            prefetch(conics, ahead)
+            prefetch(features, ahead)
             i = index(order[r])
             a, b, c, opacity = conics[i, 0], conics[i, 1], conics[i, 2], opacities[i]
             rows[r, MEAN_X], rows[r, MEAN_Y] = means[i, 0], means[i, 1]
@@ -116,12 +122,13 @@ def _pack(order, means, conics, opacities, features, rows, jobs):
             rows[r, POWER_YY], rows[r, OPACITY] = HALF_LOG2E * c, opacity
             rows[r, HIGHEST] = np.float32(-1.0)
             # In float64: a c - b² cancels for thin footprints.
-            det = np.float64(a) * np.float64(c) - np.float64(b) * np.float64(b)
+            det = np.float32(np.float64(a) * np.float64(c) - np.float64(b) * np.float64(b))
             if _drawable(means[i, 0], means[i, 1], a, c, det) and opacity >= np.float32(ALPHA_MIN):
                 # The visible ellipse is a x² + 2 b x y + c y² = reach, around the mean; its rightmost point lies at y = WIDEST.
-                reach = 2.0 * np.log(max(np.float64(opacity) / ALPHA_MIN, 1.0))
-                rows[r, WIDEST] = -b * np.sqrt(reach / (det * c))
-                rows[r, HIGHEST] = np.sqrt(a * reach / det) * 1.00001 + SLACK
+                reach = two * max(np.log(opacity * np.float32(1 / ALPHA_MIN)), np.float32(0.0))
+                size = np.sqrt(reach / det)
+                rows[r, WIDEST] = -b * size / np.sqrt(c)
+                rows[r, HIGHEST] = np.sqrt(a) * size * np.float32(1.00001) + SLACK
                 rows[r, SHEAR] = -b / a
                 rows[r, ASPECT] = np.sqrt(det) / a
             rows[r, FEATURES:] = np.float32(0.0)

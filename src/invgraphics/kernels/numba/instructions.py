@@ -1,4 +1,5 @@
-"""Instructions that Numba has no words for: one rounding for a product and a sum, and two features at a time.
+"""Instructions that Numba has no words for: one rounding for a product and a sum, two features at a time, the lowest bit
+of a word, and memory that will be needed soon.
 
 A table of two features per entry holds both in eight consecutive bytes, which one instruction reads or writes. Numba leaves
 LLVM's search for such pairs off, so they are written out here.
@@ -79,3 +80,39 @@ def spread_pair(typing: Any, table: Any, entries: Any, weights: Any, low: Any, h
         return context.get_dummy_value()
 
     return types.void(table, entries, weights, low, high), generate
+
+
+@_intrinsic
+def lowest_bit(typing: Any, word: Any) -> Any:
+    """Number of the lowest set bit of a uint64 that is not zero."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), generate
+
+
+@_intrinsic
+def prefetch(typing: Any, array: Any, row: Any) -> Any:
+    """Ask for the first and the last byte of a row (uint64) of a contiguous array, some time before it is read or written.
+
+    Rows that are visited in no order wait for memory, one after the other; a processor foresees only the next few.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = signature.args[0]
+        found = context.make_array(kind)(context, builder, arguments[0])
+        width = context.get_constant(types.intp, 1)
+        for axis in range(1, kind.ndim):
+            width = builder.mul(width, builder.extract_value(found.shape, axis))
+        first = builder.gep(found.data, [builder.mul(arguments[1], width)])
+        last = builder.gep(first, [builder.sub(width, context.get_constant(types.intp, 1))])
+        pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        ask = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
+        ask = cgutils.get_or_insert_function(builder.module, ask, "llvm.prefetch.p0")
+        for place in (first, last):
+            # To read, to be kept in every cache, data.
+            builder.call(ask, [builder.bitcast(place, pointer), *(ir.Constant(number, n) for n in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.void(array, row), generate

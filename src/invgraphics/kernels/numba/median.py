@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.binning import FEATURES, MEAN_X, MEAN_Y, OPACITY, POWER_XX, POWER_XY, POWER_YY
-from invgraphics.kernels.numba.raster import AHEAD, BLOCK, LANES, measure, span
+from invgraphics.kernels.numba.binning import FEATURES, OPACITY, POWER_XX, POWER_XY, POWER_YY
+from invgraphics.kernels.numba.instructions import lowest_bit
+from invgraphics.kernels.numba.raster import AHEAD, BLOCK, BLOCKS, EDGE, LANES, inside, measure, placed
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN
 
@@ -33,48 +34,39 @@ def _hide(transmittance, distance, base, rows, r, dx0, dy0):
 
 
 @inlined
-def _walk(rows, entries, first, last, x0, y0, edge, transmittance, distance, spans):
+def _walk(rows, entries, first, last, x0, y0, edge, transmittance, distance, is_open, touched):
     """Walk a tile's footprints front to back until no pixel is open."""
-    ox, oy = np.float32(x0), np.float32(y0)
-    blocks = edge * edge
     for begin in range(first, last, AHEAD):
         end = min(begin + AHEAD, last)
-        measure(rows, entries, begin, end, ox, oy, edge, spans)
+        measure(rows, entries, begin, end, np.float32(x0), np.float32(y0), edge, touched)
         for entry in range(begin, end):
-            r, n = index(entries[index(entry)]), index(entry - begin)
-            top, bottom = span(spans[n, edge])
-            for j in range(top, bottom + 1):
-                left, right = span(spans[n, index(j)])
-                for i in range(left, right + 1):
-                    base = index(j * edge + i) * LANES
-                    # A block whose pixels have all crossed is marked on its first pixel.
-                    if transmittance[base] >= _ZERO:
-                        dx = ox + np.float32(i * BLOCK) + _HALF - rows[r, MEAN_X]
-                        dy = oy + np.float32(j * BLOCK) + _HALF - rows[r, MEAN_Y]
-                        if _hide(transmittance, distance, base, rows, r, dx, dy) == _ZERO:
-                            transmittance[base] = -_ONE
-                            blocks -= 1
-        if blocks == 0:
+            r, blocks = index(entries[index(entry)]), touched[index(entry)] & is_open
+            while blocks:
+                block = lowest_bit(blocks)
+                dx, dy = placed(rows, r, x0, y0, block)
+                if _hide(transmittance, distance, block * LANES, rows, r, dx, dy) == _ZERO:
+                    is_open ^= index(1) << block
+                blocks &= blocks - index(1)
+        if is_open == 0:
             break
 
 
 @parallel
-def median(rows, entries, starts, bounds, edge, columns, depth):
+def median(rows, entries, starts, bounds, edge, columns, touched, depth):
     """Write where each pixel's transmittance falls to 1/2 (arguments as in `rasterise`; features are the planes).
 
     ``depth`` (h, w) holds inf and keeps it where the transmittance stays above.
     """
     height, width = depth.shape
     for job in prange(len(bounds) - 1):
-        transmittance = np.empty(index(edge * edge) * LANES, np.float32)
-        distance = np.empty(index(edge * edge) * LANES, np.float32)
-        spans = np.empty((AHEAD, edge + 1), np.int32)
+        transmittance, distance = np.empty(BLOCKS * LANES, np.float32), np.empty(BLOCKS * LANES, np.float32)
         for tile in range(bounds[job], bounds[job + 1]):
             x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
             transmittance[:] = _ONE
             distance[:] = np.inf
-            _walk(rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, transmittance, distance, spans)
+            first, last, blocks = starts[tile], starts[tile + 1], inside(x0, y0, edge, width, height)
+            _walk(rows, entries, first, last, x0, y0, edge, transmittance, distance, blocks, touched)
             for y in range(y0, min(y0 + edge * BLOCK, height)):
                 for x in range(x0, min(x0 + edge * BLOCK, width)):
-                    block = (y - y0) // BLOCK * edge + (x - x0) // BLOCK
+                    block = (y - y0) // BLOCK * EDGE + (x - x0) // BLOCK
                     depth[index(y), index(x)] = distance[block * BLOCK * BLOCK + (y - y0) % BLOCK * BLOCK + (x - x0) % BLOCK]

@@ -1,7 +1,8 @@
 """Front-to-back compositing of footprints, forward.
 
 Tiles are walked in blocks of 4 x 4 pixels, whose 16 lanes fill one or two vector registers. A tile's state lies in one flat
-scratch array, block after block, so that it stays in the L1 cache.
+scratch array, block after block, so that it stays in the L1 cache. A set of a tile's blocks is a word with a bit for
+each; ``blocks & (blocks - 1)`` leaves out the first.
 """
 
 from __future__ import annotations
@@ -22,12 +23,16 @@ from invgraphics.kernels.numba.binning import (
     WIDEST,
     chord,
 )
+from invgraphics.kernels.numba.instructions import lowest_bit, prefetch
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 BLOCK = 4
 """Edge of a block in pixels."""
 LANES = index(BLOCK * BLOCK)
+EDGE = 8
+"""Most blocks along a tile's edge: what a word has bits for, and what the L1 cache holds."""
+BLOCKS = index(EDGE * EDGE)
 AHEAD = 16
 """Footprints whose blocks are found before the first of them is drawn."""
 
@@ -37,57 +42,63 @@ _ONE, _ZERO = np.float32(1.0), np.float32(0.0)
 
 
 @inlined
-def _pair(first, last, edge):
-    """The whole numbers from ``first`` to ``last``, clipped to a tile, as one; `span` takes them apart."""
-    low = np.int32(np.ceil(min(max(first, _ZERO), np.float32(edge))))
-    high = np.int32(np.floor(max(min(last, np.float32(edge - 1)), -_ONE)))
-    return np.int32(np.int32(high << np.int32(16)) | low)
-
-
-@inlined
-def span(pair):
-    """First and last block; none if they are the wrong way round."""
-    return pair & np.int32(0xFFFF), pair >> np.int32(16)
-
-
-@inlined
-def measure(rows, entries, begin, end, x0, y0, edge, spans):
-    """Find which blocks of a tile a few footprints touch before any of them is drawn.
+def measure(rows, entries, begin, end, x0, y0, edge, touched):
+    """Write to ``touched`` which blocks of a tile a few footprints touch, before any of them is drawn.
 
     Otherwise a processor would guess how long every row is, and wait for its square roots to learn that it was wrong.
-
-    ``spans`` (`AHEAD`, edge + 1) receives the rows of blocks, and the blocks of each row.
     """
-    quarter = np.float32(1.0 / BLOCK)
-    first, last = np.float32(0.5 - BLOCK) * quarter, np.float32(-0.5) * quarter
+    quarter, most = np.float32(1.0 / BLOCK), np.float32(edge)
+    before, after = np.float32(0.5 - BLOCK) * quarter, np.float32(-0.5) * quarter + _ONE
     for entry in range(begin, end):
-        r, n = index(entries[index(entry)]), index(entry - begin)
+        prefetch(rows, index(entries[index(min(entry + AHEAD, len(entries) - 1))]))
+        r = index(entries[index(entry)])
         x, y, highest = (rows[r, MEAN_X] - x0) * quarter, rows[r, MEAN_Y] - y0, rows[r, HIGHEST]
-        spans[n, edge] = _pair((y - highest) * quarter + first, (y + highest) * quarter + last, edge)
         shape = rows[r, WIDEST], highest, rows[r, SHEAR], rows[r, ASPECT]
-        for number in range(edge):
-            low = np.float32(np.int32(number)) * np.float32(BLOCK) + np.float32(0.5) - y
-            left, right = chord(shape, low, low + np.float32(BLOCK - 1))
-            spans[n, index(number)] = _pair(x + left * quarter + first, x + right * quarter + last, edge)
+        blocks = index(0)
+        for j in range(edge):
+            low = np.float32(np.int32(j)) * np.float32(BLOCK) + np.float32(0.5) - y
+            high = low + np.float32(BLOCK - 1)
+            left, right = chord(shape, low, high)
+            first = np.int32(np.ceil(min(max(x + left * quarter + before, _ZERO), most)))
+            past = np.int32(np.floor(max(min(x + right * quarter + after, most), _ZERO)))
+            row = max(np.int32(1 << past) - np.int32(1 << first), np.int32(0))
+            row = row if low <= highest and high >= -highest else np.int32(0)
+            blocks |= index(row) << index(j * EDGE)
+        touched[index(entry)] = blocks
 
 
 @inlined
-def open_tile(state, alive, x0, y0, edge, width, height, stride):
-    """Full transmittance on every pixel of the image, and none (-1 marks a finished pixel) outside; returns live blocks."""
-    live = 0
-    for j in range(edge):
-        for i in range(edge):
-            block = index(j * edge + i)
-            inside = x0 + i * BLOCK < width and y0 + j * BLOCK < height
-            alive[block] = inside
-            live += inside
-            state[block * stride : (block + index(1)) * stride] = _ZERO
-            right, below = np.int32(width - x0 - i * BLOCK), np.int32(height - y0 - j * BLOCK)
-            for lane in range(BLOCK * BLOCK):
-                # No branch: vector registers hold a whole row of a block.
-                outside = (np.int32(lane % BLOCK) >= right) | (np.int32(lane // BLOCK) >= below)
-                state[block * stride + index(lane)] = -_ONE if outside else _ONE
-    return live
+def placed(rows, r, x0, y0, block):
+    """From a footprint's mean to a block's first pixel centre."""
+    dx = np.float32(np.int32(x0) + np.int32(block % index(EDGE)) * np.int32(BLOCK)) + np.float32(0.5) - rows[r, MEAN_X]
+    dy = np.float32(np.int32(y0) + np.int32(block // index(EDGE)) * np.int32(BLOCK)) + np.float32(0.5) - rows[r, MEAN_Y]
+    return dx, dy
+
+
+@inlined
+def inside(x0, y0, edge, width, height):
+    """The set of a tile's blocks that have pixels of the image."""
+    blocks = index(0)
+    for j in range(min(edge, -(-(height - y0) // BLOCK))):
+        for i in range(min(edge, -(-(width - x0) // BLOCK))):
+            blocks |= index(1) << index(j * EDGE + i)
+    return blocks
+
+
+@inlined
+def _open_tile(state, blocks, x0, y0, width, height, stride):
+    """Full transmittance on every pixel of the image, and none (-1 marks a finished pixel) outside."""
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - index(1)
+        base = block * stride
+        state[base : base + stride] = _ZERO
+        right = np.int32(width - x0) - np.int32(block % index(EDGE)) * np.int32(BLOCK)
+        below = np.int32(height - y0) - np.int32(block // index(EDGE)) * np.int32(BLOCK)
+        for lane in range(BLOCK * BLOCK):
+            # No branch: vector registers hold a whole row of a block.
+            outside = (np.int32(lane % BLOCK) >= right) | (np.int32(lane // BLOCK) >= below)
+            state[base + index(lane)] = -_ONE if outside else _ONE
 
 
 @inlined
@@ -131,31 +142,24 @@ def _blend_more(state, base, to, rows, r, k):
 
 
 @inlined
-def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, spans, ends, live):
+def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, touched, ends):
     """Walk a tile's footprints front to back until all its pixels are finished; returns the number of blocks visited."""
     stride = LANES * index(2 + 3 * triples)
-    half = np.float32(0.5)
-    ox, oy = np.float32(x0), np.float32(y0)
     visits = 0
     for begin in range(first, last, AHEAD):
         end = min(begin + AHEAD, last)
-        measure(rows, entries, begin, end, ox, oy, edge, spans)
+        measure(rows, entries, begin, end, np.float32(x0), np.float32(y0), edge, touched)
         for entry in range(begin, end):
-            r, n = index(entries[index(entry)]), index(entry - begin)
-            top, bottom = span(spans[n, edge])
-            for j in range(top, bottom + 1):
-                left, right = span(spans[n, index(j)])
-                for i in range(left, right + 1):
-                    block = index(j * edge + i)
-                    if alive[block]:
-                        visits += 1
-                        dx = ox + np.float32(i * BLOCK) + half - rows[r, MEAN_X]
-                        dy = oy + np.float32(j * BLOCK) + half - rows[r, MEAN_Y]
-                        if _blend(state, block * stride, rows, r, dx, dy, triples) == 0:
-                            alive[block] = False
-                            ends[block] = entry + 1
-                            live -= 1
-        if live == 0:
+            r, blocks = index(entries[index(entry)]), touched[index(entry)] & alive
+            while blocks:
+                block = lowest_bit(blocks)
+                dx, dy = placed(rows, r, x0, y0, block)
+                visits += 1
+                if _blend(state, block * stride, rows, r, dx, dy, triples) == 0:
+                    alive ^= index(1) << block
+                    ends[block] = entry + 1
+                blocks &= blocks - index(1)
+        if alive == 0:
             break
     return visits
 
@@ -164,24 +168,25 @@ def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, al
 def _write_tile(state, x0, y0, edge, stride, image, alpha):
     """Copy a tile's sums into the picture."""
     height, width, channels = image.shape
-    for block in range(edge * edge):
-        left, top = x0 + block % edge * BLOCK, y0 + block // edge * BLOCK
-        for row in range(min(BLOCK, height - top)):
-            for column in range(min(BLOCK, width - left)):
-                y, x = index(top + row), index(left + column)
-                at = index(block) * stride + index(row * BLOCK + column)
-                alpha[y, x] = _ONE - abs(state[at])
-                if channels == 3:
-                    image[y, x, index(0)] = state[at + index(2) * LANES]
-                    image[y, x, index(1)] = state[at + index(3) * LANES]
-                    image[y, x, index(2)] = state[at + index(4) * LANES]
-                else:
-                    for k in range(channels):
-                        image[y, x, index(k)] = state[at + index(2 + k) * LANES]
+    for j in range(edge):
+        for i in range(edge):
+            left, top = x0 + i * BLOCK, y0 + j * BLOCK
+            for row in range(min(BLOCK, height - top)):
+                for column in range(min(BLOCK, width - left)):
+                    y, x = index(top + row), index(left + column)
+                    at = index(j * EDGE + i) * stride + index(row * BLOCK + column)
+                    alpha[y, x] = _ONE - abs(state[at])
+                    if channels == 3:
+                        image[y, x, index(0)] = state[at + index(2) * LANES]
+                        image[y, x, index(1)] = state[at + index(3) * LANES]
+                        image[y, x, index(2)] = state[at + index(4) * LANES]
+                    else:
+                        for k in range(channels):
+                            image[y, x, index(k)] = state[at + index(2 + k) * LANES]
 
 
 @parallel
-def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, ends, work):
+def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, touched, ends, work):
     """Composite every tile.
 
     Args:
@@ -193,6 +198,7 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, ends, 
         columns: tiles per row.
         image: output, sums of w * features (h, w, c).
         alpha: output, sums of w (h, w).
+        touched: output, per entry the set of blocks that it touches; none behind the last one that was drawn in a tile.
         ends: output, per tile and block, the entry at which all its pixels were finished.
         work: output, blocks visited per tile.
     """
@@ -200,14 +206,12 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, ends, 
     triples = (rows.shape[1] - FEATURES) // 3
     stride = LANES * index(2 + 3 * triples)
     for job in prange(len(bounds) - 1):
-        state = np.empty(index(edge * edge) * stride, np.float32)
-        alive, spans = np.empty(edge * edge, np.bool_), np.empty((AHEAD, edge + 1), np.int32)
+        state = np.empty(BLOCKS * stride, np.float32)
         for tile in range(bounds[job], bounds[job + 1]):
             x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
-            live = open_tile(state, alive, x0, y0, edge, width, height, stride)
+            alive = inside(x0, y0, edge, width, height)
+            _open_tile(state, alive, x0, y0, width, height, stride)
             first, last = starts[tile], starts[tile + 1]
             ends[tile, :] = last
-            work[tile] = _composite_tile(
-                rows, entries, first, last, x0, y0, edge, triples, state, alive, spans, ends[tile], live
-            )
+            work[tile] = _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, touched, ends[tile])
             _write_tile(state, x0, y0, edge, stride, image, alpha)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, MEAN_X, MEAN_Y, OPACITY, POWER_XX, POWER_XY, POWER_YY
-from invgraphics.kernels.numba.raster import AHEAD, BLOCK, LANES, measure, span
+from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, OPACITY, POWER_XX, POWER_XY, POWER_YY
+from invgraphics.kernels.numba.instructions import lowest_bit, prefetch
+from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, LANES, inside, placed
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
@@ -59,25 +60,26 @@ def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_
     """Load a tile's gradients, and the derivative along the whole of each pixel."""
     height, width, channels = image.shape
     state[:] = _ZERO
-    for block in range(edge * edge):
-        left, top = x0 + block % edge * BLOCK, y0 + block // edge * BLOCK
-        base = index(block) * stride
-        # Pixels outside the image count as finished.
-        state[base : base + LANES] = -_ONE
-        for row in range(min(BLOCK, height - top)):
-            for column in range(min(BLOCK, width - left)):
-                y, x, at = index(top + row), index(left + column), base + index(row * BLOCK + column)
-                gradient = alpha_gradient[y, x]
-                behind = gradient * alpha[y, x]
-                if channels == 3:
-                    behind += _hand_over(state, at, image, image_gradient, y, x, index(0))
-                    behind += _hand_over(state, at, image, image_gradient, y, x, index(1))
-                    behind += _hand_over(state, at, image, image_gradient, y, x, index(2))
-                else:
-                    for k in range(channels):
-                        behind += _hand_over(state, at, image, image_gradient, y, x, index(k))
-                state[at + _T], state[at + _BEHIND] = _ONE, behind
-                state[at + _ALPHA], state[at + _ALONG] = gradient, gradient
+    for j in range(edge):
+        for i in range(edge):
+            left, top = x0 + i * BLOCK, y0 + j * BLOCK
+            base = index(j * EDGE + i) * stride
+            # Pixels outside the image count as finished.
+            state[base : base + LANES] = -_ONE
+            for row in range(min(BLOCK, height - top)):
+                for column in range(min(BLOCK, width - left)):
+                    y, x, at = index(top + row), index(left + column), base + index(row * BLOCK + column)
+                    gradient = alpha_gradient[y, x]
+                    behind = gradient * alpha[y, x]
+                    if channels == 3:
+                        behind += _hand_over(state, at, image, image_gradient, y, x, index(0))
+                        behind += _hand_over(state, at, image, image_gradient, y, x, index(1))
+                        behind += _hand_over(state, at, image, image_gradient, y, x, index(2))
+                    else:
+                        for k in range(channels):
+                            behind += _hand_over(state, at, image, image_gradient, y, x, index(k))
+                    state[at + _T], state[at + _BEHIND] = _ONE, behind
+                    state[at + _ALPHA], state[at + _ALONG] = gradient, gradient
 
 
 @inlined
@@ -189,59 +191,58 @@ def _add_up(lanes, half, sums, r, absolute):
 
 @inlined
 def _walk_tile(
-    rows, entries, first, last, x0, y0, edge, triples, state, lanes, stride, spans, ends, sums, absolute, receivers
+    rows, entries, first, last, x0, y0, triples, state, lanes, stride, alive, touched, ends, sums, absolute, receivers
 ):  # fmt: skip
     """Walk a tile's footprints front to back and add what each of them receives to ``sums``."""
-    ox, oy = np.float32(x0), np.float32(y0)
     half = index(len(lanes) // (_ROOM // HALF))
-    for begin in range(first, last, AHEAD):
-        end = min(begin + AHEAD, last)
-        measure(rows, entries, begin, end, ox, oy, edge, spans)
-        for entry in range(begin, end):
-            r, n, visited = index(entries[index(entry)]), index(entry - begin), False
-            top, bottom = span(spans[n, edge])
-            for j in range(top, bottom + 1):
-                left, right = span(spans[n, index(j)])
-                for i in range(left, right + 1):
-                    block = index(j * edge + i)
-                    if entry < ends[block]:
-                        base = block * stride
-                        dx = ox + np.float32(i * BLOCK) + _HALF - rows[r, MEAN_X]
-                        dy = oy + np.float32(j * BLOCK) + _HALF - rows[r, MEAN_Y]
-                        if triples > 1:
-                            _look_along(state, base, rows, r, triples)
-                        visited = True
-                        _unblend(state, lanes, base, rows, r, dx, dy, base + stride - LANES, receivers)
-                        _sum(state, lanes, half, base, rows, r, dx, dy, absolute)
-                        if triples > 1:
-                            _sum_further(state, lanes, base, sums, r, triples)
-            if visited:
-                _add_up(lanes, half, sums, r, absolute)
+    for entry in range(first, last):
+        if not alive:
+            break
+        ahead = index(entries[index(min(entry + 6, last - 1))])
+        prefetch(rows, ahead)
+        prefetch(sums, ahead)
+        r, blocks = index(entries[index(entry)]), touched[index(entry)] & alive
+        if blocks:
+            while blocks:
+                block = lowest_bit(blocks)
+                base = block * stride
+                dx, dy = placed(rows, r, x0, y0, block)
+                if triples > 1:
+                    _look_along(state, base, rows, r, triples)
+                _unblend(state, lanes, base, rows, r, dx, dy, base + stride - LANES, receivers)
+                _sum(state, lanes, half, base, rows, r, dx, dy, absolute)
+                if triples > 1:
+                    _sum_further(state, lanes, base, sums, r, triples)
+                if entry + 1 == ends[block]:
+                    alive ^= index(1) << block
+                blocks &= blocks - index(1)
+            _add_up(lanes, half, sums, r, absolute)
 
 
 @parallel
 def walk_back(
-    rows, entries, starts, bounds, edge, columns, ends, image, alpha, image_gradient, alpha_gradient, sums, absolute, receivers
-):
+    rows, entries, starts, bounds, edge, columns, touched, ends, image, alpha, image_gradient, alpha_gradient, sums, absolute,
+    receivers,
+):  # fmt: skip
     """Per job and packed footprint, the sums from which `gather` makes gradients (arguments as in `rasterise`).
 
     Two switches: ``absolute`` adds `PULLS` sums of absolute gradients; ``receivers`` lets only so many footprints of a pixel,
     from the front, receive its gradient.
     """
+    height, width = alpha.shape
     triples = (rows.shape[1] - FEATURES) // 3
     stride = _PICTURE + LANES * index(3 * triples + (1 if len(receivers) == ON else 0))
     for job in prange(len(bounds) - 1):
-        state = np.empty(index(edge * edge) * stride, np.float32)
+        state, lanes = np.empty(BLOCKS * stride, np.float32), np.zeros(_ROOM, np.float32)
         own = sums[job]
-        lanes, spans = np.zeros(_ROOM, np.float32), np.empty((AHEAD, edge + 1), np.int32)
         own[:] = _ZERO
         for tile in range(bounds[job], bounds[job + 1]):
             if starts[tile] < starts[tile + 1]:
                 x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
                 _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient)
                 _walk_tile(
-                    rows, entries, starts[tile], starts[tile + 1], x0, y0, edge, triples, state, lanes, stride, spans,
-                    ends[tile], own, absolute, receivers,
+                    rows, entries, starts[tile], starts[tile + 1], x0, y0, triples, state, lanes, stride,
+                    inside(x0, y0, edge, width, height), touched, ends[tile], own, absolute, receivers,
                 )  # fmt: skip
 
 

@@ -12,13 +12,13 @@ from torch import Tensor
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.binning import FEATURES, Packed, pack
 from invgraphics.kernels.numba.median import median
-from invgraphics.kernels.numba.raster import BLOCK, rasterise
+from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, rasterise
 from invgraphics.kernels.numba.raster_backward import MOMENTS, OFF, ON, PULLS, gather, walk_back
 from invgraphics.kernels.numba.runtime import array, once_differentiable, scratch, split_by_work, threads
 from invgraphics.kernels.types import Footprints
 
-TILE = 32
-"""Edge of a tile in pixels: the measured best on CPUs (a tile's state fits into the L1 cache)."""
+TILE = EDGE * BLOCK
+"""Edge of a tile in pixels, and the largest: the measured best on CPUs (a tile's state fits into the L1 cache)."""
 
 
 class _Walk(NamedTuple):
@@ -27,6 +27,7 @@ class _Walk(NamedTuple):
     packed: Packed
     edge: int
     columns: int
+    touched: np.ndarray
     ends: np.ndarray
     work: np.ndarray
 
@@ -39,17 +40,17 @@ class _Rasterise(torch.autograd.Function):
         ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, pull: Tensor | None, *constants: Any
     ) -> tuple[Tensor, Tensor]:
         footprints, (width, height), tile, ctx.receivers = constants
-        edge = max(1, -(-tile // BLOCK))
-        columns, lines = -(-width // (edge * BLOCK)), -(-height // (edge * BLOCK))
+        edge, columns, lines = _tiles(width, height, tile)
         packed = pack(footprints, features, columns, lines, edge * BLOCK)
         image, alpha = means2d.new_empty(height, width, features.shape[1]), means2d.new_empty(height, width)
-        ends = np.empty((columns * lines, edge * edge), np.int32)
-        work = np.empty(columns * lines, np.int64)
+        ends = np.empty((columns * lines, BLOCKS), np.int32)
+        touched, work = np.empty(len(packed.entries), np.uintp), np.empty(columns * lines, np.int64)
+        pixels = image.numpy(), alpha.numpy()
         bounds = _bounds(np.diff(packed.starts))
-        rasterise(packed.rows, packed.entries, packed.starts, bounds, edge, columns, image.numpy(), alpha.numpy(), ends, work)
+        rasterise(packed.rows, packed.entries, packed.starts, bounds, edge, columns, *pixels, touched, ends, work)
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(means2d, conics, opacities, features, image, alpha)
-        ctx.walk = _Walk(packed, edge, columns, ends, work)
+        ctx.walk = _Walk(packed, edge, columns, touched, ends, work)
         return image, alpha
 
     @staticmethod
@@ -57,7 +58,7 @@ class _Rasterise(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         image_gradient, alpha_gradient = grad_outputs
         means2d, conics, opacities, features, image, alpha = ctx.saved_tensors
-        packed, edge, columns, ends, work = ctx.walk
+        packed, edge, columns, touched, ends, work = ctx.walk
         to_image = array(torch.zeros_like(image) if image_gradient is None else image_gradient)
         to_alpha = array(torch.zeros_like(alpha) if alpha_gradient is None else alpha_gradient)
         bounds = _bounds(work)
@@ -73,6 +74,7 @@ class _Rasterise(torch.autograd.Function):
             bounds,
             edge,
             columns,
+            touched,
             ends,
             array(image),
             array(alpha),
@@ -88,6 +90,12 @@ class _Rasterise(torch.autograd.Function):
         pulls = means2d.new_zeros(len(means2d) if absolute else 0, PULLS)
         gather(packed.order, rows, sums, *(gradient.numpy() for gradient in (*gradients, pulls)))
         return (*gradients, pulls if absolute else None, None, None, None, None)
+
+
+def _tiles(width: int, height: int, tile: int | None) -> tuple[int, int, int]:
+    """Blocks along a tile's edge, and the tiles per row and per column."""
+    edge = -(-min(tile or TILE, TILE) // BLOCK)
+    return edge, -(-width // (edge * BLOCK)), -(-height // (edge * BLOCK))
 
 
 def _bounds(work: np.ndarray) -> np.ndarray:
@@ -110,7 +118,7 @@ def splat_rasterise(
     if footprints.homography is not None:
         return reference.splat_rasterise(footprints, features, width, height, tile, receivers)
     f = footprints
-    constants = (footprints, (width, height), tile or TILE, receivers)
+    constants = (footprints, (width, height), tile, receivers)
     return _Rasterise.apply(f.means2d, f.conics, f.opacities, features, f.pull, *constants)
 
 
@@ -119,9 +127,9 @@ def splat_median(footprints: Footprints, width: int, height: int, tile: int | No
     """See `invgraphics.kernels.splat_median`; discs are left to the reference."""
     if footprints.homography is not None:
         return reference.splat_median(footprints, width, height, tile)
-    edge = max(1, -(-(tile or TILE) // BLOCK))
-    columns, lines = -(-width // (edge * BLOCK)), -(-height // (edge * BLOCK))
+    edge, columns, lines = _tiles(width, height, tile)
     packed = pack(footprints, footprints.planes, columns, lines, edge * BLOCK)
     depth = torch.full((height, width), torch.inf)
-    median(packed.rows, packed.entries, packed.starts, _bounds(np.diff(packed.starts)), edge, columns, depth.numpy())
+    bounds, touched = _bounds(np.diff(packed.starts)), np.empty(len(packed.entries), np.uintp)
+    median(packed.rows, packed.entries, packed.starts, bounds, edge, columns, touched, depth.numpy())
     return depth
