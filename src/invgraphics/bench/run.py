@@ -14,6 +14,7 @@ from invgraphics.bench.memory import footprints
 from invgraphics.bench.peers import peers
 from invgraphics.bench.results import BOTH, MACHINE, THREADS, Measurement, Results, Skipped
 from invgraphics.bench.timing import Effort, alternate
+from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.dispatch import IMPLEMENTATIONS, here, why_not
 
 QUICK, FULL = Effort(0.4, 2, 9), Effort(0.6, 3, 15)
@@ -55,6 +56,7 @@ class Request:
 
 def bench(request: Request) -> Results:
     """Measure; the kernels in use afterwards are those in use before."""
+    keep_freed_memory()
     results = Results()
     if not request.kernels:
         missing = (name for name in IMPLEMENTATIONS if name not in here())

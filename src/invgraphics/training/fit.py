@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from invgraphics.core import Batch, Context, Field, RayRenderer, Renderer, Rendering, Scene, Trace, check
 from invgraphics.errors import NumericalError
+from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
@@ -66,6 +67,7 @@ class Fit:
         check(plan.field, plan.renderer)
         for hook in plan.hooks:
             hook.check(plan.field, plan.renderer)
+        keep_freed_memory()
         self.plan = plan
         self.steps = 0
         self.seconds = 0.0

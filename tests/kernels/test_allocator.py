@@ -1,0 +1,40 @@
+"""Freed memory is kept: counted in page faults, by the operating system."""
+
+import platform
+import subprocess
+import sys
+from textwrap import dedent
+
+import pytest
+
+from invgraphics.kernels.allocator import keep_freed_memory
+
+COUNT = dedent("""
+    import resource
+    import torch
+    from invgraphics.kernels.allocator import keep_freed_memory
+
+    {setting}
+    faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for repetition in range(4):
+        before = faults()
+        torch.ones(64 * 2**18)
+        last = faults() - before
+    print(last)
+""")
+
+
+def _faults(setting: str) -> int:
+    """Page faults of writing 64 MB for the fourth time, in a process of its own."""
+    return int(subprocess.run([sys.executable, "-c", COUNT.format(setting=setting)], capture_output=True, check=True).stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
+def test_large_blocks_are_used_again() -> None:
+    kept, returned = _faults("assert keep_freed_memory()"), _faults("")
+    assert kept <= max(returned / 50, 4)
+
+
+def test_where_there_is_nothing_to_set_it_says_no(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ctypes.CDLL", lambda name: object())
+    assert not keep_freed_memory()
