@@ -167,6 +167,17 @@ def test_nothing_to_see():
         assert all(not leaf.grad.any() for leaf in leaves)
 
 
+def test_the_culled_stay_out_of_the_gradients_of_their_neighbours():
+    gaussians, rest = cloud(70), torch.arange(70) % 4 > 1
+    gaussians.means[::4] = torch.nan
+    gaussians.means[1::4] = torch.tensor([0.0, 0.0, -3.0])
+    _, _, (*leaves, pose) = whole(gaussians, camera())
+    _, _, (*alone, alone_pose) = whole(Gaussians(*(getattr(gaussians, name)[rest] for name in PARAMETERS)), camera())
+    assert_close([leaf.grad[rest] for leaf in leaves], [leaf.grad for leaf in alone], 1e-6)
+    assert_close([pose.grad], [alone_pose.grad], 1e-6)
+    assert all(torch.equal(leaf.grad[~rest], torch.zeros_like(leaf.grad[~rest])) for leaf in leaves)
+
+
 def test_one_gaussian_covers_the_screen():
     one = cloud(1, 1)
     one = replace(one, means=torch.zeros(1, 3), scales=torch.full((1, 3), 1e3), opacities=torch.tensor([0.5]))

@@ -62,7 +62,7 @@ def alpha_evaluations(footprints: Footprints, rgb: Tensor, width: int, height: i
     """
     if why_not("numba"):
         return 0.0
-    from invgraphics.kernels.numba.raster import LANES
+    from invgraphics.kernels.numba.runtime import LANES
 
     with kernels.using("numba"), torch.enable_grad():
         image: Any = kernels.splat_rasterise(footprints, rgb.detach().requires_grad_(), width, height)[0]

@@ -1,33 +1,64 @@
-"""EWA projection, forward: the formulas are those of `invgraphics.kernels.reference.splat_project`."""
+"""EWA projection, forward: the formulas are those of `invgraphics.kernels.reference.splat_project`.
+
+Primitives are projected `LANES` at a time, side by side in vector registers, without a branch: what is culled is computed too,
+and replaced by something harmless.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from invgraphics.kernels.numba.harmonics import harmonics
-from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, share
+from invgraphics.kernels.numba.runtime import LANES, index, inlined, log2, parallel, prange, share
 from invgraphics.kernels.reference.splat_project import ILL_CONDITIONED, MARGIN, NEAR
 from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN
 
 # A camera as a flat tuple: rotation to the world row by row, position, focal lengths, principal point, width, height.
 ROTATION, POSITION, FOCAL, CENTRE, SIZE, VIEW = 0, 9, 12, 14, 16, 18
 
+GROUP = int(LANES)
+# Slots of a group of primitives, LANES values each.
+MEAN, QUATERNION, SCALE, _OPACITY = (index(slot) * LANES for slot in (0, 3, 7, 10))
+_DEPTH, _RADIUS, _FADE, _SCREEN, _CONIC, _PLANE = (index(slot) * LANES for slot in (11, 12, 13, 14, 16, 19))
+_WEIGHTS, _ROOM = index(22) * LANES, index(22 + 16) * LANES
+
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 _NEAR, _MARGIN, _THIN = np.float32(NEAR), np.float32(MARGIN), np.float32(ILL_CONDITIONED)
 _TINY, _EPSILON = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
+_TWO_LN_2, _PER_ALPHA_MIN = np.float32(2 * np.log(2)), np.float32(1 / ALPHA_MIN)
 _NORM_MIN, _FADE_MIN = np.float32(1e-12), np.float32(FADE_MIN)
 
 
 @inlined
-def three(values, i):
-    """The i-th row, as a tuple: a slice of an array counts references, with calls that no register outlives."""
-    return values[i, 0], values[i, 1], values[i, 2]
+def load(lanes, slot, values, i):
+    """Copy the columns of row ``i`` to a lane, given as the place of its first slot."""
+    for k in range(values.shape[1]):
+        lanes[slot + index(k) * LANES] = values[i, index(k)]
 
 
 @inlined
-def four(values, i):
-    """The same of four columns."""
-    return values[i, 0], values[i, 1], values[i, 2], values[i, 3]
+def store(lanes, slot, values, i):
+    """Copy a lane to the columns of row ``i``."""
+    for k in range(values.shape[1]):
+        values[i, index(k)] = lanes[slot + index(k) * LANES]
+
+
+@inlined
+def three(lanes, at):
+    """What a lane holds in three slots."""
+    return lanes[at], lanes[at + LANES], lanes[at + LANES + LANES]
+
+
+@inlined
+def four(lanes, at):
+    """The same of four slots."""
+    return lanes[at], lanes[at + LANES], lanes[at + LANES + LANES], lanes[at + LANES + LANES + LANES]
+
+
+@inlined
+def put(lanes, at, values):
+    """Write three values to a lane."""
+    lanes[at], lanes[at + LANES], lanes[at + LANES + LANES] = values
 
 
 @inlined
@@ -149,9 +180,9 @@ def _plane(mean, x, y, root, dilation):
         dot(mean, column(root, 1)) / distance,
         dot(mean, column(root, 2)) / distance,
     )
-    xx, xy, yy, det = covariance(x, y, _ZERO)
-    if det < _THIN * (xx + yy) * (xx + yy):
-        xx, xy, yy, det = covariance(x, y, max(dilation, _EPSILON))
+    xx, _, yy, det = covariance(x, y, _ZERO)
+    thin = det < _THIN * (xx + yy) * (xx + yy)
+    xx, xy, yy, det = covariance(x, y, max(dilation, _EPSILON) if thin else _ZERO)
     along_x, along_y = dot(away, x), dot(away, y)
     return distance, (along_x * yy - along_y * xy) / det, (along_y * xx - along_x * xy) / det
 
@@ -159,7 +190,7 @@ def _plane(mean, x, y, root, dilation):
 @inlined
 def _radius(view, u, v, xx, xy, yy, opacity):
     """Half-width of the visible ellipse's square; 0 where its bounding box misses the image."""
-    reach = np.sqrt(_TWO * np.log(max(opacity / np.float32(ALPHA_MIN), _ONE)))
+    reach = np.sqrt(_TWO_LN_2 * log2(max(opacity * _PER_ALPHA_MIN, _ONE)))
     width, height = reach * np.sqrt(xx), reach * np.sqrt(yy)
     half = _HALF * (xx - yy)
     largest = _HALF * (xx + yy) + np.sqrt(half * half + xy * xy)
@@ -169,9 +200,14 @@ def _radius(view, u, v, xx, xy, yy, opacity):
 
 
 @inlined
-def _footprint(view, dilation, compensate, mean, q, scales, opacity):
-    """Radius, fade, centre, conic and plane of a primitive in front of the camera; the radius is 0 if it is culled."""
-    _, root = scaled_axes(view, q, scales)
+def _project_lane(view, dilation, compensate, lanes, lane):
+    """Footprint of one primitive, and the harmonics in its direction."""
+    offset, mean = camera_point(view, three(lanes, MEAN + lane))
+    in_front = mean[2] > _NEAR
+    lanes[_DEPTH + lane] = mean[2]
+    mean = mean[0], mean[1], mean[2] if in_front else _ONE
+    q, _ = normalised(four(lanes, QUATERNION + lane))
+    _, root = scaled_axes(view, q, three(lanes, SCALE + lane))
     x, y, _, _ = screen_axes(view, mean, root)
     xx, xy, yy, det = covariance(x, y, dilation)
     u = view[CENTRE] + view[FOCAL] * mean[0] / mean[2]
@@ -179,10 +215,30 @@ def _footprint(view, dilation, compensate, mean, q, scales, opacity):
     fade = _ONE
     if compensate:
         fade, _, _, _, _ = fade_of(x, y, dilation)
-    radius = _radius(view, u, v, xx, xy, yy, opacity * fade)
-    if radius > _ZERO:
-        return radius, fade, (u, v), (yy / det, -xy / det, xx / det), _plane(mean, x, y, root, dilation)
-    return _ZERO, fade, (_ZERO, _ZERO), (_ONE, _ZERO, _ONE), (_ZERO, _ZERO, _ZERO)
+    radius = _radius(view, u, v, xx, xy, yy, lanes[_OPACITY + lane] * fade)
+    seen = in_front and radius > _ZERO
+    lanes[_RADIUS + lane], lanes[_FADE + lane] = radius if seen else _ZERO, fade if in_front else _ONE
+    lanes[_SCREEN + lane], lanes[_SCREEN + LANES + lane] = u if seen else _ZERO, v if seen else _ZERO
+    put(lanes, _CONIC + lane, (yy / det if seen else _ONE, -xy / det if seen else _ZERO, xx / det if seen else _ONE))
+    distance, along_x, along_y = _plane(mean, x, y, root, dilation)
+    put(lanes, _PLANE + lane, (distance if seen else _ZERO, along_x if seen else _ZERO, along_y if seen else _ZERO))
+    scale = _ONE / max(distance, _NORM_MIN)
+    harmonics((offset[0] * scale, offset[1] * scale, offset[2] * scale), lanes, _WEIGHTS + lane)
+
+
+@inlined
+def _colour(lanes, lane, sh, i):
+    """Colour of a primitive; black where it is culled."""
+    red = green = blue = _HALF
+    if lanes[_RADIUS + lane] == _ZERO:
+        return _ZERO, _ZERO, _ZERO
+    for band in range(sh.shape[1]):
+        k = index(band)
+        weight = lanes[_WEIGHTS + k * LANES + lane]
+        red += weight * sh[i, k, 0]
+        green += weight * sh[i, k, 1]
+        blue += weight * sh[i, k, 2]
+    return max(red, _ZERO), max(green, _ZERO), max(blue, _ZERO)
 
 
 @parallel
@@ -193,29 +249,22 @@ def project(
     """Footprints and colours; those of culled primitives are set to something harmless."""
     n = len(means)
     for job in prange(jobs):
-        weights = np.empty(16, np.float32)
-        for number in range(share(n, jobs, job), share(n, jobs, job + 1)):
-            i = index(number)
-            offset, mean = camera_point(view, three(means, i))
-            radius, fade = _ZERO, _ONE
-            centre, conic, plane = (_ZERO, _ZERO), (_ONE, _ZERO, _ONE), (_ZERO, _ZERO, _ZERO)
-            if mean[2] > _NEAR:
-                q, _ = normalised(four(quaternions, i))
-                radius, fade, centre, conic, plane = _footprint(
-                    view, dilation, compensate, mean, q, three(scales, i), opacities[i]
-                )
-            red = green = blue = _ZERO
-            if radius > _ZERO:
-                distance = max(plane[0], _NORM_MIN)
-                harmonics((offset[0] / distance, offset[1] / distance, offset[2] / distance), weights)
-                red = green = blue = _HALF
-                for band in range(sh.shape[1]):
-                    k = index(band)
-                    red += weights[k] * sh[i, k, 0]
-                    green += weights[k] * sh[i, k, 1]
-                    blue += weights[k] * sh[i, k, 2]
-            depths[i], radii[i], fades[i] = mean[2], radius, fade
-            means2d[i, 0], means2d[i, 1] = centre
-            conics[i, 0], conics[i, 1], conics[i, 2] = conic
-            planes[i, 0], planes[i, 1], planes[i, 2] = plane
-            rgb[i, 0], rgb[i, 1], rgb[i, 2] = max(red, _ZERO), max(green, _ZERO), max(blue, _ZERO)
+        lanes = np.zeros(_ROOM, np.float32)
+        end = share(n, jobs, job + 1)
+        for begin in range(share(n, jobs, job), end, GROUP):
+            count = min(GROUP, end - begin)
+            for lane in range(count):
+                i, at = index(begin + lane), index(lane)
+                load(lanes, MEAN + at, means, i)
+                load(lanes, QUATERNION + at, quaternions, i)
+                load(lanes, SCALE + at, scales, i)
+                lanes[_OPACITY + at] = opacities[i]
+            for lane in range(LANES):
+                _project_lane(view, dilation, compensate, lanes, lane)
+            for lane in range(count):
+                i, at = index(begin + lane), index(lane)
+                depths[i], radii[i], fades[i] = lanes[_DEPTH + at], lanes[_RADIUS + at], lanes[_FADE + at]
+                store(lanes, _SCREEN + at, means2d, i)
+                store(lanes, _CONIC + at, conics, i)
+                store(lanes, _PLANE + at, planes, i)
+                rgb[i, 0], rgb[i, 1], rgb[i, 2] = _colour(lanes, at, sh, i)

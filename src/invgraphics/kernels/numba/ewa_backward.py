@@ -1,4 +1,4 @@
-"""EWA projection, backward."""
+"""EWA projection, backward; side by side like the forward pass."""
 
 from __future__ import annotations
 
@@ -6,22 +6,35 @@ import numpy as np
 
 from invgraphics.kernels.numba.ewa import (
     FOCAL,
+    GROUP,
+    MEAN,
+    QUATERNION,
+    SCALE,
     camera_point,
     column,
     dot,
     fade_of,
     four,
+    load,
     matrix_of,
     normalised,
+    put,
     rotation_of,
     scaled_axes,
     scaled_columns,
     screen_axes,
+    store,
     three,
 )
 from invgraphics.kernels.numba.harmonics import harmonics, harmonics_gradient
-from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, share
+from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import FADE_MIN
+
+# Slots of a group of primitives behind what the forward pass reads: its results, their gradients, ...
+_CONIC, _SEEN, _TO_SCREEN, _TO_CONIC, _TO_DEPTH, _TO_FADE = (index(slot) * LANES for slot in (10, 13, 14, 16, 19, 20))
+# ... what is wanted, 16 harmonics (and then the gradients along them), and the sums along the pose.
+_TO_MEAN, _TO_QUATERNION, _TO_SCALE, _HARMONICS, _POSE = (index(slot) * LANES for slot in (21, 24, 28, 31, 47))
+_ROOM = index(47 + 12) * LANES
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 _FADE_MIN = np.float32(FADE_MIN)
@@ -50,13 +63,13 @@ def _through_fade(x, y, dilation, conic, to_fade):
 
 
 @inlined
-def _through_screen(view, dilation, mean, root, conic, to_conic, to_mean2d, to_fade):
+def _through_screen(view, dilation, compensate, mean, root, conic, to_conic, to_mean2d, to_fade):
     """Gradients along the mean in camera axes and along the covariance's root."""
     x, y, sx, sy = screen_axes(view, mean, root)
     gxx, gxy, gyy = _through_inverse(conic, to_conic)
     gx = (_TWO * gxx * x[0] + gxy * y[0], _TWO * gxx * x[1] + gxy * y[1], _TWO * gxx * x[2] + gxy * y[2])
     gy = (_TWO * gyy * y[0] + gxy * x[0], _TWO * gyy * y[1] + gxy * x[1], _TWO * gyy * y[2] + gxy * x[2])
-    if to_fade != _ZERO:
+    if compensate:
         hx, hy = _through_fade(x, y, dilation, conic, to_fade)
         gx = (gx[0] + hx[0], gx[1] + hx[1], gx[2] + hx[2])
         gy = (gy[0] + hy[0], gy[1] + hy[1], gy[2] + hy[2])
@@ -91,20 +104,38 @@ def _to_quaternion(q, norm, m):
 
 
 @inlined
-def _through_colour(offset, sh, i, colour, to_colour, to_sh, weights, along):
-    """Write the gradients along the coefficients; returns the gradient along the offset from the camera."""
+def _look(view, lanes, lane):
+    """The harmonics in a primitive's direction."""
+    offset, _ = camera_point(view, three(lanes, MEAN + lane))
     distance = np.sqrt(dot(offset, offset))
-    d = (offset[0] / distance, offset[1] / distance, offset[2] / distance)
+    harmonics((offset[0] / distance, offset[1] / distance, offset[2] / distance), lanes, _HARMONICS + lane)
+
+
+@inlined
+def _through_colour(lanes, at, i, sh, rgb, to_rgb, to_sh):
+    """Write the gradients along a primitive's coefficients; those along its harmonics take the harmonics' place."""
+    if lanes[_SEEN + at] == _ZERO:
+        to_sh[i, :, :] = _ZERO
+        return
     # Colours are cut off at zero.
-    red = to_colour[0] if colour[0] > _ZERO else _ZERO
-    green = to_colour[1] if colour[1] > _ZERO else _ZERO
-    blue = to_colour[2] if colour[2] > _ZERO else _ZERO
-    harmonics(d, weights)
+    red = to_rgb[i, 0] if rgb[i, 0] > _ZERO else _ZERO
+    green = to_rgb[i, 1] if rgb[i, 1] > _ZERO else _ZERO
+    blue = to_rgb[i, 2] if rgb[i, 2] > _ZERO else _ZERO
     for number in range(sh.shape[1]):
         k = index(number)
-        to_sh[i, k, 0], to_sh[i, k, 1], to_sh[i, k, 2] = weights[k] * red, weights[k] * green, weights[k] * blue
-        along[k] = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
-    g = harmonics_gradient(d, along)
+        weight = lanes[_HARMONICS + k * LANES + at]
+        to_sh[i, k, 0], to_sh[i, k, 1], to_sh[i, k, 2] = weight * red, weight * green, weight * blue
+        lanes[_HARMONICS + k * LANES + at] = sh[i, k, 0] * red + sh[i, k, 1] * green + sh[i, k, 2] * blue
+    for number in range(sh.shape[1], 16):
+        lanes[_HARMONICS + index(number) * LANES + at] = _ZERO
+
+
+@inlined
+def _through_direction(offset, lanes, at):
+    """Gradient along the offset from the camera, which turns the harmonics."""
+    distance = np.sqrt(dot(offset, offset))
+    d = (offset[0] / distance, offset[1] / distance, offset[2] / distance)
+    g = harmonics_gradient(d, lanes, at)
     radial = dot(g, d)
     return (g[0] - d[0] * radial) / distance, (g[1] - d[1] * radial) / distance, (g[2] - d[2] * radial) / distance
 
@@ -121,58 +152,88 @@ def _product(a, b):
 
 
 @inlined
-def _through_pose(offset, turned, to_turn, to_mean, to_world_mean):
-    """A primitive's share of the gradient along the camera's rotation (row by row) and position."""
+def _through_pose(offset, turned, to_turn, to_mean):
+    """A primitive's share of the gradient along the camera's rotation, row by row."""
     (x, y, z), (a, b, c), (p, q, r) = offset, to_mean, turned
     u, v, w = to_turn
     return (
-        x * a + dot(p, u), x * b + dot(p, v), x * c + dot(p, w),
-        y * a + dot(q, u), y * b + dot(q, v), y * c + dot(q, w),
-        z * a + dot(r, u), z * b + dot(r, v), z * c + dot(r, w),
-        -to_world_mean[0], -to_world_mean[1], -to_world_mean[2],
-    )  # fmt: skip
+        (x * a + dot(p, u), x * b + dot(p, v), x * c + dot(p, w)),
+        (y * a + dot(q, u), y * b + dot(q, v), y * c + dot(q, w)),
+        (z * a + dot(r, u), z * b + dot(r, v), z * c + dot(r, w)),
+    )
+
+
+@inlined
+def _kept(seen, values):
+    """Three values; zeros where a primitive is culled, whatever was computed."""
+    return values[0] if seen else _ZERO, values[1] if seen else _ZERO, values[2] if seen else _ZERO
+
+
+@inlined
+def _back_lane(view, dilation, compensate, lanes, lane):
+    """Gradients along one primitive, and its share of those along the camera's pose."""
+    rotation = rotation_of(view)
+    seen = lanes[_SEEN + lane] > _ZERO
+    offset, mean = camera_point(view, three(lanes, MEAN + lane))
+    q, norm = normalised(four(lanes, QUATERNION + lane))
+    s = three(lanes, SCALE + lane)
+    turn, root = scaled_axes(view, q, s)
+    to_mean2d = lanes[_TO_SCREEN + lane], lanes[_TO_SCREEN + LANES + lane]
+    conic, to_conic, to_fade = three(lanes, _CONIC + lane), three(lanes, _TO_CONIC + lane), lanes[_TO_FADE + lane]
+    to_mean, to_root = _through_screen(view, dilation, compensate, mean, root, conic, to_conic, to_mean2d, to_fade)
+    to_mean = (to_mean[0], to_mean[1], to_mean[2] + lanes[_TO_DEPTH + lane])
+    to_turn = scaled_columns(to_root, s)
+    w, x, y, z = _to_quaternion(q, norm, _product(rotation, to_turn))
+    lanes[_TO_QUATERNION + lane] = w if seen else _ZERO
+    put(lanes, _TO_QUATERNION + LANES + lane, _kept(seen, (x, y, z)))
+    along = dot(column(to_root, 0), column(turn, 0)), dot(column(to_root, 1), column(turn, 1))
+    put(lanes, _TO_SCALE + lane, _kept(seen, (along[0], along[1], dot(column(to_root, 2), column(turn, 2)))))
+    colour = _through_direction(offset, lanes, _HARMONICS + lane)
+    a, b, c = dot(rotation[0], to_mean), dot(rotation[1], to_mean), dot(rotation[2], to_mean)
+    world = (a + colour[0], b + colour[1], c + colour[2])
+    put(lanes, _TO_MEAN + lane, _kept(seen, world))
+    turns, moves = _through_pose(offset, matrix_of(q), to_turn, to_mean), _kept(seen, world)
+    put(lanes, _POSE + lane, _kept(seen, turns[0]))
+    put(lanes, _POSE + index(3) * LANES + lane, _kept(seen, turns[1]))
+    put(lanes, _POSE + index(6) * LANES + lane, _kept(seen, turns[2]))
+    put(lanes, _POSE + index(9) * LANES + lane, (-moves[0], -moves[1], -moves[2]))
 
 
 @parallel
 def project_back(
-    view, dilation, means, quaternions, scales, sh, radii, conics, rgb,
+    view, dilation, compensate, means, quaternions, scales, sh, radii, conics, rgb,
     to_means2d, to_conics, to_depths, to_rgb, to_fades,
     to_means, to_quaternions, to_scales, to_sh, pose,
 ):  # fmt: skip
     """Write the gradients along the primitives and, per job, along the camera's pose."""
     n, jobs = sh.shape[0], pose.shape[0]
     for job in prange(jobs):
-        weights, along = np.empty(16, np.float32), np.zeros(16, np.float32)
-        rotation = rotation_of(view)
-        pose[job, :] = 0.0
-        for number in range(share(n, jobs, job), share(n, jobs, job + 1)):
-            i = index(number)
-            if radii[i] > _ZERO:
-                offset, mean = camera_point(view, three(means, i))
-                q, norm = normalised(four(quaternions, i))
-                s = three(scales, i)
-                turn, root = scaled_axes(view, q, s)
-                to_mean2d = to_means2d[i, 0], to_means2d[i, 1]
-                to_mean, to_root = _through_screen(
-                    view, dilation, mean, root, three(conics, i), three(to_conics, i), to_mean2d, to_fades[i]
-                )
-                to_mean = (to_mean[0], to_mean[1], to_mean[2] + to_depths[i])
-                to_turn = scaled_columns(to_root, s)
-                w, x, y, z = _to_quaternion(q, norm, _product(rotation, to_turn))
-                to_quaternions[i, 0], to_quaternions[i, 1], to_quaternions[i, 2], to_quaternions[i, 3] = w, x, y, z
-                for k in range(3):
-                    to_scales[i, k] = dot(column(to_root, k), column(turn, k))
-                colour = _through_colour(offset, sh, i, three(rgb, i), three(to_rgb, i), to_sh, weights, along)
-                a, b, c = dot(rotation[0], to_mean), dot(rotation[1], to_mean), dot(rotation[2], to_mean)
-                world = (a + colour[0], b + colour[1], c + colour[2])
-                to_means[i, 0], to_means[i, 1], to_means[i, 2] = world
-                shares = _through_pose(offset, matrix_of(q), to_turn, to_mean, world)
-                for k in range(12):
-                    pose[job, k] += shares[k]
-            else:
-                to_means[i, 0], to_means[i, 1], to_means[i, 2] = _ZERO, _ZERO, _ZERO
-                to_scales[i, 0], to_scales[i, 1], to_scales[i, 2] = _ZERO, _ZERO, _ZERO
-                to_quaternions[i, 0], to_quaternions[i, 1] = _ZERO, _ZERO
-                to_quaternions[i, 2], to_quaternions[i, 3] = _ZERO, _ZERO
-                for k in range(sh.shape[1]):
-                    to_sh[i, index(k), 0], to_sh[i, index(k), 1], to_sh[i, index(k), 2] = _ZERO, _ZERO, _ZERO
+        lanes, shares = np.zeros(_ROOM, np.float32), np.zeros(12 * GROUP, np.float64)
+        end = share(n, jobs, job + 1)
+        for begin in range(share(n, jobs, job), end, GROUP):
+            count = min(GROUP, end - begin)
+            lanes[_SEEN : _SEEN + LANES] = _ZERO
+            for lane in range(count):
+                i, at = index(begin + lane), index(lane)
+                load(lanes, MEAN + at, means, i)
+                load(lanes, QUATERNION + at, quaternions, i)
+                load(lanes, SCALE + at, scales, i)
+                load(lanes, _CONIC + at, conics, i)
+                load(lanes, _TO_SCREEN + at, to_means2d, i)
+                load(lanes, _TO_CONIC + at, to_conics, i)
+                lanes[_SEEN + at], lanes[_TO_DEPTH + at], lanes[_TO_FADE + at] = radii[i], to_depths[i], to_fades[i]
+            for lane in range(LANES):
+                _look(view, lanes, lane)
+            for lane in range(count):
+                _through_colour(lanes, index(lane), index(begin + lane), sh, rgb, to_rgb, to_sh)
+            for lane in range(LANES):
+                _back_lane(view, dilation, compensate, lanes, lane)
+            for k in range(12 * GROUP):
+                shares[k] += lanes[_POSE + index(k)]
+            for lane in range(count):
+                i, at = index(begin + lane), index(lane)
+                store(lanes, _TO_MEAN + at, to_means, i)
+                store(lanes, _TO_QUATERNION + at, to_quaternions, i)
+                store(lanes, _TO_SCALE + at, to_scales, i)
+        for k in range(12):
+            pose[job, k] = shares[k * GROUP : (k + 1) * GROUP].sum()

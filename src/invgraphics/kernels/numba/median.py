@@ -6,8 +6,8 @@ import numpy as np
 
 from invgraphics.kernels.numba.binning import FEATURES, OPACITY, POWER_XX, POWER_XY, POWER_YY
 from invgraphics.kernels.numba.instructions import lowest_bit
-from invgraphics.kernels.numba.raster import AHEAD, BLOCK, BLOCKS, EDGE, LANES, inside, measure, placed
-from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange
+from invgraphics.kernels.numba.raster import AHEAD, BLOCK, BLOCKS, EDGE, inside, measure, placed
+from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN
 
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)

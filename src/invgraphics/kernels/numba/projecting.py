@@ -37,7 +37,7 @@ class _Project(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(means, quaternions, scales, sh, opacities, conics, radii, rgb, pose)
-        ctx.view, ctx.camera, ctx.dilation = view, camera, dilation
+        ctx.view, ctx.camera, ctx.dilation, ctx.compensate = view, camera, dilation, compensate
         return outputs
 
     @staticmethod
@@ -52,9 +52,8 @@ class _Project(torch.autograd.Function):
         results = [torch.empty(x.shape) for x in (means, quaternions, scales, sh)]
         poses = np.empty((threads(), 12))
         inputs = (array(x) for x in (means, quaternions, scales, sh, radii, conics, rgb))
-        project_back(
-            ctx.view, np.float32(ctx.dilation), *inputs, *(array(g) for g in received), *(r.numpy() for r in results), poses
-        )
+        outputs = (result.numpy() for result in results)
+        project_back(ctx.view, np.float32(ctx.dilation), ctx.compensate, *inputs, *map(array, received), *outputs, poses)
         results.append(_pose_gradient(poses, pose))
         if to_planes is not None:
             gaussians = Gaussians(means, quaternions, scales, opacities, sh)

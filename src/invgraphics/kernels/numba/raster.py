@@ -24,12 +24,11 @@ from invgraphics.kernels.numba.binning import (
     chord,
 )
 from invgraphics.kernels.numba.instructions import lowest_bit, prefetch
-from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange
+from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 BLOCK = 4
-"""Edge of a block in pixels."""
-LANES = index(BLOCK * BLOCK)
+"""Edge of a block in pixels, which are the `LANES`."""
 EDGE = 8
 """Most blocks along a tile's edge: what a word has bits for, and what the L1 cache holds."""
 BLOCKS = index(EDGE * EDGE)

@@ -10,8 +10,8 @@ import numpy as np
 
 from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, OPACITY, POWER_XX, POWER_XY, POWER_YY
 from invgraphics.kernels.numba.instructions import lowest_bit, prefetch
-from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, LANES, inside, placed
-from invgraphics.kernels.numba.runtime import exp2, index, inlined, parallel, prange, share
+from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, inside, placed
+from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 # What a block holds for each of its pixels, LANES values each: transmittance, the loss's derivative along what is still to be
