@@ -84,7 +84,7 @@ def rasterise(kernels, dtype, footprints, features, size, tile=None):
 
 @pytest.mark.parametrize(
     ("channels", "size", "tile"),
-    [(3, (72, 56), None), (1, (37, 41), 16), (7, (33, 65), 32), (3, (3, 2), None), (4, (50, 50), 10)],
+    [(3, (72, 56), None), (1, (37, 41), 16), (7, (33, 65), 32), (3, (3, 2), None), (4, (50, 50), 10), (11, (40, 30), None)],
 )
 def test_rasterising_equals_reference(channels, size, tile):
     footprints, _ = numba.splat_project(cloud(300), camera(*size))

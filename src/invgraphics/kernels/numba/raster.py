@@ -38,6 +38,7 @@ AHEAD = 16
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
 _STOP = np.float32(TRANSMITTANCE_MIN)
 _ONE, _ZERO = np.float32(1.0), np.float32(0.0)
+_NO_FEATURES = (_ZERO, _ZERO, _ZERO)
 
 
 @inlined
@@ -101,11 +102,18 @@ def _open_tile(state, blocks, x0, y0, width, height, stride):
 
 
 @inlined
-def _blend(state, base, rows, r, dx0, dy0, triples):
-    """Composite one footprint onto one block; returns how many of its pixels are unfinished (as a float: it vectorises)."""
+def _blend(state, base, rows, r, dx0, dy0, triples, fused):
+    """Composite one footprint onto one block; returns how many of its pixels are unfinished (as a float: it vectorises).
+
+    ``fused`` is how many of the triples of channels the loop takes along: a literal, for which LLVM drops what is not used.
+    """
     xx, xy, yy = rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]
     opacity = rows[r, OPACITY]
-    red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
+    first, second, third = _three_features(rows, r, 0), _NO_FEATURES, _NO_FEATURES
+    if fused > 1:
+        second = _three_features(rows, r, 1)
+    if fused > 2:
+        third = _three_features(rows, r, 2)
     unfinished = _ZERO
     for lane in range(LANES):
         dx = dx0 + np.float32(lane & index(3))
@@ -120,24 +128,32 @@ def _blend(state, base, rows, r, dx0, dy0, triples):
         weight = weight if goes_on else _ZERO
         state[base + lane] = after if goes_on else -abs(transmittance)
         state[base + LANES + lane] = weight
-        state[base + index(2) * LANES + lane] += weight * red
-        state[base + index(3) * LANES + lane] += weight * green
-        state[base + index(4) * LANES + lane] += weight * blue
+        _add(state, base + index(2) * LANES + lane, weight, first)
+        if fused > 1:
+            _add(state, base + index(5) * LANES + lane, weight, second)
+        if fused > 2:
+            _add(state, base + index(8) * LANES + lane, weight, third)
         unfinished += _ONE if goes_on else _ZERO
-    for k in range(1, triples):
-        _blend_more(state, base, index(2 + 3 * k) * LANES, rows, r, index(FEATURES + 3 * k))
+    for k in range(fused, triples):
+        more = _three_features(rows, r, k)
+        for lane in range(LANES):
+            _add(state, base + index(2 + 3 * k) * LANES + lane, state[base + LANES + lane], more)
     return unfinished
 
 
 @inlined
-def _blend_more(state, base, to, rows, r, k):
-    """Add three further channels with the weights that `_blend` left behind."""
-    first, second, third = rows[r, k], rows[r, k + index(1)], rows[r, k + index(2)]
-    for lane in range(LANES):
-        weight = state[base + LANES + lane]
-        state[base + to + lane] += weight * first
-        state[base + to + LANES + lane] += weight * second
-        state[base + to + LANES + LANES + lane] += weight * third
+def _three_features(rows, r, k):
+    """A triple of a footprint's features."""
+    column = index(FEATURES + 3 * k)
+    return rows[r, column], rows[r, column + index(1)], rows[r, column + index(2)]
+
+
+@inlined
+def _add(state, at, weight, values):
+    """Add three weighted channels of one pixel to its sums."""
+    state[at] += weight * values[0]
+    state[at + LANES] += weight * values[1]
+    state[at + LANES + LANES] += weight * values[2]
 
 
 @inlined
@@ -154,7 +170,15 @@ def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, al
                 block = lowest_bit(blocks)
                 dx, dy = placed(rows, r, x0, y0, block)
                 visits += 1
-                if _blend(state, block * stride, rows, r, dx, dy, triples) == 0:
+                base = block * stride
+                # Colours alone, with a depth, and with a normal: each has a loop of its own.
+                if triples == 1:
+                    unfinished = _blend(state, base, rows, r, dx, dy, triples, 1)
+                elif triples == 2:
+                    unfinished = _blend(state, base, rows, r, dx, dy, triples, 2)
+                else:
+                    unfinished = _blend(state, base, rows, r, dx, dy, triples, 3)
+                if unfinished == 0:
                     alive ^= index(1) << block
                     ends[block] = entry + 1
                 blocks &= blocks - index(1)
