@@ -13,6 +13,7 @@ from invgraphics.experiments.build import build_model, device_of
 from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import optimised, scene_of_fit
 from invgraphics.experiments.recipe import Method, resolve
+from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training import checkpoint
 from invgraphics.training.poses import Poses
@@ -66,6 +67,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     Raises:
         InputError: the checkpoint is missing or does not fit the recipe.
     """
+    keep_freed_memory()
     provenance = folder.read_json("provenance.json")
     method = resolve(provenance["method"], provenance["preset"], folder.read_recipe())
     device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
