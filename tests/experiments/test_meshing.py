@@ -188,7 +188,7 @@ def test_surface_distances_in_closed_form() -> None:
 @pytest.fixture(scope="module")
 def runs(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("meshes")
-    steps = {"volumetric/hash": "300steps", "splatting/gaussians": "60steps"}
+    steps = {"volumetric/hash": "300steps", "splatting/gaussians": "200steps"}
     return {
         method: fit_run(
             FitRequest(

@@ -16,7 +16,7 @@ COUNT = dedent("""
 
     {setting}
     faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for repetition in range(4):
+    for repetition in range(12):
         before = faults()
         torch.ones(64 * 2**18)
         last = faults() - before
@@ -25,7 +25,7 @@ COUNT = dedent("""
 
 
 def _faults(setting: str) -> int:
-    """Page faults of writing 64 MB for the fourth time, in a process of its own."""
+    """Page faults of writing 64 MB for the twelfth time, in a process of its own; at first, gaps may be too narrow."""
     return int(subprocess.run([sys.executable, "-c", COUNT.format(setting=setting)], capture_output=True, check=True).stdout)
 
 
