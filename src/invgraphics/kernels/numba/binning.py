@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.kernels.numba.instructions import prefetch
+from invgraphics.kernels.numba.ewa import reach_of
+from invgraphics.kernels.numba.instructions import SOON, prefetch
 from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, prange, scratch, serial, share, threads
 from invgraphics.kernels.types import ALPHA_MIN, Bins, Footprints
 
@@ -108,10 +109,9 @@ def _drawable(x, y, xx, yy, det):
 @parallel
 def _pack(order, means, conics, opacities, features, rows, jobs):
     """Gather footprints front to back; those that cannot be drawn get an ellipse of negative height."""
-    two = np.float32(2.0)
     for job in prange(jobs):
         for r in range(share(len(order), jobs, job), share(len(order), jobs, job + 1)):
-            ahead = index(order[min(r + 8, len(order) - 1)])
+            ahead = index(order[min(r + SOON, len(order) - 1)])
             prefetch(means, ahead)
             prefetch(conics, ahead)
             prefetch(features, ahead)
@@ -124,9 +124,8 @@ def _pack(order, means, conics, opacities, features, rows, jobs):
             # In float64: a c - b² cancels for thin footprints.
             det = np.float32(np.float64(a) * np.float64(c) - np.float64(b) * np.float64(b))
             if _drawable(means[i, 0], means[i, 1], a, c, det) and opacity >= np.float32(ALPHA_MIN):
-                # The visible ellipse is a x² + 2 b x y + c y² = reach, around the mean; its rightmost point lies at y = WIDEST.
-                reach = two * max(np.log(opacity * np.float32(1 / ALPHA_MIN)), np.float32(0.0))
-                size = np.sqrt(reach / det)
+                # The visible ellipse is a x² + 2 b x y + c y² = `reach_of`; its rightmost point lies at y = WIDEST.
+                size = np.sqrt(reach_of(opacity) / det)
                 rows[r, WIDEST] = -b * size / np.sqrt(c)
                 rows[r, HIGHEST] = np.sqrt(a) * size * np.float32(1.00001) + SLACK
                 rows[r, SHEAR] = -b / a

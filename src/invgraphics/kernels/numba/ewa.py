@@ -17,6 +17,7 @@ from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN
 ROTATION, POSITION, FOCAL, CENTRE, SIZE, VIEW = 0, 9, 12, 14, 16, 18
 
 GROUP = int(LANES)
+"""`LANES` for arithmetic with signed numbers, which Numba would turn into floats."""
 # Slots of a group of primitives, LANES values each.
 MEAN, QUATERNION, SCALE, _OPACITY = (index(slot) * LANES for slot in (0, 3, 7, 10))
 _DEPTH, _RADIUS, _FADE, _SCREEN, _CONIC, _PLANE = (index(slot) * LANES for slot in (11, 12, 13, 14, 16, 19))
@@ -188,9 +189,15 @@ def _plane(mean, x, y, root, dilation):
 
 
 @inlined
+def reach_of(opacity):
+    """The quadratic form q at which ``opacity exp(-q / 2)`` has faded to what is skipped; 0 if it never is more."""
+    return _TWO_LN_2 * log2(max(opacity * _PER_ALPHA_MIN, _ONE))
+
+
+@inlined
 def _radius(view, u, v, xx, xy, yy, opacity):
     """Half-width of the visible ellipse's square; 0 where its bounding box misses the image."""
-    reach = np.sqrt(_TWO_LN_2 * log2(max(opacity * _PER_ALPHA_MIN, _ONE)))
+    reach = np.sqrt(reach_of(opacity))
     width, height = reach * np.sqrt(xx), reach * np.sqrt(yy)
     half = _HALF * (xx - yy)
     largest = _HALF * (xx + yy) + np.sqrt(half * half + xy * xy)

@@ -212,6 +212,7 @@ def project_back(
         end = share(n, jobs, job + 1)
         for begin in range(share(n, jobs, job), end, GROUP):
             count = min(GROUP, end - begin)
+            # The last group may be short: what its other lanes still hold must not count.
             lanes[_SEEN : _SEEN + LANES] = _ZERO
             for lane in range(count):
                 i, at = index(begin + lane), index(lane)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, OPACITY, POWER_XX, POWER_XY, POWER_YY
-from invgraphics.kernels.numba.instructions import lowest_bit, prefetch
+from invgraphics.kernels.numba.instructions import SOON, lowest_bit, prefetch
 from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, inside, placed
 from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -198,7 +198,7 @@ def _walk_tile(
     for entry in range(first, last):
         if not alive:
             break
-        ahead = index(entries[index(min(entry + 6, last - 1))])
+        ahead = index(entries[index(min(entry + SOON, last - 1))])
         prefetch(rows, ahead)
         prefetch(sums, ahead)
         r, blocks = index(entries[index(entry)]), touched[index(entry)] & alive
