@@ -1,8 +1,10 @@
-"""How Numba is set up here: compiler flags, threads, scratch memory and the message at the first compilation."""
+"""How Numba is set up here: compiler flags, where compilation happens, threads and scratch memory."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -19,6 +21,8 @@ import torch
 from numba.core import event
 
 PACKAGE = __name__.rpartition(".")[0]
+PARTS = ("splats", "samples")
+"""Functions of `warming` that together call every kernel; each takes about as long to compile."""
 
 FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """LLVM's fast-math without ``nnan`` and ``ninf``: comparisons must sort out NaN and infinity, not assume them away."""
@@ -31,15 +35,87 @@ def _njit(**options: Any) -> _Decorator:
     return partial(nb.njit, error_model="numpy", no_cfunc_wrapper=True, **options)
 
 
-parallel = _njit(parallel=True, cache=True, nogil=True, fastmath=FASTMATH)
+class _NotCachedError(Exception):
+    """A kernel would have to be compiled in this process."""
+
+
+class _Compiler(event.Listener):
+    """Has kernels compiled, all at once, by processes that end afterwards; Numba's event comes when its cache has no match.
+
+    What those could not provide (they cannot start, the cache cannot be written, they do not know these types) is compiled
+    here.
+    """
+
+    def __init__(self) -> None:
+        self.here = False
+        self.kernels: set[Any] = set()
+        self._lock = threading.Lock()
+
+    def on_start(self, event: Any) -> None:
+        if not self.here and (event.data or {}).get("dispatcher") in self.kernels:
+            raise _NotCachedError
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+    def run(self) -> None:
+        """Fill the cache, once in the life of this process."""
+        with self._lock:
+            if not self.here:
+                print("compiling kernels, once, about half a minute", file=sys.stderr, flush=True)
+                with contextlib.suppress(OSError):
+                    # The compiler knows one thread only: two processes share the work.
+                    for process in [_warming(part) for part in PARTS]:
+                        process.wait()
+                self.here = True
+
+
+def _warming(part: str) -> subprocess.Popen[bytes]:
+    """A process that runs, and so compiles, one of the `PARTS`."""
+    code = f"from {PACKAGE} import runtime, warming; runtime.compile_here(); warming.{part}()"
+    return subprocess.Popen([sys.executable, "-P", "-c", code], stderr=subprocess.DEVNULL)
+
+
+_compiler = _Compiler()
+event.register("numba:compile", _compiler)
+
+
+def _cached(**options: Any) -> _Decorator:
+    """`_njit` for what Python calls: machine code always comes from the cache on disk, which another process fills.
+
+    A kernel that is compiled and one that is loaded are not the same bits: the loop's body is optimised on its own, and
+    again with the function around it. The process that compiles runs the first version, all later ones the second.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        kernel = _njit(cache=True, nogil=True, **options)(function)
+        load = kernel.compile
+
+        def compile_or_load(signature: Any) -> Any:
+            try:
+                return load(signature)
+            except _NotCachedError:
+                _compiler.run()
+                return load(signature)
+
+        # Those of others, who borrow these decorators, are unknown to `warming`.
+        if function.__module__.startswith(PACKAGE):
+            kernel.compile = compile_or_load
+            _compiler.kernels.add(kernel)
+        return kernel
+
+    return decorate
+
+
+parallel = _cached(parallel=True, fastmath=FASTMATH)
 """Decorator of kernels that loop over jobs with `prange`, one job per thread."""
-serial = _njit(cache=True, nogil=True, fastmath=FASTMATH)
+serial = _cached(fastmath=FASTMATH)
 """Decorator of kernels that one thread runs."""
 inlined = _njit(fastmath=FASTMATH, forceinline=True, no_cpython_wrapper=True)
 """Decorator of functions that kernels call; they are cached as part of those."""
 ordered = _njit(fastmath=FASTMATH - {"reassoc"}, forceinline=True, no_cpython_wrapper=True)
 """`inlined`, with sums added up as they are written: rearranged, they become one chain whose links wait for each other."""
-exact_parallel = _njit(parallel=True, cache=True, nogil=True)
+exact_parallel = _cached(parallel=True)
 exact = _njit(forceinline=True, no_cpython_wrapper=True)
 """`parallel` and `inlined` in plain IEEE arithmetic."""
 
@@ -97,32 +173,9 @@ def scratch(name: str, size: int, dtype: Any = np.float32) -> np.ndarray:
     return buffer[:size]
 
 
-class _Announcement(event.Listener):
-    """Says once that kernels are being compiled; Numba's event comes only when its cache on disk has no match."""
-
-    def __init__(self) -> None:
-        self.compiled = 0
-
-    def on_start(self, event: Any) -> None:
-        dispatcher = (event.data or {}).get("dispatcher")
-        module = getattr(getattr(dispatcher, "py_func", None), "__module__", "")
-        if not module.startswith(PACKAGE):
-            return
-        self.compiled += 1
-        if self.compiled == 1:
-            print("compiling kernels, once, about half a minute", file=sys.stderr, flush=True)
-
-    def on_end(self, event: Any) -> None:
-        pass
-
-
-_announcement = _Announcement()
-event.register("numba:compile", _announcement)
-
-
-def compilations() -> int:
-    """How many kernels this process has had to compile because they were not cached."""
-    return _announcement.compiled
+def compile_here() -> None:
+    """Compile in this process from now on."""
+    _compiler.here = True
 
 
 @inlined

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from time import perf_counter
 
-import numpy as np
 import torch
 
 from invgraphics.core.bounds import Bounds
@@ -20,36 +17,19 @@ from invgraphics.kernels.numba.hash import hash_encode
 from invgraphics.kernels.numba.march import ray_march
 from invgraphics.kernels.numba.projecting import splat_project
 from invgraphics.kernels.numba.rasterising import splat_rasterise
-from invgraphics.kernels.numba.runtime import compilations, split_by_work
 from invgraphics.kernels.numba.ssim import ssim
 from invgraphics.kernels.types import HashGrid, MarchSteps
 
 
 def warm_up() -> float:
-    """Run every kernel forward and backward on tiny input; returns the seconds it took, next to none when all were cached.
+    """Run every kernel forward and backward on tiny input, which has it compiled; returns the seconds it took.
 
-    The compiler knows one thread only, so where there is something to compile a second process does its half.
+    Next to none when everything was cached.
     """
     began = perf_counter()
-    # The smallest kernel tells whether there is a cache.
-    before = compilations()
-    split_by_work(np.zeros(1, np.int64), 1, np.zeros(1, np.int64))
-    work = [sys.executable, "-P", "-c", f"import {__name__} as warming; warming.splats()"]
-    helper = subprocess.Popen(work, stderr=subprocess.DEVNULL) if compilations() > before else None
-    try:
-        _pictures()
-        _samples()
-    finally:
-        if helper is not None:
-            # Where it fails, what it leaves is compiled here.
-            helper.wait()
+    samples()
     splats()
     return perf_counter() - began
-
-
-def _pictures() -> None:
-    image = torch.zeros(8, 8, 3).requires_grad_()
-    ssim(image, torch.zeros_like(image)).backward()
 
 
 def splats() -> None:
@@ -64,7 +44,10 @@ def splats() -> None:
     (image.sum() + alpha.sum()).backward()
 
 
-def _samples() -> None:
+def samples() -> None:
+    """The kernels of ray renderers, and SSIM."""
+    image = torch.zeros(8, 8, 3).requires_grad_()
+    ssim(image, torch.zeros_like(image)).backward()
     unit = torch.full((2, 3), 0.4).requires_grad_()
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)

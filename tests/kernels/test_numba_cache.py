@@ -1,0 +1,62 @@
+"""Machine code comes from the cache on disk, also in the process that found it empty: first runs repeat bit by bit."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BITS = """
+import hashlib, torch
+from invgraphics import kernels
+from invgraphics.bench.subject import activated, camera, gaussian_field, leaves
+
+def bits(*tensors):
+    return hashlib.sha256(b"".join(tensor.detach().numpy().tobytes() for tensor in tensors)).hexdigest()
+
+torch.manual_seed(0)
+table, unit = torch.rand(8, 8, 8, 3).requires_grad_(), torch.rand(5000, 3)
+values = kernels.grid_sample(unit, table)
+print(bits(values, *torch.autograd.grad(values.square().sum(), table)))
+gaussians, seen_by = activated(gaussian_field(3000)), camera(100)
+footprints, rgb = kernels.splat_project(gaussians, seen_by)
+image, alpha = kernels.splat_rasterise(footprints, rgb, 100, 100)
+print(bits(image, alpha, *torch.autograd.grad(image.square().sum() + alpha.sum(), leaves(gaussians))))
+"""
+
+ALONE = """
+import subprocess
+import numpy as np
+from invgraphics.kernels.numba import runtime
+
+def refuse(*arguments, **options):
+    raise PermissionError("no second process here")
+
+subprocess.Popen = refuse
+first = np.empty(3, np.int64)
+runtime.split_by_work(np.array([5, 1, 1, 3]), 2, first)
+print(*first)
+"""
+
+
+def run(code: str, cache: Path, *, cold: bool) -> list[str]:
+    """What a process of its own prints."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    command = [sys.executable, "-c", code]
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400, check=False)
+    assert process.returncode == 0, process.stderr[-3000:]
+    assert ("compiling kernels" in process.stderr) == cold
+    return process.stdout.split()
+
+
+def test_kernels_are_compiled_here_where_no_other_process_can(tmp_path: Path) -> None:
+    assert run(ALONE, tmp_path, cold=True) == ["0", "2", "4"]
+    assert run(ALONE, tmp_path, cold=False) == ["0", "2", "4"]
+
+
+@pytest.mark.slow
+def test_the_first_run_has_the_bits_of_the_second(tmp_path: Path) -> None:
+    first = run(BITS, tmp_path, cold=True)
+    assert len(first) == 2
+    assert run(BITS, tmp_path, cold=False) == first
