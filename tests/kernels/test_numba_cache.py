@@ -55,6 +55,13 @@ def test_kernels_are_compiled_here_where_no_other_process_can(tmp_path: Path) ->
     assert run(ALONE, tmp_path, cold=False) == ["0", "2", "4"]
 
 
+def test_without_a_compiler_the_reference_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    code = "from invgraphics.kernels import dispatch; print(dispatch.in_use(), dispatch.why_not('numba'))"
+    words = run(code, tmp_path, cold=False)
+    assert (words[0], words[2]) == ("reference", "NUMBA_DISABLE_JIT")
+
+
 @pytest.mark.slow
 def test_the_first_run_has_the_bits_of_the_second(tmp_path: Path) -> None:
     first = run(BITS, tmp_path, cold=True)

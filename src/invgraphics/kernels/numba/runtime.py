@@ -20,6 +20,9 @@ import numpy as np
 import torch
 from numba.core import event
 
+if nb.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    raise ImportError("NUMBA_DISABLE_JIT is set")
+
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("splats", "samples")
 """Functions of `warming` that together call every kernel; each takes about as long to compile."""
