@@ -9,6 +9,7 @@ import pytest
 
 BITS = """
 import hashlib, torch
+from dataclasses import replace
 from invgraphics import kernels
 from invgraphics.bench.subject import activated, camera, gaussian_field, leaves
 
@@ -21,8 +22,14 @@ values = kernels.grid_sample(unit, table)
 print(bits(values, *torch.autograd.grad(values.square().sum(), table)))
 gaussians, seen_by = activated(gaussian_field(3000)), camera(100)
 footprints, rgb = kernels.splat_project(gaussians, seen_by)
-image, alpha = kernels.splat_rasterise(footprints, rgb, 100, 100)
-print(bits(image, alpha, *torch.autograd.grad(image.square().sum() + alpha.sum(), leaves(gaussians))))
+print(bits(kernels.splat_median(footprints, 100, 100)))
+for pull in (None, torch.zeros(3000, 2, requires_grad=True)):
+    for receivers in (0, 5):
+        pulled = replace(footprints, pull=pull)
+        image, alpha = kernels.splat_rasterise(pulled, rgb, 100, 100, receivers=receivers)
+        wanted = [*leaves(gaussians), *([] if pull is None else [pull])]
+        loss = image.square().sum() + alpha.sum()
+        print(bits(image, alpha, *torch.autograd.grad(loss, wanted, retain_graph=True)))
 """
 
 ALONE = """
@@ -65,5 +72,5 @@ def test_without_a_compiler_the_reference_is_used(tmp_path: Path, monkeypatch: p
 @pytest.mark.slow
 def test_the_first_run_has_the_bits_of_the_second(tmp_path: Path) -> None:
     first = run(BITS, tmp_path, cold=True)
-    assert len(first) == 2
+    assert len(first) == 6
     assert run(BITS, tmp_path, cold=False) == first

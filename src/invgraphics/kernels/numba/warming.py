@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import perf_counter
 
 import torch
@@ -16,7 +17,7 @@ from invgraphics.kernels.numba.grid import grid_sample
 from invgraphics.kernels.numba.hash import hash_encode
 from invgraphics.kernels.numba.march import ray_march
 from invgraphics.kernels.numba.projecting import splat_project
-from invgraphics.kernels.numba.rasterising import splat_rasterise
+from invgraphics.kernels.numba.rasterising import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
 from invgraphics.kernels.types import HashGrid, MarchSteps
 
@@ -40,8 +41,12 @@ def splats() -> None:
     gaussians = Gaussians(*(torch.full(shape, 0.5).requires_grad_() for shape in shapes))
     footprints, rgb = splat_project(gaussians, camera)
     splat_bin(footprints, 8, 8, 4)
-    image, alpha = splat_rasterise(footprints, rgb, 8, 8)
-    (image.sum() + alpha.sum()).backward()
+    splat_median(footprints, 8, 8)
+    # The backward walk is compiled anew for each setting of its two switches.
+    for pull in (None, torch.zeros(4, 2, requires_grad=True)):
+        for receivers in (0, 1):
+            image, alpha = splat_rasterise(replace(footprints, pull=pull), rgb, 8, 8, receivers=receivers)
+            (image.sum() + alpha.sum()).backward(retain_graph=True)
 
 
 def samples() -> None:
