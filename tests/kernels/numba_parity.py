@@ -15,7 +15,7 @@ from invgraphics.core.field import Gaussians
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
 from invgraphics.kernels.numba.runtime import compile_here
-from invgraphics.kernels.types import HashGrid, MarchSteps
+from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
 
 WIDER = {"xmm": ("ymm", "zmm"), "ymm": ("zmm",), "zmm": ()}
 
@@ -39,7 +39,7 @@ def assert_equal(fast, plain, inputs: list[Tensor], tolerance: float = 1e-5) -> 
 
 
 def samples() -> list[str]:
-    """Hash encoding and compositing; returns the machine code."""
+    """Hash encoding, compositing, and pictures of hash grids; returns the machine code."""
     grid = HashGrid(levels=4, features=2, log2_size=8, base=4, finest=100)
     unit = torch.rand(200, 3) * 1.2 - 0.1
     ours, theirs = (lambda t, k=k: k.hash_encode(unit.to(t.dtype), t, grid) for k in (numba, reference))
@@ -47,7 +47,22 @@ def samples() -> list[str]:
     ray = torch.repeat_interleave(torch.arange(30), torch.randint(0, 40, (30,)))
     inputs = [torch.rand(len(ray)) ** 6 * 2, torch.randn(len(ray), 4)]
     assert_equal(lambda d, c: numba.composite(d, c, ray, 30), lambda d, c: reference.composite(d, c, ray, 30), inputs)
-    return assembly("hash.encode", "hash.encode_back", "composite.accumulate", "composite.accumulate_back")
+    networks = [((torch.randn(16, 8), torch.randn(16)), (torch.randn(4, 16), torch.randn(4)))]
+    networks += [((torch.randn(5, 7), torch.randn(5)), (torch.randn(3, 5), torch.randn(3)))]
+    field = HashField(torch.randn(grid.entries, 2), grid, *networks, "exp", -2.0, 2, "srgb")
+    bounds, rays = box_of_rays()
+    call = rays, torch.rand(8, 8, 8) < 0.5, bounds, MarchSteps(0.05), field
+    for number, true in zip(numba.hash_render(*call), reference.hash_render(*call), strict=True):
+        assert true.abs().max() > 0.1
+        assert (number - true).abs().max() <= 1e-4 * true.abs().max()
+    parts = ("hash.encode", "hash.encode_back", "composite.accumulate", "composite.accumulate_back", "hash_render.render")
+    return assembly(*parts)
+
+
+def box_of_rays() -> tuple[Bounds, Rays]:
+    """Rays from all around into a box."""
+    bounds, origins = Bounds(-torch.ones(3), torch.ones(3)), torch.nn.functional.normalize(torch.randn(60, 3), dim=1) * 3
+    return bounds, bounds.clip(Rays.make(origins, torch.nn.functional.normalize(torch.randn(60, 3) * 0.4 - origins, dim=1)))
 
 
 def pictures() -> list[str]:
@@ -69,9 +84,7 @@ def pictures() -> list[str]:
     assert_equal(lambda *x: render(numba, *x), lambda *x: render(reference, *x), leaves, 2e-4)
     target = torch.rand(37, 45, 3)
     assert_equal(lambda x: numba.ssim(x, target), lambda x: reference.ssim(x, target.double()), [torch.rand(37, 45, 3)])
-    bounds, occupied = Bounds(-torch.ones(3), torch.ones(3)), torch.rand(24, 24, 24) < 0.05
-    origins = torch.nn.functional.normalize(torch.randn(60, 3), dim=1) * 3
-    rays = bounds.clip(Rays.make(origins, torch.nn.functional.normalize(torch.randn(60, 3) * 0.4 - origins, dim=1)))
+    (bounds, rays), occupied = box_of_rays(), torch.rand(24, 24, 24) < 0.05
     ours, theirs = (k.ray_march(rays, occupied, bounds, MarchSteps(0.01), rays.near) for k in (numba, reference))
     assert len(ours.ray) > 0
     assert all(torch.equal(getattr(ours, name), getattr(theirs, name)) for name in ("ray", "t0", "t1", "resume"))

@@ -150,6 +150,17 @@ def test_training_may_begin_with_longer_steps(make_scene: Callable[..., Scene]) 
     assert float(seen.delta[0]) == pytest.approx(sampler.length, rel=1e-5)
 
 
+def test_training_may_end_with_shorter_steps(make_scene: Callable[..., Scene]) -> None:
+    """Four times the steps at the end, twice as many when three quarters are over; before the middle nothing is different."""
+    scene = make_scene()
+    rays, config = scene.bounds.clip(scene.train[0].camera.rays())[:20], replace(SMALL, stop="never", late_steps=1024)
+    sampler, lengths = config.build(scene), []
+    for progress in (0.0, 0.5, 0.75, 1.0):
+        samples, _ = sampler.sample(rays, None, replace(context(scene), progress=progress))  # type: ignore[arg-type]
+        lengths.append(float(samples.delta[0]) / sampler.length)
+    assert lengths == pytest.approx([1, 1, 1 / 2, 1 / 4], rel=1e-4)
+
+
 def test_looks_on_schedule_at_as_many_cells_as_allowed(make_scene: Callable[..., Scene]) -> None:
     scene, looks = make_scene(), []
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.bench.growth import Growth, growths
-from invgraphics.bench.results import BOTH, MACHINE, THREADS, Results
+from invgraphics.bench.results import BOTH, FORWARD_ONLY, MACHINE, THREADS, Results
 from invgraphics.bench.tables import kernels_of, quantity, sizes
 from invgraphics.kernels.dispatch import IMPLEMENTATIONS
 
@@ -58,7 +58,7 @@ def growth_plots(results: Results, folder: Path, look: Look) -> list[Plot]:
     """Time against every size that varies, one plot per kernel and size."""
     groups: dict[tuple[str, str, str, str], list[Growth]] = {}
     for g in growths(kernels_of(results)):
-        if g.direction == BOTH or g.operation == "ray_march":
+        if g.direction == BOTH or g.operation in FORWARD_ONLY:
             groups.setdefault((g.operation, g.along, str(g.fixed), g.direction), []).append(g)
     plots = []
     for number, ((operation, along, _, direction), members) in enumerate(groups.items()):

@@ -11,6 +11,8 @@ from invgraphics.bench.timing import Timing
 
 FORWARD, BOTH = "forward", "forward+backward"
 """Directions."""
+FORWARD_ONLY = ("ray_march", "hash_render")
+"""Operations without a gradient."""
 
 SIZE_KEYS = (
     "gaussians", "width", "points", "levels", "log2_size", "hidden", "resolution", "channels", "rays", "samples", "bytes",

@@ -12,7 +12,7 @@ from invgraphics.bench import PARTS, iterations, limits, sample_cases, splat_cas
 from invgraphics.bench.case import Case
 from invgraphics.bench.memory import footprints
 from invgraphics.bench.peers import peers
-from invgraphics.bench.results import BOTH, MACHINE, THREADS, Measurement, Results, Skipped
+from invgraphics.bench.results import BOTH, FORWARD_ONLY, MACHINE, THREADS, Measurement, Results, Skipped
 from invgraphics.bench.timing import Effort, alternate
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.dispatch import IMPLEMENTATIONS, here, why_not
@@ -28,6 +28,7 @@ _CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
     "grid": sample_cases.grid_sample,
     "march": sample_cases.ray_march,
     "composite": sample_cases.composite,
+    "picture": sample_cases.hash_render,
     "ssim": splat_cases.ssim,
 }
 
@@ -154,7 +155,7 @@ def _measure_threads(request: Request, results: Results) -> None:
             torch.set_num_threads(count)
             for case in _promised():
                 for m in measure_case(case, alone, results.skipped):
-                    if m.direction == BOTH or case.operation == "ray_march":
+                    if m.direction == BOTH or case.operation in FORWARD_ONLY:
                         results.measurements.append(_renamed(m))
     finally:
         torch.set_num_threads(most)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 
@@ -16,7 +17,7 @@ from invgraphics.bench.results import BOTH, FORWARD
 from invgraphics.bench.splat_cases import both_ways, without_gradient
 from invgraphics.bench.subject import bounds, camera, occupied
 from invgraphics.core import Rays
-from invgraphics.kernels.types import HashGrid, MarchSteps
+from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
 
 GATE = {"levels": 16, "log2_size": 15, "points": 1 << 16}
 """The size that the project's promise about hash grids is made for."""
@@ -38,6 +39,11 @@ PICTURE = 400
 """Edge of the picture whose pixels' rays are marched, taken at random."""
 MARCH_BYTES = 8 + 4 + 4
 """What a kept interval is written as: ray, start, end."""
+
+PICTURE_GRID = HashGrid(levels=10, log2_size=18, base=16, finest=1024)
+PICTURE_WIDTH, HANDED, BANDS, PICTURE_STEPS = 64, 15, 4, 256
+"""A hash field of the size that is fitted in minutes, and steps across the diagonal."""
+PICTURE_RAYS, QUICK_PICTURE_RAYS = (1 << 10, 1 << 12, 1 << 14), (1 << 10, 1 << 12)
 
 COMPOSITE_SAMPLES, QUICK_COMPOSITE_SAMPLES = (1 << 16, 1 << 18, 1 << 20), (1 << 16, 1 << 18)
 SAMPLES_PER_RAY, CHANNELS = 32, 4
@@ -65,6 +71,12 @@ def ray_march(quick: bool) -> Iterator[Case]:
     """Marching through an occupancy grid over rays."""
     for rays in QUICK_MARCH_RAYS if quick else MARCH_RAYS:
         yield Case("ray_march", {"resolution": OCCUPANCY, "rays": rays}, lambda rays=rays: _march(rays))
+
+
+def hash_render(quick: bool) -> Iterator[Case]:
+    """Pictures of a hash grid in one pass over rays; nothing is opaque, so that every step is looked at."""
+    for rays in QUICK_PICTURE_RAYS if quick else PICTURE_RAYS:
+        yield Case("hash_render", {"resolution": OCCUPANCY, "rays": rays}, lambda rays=rays: _picture(rays))
 
 
 def composite(quick: bool) -> Iterator[Case]:
@@ -113,6 +125,25 @@ def _march(count: int) -> dict[str, Pass]:
     steps = MarchSteps(2 * region.radius / STEPS_PER_DIAGONAL)
     march = lambda: kernels.ray_march(rays, cells, region, steps, rays.near)  # noqa: E731
     return {FORWARD: Pass(march, float(MARCH_BYTES * len(march().ray)), limits.triad(), "bytes")}
+
+
+def _picture(count: int) -> dict[str, Pass]:
+    generator = torch.Generator().manual_seed(0)
+
+    def network(*widths: int) -> tuple[tuple[Tensor, Tensor], ...]:
+        sizes = itertools.pairwise(widths)
+        return tuple((torch.randn(outs, ins, generator=generator) / ins**0.5, torch.zeros(outs)) for ins, outs in sizes)
+
+    table = torch.randn(PICTURE_GRID.entries, 2, generator=generator)
+    geometry = network(2 * PICTURE_GRID.levels, PICTURE_WIDTH, 1 + HANDED)
+    colour = network(HANDED + BANDS**2, PICTURE_WIDTH, PICTURE_WIDTH, 3)
+    field = HashField(table, PICTURE_GRID, geometry, colour, "exp", 0.0, BANDS, "srgb")
+    region, cells, rays = bounds(), occupied(OCCUPANCY), some_rays(count)
+    steps = MarchSteps(2 * region.radius / PICTURE_STEPS)
+    render = lambda: kernels.hash_render(rays, cells, region, steps, field)  # noqa: E731
+    products = sum(weight.numel() for weight, _ in geometry + colour)
+    looks = len(kernels.ray_march(rays, cells, region, steps, rays.near).ray)
+    return {FORWARD: Pass(render, 2.0 * products * looks, limits.sgemm(), "flop")}
 
 
 def some_rays(count: int) -> Rays:

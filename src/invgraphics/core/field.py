@@ -182,22 +182,26 @@ class Encoding(nn.Module, ABC):
 
 
 class NoGradDensity:
-    """A field's density as a plain function, outside the graph."""
+    """A field's density as a plain function, outside the graph.
+
+    Attributes:
+        field: whose.
+    """
 
     def __init__(self, field: Field) -> None:
-        self._field = field
+        self.field = field
 
     def __call__(self, samples: Samples) -> Float[Tensor, " m"]:
         """The density alone."""
         with torch.no_grad():
-            values = self._field.query(samples, Quantity.DENSITY)
+            values = self.field.query(samples, Quantity.DENSITY)
         assert values.density is not None
         return values.density
 
     def look(self, samples: Samples) -> FieldValues:
         """The density and, of a field that has some, the features that it would start from to say a colour."""
         with torch.no_grad():
-            return self._field.query(samples, Quantity.DENSITY | (self._field.provides & Quantity.FEATURES))
+            return self.field.query(samples, Quantity.DENSITY | (self.field.provides & Quantity.FEATURES))
 
 
 def no_grad_density(field: Field) -> NoGradDensity:

@@ -10,9 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import linear, relu, softplus
 
-EXP_LIMIT = 15.0
-"""Where `truncated_exp` stops growing (Instant-NGP's source clips the derivative there)."""
-
+from invgraphics.kernels.types import EXP_LIMIT
 
 SPHERE_POINTS = 4096
 """Points on which `Mlp.initialise_as_sphere` corrects its output layer."""
@@ -44,6 +42,11 @@ class Mlp(nn.Module):
     def forward(self, x: Float[Tensor, "m inputs"], outputs: int | None = None) -> Float[Tensor, "m outputs"]:
         """The network's first ``outputs`` output features (``None``: all); the others are not computed."""
         return linear(self._last_hidden(x), self.output.weight[:outputs], self.output.bias[:outputs])
+
+    def layers(self) -> tuple[tuple[Tensor, Tensor], ...]:
+        """Weights and biases of all layers, the output last, detached."""
+        layers = [layer for layer in (*self.hidden, self.output) if isinstance(layer, nn.Linear)]
+        return tuple((layer.weight.detach(), layer.bias.detach()) for layer in layers)
 
     def _last_hidden(self, x: Float[Tensor, "m inputs"]) -> Float[Tensor, "m width"]:
         h = x

@@ -26,7 +26,9 @@ from invgraphics.core.field import Encoding, Field, Quantity
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies, frequency_width
+from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.mlp import Mlp, truncated_exp
+from invgraphics.kernels.types import HashField
 
 CPU_CHUNK = 8192
 """Samples that go through the networks at once on a CPU: larger activations cost more in page faults than in arithmetic."""
@@ -124,7 +126,7 @@ class NeuralField(Field):
         super().__init__()
         self.config = config
         self.provides = _POINTWISE[config.geometry]
-        self.colour = colour
+        self.colour: Literal["srgb", "linear"] = colour
         self._space: Space = bounds.space
         self._near = bounds.near
         self.register_buffer("lo", bounds.lo.clone())
@@ -189,6 +191,17 @@ class NeuralField(Field):
             normal=normal,
             features=torch.cat(handed) if Quantity.FEATURES in want else None,
         )
+
+    def hash_field(self) -> HashField | None:
+        """The parts of a plain hash grid; ``None`` for other encodings and networks, and while a window is open."""
+        config, encoding = self.config, self.encoding
+        plain = config.geometry == "density" and config.skip < 0 and config.direction in ("sh", "none")
+        if not plain or not isinstance(encoding, HashEncoding) or encoding.detail is not None:
+            return None
+        geometry, colour = (net.layers() for net in (self.geometry_net, self.colour_net))
+        bands = config.direction_degree if config.direction == "sh" else 0
+        activation, bias = config.density_activation, config.density_bias
+        return HashField(encoding.table.detach(), encoding.grid, geometry, colour, activation, bias, bands, self.colour)
 
     def _encode(self, samples: Samples, position: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
         unit = self.bounds.to_unit(position)

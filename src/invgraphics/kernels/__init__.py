@@ -15,11 +15,12 @@ from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.dispatch import choose
+from invgraphics.kernels.dispatch import compiled as compiled
 from invgraphics.kernels.dispatch import in_use as in_use
 from invgraphics.kernels.dispatch import use as use
 from invgraphics.kernels.dispatch import using as using
 from invgraphics.kernels.dispatch import warm_up as warm_up
-from invgraphics.kernels.types import Bins, Footprints, HashGrid, March, MarchSteps
+from invgraphics.kernels.types import Bins, Footprints, HashField, HashGrid, March, MarchSteps
 
 
 def hash_encode(
@@ -58,6 +59,55 @@ def ray_march(
         start: where each ray begins or resumes (``resume`` of an earlier march).
     """
     return choose("ray_march", rays.origins)(rays, occupied, bounds, steps, start)
+
+
+def hash_march(
+    rays: Rays,
+    occupied: Bool[Tensor, "r r r"],
+    bounds: Bounds,
+    steps: MarchSteps,
+    field: HashField,
+    start: Float[Tensor, " n"],
+    transmittance: float,
+) -> March:
+    """`ray_march` as far as light reaches in a hash grid: per-ray early termination inside the march.
+
+    Args:
+        rays: with near and far set.
+        occupied: as in `ray_march`.
+        bounds: as in `ray_march`.
+        steps: step lengths; ``limit`` is of no concern.
+        field: what is there.
+        start: where each ray begins.
+        transmittance: least share of light that must reach a step for it to be kept.
+    """
+    return choose("hash_march", rays.origins)(rays, occupied, bounds, steps, field, start, transmittance)
+
+
+def hash_render(
+    rays: Rays,
+    occupied: Bool[Tensor, "r r r"],
+    bounds: Bounds,
+    steps: MarchSteps,
+    field: HashField,
+    transmittance: float = 0.0,
+    unseen: float = 0.0,
+) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
+    """Volume rendering of a hash grid and its networks, in one pass. Not differentiable.
+
+    Args:
+        rays: with near and far set.
+        occupied: cells of the unit cube that are looked at, as in `ray_march`.
+        bounds: the region's map to the unit cube.
+        steps: step lengths.
+        field: what is there.
+        transmittance: a ray may stop when less than this share of its light is left.
+        unseen: most that all samples together that are not asked for their colour may contribute to a ray, in [0, 1].
+
+    Returns:
+        Sums of w * (radiance, distance), and of w, per ray (see `composite`).
+    """
+    return choose("hash_render", rays.origins)(rays, occupied, bounds, steps, field, transmittance, unseen)
 
 
 def composite(

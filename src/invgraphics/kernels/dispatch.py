@@ -84,6 +84,11 @@ def choose(operation: str, like: torch.Tensor) -> Any:
     return getattr(_module("reference"), operation)
 
 
+def compiled(operation: str, like: torch.Tensor) -> bool:
+    """Whether `choose` would find something faster than the reference."""
+    return choose(operation, like) is not getattr(_module("reference"), operation)
+
+
 def _name_for(kind: str) -> str:
     """What is asked for on a kind of device: what was forced, else what is written for it."""
     return _forced or next((name for name, device in DEVICES.items() if device == kind), "reference")

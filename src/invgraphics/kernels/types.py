@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -52,6 +53,42 @@ class HashGrid:
     def entries(self) -> int:
         """Entries of the whole table."""
         return self.offsets[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class HashField:
+    """A density and a radiance by two ReLU networks over a hash grid, as a picture needs them (Instant-NGP, §5).
+
+    Attributes:
+        table: features of all levels.
+        grid: geometry of the levels.
+        geometry: weights (outs, ins) and biases of each layer of the network that says the raw density, and after it what it
+            hands to the other one.
+        colour: the same of the network that says the raw radiance, from that and the direction.
+        density: what makes a density of the sum of raw density and ``bias``; ``exp`` stops growing at exp(15).
+        bias: see ``density``.
+        bands: bands of spherical harmonics of the direction that the colour network sees, 0 to 4.
+        colour_space: radiance is the raw one's sigmoid for ``srgb``, its softplus for ``linear``.
+    """
+
+    table: Float[Tensor, "entries f"]
+    grid: HashGrid
+    geometry: tuple[tuple[Tensor, Tensor], ...]
+    colour: tuple[tuple[Tensor, Tensor], ...]
+    density: Literal["exp", "softplus", "relu"]
+    bias: float
+    bands: int
+    colour_space: Literal["srgb", "linear"]
+
+
+@runtime_checkable
+class _MaybeHashField(Protocol):
+    def hash_field(self) -> HashField | None: ...
+
+
+def hash_field(field: object) -> HashField | None:
+    """What a field is made of, detached, where its method of this name says that it is a `HashField`."""
+    return field.hash_field() if isinstance(field, _MaybeHashField) else None
 
 
 @dataclass(frozen=True)
@@ -143,6 +180,8 @@ class Bins:
     rows: int
 
 
+EXP_LIMIT = 15.0
+"""Where an exponential density stops growing (Instant-NGP's source clips its derivative there)."""
 ALPHA_MIN = 1 / 255
 """Responses below this are skipped (3DGS, appendix C)."""
 ALPHA_MAX = 0.99

@@ -12,9 +12,9 @@ from torch import Tensor
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, FieldValues, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.core.field import Density, NoGradDensity
-from invgraphics.kernels.types import March, MarchSteps
+from invgraphics.kernels.types import March, MarchSteps, hash_field
 from invgraphics.renderers.samplers import uniform
-from invgraphics.renderers.termination import in_front
+from invgraphics.renderers.termination import Look, in_front
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class OccupancyConfig:
         early_steps: the same at the start of training; the number moves to ``steps_per_diagonal`` over the first quarter of the
             fit. While there is fog, few long steps tell as much as many short ones, and more rays can be afforded. ``None``:
             no change.
+        late_steps: the same at the end of training; the number moves there over the second half of the fit. Shorter steps
+            show thin things, once they are all that is left to be learned. ``None``: no change.
         cone: growth of the step with distance; ``None`` means 0 in a box and 4 / ``steps_per_diagonal`` (Instant-NGP's
             1/256) in a contracted space.
         grace: training steps before the first refresh. What is thinner than the threshold before it was ever seen would be
@@ -49,6 +51,7 @@ class OccupancyConfig:
     steps_per_diagonal: int = 1024
     evaluation_steps: int | None = None
     early_steps: int | None = None
+    late_steps: int | None = None
     cone: float | None = None
     grace: int = 0
     decay: float = 0.95
@@ -62,7 +65,16 @@ class OccupancyConfig:
     wave: int = 6
 
     def __post_init__(self) -> None:
-        for key in ("resolution", "steps_per_diagonal", "evaluation_steps", "early_steps", "every", "cells", "wave"):
+        for key in (
+            "resolution",
+            "steps_per_diagonal",
+            "evaluation_steps",
+            "early_steps",
+            "late_steps",
+            "every",
+            "cells",
+            "wave",
+        ):
             value = getattr(self, key)
             if value is not None and value < 1:
                 raise ValueError(f"{key} must be at least 1, not {value}")
@@ -82,8 +94,9 @@ class OccupancyConfig:
 
     def steps_at(self, progress: float) -> float:
         """Training steps across the diagonal at a point of the fit."""
-        early = self.early_steps or self.steps_per_diagonal
-        return early * (self.steps_per_diagonal / early) ** min(1.0, 4 * progress)
+        usual = self.steps_per_diagonal
+        early, late = self.early_steps or usual, self.late_steps or usual
+        return early * (usual / early) ** min(1.0, 4 * progress) * (late / usual) ** max(0.0, 2 * progress - 1)
 
     def build(self, scene: Scene) -> Occupancy:
         """The sampler, every cell occupied."""
@@ -116,29 +129,45 @@ class Occupancy(Sampler):
 
     def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Samples in occupied cells, in front of what is opaque; with their densities where those were asked for."""
-        march = self._march(rays, ctx)
-        if self.config.stop == "always" or (self.config.stop == "evaluation" and not ctx.training):
+        if self.config.stop == "never" or (self.config.stop == "evaluation" and ctx.training):
+            march = self._march(rays, ctx)
+            return Samples.on(rays, march.ray, march.t0, march.t1), ()
+        look: Look = lambda samples: FieldValues(density=density(samples))  # noqa: E731
+        if isinstance(density, NoGradDensity) and torch.is_grad_enabled():
+            march = self._march_in_one_pass(rays, density, ctx)
+            if march is not None:
+                return Samples.on(rays, march.ray, march.t0, march.t1), ()
+        elif isinstance(density, NoGradDensity):
             # Features are of use to the renderer only where it needs no gradients through them.
-            wanted = density.look if isinstance(density, NoGradDensity) and not torch.is_grad_enabled() else None
-            look = wanted or (lambda samples: FieldValues(density=density(samples)))
-            return in_front(rays, march, look, self.config.transmittance, self.config.wave), ()
-        return Samples.on(rays, march.ray, march.t0, march.t1), ()
+            look = density.look
+        return in_front(rays, self._march(rays, ctx), look, self.config.transmittance, self.config.wave), ()
 
-    def _steps(self, ctx: Context) -> MarchSteps:
+    @torch.no_grad()
+    def _march_in_one_pass(self, rays: Rays, density: NoGradDensity, ctx: Context) -> March | None:
+        """A march that stops by itself, if there is a kernel for what the field is made of and for these steps."""
+        parts, steps, boxed = hash_field(density.field), self.steps(ctx), ctx.bounds.space == "box"
+        if parts is None or not boxed or steps.cone > 0 or not kernels.compiled("hash_march", parts.table):
+            return None
+        start = self._start(rays, steps, ctx)
+        return kernels.hash_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
+
+    def steps(self, ctx: Context) -> MarchSteps:
         """How long steps are now."""
         usual = self.config.steps_per_diagonal
         now = self.config.steps_at(ctx.progress) if ctx.training else self.config.evaluation_steps or usual
         return MarchSteps(self.length * usual / now, self.cone * usual / now)
 
+    def _start(self, rays: Rays, steps: MarchSteps, ctx: Context) -> Float[Tensor, " n"]:
+        """Where rays begin: in training their whole lattice of steps is shifted, so that every distance gets its turn."""
+        if not ctx.training:
+            return rays.near
+        return rays.near + uniform((len(rays),), ctx, like=rays.near) * (steps.cone * rays.near).clamp_min(steps.step)
+
     @torch.no_grad()
     def _march(self, rays: Rays, ctx: Context) -> March:
         """March all rays to their ends."""
-        steps = self._steps(ctx)
-        start = rays.near
-        if ctx.training:
-            # The whole lattice of steps is shifted, so that over many visits every distance gets its turn.
-            start = start + uniform((len(rays),), ctx, like=start) * (steps.cone * start).clamp_min(steps.step)
-        march = kernels.ray_march(rays, self.occupied, ctx.bounds, steps, start)
+        steps = self.steps(ctx)
+        march = kernels.ray_march(rays, self.occupied, ctx.bounds, steps, self._start(rays, steps, ctx))
         parts = [march]
         going = torch.nonzero(march.resume < rays.far)[:, 0]
         while len(going):
@@ -192,7 +221,7 @@ class Occupancy(Sampler):
         corner = torch.stack(torch.unravel_index(cells, self.ema.shape), dim=1)
         unit = (corner + uniform((len(cells), 3), ctx, like=self.ema)) / self.config.resolution
         position = ctx.bounds.from_unit(unit.to(ctx.bounds.lo.dtype))
-        distance, steps = (position - ctx.bounds.centre).norm(dim=1), self._steps(ctx)
+        distance, steps = (position - ctx.bounds.centre).norm(dim=1), self.steps(ctx)
         return density(Samples.at(position)) * (steps.cone * distance).clamp_min(steps.step)
 
 

@@ -10,6 +10,7 @@ import torch
 from invgraphics import kernels
 from invgraphics.config import Slot
 from invgraphics.core import (
+    Camera,
     Context,
     Field,
     FieldValues,
@@ -23,6 +24,9 @@ from invgraphics.core import (
     Trace,
     no_grad_density,
 )
+from invgraphics.kernels.types import hash_field
+from invgraphics.renderers.base import picture
+from invgraphics.renderers.occupancy import Occupancy
 from invgraphics.renderers.quadrature import integrate
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.termination import weighty
@@ -69,6 +73,24 @@ class Volumetric(RayRenderer):
             values = query(field, samples, want, ctx.chunk)
         assert values.density is not None
         return integrate(rays, samples, values, values.density * samples.delta, levels)
+
+    def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
+        """See `Renderer.render_image`; where a kernel does all of it in one pass, there is nothing to trace."""
+        rendering = self._at_once(field, camera, ctx)
+        return super().render_image(field, camera, ctx) if rendering is None else (rendering, Trace())
+
+    def _at_once(self, field: Field, camera: Camera, ctx: Context) -> Rendering | None:
+        """A picture that nobody asks a gradient or normals of, if there is a kernel for the whole of it."""
+        sampler, normals = self.sampler, ctx.geometry and Quantity.NORMAL in field.provides
+        if torch.is_grad_enabled() or ctx.training or normals or not isinstance(sampler, Occupancy):
+            return None
+        parts = hash_field(field)
+        if parts is None or sampler.config.stop == "never" or not kernels.compiled("hash_render", parts.table):
+            return None
+        rays, given = camera.rays(), (sampler.occupied, ctx.bounds, sampler.steps(ctx), parts)
+        sums, alpha = kernels.hash_render(ctx.bounds.clip(rays), *given, sampler.config.transmittance, UNSEEN)
+        flat = picture(sums[:, :3], alpha, sums[:, 3], None, rays.far)
+        return flat.reshape(camera.height, camera.width)
 
     def update(self, field: Field, ctx: Context) -> None:
         """Let the sampler refresh what it remembers of the field."""

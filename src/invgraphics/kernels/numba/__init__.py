@@ -1,13 +1,16 @@
 """Float32 kernels for the CPU, compiled by Numba at first use and cached on disk.
 
 `runtime` holds the compiler settings; the operations are those of `invgraphics.kernels`. What a kernel does not cover goes to
-the reference: discs, lenses that are being optimised, gradients through `Footprints.planes`, the Jacobian of the hash encoding.
+the reference: discs, lenses that are being optimised, gradients through `Footprints.planes`, the Jacobian of the hash encoding,
+pictures of hash grids with other than two features per entry.
 """
 
 from invgraphics.kernels.numba.binning import splat_bin as splat_bin
 from invgraphics.kernels.numba.composite import composite as composite
 from invgraphics.kernels.numba.grid import grid_sample as grid_sample
 from invgraphics.kernels.numba.hash import hash_encode as hash_encode
+from invgraphics.kernels.numba.hash_march import hash_march as hash_march
+from invgraphics.kernels.numba.hash_render import hash_render as hash_render
 from invgraphics.kernels.numba.march import ray_march as ray_march
 from invgraphics.kernels.numba.projecting import splat_project as splat_project
 from invgraphics.kernels.numba.rasterising import splat_median as splat_median

@@ -27,7 +27,7 @@ _ZERO = np.float32(0.0)
 
 
 @inlined
-def _absorb(optical_depth):
+def absorb(optical_depth):
     """Transmittance of one interval (float64, so that products of many stay exact) and its complement."""
     loss, scale = power_minus_one(-min(optical_depth, _OPAQUE) * _LOG2E)
     if scale == np.float32(1.0):
@@ -57,7 +57,7 @@ def accumulate(optical_depth, channels, ray, jobs, weights, after, sums, alpha):
             if ray[i] != current:
                 transmittance, current = 1.0, ray[i]
             r = index(current)
-            passed, opacity = _absorb(optical_depth[i])
+            passed, opacity = absorb(optical_depth[i])
             weight = np.float32(transmittance) * opacity
             transmittance *= passed
             weights[i], after[i] = weight, np.float32(transmittance)

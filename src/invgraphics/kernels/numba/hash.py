@@ -88,7 +88,7 @@ def encode_back(planes, gradient, width, cells, offsets, masks, jobs, to_table):
 
 
 @cache
-def _levels(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def levels_of(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cells along an edge, first entries, and masks of the hash (0 where all vertices are stored) of every level."""
     cells = np.array(grid.resolutions, np.int64)
     hashed = (cells + 1) ** 3 > 2**grid.log2_size
@@ -107,7 +107,7 @@ class _Encode(torch.autograd.Function):
     def forward(ctx: Any, unit: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
         width = table.shape[1]
         out = unit.new_empty(len(unit), grid.levels * width)
-        encode(_planes(unit), array(table).reshape(-1), index(width), *_levels(grid), threads(), out.numpy())
+        encode(_planes(unit), array(table).reshape(-1), index(width), *levels_of(grid), threads(), out.numpy())
         ctx.save_for_backward(unit, table)
         ctx.grid = grid
         return out
@@ -129,7 +129,7 @@ class _Slope(torch.autograd.Function):
         ctx.save_for_backward(unit, table, gradient)
         ctx.grid, to_unit, width = grid, torch.empty(unit.shape), index(table.shape[1])
         flat = array(table).reshape(-1)
-        locate_back(array(unit), flat, array(gradient), width, *_levels(grid), threads(), to_unit.numpy())
+        locate_back(array(unit), flat, array(gradient), width, *levels_of(grid), threads(), to_unit.numpy())
         return to_unit
 
     @staticmethod
@@ -137,7 +137,7 @@ class _Slope(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         unit, table, gradient = ctx.saved_tensors
         along = torch.where((unit >= 0) & (unit <= 1), grad_outputs[0], 0.0)
-        points, direction, width, levels = array(unit), array(along), index(table.shape[1]), _levels(ctx.grid)
+        points, direction, width, levels = array(unit), array(along), index(table.shape[1]), levels_of(ctx.grid)
         to_table = to_gradient = None
         if ctx.needs_input_grad[1]:
             to_table = torch.empty(table.shape)
@@ -155,7 +155,7 @@ class _Scatter(torch.autograd.Function):
     def forward(ctx: Any, unit: Tensor, gradient: Tensor, shape: torch.Size, grid: HashGrid) -> Tensor:
         to_table = torch.empty(shape)
         flat = to_table.numpy().reshape(-1)
-        encode_back(_planes(unit), array(gradient), index(shape[1]), *_levels(grid), threads(), flat)
+        encode_back(_planes(unit), array(gradient), index(shape[1]), *levels_of(grid), threads(), flat)
         return to_table
 
 

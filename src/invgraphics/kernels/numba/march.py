@@ -30,7 +30,7 @@ _ZERO, _ONE, _TWO = (np.float32(value) for value in (0.0, 1.0, 2.0))
 
 
 @exact
-def _to_unit(box, contracted, x, y, z):
+def to_unit(box, contracted, x, y, z):
     """`Bounds.to_unit`; ``box`` holds its centre and half edges."""
     x, y, z = (x - box[0]) / box[3], (y - box[1]) / box[4], (z - box[2]) / box[5]
     if contracted:
@@ -72,7 +72,7 @@ def _pace(direction, half):
 
 
 @exact
-def _walk(origin, direction, first, far, occupied, gaps, shift, box, contracted, step, cone, t0, t1):
+def walk_ray(origin, direction, first, far, occupied, gaps, shift, box, contracted, step, cone, t0, t1):
     """Keep intervals of one ray until ``far`` or until ``t0`` is full; returns their number and where to go on."""
     resolution = occupied.shape[0]
     cell, per_step = _ONE / np.float32(resolution), _ONE / step
@@ -89,7 +89,7 @@ def _walk(origin, direction, first, far, occupied, gaps, shift, box, contracted,
         end = min(after, far)
         middle = (t + end) / _TWO
         if middle >= free:
-            ux, uy, uz = _to_unit(
+            ux, uy, uz = to_unit(
                 box,
                 contracted,
                 origin[0] + middle * direction[0],
@@ -170,7 +170,7 @@ def walk(origins, directions, start, far, occupied, gaps, shift, box, contracted
     for job in prange(jobs):
         # Neighbouring rays cost alike: dealing them out in turn balances the jobs.
         for i in range(job, len(start), jobs):
-            counts[i], resume[i] = _walk(
+            counts[i], resume[i] = walk_ray(
                 origins[i], directions[i], start[i], far[i], occupied, gaps, shift, box, contracted, step, cone, t0[i], t1[i]
             )
 
@@ -186,11 +186,8 @@ def gather(t0, t1, counts, ends, first_ray, jobs, ray, packed0, packed1):
                 ray[at], packed0[at], packed1[at] = first_ray + i, t0[i, k], t1[i, k]
 
 
-@torch.no_grad()
-def ray_march(
-    rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps, start: Float[Tensor, " n"]
-) -> March:
-    """See `invgraphics.kernels.ray_march`."""
+def surroundings(occupied: Bool[Tensor, "r r r"], bounds: Bounds) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """What a walk needs besides the ray: the box, its cells, blocks' distances to occupied ones, and the blocks' shift."""
     box = array(torch.cat([bounds.centre, bounds.half]).float())
     cells = array(occupied)
     shift = max(0, (-(-len(cells) // BLOCKS) - 1).bit_length())
@@ -198,6 +195,15 @@ def ray_march(
     summarise(cells, shift, gaps)
     if bounds.space == "box":
         measure(gaps)
+    return box, cells, gaps, shift
+
+
+@torch.no_grad()
+def ray_march(
+    rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps, start: Float[Tensor, " n"]
+) -> March:
+    """See `invgraphics.kernels.ray_march`."""
+    box, cells, gaps, shift = surroundings(occupied, bounds)
     resume = torch.empty(len(rays))
     parts = []
     limit = _most(rays, start, steps)
@@ -211,18 +217,27 @@ def ray_march(
         lines = (array(x[some]) for x in (rays.origins, rays.directions, start, rays.far))
         settings = (box, bounds.space == "contracted", np.float32(steps.step), np.float32(steps.cone), threads())
         walk(*lines, cells, gaps, shift, *settings, t0, t1, counts, resume[some].numpy())
-        ends = np.cumsum(counts)
-        kept = int(ends[-1])
-        packed = (torch.empty(kept, dtype=torch.int64), torch.empty(kept), torch.empty(kept))
-        gather(t0, t1, counts, ends, first, threads(), *(x.numpy() for x in packed))
-        parts.append(packed)
+        parts.append(packed(t0, t1, counts, first))
     if not parts:
         return March(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0), resume)
     ray, t0, t1 = parts[0] if len(parts) == 1 else (torch.cat(columns) for columns in zip(*parts, strict=True))
     return March(ray, t0, t1, resume)
 
 
+def packed(t0: np.ndarray, t1: np.ndarray, counts: np.ndarray, first: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Ray, begin and end of all intervals: ``counts[i]`` of each row, which is ray ``first + i``."""
+    ends = np.cumsum(counts)
+    kept = int(ends[-1]) if len(ends) else 0
+    columns = torch.empty(kept, dtype=torch.int64), torch.empty(kept), torch.empty(kept)
+    gather(t0, t1, counts, ends, first, threads(), *(column.numpy() for column in columns))
+    return columns
+
+
+def longest(rays: Rays, start: Float[Tensor, " n"]) -> float:
+    """Length of the longest way that a ray has before it."""
+    return max(float((rays.far - start).nan_to_num(0.0).max()), 0.0) if len(rays) else 0.0
+
+
 def _most(rays: Rays, start: Float[Tensor, " n"], steps: MarchSteps) -> int:
     """Most intervals that any ray can keep: steps are never shorter than ``steps.step``."""
-    longest = float((rays.far - start).nan_to_num(0.0).max()) if len(rays) else 0.0
-    return min(steps.limit, int(min(max(longest, 0.0) / steps.step, steps.limit)) + 2)
+    return min(steps.limit, int(min(longest(rays, start) / steps.step, steps.limit)) + 2)

@@ -15,11 +15,13 @@ from invgraphics.kernels.numba.binning import splat_bin
 from invgraphics.kernels.numba.composite import composite
 from invgraphics.kernels.numba.grid import grid_sample
 from invgraphics.kernels.numba.hash import hash_encode
+from invgraphics.kernels.numba.hash_march import hash_march
+from invgraphics.kernels.numba.hash_render import hash_render
 from invgraphics.kernels.numba.march import ray_march
 from invgraphics.kernels.numba.projecting import splat_project
 from invgraphics.kernels.numba.rasterising import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
-from invgraphics.kernels.types import HashGrid, MarchSteps
+from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
 
 
 def warm_up() -> float:
@@ -63,4 +65,11 @@ def samples() -> None:
     (sums.sum() + alpha.sum() + slope.sum()).backward()
     bounds = Bounds(torch.zeros(3), torch.ones(3))
     rays = bounds.clip(Rays.make(torch.full((2, 3), 0.1), torch.full((2, 3), 3**-0.5)))
-    ray_march(rays, torch.ones(2, 2, 2, dtype=torch.bool), bounds, MarchSteps(0.1), rays.near)
+    everywhere = torch.ones(2, 2, 2, dtype=torch.bool)
+    ray_march(rays, everywhere, bounds, MarchSteps(0.1), rays.near)
+    layer = torch.zeros(16, 4), torch.zeros(16)
+    field = HashField(
+        torch.zeros(levels.entries, 2), levels, (layer,), ((torch.zeros(3, 16), torch.zeros(3)),), "exp", 0.0, 1, "srgb"
+    )
+    hash_march(rays, everywhere, bounds, MarchSteps(0.1), field, rays.near, 0.5)
+    hash_render(rays, everywhere, bounds, MarchSteps(0.1), field)

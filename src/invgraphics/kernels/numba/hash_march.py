@@ -1,0 +1,102 @@
+"""Walking along rays through a hash grid until something opaque is met: march, look-ups and networks in one pass."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.rays import Rays
+from invgraphics.kernels import reference
+from invgraphics.kernels.numba.composite import absorb
+from invgraphics.kernels.numba.dense import POINTS
+from invgraphics.kernels.numba.hash import levels_of
+from invgraphics.kernels.numba.hash_cells import BLOCK
+from invgraphics.kernels.numba.hash_places import (
+    ACTIVATIONS,
+    advance,
+    density_of,
+    encode,
+    outputs_of,
+    packed_network,
+    places,
+    position,
+)
+from invgraphics.kernels.numba.march import ROOM, longest, packed, surroundings
+from invgraphics.kernels.numba.runtime import array, inlined, parallel, prange, scratch, threads
+from invgraphics.kernels.types import HashField, March, MarchSteps
+
+
+@inlined
+def _keep(s, said, way, far, settings, rows, counts):
+    """Write down the step of place ``s``, and let its ray go on if light is left behind it."""
+    activation, bias, opaque = settings
+    which, t0, t1, kept, done, resume, light, _, _ = way
+    r, begin, end = which[s], t0[s, done[s]], t1[s, done[s]]
+    done[s] += 1
+    rows[0, r, counts[r]], rows[1, r, counts[r]] = begin, end
+    counts[r] += 1
+    passed, _ = absorb(density_of(said[s] + bias, activation) * (end - begin))
+    light[s] *= passed
+    if light[s] < opaque:
+        done[s], resume[s] = kept[s], far[r]
+
+
+@parallel
+def reach(lines, space, table, levels, geometry, settings, jobs, rows, counts):
+    """Steps of every ray that light reaches, in ``rows``: begin and end; ``counts`` of them, which are 0 before.
+
+    Arguments as in `hash_render.render`; ``settings`` are activation, bias and least transmittance.
+    """
+    sizes = geometry[1]
+    for job in prange(jobs):
+        entries, shares = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        points, room = np.zeros((3, POINTS), np.float32), sizes.max() * POINTS
+        x, odd, even = np.zeros(room, np.float32), np.zeros(room, np.float32), np.zeros(room, np.float32)
+        way, taken, busy = places(), 0, True
+        which = way[0]
+        while busy:
+            busy = False
+            for s in range(POINTS):
+                taken = advance(s, taken, (job, jobs), lines, space, way)
+                if which[s] >= 0:
+                    busy = True
+                    position(s, way, lines, space, points)
+            encode(table, levels, points, entries, shares, x)
+            said = outputs_of(geometry, x, odd, even)
+            for s in range(POINTS):
+                if which[s] >= 0:
+                    _keep(s, said, way, lines[3], settings, rows, counts)
+
+
+@torch.no_grad()
+def hash_march(
+    rays: Rays,
+    occupied: Bool[Tensor, "r r r"],
+    bounds: Bounds,
+    steps: MarchSteps,
+    field: HashField,
+    start: Float[Tensor, " n"],
+    transmittance: float,
+) -> March:
+    """See `invgraphics.kernels.hash_march`; endless space, steps that grow and other widths are left to the reference."""
+    if field.table.shape[1] != 2 or steps.cone > 0 or bounds.space != "box":
+        return reference.hash_march(rays, occupied, bounds, steps, field, start, transmittance)
+    box, cells, gaps, shift = surroundings(occupied, bounds)
+    space = cells, gaps, shift, box, False, np.float32(steps.step), np.float32(0)
+    # The first output alone: nobody asks for a colour.
+    *hidden, (weight, bias) = field.geometry
+    model = array(field.table).reshape(-1), levels_of(field.grid), packed_network((*hidden, (weight[:1], bias[:1])))
+    settings = ACTIVATIONS.index(field.density), np.float32(field.bias), float(transmittance)
+    most = int(longest(rays, start) / steps.step) + 2
+    batch, found = max(1, ROOM // most), []
+    for first in range(0, max(len(rays), 1), batch):
+        lines = tuple(array(x[first : first + batch]) for x in (rays.origins, rays.directions, start, rays.far))
+        n = len(lines[2])
+        rows, counts = scratch("reached", 2 * n * most).reshape(2, n, most), np.zeros(n, np.int64)
+        reach(lines, space, *model, settings, threads(), rows, counts)
+        found.append(packed(rows[0], rows[1], counts, first))
+    ray, t0, t1 = (torch.cat(columns) for columns in zip(*found, strict=True))
+    return March(ray, t0, t1, torch.maximum(start, rays.far))

@@ -1,0 +1,161 @@
+"""Pictures of a hash grid in one pass: walking, looking up, networks and compositing.
+
+Colours are asked for `POINTS` at a time, like densities, but only where they count. Nothing is written to memory but the
+picture.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.rays import Rays
+from invgraphics.kernels import reference
+from invgraphics.kernels.numba.composite import absorb
+from invgraphics.kernels.numba.dense import POINTS
+from invgraphics.kernels.numba.hash import levels_of
+from invgraphics.kernels.numba.hash_cells import BLOCK
+from invgraphics.kernels.numba.hash_places import (
+    ACTIVATIONS,
+    advance,
+    density_of,
+    encode,
+    outputs_of,
+    packed_network,
+    places,
+    position,
+    sigmoid,
+    softplus,
+    view_of,
+)
+from invgraphics.kernels.numba.march import surroundings
+from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, parallel, prange, threads
+from invgraphics.kernels.types import HashField, MarchSteps
+
+_ZERO, _HALF = np.float32(0.0), np.float32(0.5)
+
+
+@inlined
+def _meet(s, said, way, far, settings, sums, alpha):
+    """Composite the step of place ``s``; returns what its colour weighs, 0 if nobody will miss it."""
+    activation, bias, _, _, opaque, unseen = settings
+    which, t0, t1, kept, done, resume, light, missed, _ = way
+    r, begin, end = which[s], t0[s, done[s]], t1[s, done[s]]
+    done[s] += 1
+    passed, opacity = absorb(density_of(said[s] + bias, activation) * (end - begin))
+    weight = np.float32(light[s]) * opacity
+    light[s] *= passed
+    alpha[r] += weight
+    sums[r, 3] += weight * ((begin + end) * _HALF)
+    if light[s] < opaque:
+        done[s], resume[s] = kept[s], far[r]
+    if missed[s] + weight <= unseen:
+        missed[s] += weight
+        weight = _ZERO
+    return weight
+
+
+@inlined
+def _ask(s, said, views, waiting, handed, harmonic, asked):
+    """Put what the colour network wants to know of place ``s`` at the end of the queue."""
+    for k in range(handed):
+        asked[index(k) * POINTS + index(waiting)] = said[index(1 + k) * POINTS + index(s)]
+    for k in range(harmonic):
+        asked[index(handed + k) * POINTS + index(waiting)] = views[view_of(s) + index(k) * LANES]
+
+
+@inlined
+def _answer(network, asked, odd, even, whose, weights, count, linear, sums):
+    """Add the colours of the first ``count`` places of the queue to their rays."""
+    raw = outputs_of(network, asked, odd, even)
+    for n in range(count):
+        r = whose[n]
+        for channel in range(3):
+            value = raw[index(channel) * POINTS + index(n)]
+            sums[r, channel] += weights[n] * (softplus(value) if linear else sigmoid(value))
+
+
+@parallel
+def render(lines, space, table, levels, geometry, colour, widest, settings, jobs, sums, alpha):
+    """Sums of w * (radiance, distance) and of w for every ray; both hold zeros.
+
+    Args:
+        lines: origins, directions, start and far of the rays.
+        space: cells, what `surroundings` says of them, and the steps (see `walk_ray`).
+        table: features, flat.
+        levels: see `levels_of`.
+        geometry: layers of the density's network as `packed_network`, and their inputs and padded outputs.
+        colour: the same of the radiance's.
+        widest: most inputs or outputs of any layer.
+        settings: activation, bias, whether radiance is linear, bands, least transmittance, most weight of a ray to leave out.
+        jobs: number of jobs.
+        sums: output (n, 4).
+        alpha: output (n,).
+    """
+    linear, harmonic = settings[2], settings[3] * settings[3]
+    handed = colour[1][0, 0] - harmonic
+    for job in prange(jobs):
+        entries, shares = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        points, room = np.zeros((3, POINTS), np.float32), widest * POINTS
+        x, asked = np.zeros(room, np.float32), np.zeros(room, np.float32)
+        odd, even = np.zeros(room, np.float32), np.zeros(room, np.float32)
+        odd_colour, even_colour = np.zeros(room, np.float32), np.zeros(room, np.float32)
+        whose, weights, waiting = np.zeros(POINTS, np.int64), np.zeros(POINTS, np.float32), 0
+        way, taken, busy = places(), 0, True
+        which, views = way[0], way[8]
+        while busy:
+            busy = False
+            for s in range(POINTS):
+                taken = advance(s, taken, (job, jobs), lines, space, way)
+                if which[s] >= 0:
+                    busy = True
+                    position(s, way, lines, space, points)
+            encode(table, levels, points, entries, shares, x)
+            said = outputs_of(geometry, x, odd, even)
+            for s in range(POINTS):
+                weight = _meet(s, said, way, lines[3], settings, sums, alpha) if which[s] >= 0 else _ZERO
+                if weight > _ZERO:
+                    _ask(s, said, views, waiting, handed, harmonic, asked)
+                    whose[waiting], weights[waiting] = which[s], weight
+                    waiting += 1
+                    if waiting == POINTS:
+                        _answer(colour, asked, odd_colour, even_colour, whose, weights, waiting, linear, sums)
+                        waiting = 0
+        _answer(colour, asked, odd_colour, even_colour, whose, weights, waiting, linear, sums)
+
+
+@torch.no_grad()
+def hash_render(
+    rays: Rays,
+    occupied: Bool[Tensor, "r r r"],
+    bounds: Bounds,
+    steps: MarchSteps,
+    field: HashField,
+    transmittance: float = 0.0,
+    unseen: float = 0.0,
+) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
+    """See `invgraphics.kernels.hash_render`; what has other than two features per entry is left to the reference."""
+    if field.table.shape[1] != 2:
+        return reference.hash_render(rays, occupied, bounds, steps, field, transmittance, unseen)
+    box, cells, gaps, shift = surroundings(occupied, bounds)
+    lines = tuple(array(part) for part in (rays.origins, rays.directions, rays.near, rays.far))
+    space = cells, gaps, shift, box, bounds.space == "contracted", np.float32(steps.step), np.float32(steps.cone)
+    geometry, colour = packed_network(field.geometry), packed_network(field.colour)
+    settings = (
+        ACTIVATIONS.index(field.density),
+        np.float32(field.bias),
+        field.colour_space == "linear",
+        field.bands,
+        float(transmittance),
+        np.float32(unseen),
+    )
+    widest = int(max(geometry[1].max(), colour[1].max()))
+    sums, alpha = torch.zeros(len(rays), 4), torch.zeros(len(rays))
+    table = array(field.table).reshape(-1)
+    render(
+        lines, space, table, levels_of(field.grid), geometry, colour, widest, settings, threads(), sums.numpy(), alpha.numpy()
+    )
+    return sums, alpha
