@@ -70,14 +70,13 @@ def encode(table, levels, points, entries, weights, out):
 def outputs_of(network, x, odd, even):
     """The outputs of `POINTS` inputs; layers write to ``odd`` and ``even`` in turn."""
     layers, sizes = network
-    last = len(sizes) - 1
-    at = index(0)
+    at, last, source, target = index(0), len(sizes) - 1, x, odd
     for number in range(len(sizes)):
         size = index(sizes[number, 0]), index(sizes[number, 1])
-        source = x if number == 0 else (odd if number % 2 == 1 else even)
-        dense(layers, at, source, odd if number % 2 == 0 else even, size, number < last)
+        dense(layers, at, source, target, size, number < last)
         at += (size[0] + index(1)) * size[1]
-    return odd if last % 2 == 0 else even
+        source, target = target, even if number % 2 == 0 else odd
+    return source
 
 
 @inlined
