@@ -62,7 +62,7 @@ class OccupancyConfig:
     cells: int = 1 << 17
     stop: Literal["always", "evaluation", "never"] = "always"
     transmittance: float = 1e-3
-    wave: int = 6
+    wave: int = 16
 
     def __post_init__(self) -> None:
         for key in (
