@@ -127,7 +127,8 @@ def _march(count: int) -> dict[str, Pass]:
     return {FORWARD: Pass(march, float(MARCH_BYTES * len(march().ray)), limits.triad(), "bytes")}
 
 
-def _picture(count: int) -> dict[str, Pass]:
+def hash_field() -> HashField:
+    """Random tables and networks: a half transparent fog."""
     generator = torch.Generator().manual_seed(0)
 
     def network(*widths: int) -> tuple[tuple[Tensor, Tensor], ...]:
@@ -137,11 +138,14 @@ def _picture(count: int) -> dict[str, Pass]:
     table = torch.randn(PICTURE_GRID.entries, 2, generator=generator)
     geometry = network(2 * PICTURE_GRID.levels, PICTURE_WIDTH, 1 + HANDED)
     colour = network(HANDED + BANDS**2, PICTURE_WIDTH, PICTURE_WIDTH, 3)
-    field = HashField(table, PICTURE_GRID, geometry, colour, "exp", 0.0, BANDS, "srgb")
-    region, cells, rays = bounds(), occupied(OCCUPANCY), some_rays(count)
+    return HashField(table, PICTURE_GRID, geometry, colour, "exp", 0.0, BANDS, "srgb")
+
+
+def _picture(count: int) -> dict[str, Pass]:
+    field, region, cells, rays = hash_field(), bounds(), occupied(OCCUPANCY), some_rays(count)
     steps = MarchSteps(2 * region.radius / PICTURE_STEPS)
     render = lambda: kernels.hash_render(rays, cells, region, steps, field)  # noqa: E731
-    products = sum(weight.numel() for weight, _ in geometry + colour)
+    products = sum(weight.numel() for weight, _ in field.geometry + field.colour)
     looks = len(kernels.ray_march(rays, cells, region, steps, rays.near).ray)
     return {FORWARD: Pass(render, 2.0 * products * looks, limits.sgemm(), "flop")}
 

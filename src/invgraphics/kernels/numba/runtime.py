@@ -65,7 +65,7 @@ class _Compiler(event.Listener):
         """Fill the cache, once in the life of this process."""
         with self._lock:
             if not self.here:
-                print("compiling kernels, once, about half a minute", file=sys.stderr, flush=True)
+                print("compiling kernels, once, less than a minute", file=sys.stderr, flush=True)
                 with contextlib.suppress(OSError):
                     # The compiler knows one thread only: two processes share the work.
                     for process in [_warming(part) for part in PARTS]:
