@@ -16,6 +16,9 @@ from invgraphics.kernels.types import March, MarchSteps, hash_field
 from invgraphics.renderers.samplers import uniform
 from invgraphics.renderers.termination import Look, in_front
 
+LATE = 0.5
+"""Progress of a fit at which its late steps begin to replace the usual ones."""
+
 
 @dataclass(frozen=True)
 class OccupancyConfig:
@@ -96,7 +99,7 @@ class OccupancyConfig:
         """Training steps across the diagonal at a point of the fit."""
         usual = self.steps_per_diagonal
         early, late = self.early_steps or usual, self.late_steps or usual
-        return early * (usual / early) ** min(1.0, 4 * progress) * (late / usual) ** max(0.0, 2 * progress - 1)
+        return early * (usual / early) ** min(1.0, 4 * progress) * (late / usual) ** max(0.0, (progress - LATE) / (1 - LATE))
 
     def build(self, scene: Scene) -> Occupancy:
         """The sampler, every cell occupied."""
@@ -216,12 +219,13 @@ class Occupancy(Sampler):
         """Optical depth of one step at a random point of each cell.
 
         Steps grow with the distance from the camera, which a cell does not know; the distance from the middle of the
-        bounds stands in for it.
+        bounds stands in for it. Steps that become shorter late in a fit make no cell emptier.
         """
         corner = torch.stack(torch.unravel_index(cells, self.ema.shape), dim=1)
         unit = (corner + uniform((len(cells), 3), ctx, like=self.ema)) / self.config.resolution
         position = ctx.bounds.from_unit(unit.to(ctx.bounds.lo.dtype))
-        distance, steps = (position - ctx.bounds.centre).norm(dim=1), self.steps(ctx)
+        steps = self.steps(replace(ctx, progress=min(ctx.progress, LATE)))
+        distance = (position - ctx.bounds.centre).norm(dim=1)
         return density(Samples.at(position)) * (steps.cone * distance).clamp_min(steps.step)
 
 

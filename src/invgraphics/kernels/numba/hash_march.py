@@ -33,7 +33,7 @@ from invgraphics.kernels.types import HashField, March, MarchSteps
 def _keep(s, said, way, far, settings, rows, counts):
     """Write down the step of place ``s``, and let its ray go on if light is left behind it."""
     activation, bias, opaque = settings
-    which, t0, t1, kept, done, resume, light, _, _ = way
+    which, t0, t1, kept, done, _, resume, light, _, _ = way
     r, begin, end = which[s], t0[s, done[s]], t1[s, done[s]]
     done[s] += 1
     rows[0, r, counts[r]], rows[1, r, counts[r]] = begin, end

@@ -83,14 +83,15 @@ def outputs_of(network, x, odd, even):
 def places():
     """`POINTS` places without a ray.
 
-    Their rays; begin and end of the steps found, how many there are and have been looked at; where the ray goes on; what is
-    left of its light, and what was left out of its picture; harmonics of its direction.
+    Their rays; begin and end of the steps found, how many there are and have been looked at; after how many of all steps and
+    where the ray goes on; what is left of its light, and what was left out of its picture; harmonics of its direction.
     """
-    which, kept, done = np.full(POINTS, -1, np.int64), np.zeros(POINTS, np.int64), np.zeros(POINTS, np.int64)
+    which, steps = np.full(POINTS, -1, np.int64), np.zeros(POINTS, np.int64)
+    kept, done = np.zeros(POINTS, np.int64), np.zeros(POINTS, np.int64)
     t0, t1 = np.zeros((POINTS, AHEAD), np.float32), np.zeros((POINTS, AHEAD), np.float32)
     resume, missed = np.zeros(POINTS, np.float32), np.zeros(POINTS, np.float32)
     light, views = np.zeros(POINTS, np.float64), np.zeros(16 * POINTS, np.float32)
-    return which, t0, t1, kept, done, resume, light, missed, views
+    return which, t0, t1, kept, done, steps, resume, light, missed, views
 
 
 @inlined
@@ -110,14 +111,16 @@ def advance(s, taken, deal, lines, space, way):
     """Find the next occupied steps for place ``s``, of its ray or of further ones; returns the rays taken by then."""
     origins, directions, start, far = lines
     occupied, gaps, shift, box, contracted, step, cone = space
-    which, t0, t1, kept, done, resume, light, missed, views = way
+    which, t0, t1, kept, done, steps, resume, light, missed, views = way
     job, jobs = deal
     while done[s] == kept[s]:
         r = which[s]
         if r >= 0 and resume[s] < far[r]:
-            kept[s], resume[s] = walk_ray(
-                origins[r], directions[r], resume[s], far[r], occupied, gaps, shift, box, contracted, step, cone, t0[s], t1[s]
-            )
+            # The lattice is counted from the ray's start, so that these are the very steps of an ordinary march.
+            kept[s], steps[s], resume[s] = walk_ray(
+                origins[r], directions[r], start[r], steps[s], resume[s], far[r], occupied, gaps, shift, box, contracted, step,
+                cone, t0[s], t1[s],
+            )  # fmt: skip
             done[s] = 0
             direction = directions[r, 0], directions[r, 1], directions[r, 2]
             harmonics(direction, views, view_of(s))
@@ -127,7 +130,7 @@ def advance(s, taken, deal, lines, space, way):
                 which[s] = -1
                 break
             taken += 1
-            which[s], resume[s], light[s], missed[s] = r, start[r], 1.0, _ZERO
+            which[s], steps[s], resume[s], light[s], missed[s] = r, 0, start[r], 1.0, _ZERO
     return taken
 
 
@@ -135,7 +138,7 @@ def advance(s, taken, deal, lines, space, way):
 def position(s, way, lines, space, points):
     """Where the step of place ``s`` has its middle, in the unit cube."""
     origins, directions, box, contracted = lines[0], lines[1], space[3], space[4]
-    which, t0, t1, _, done, _, _, _, _ = way
+    which, t0, t1, _, done, _, _, _, _, _ = way
     r, t = which[s], (t0[s, done[s]] + t1[s, done[s]]) * _HALF
     x, y, z = (
         origins[r, 0] + t * directions[r, 0],

@@ -42,7 +42,7 @@ _ZERO, _HALF = np.float32(0.0), np.float32(0.5)
 def _meet(s, said, way, far, settings, sums, alpha):
     """Composite the step of place ``s``; returns what its colour weighs, 0 if nobody will miss it."""
     activation, bias, _, _, opaque, unseen = settings
-    which, t0, t1, kept, done, resume, light, missed, _ = way
+    which, t0, t1, kept, done, _, resume, light, missed, _ = way
     r, begin, end = which[s], t0[s, done[s]], t1[s, done[s]]
     done[s] += 1
     passed, opacity = absorb(density_of(said[s] + bias, activation) * (end - begin))
@@ -105,7 +105,7 @@ def render(lines, space, table, levels, geometry, colour, widest, settings, jobs
         odd_colour, even_colour = np.zeros(room, np.float32), np.zeros(room, np.float32)
         whose, weights, waiting = np.zeros(POINTS, np.int64), np.zeros(POINTS, np.float32), 0
         way, taken, busy = places(), 0, True
-        which, views = way[0], way[8]
+        which, views = way[0], way[9]
         while busy:
             busy = False
             for s in range(POINTS):

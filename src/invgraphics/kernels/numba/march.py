@@ -72,20 +72,22 @@ def _pace(direction, half):
 
 
 @exact
-def walk_ray(origin, direction, first, far, occupied, gaps, shift, box, contracted, step, cone, t0, t1):
-    """Keep intervals of one ray until ``far`` or until ``t0`` is full; returns their number and where to go on."""
+def walk_ray(origin, direction, first, taken, t, far, occupied, gaps, shift, box, contracted, step, cone, t0, t1):
+    """Keep intervals of one ray until ``far`` or until ``t0`` is full.
+
+    The ray began at ``first`` and is at ``t``, after ``taken`` steps. Returns how many intervals were kept, and both of these.
+    """
     resolution = occupied.shape[0]
     cell, per_step = _ONE / np.float32(resolution), _ONE / step
     pace_x, pace_y, pace_z = _pace(direction[0], box[3]), _pace(direction[1], box[4]), _pace(direction[2], box[5])
-    t = first
-    kept = taken = 0
+    kept = 0
     free = -np.float32(np.inf)
     while t < far and kept < len(t0):
         # Without a cone the lattice is counted from the first step, so that leaping over steps changes no bit of the rest.
         after = first + np.float32(taken + 1) * step if cone == _ZERO else t + max(cone * t, step)
         if not after > t:
             # The step is lost to rounding, or not a number.
-            return kept, far
+            return kept, taken, far
         end = min(after, far)
         middle = (t + end) / _TWO
         if middle >= free:
@@ -122,7 +124,7 @@ def walk_ray(origin, direction, first, far, occupied, gaps, shift, box, contract
                             end = first + np.float32(leap) * step
         t = end
         taken += 1
-    return kept, t
+    return kept, taken, t
 
 
 @exact_parallel
@@ -170,9 +172,10 @@ def walk(origins, directions, start, far, occupied, gaps, shift, box, contracted
     for job in prange(jobs):
         # Neighbouring rays cost alike: dealing them out in turn balances the jobs.
         for i in range(job, len(start), jobs):
-            counts[i], resume[i] = walk_ray(
-                origins[i], directions[i], start[i], far[i], occupied, gaps, shift, box, contracted, step, cone, t0[i], t1[i]
-            )
+            counts[i], _, resume[i] = walk_ray(
+                origins[i], directions[i], start[i], 0, start[i], far[i], occupied, gaps, shift, box, contracted, step, cone,
+                t0[i], t1[i],
+            )  # fmt: skip
 
 
 @exact_parallel

@@ -118,9 +118,9 @@ inlined = _njit(fastmath=FASTMATH, forceinline=True, no_cpython_wrapper=True)
 """Decorator of functions that kernels call; they are cached as part of those."""
 ordered = _njit(fastmath=FASTMATH - {"reassoc"}, forceinline=True, no_cpython_wrapper=True)
 """`inlined`, with sums added up as they are written: rearranged, they become one chain whose links wait for each other."""
-exact_parallel = _cached(parallel=True)
-exact = _njit(forceinline=True, no_cpython_wrapper=True)
-"""`parallel` and `inlined` in plain IEEE arithmetic."""
+exact_parallel = _cached(parallel=True, fastmath=False)
+exact = _njit(fastmath=False, forceinline=True, no_cpython_wrapper=True)
+"""`parallel` and `inlined` in plain IEEE arithmetic; what does not say so inherits the flags of what calls it."""
 
 # Both packages type these in ways that no checker can follow.
 prange: Any = nb.prange
