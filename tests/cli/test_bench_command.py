@@ -50,6 +50,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_parts() -> None:
     assert Bench().parts() == PARTS
     assert Bench(quick=True).parts() == QUICK
+    assert set(QUICK) == {*bench_run._CASES, "iterations"}
     assert Bench(only="splats, hash").parts() == ("splats", "hash")
     with pytest.raises(InputError, match="no part 'splat'"):
         Bench(only="splat").parts()

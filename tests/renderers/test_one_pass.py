@@ -82,8 +82,13 @@ def test_everything_else_is_composed(setting, calls, what: str) -> None:
 
 def test_other_networks_are_no_hash_field(setting) -> None:
     scene, *_ = setting
-    for change in ({"geometry": "sdf"}, {"direction": "frequency"}, {"layers": 2, "skip": 0}):
-        assert replace(FIELD, **change).build(scene).hash_field() is None
+    for change in (
+        {"geometry": "sdf"},
+        {"direction": "frequency"},
+        {"layers": 2, "skip": 0},
+        {"encoding": replace(GRID, features=4)},
+    ):
+        assert replace(FIELD, **change).build(scene).hash_field(scene.bounds) is None
 
 
 def test_training_marches_in_one_pass_and_sees_the_same(setting, monkeypatch) -> None:
@@ -114,3 +119,14 @@ def test_growing_steps_are_marched_in_parts(setting, monkeypatch) -> None:
     renderer = Volumetric(replace(SAMPLER, cone=0.01).build(scene))
     picture, _ = renderer.render_rays(fitted(FIELD, scene), camera.rays(), Context(scene.bounds, training=True))
     assert bool(picture.rgb.isfinite().all())
+
+
+def test_a_field_over_other_bounds_is_composed(setting, calls) -> None:
+    """Its own bounds say where it is, whatever is looked at."""
+    scene, renderer, camera = setting
+    field = fitted(FIELD, scene)
+    assert field.hash_field(scene.bounds) is not None
+    half = replace(scene.bounds, lo=scene.bounds.lo / 2, hi=scene.bounds.hi / 2)
+    with torch.no_grad():
+        renderer.render_image(field, camera, Context(half))
+    assert calls == []

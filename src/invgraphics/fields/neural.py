@@ -192,11 +192,18 @@ class NeuralField(Field):
             features=torch.cat(handed) if Quantity.FEATURES in want else None,
         )
 
-    def hash_field(self) -> HashField | None:
-        """The parts of a plain hash grid; ``None`` for other encodings and networks, and while a window is open."""
+    def hash_field(self, bounds: Bounds) -> HashField | None:
+        """The parts of a plain hash grid over ``bounds``, two features per entry.
+
+        ``None`` for other encodings and networks, elsewhere, and while a window is open.
+        """
         config, encoding = self.config, self.encoding
         plain = config.geometry == "density" and config.skip < 0 and config.direction in ("sh", "none")
-        if not plain or not isinstance(encoding, HashEncoding) or encoding.detail is not None:
+        here = bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)
+        if not plain or not here or not isinstance(encoding, HashEncoding):
+            return None
+        # Entries of other widths have no compiled kernel, and the plain one keeps every sample of a picture.
+        if encoding.detail is not None or encoding.grid.features != 2:
             return None
         geometry, colour = (net.layers() for net in (self.geometry_net, self.colour_net))
         bands = config.direction_degree if config.direction == "sh" else 0

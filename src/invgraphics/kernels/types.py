@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from invgraphics.core.bounds import Bounds
+
 
 @dataclass(frozen=True)
 class HashGrid:
@@ -83,12 +85,12 @@ class HashField:
 
 @runtime_checkable
 class _MaybeHashField(Protocol):
-    def hash_field(self) -> HashField | None: ...
+    def hash_field(self, bounds: Bounds) -> HashField | None: ...
 
 
-def hash_field(field: object) -> HashField | None:
-    """What a field is made of, detached, where its method of this name says that it is a `HashField`."""
-    return field.hash_field() if isinstance(field, _MaybeHashField) else None
+def hash_field(field: object, bounds: Bounds) -> HashField | None:
+    """What a field is made of, detached, where its method of this name says that it is a `HashField` over ``bounds``."""
+    return field.hash_field(bounds) if isinstance(field, _MaybeHashField) else None
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ class Occupancy(Sampler):
     @torch.no_grad()
     def _march_in_one_pass(self, rays: Rays, density: NoGradDensity, ctx: Context) -> March | None:
         """A march that stops by itself, if there is a kernel for what the field is made of and for these steps."""
-        parts, steps, boxed = hash_field(density.field), self.steps(ctx), ctx.bounds.space == "box"
+        parts, steps, boxed = hash_field(density.field, ctx.bounds), self.steps(ctx), ctx.bounds.space == "box"
         if parts is None or not boxed or steps.cone > 0 or not kernels.compiled("hash_march", parts.table):
             return None
         start = self._start(rays, steps, ctx)

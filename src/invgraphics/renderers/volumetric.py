@@ -84,7 +84,7 @@ class Volumetric(RayRenderer):
         sampler, normals = self.sampler, ctx.geometry and Quantity.NORMAL in field.provides
         if torch.is_grad_enabled() or ctx.training or normals or not isinstance(sampler, Occupancy):
             return None
-        parts = hash_field(field)
+        parts = hash_field(field, ctx.bounds)
         if parts is None or sampler.config.stop == "never" or not kernels.compiled("hash_render", parts.table):
             return None
         rays, given = camera.rays(), (sampler.occupied, ctx.bounds, sampler.steps(ctx), parts)

@@ -16,13 +16,12 @@ from invgraphics.kernels.numba.hash import levels_of
 from invgraphics.kernels.numba.hash_cells import BLOCK
 from invgraphics.kernels.numba.hash_places import (
     ACTIVATIONS,
-    advance,
     density_of,
     encode,
+    fill,
     outputs_of,
     packed_network,
     places,
-    position,
 )
 from invgraphics.kernels.numba.march import ROOM, longest, packed, surroundings
 from invgraphics.kernels.numba.runtime import array, inlined, parallel, prange, scratch, threads
@@ -58,12 +57,7 @@ def reach(lines, space, table, levels, geometry, settings, jobs, rows, counts):
         way, taken, busy = places(), 0, True
         which = way[0]
         while busy:
-            busy = False
-            for s in range(POINTS):
-                taken = advance(s, taken, (job, jobs), lines, space, way)
-                if which[s] >= 0:
-                    busy = True
-                    position(s, way, lines, space, points)
+            taken, busy = fill(taken, (job, jobs), lines, space, way, points)
             encode(table, levels, points, entries, shares, x)
             said = outputs_of(geometry, x, odd, even)
             for s in range(POINTS):

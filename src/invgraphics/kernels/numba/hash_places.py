@@ -107,7 +107,7 @@ def view_of(s):
 
 
 @inlined
-def advance(s, taken, deal, lines, space, way):
+def _advance(s, taken, deal, lines, space, way):
     """Find the next occupied steps for place ``s``, of its ray or of further ones; returns the rays taken by then."""
     origins, directions, start, far = lines
     occupied, gaps, shift, box, contracted, step, cone = space
@@ -135,7 +135,7 @@ def advance(s, taken, deal, lines, space, way):
 
 
 @inlined
-def position(s, way, lines, space, points):
+def _position(s, way, lines, space, points):
     """Where the step of place ``s`` has its middle, in the unit cube."""
     origins, directions, box, contracted = lines[0], lines[1], space[3], space[4]
     which, t0, t1, _, done, _, _, _, _, _ = way
@@ -146,6 +146,18 @@ def position(s, way, lines, space, points):
         origins[r, 2] + t * directions[r, 2],
     )
     points[0, s], points[1, s], points[2, s] = to_unit(box, contracted, x, y, z)
+
+
+@inlined
+def fill(taken, deal, lines, space, way, points):
+    """Give every place its ray's next occupied step; returns the rays taken by then, and whether any has one."""
+    busy = False
+    for s in range(POINTS):
+        taken = _advance(s, taken, deal, lines, space, way)
+        if way[0][s] >= 0:
+            busy = True
+            _position(s, way, lines, space, points)
+    return taken, busy
 
 
 def packed_network(layers: tuple[tuple[Tensor, Tensor], ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -20,13 +20,12 @@ from invgraphics.kernels.numba.hash import levels_of
 from invgraphics.kernels.numba.hash_cells import BLOCK
 from invgraphics.kernels.numba.hash_places import (
     ACTIVATIONS,
-    advance,
     density_of,
     encode,
+    fill,
     outputs_of,
     packed_network,
     places,
-    position,
     sigmoid,
     softplus,
     view_of,
@@ -107,12 +106,7 @@ def render(lines, space, table, levels, geometry, colour, widest, settings, jobs
         way, taken, busy = places(), 0, True
         which, views = way[0], way[9]
         while busy:
-            busy = False
-            for s in range(POINTS):
-                taken = advance(s, taken, (job, jobs), lines, space, way)
-                if which[s] >= 0:
-                    busy = True
-                    position(s, way, lines, space, points)
+            taken, busy = fill(taken, (job, jobs), lines, space, way, points)
             encode(table, levels, points, entries, shares, x)
             said = outputs_of(geometry, x, odd, even)
             for s in range(POINTS):

@@ -14,16 +14,20 @@ def composite(
     optical_depth: Float[Tensor, " m"], channels: Float[Tensor, "m c"], ray: Int[Tensor, " m"], rays: int
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, "n c"], Float[Tensor, " n"]]:
     """See `invgraphics.kernels.composite`."""
-    # One running sum over all samples, from which each ray's own start is taken away. In float64, because the difference
-    # of two large float32 sums would have lost the digits that a late ray needs.
     tau = optical_depth.double().clamp_max(OPAQUE)
-    running = torch.cat([tau.new_zeros(1), tau.cumsum(0)])[:-1]
-    counts = torch.bincount(ray, minlength=rays)
-    first = counts.cumsum(0) - counts
-    before = running - running[first[ray]]
-
-    transmittance = torch.exp(-before)
-    weights = (transmittance * -torch.expm1(-tau)).to(optical_depth.dtype)
+    weights = (transmittance(tau, ray, rays) * -torch.expm1(-tau)).to(optical_depth.dtype)
     sums = channels.new_zeros(rays, channels.shape[1]).index_add(0, ray, weights[:, None] * channels)
     alpha = weights.new_zeros(rays).index_add(0, ray, weights)
     return weights, sums, alpha
+
+
+def transmittance(tau: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int) -> Float[Tensor, " m"]:
+    """Share of each ray's light that reaches its samples, from their optical depths in float64, `OPAQUE` at most.
+
+    One running sum over all samples, from which each ray's own start is taken away: the difference of two large float32 sums
+    would have lost the digits that a late ray needs.
+    """
+    running = torch.cat([tau.new_zeros(1), tau.cumsum(0)])[:-1]
+    counts = torch.bincount(ray, minlength=rays)
+    first = counts.cumsum(0) - counts
+    return torch.exp(running[first[ray]] - running)

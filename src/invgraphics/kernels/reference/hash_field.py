@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -10,10 +12,14 @@ from torch.nn.functional import linear, relu, softplus
 from invgraphics.core import harmonics
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.rays import Rays
-from invgraphics.kernels.reference.composite import composite
+from invgraphics.kernels.reference.composite import OPAQUE, composite
+from invgraphics.kernels.reference.composite import transmittance as light_reaching
 from invgraphics.kernels.reference.hash import hash_encode
 from invgraphics.kernels.reference.march import ray_march
 from invgraphics.kernels.types import EXP_LIMIT, HashField, March, MarchSteps
+
+ENDLESS = 1 << 62
+"""More steps than any ray has."""
 
 
 @torch.no_grad()
@@ -27,7 +33,7 @@ def hash_render(
     unseen: float = 0.0,
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
     """See `invgraphics.kernels.hash_render`; every occupied step is looked at, whatever may be left out."""
-    march = _whole_march(rays, occupied, bounds, steps, rays.near)
+    march = ray_march(rays, occupied, bounds, replace(steps, limit=ENDLESS), rays.near)
     density, radiance = _look(field, rays, bounds, march)
     channels = torch.cat([radiance, ((march.t0 + march.t1) / 2)[:, None]], dim=1)
     _, sums, alpha = composite(density * (march.t1 - march.t0), channels, march.ray, len(rays))
@@ -45,26 +51,11 @@ def hash_march(
     transmittance: float,
 ) -> March:
     """See `invgraphics.kernels.hash_march`."""
-    march = _whole_march(rays, occupied, bounds, steps, start)
+    march = ray_march(rays, occupied, bounds, replace(steps, limit=ENDLESS), start)
     density, _ = _look(field, rays, bounds, march)
-    depth = (density * (march.t1 - march.t0)).double()
-    counts = torch.bincount(march.ray, minlength=len(rays))
-    before = torch.cat([depth.new_zeros(1), depth.cumsum(0)])[:-1]
-    before = before - before[(counts.cumsum(0) - counts)[march.ray]]
-    kept = torch.exp(-before) >= transmittance
+    tau = (density * (march.t1 - march.t0)).double().clamp_max(OPAQUE)
+    kept = light_reaching(tau, march.ray, len(rays)) >= transmittance
     return March(march.ray[kept], march.t0[kept], march.t1[kept], march.resume)
-
-
-def _whole_march(
-    rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps, start: Float[Tensor, " n"]
-) -> March:
-    """All the way to the end, however many steps are kept."""
-    parts = [ray_march(rays, occupied, bounds, steps, start)]
-    while bool((parts[-1].resume < rays.far).any()):
-        parts.append(ray_march(rays, occupied, bounds, steps, parts[-1].resume))
-    ray, t0, t1 = (torch.cat([getattr(part, name) for part in parts]) for name in ("ray", "t0", "t1"))
-    order = torch.argsort(ray, stable=True)
-    return March(ray[order], t0[order], t1[order], parts[-1].resume)
 
 
 def _look(field: HashField, rays: Rays, bounds: Bounds, march: March) -> tuple[Float[Tensor, " m"], Float[Tensor, "m 3"]]:
