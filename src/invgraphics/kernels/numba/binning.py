@@ -136,21 +136,21 @@ def _pack(order, means, conics, opacities, features, rows, jobs):
 
 
 @inlined
-def _half_span(shape, y):
-    """Half the ellipse's width at height ``y`` over its centre, and the offset of that chord's middle."""
+def half_span(shape, y):
+    """Half the ellipse's width at height ``y`` over its centre, and the offset of that chord's middle.
+
+    ``shape`` is what `_pack` wrote to the columns from WIDEST to ASPECT; ``y`` may be a register.
+    """
     _, highest, shear, aspect = shape
     return aspect * np.sqrt(max(highest * highest - y * y, np.float32(0.0))), shear * y
 
 
 @inlined
-def chord(shape, low, high):
-    """Leftmost and rightmost point, relative to the centre, of the ellipse between two heights over its centre.
-
-    ``shape`` is what `_pack` wrote to the columns from WIDEST to ASPECT.
-    """
+def _chord(shape, low, high):
+    """Leftmost and rightmost point, relative to the centre, of the ellipse between two heights over its centre."""
     right, left = min(max(shape[0], low), high), min(max(-shape[0], low), high)
-    width_right, middle_right = _half_span(shape, right)
-    width_left, middle_left = _half_span(shape, left)
+    width_right, middle_right = half_span(shape, right)
+    width_left, middle_left = half_span(shape, left)
     return middle_left - width_left - SLACK, middle_right + width_right + SLACK
 
 
@@ -166,7 +166,7 @@ def _tile_columns(rows, r, y, tile, count):
     """Tiles of tile row ``y`` that the ellipse touches (between the first and the last pixel centre)."""
     low = y * tile + np.float32(0.5) - rows[r, MEAN_Y]
     shape = rows[r, WIDEST], rows[r, HIGHEST], rows[r, SHEAR], rows[r, ASPECT]
-    left, right = chord(shape, low, low + tile - np.float32(1.0))
+    left, right = _chord(shape, low, low + tile - np.float32(1.0))
     x, half = rows[r, MEAN_X], np.float32(0.5)
     return _tiles(x + left + half, x + right - half, tile, count)
 

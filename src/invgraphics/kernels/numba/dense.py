@@ -14,6 +14,7 @@ from numba import extending
 from numba.core import cgutils, types
 from torch import Tensor
 
+from invgraphics.kernels.numba.lanes import everywhere, lanes
 from invgraphics.kernels.numba.runtime import LANES, array
 
 POINTS = LANES + LANES
@@ -23,7 +24,7 @@ TOGETHER = 4
 
 # Drops the first parameter, in a way that no checker can follow.
 _intrinsic: Any = extending.intrinsic
-_REGISTER = ir.VectorType(ir.FloatType(), int(LANES))
+_REGISTER = lanes.layout
 _FLAGS = ("contract", "nsz")
 _NUMBER = ir.IntType(64)
 
@@ -43,13 +44,6 @@ def packed_layer(weight: Float[Tensor, "outs ins"], bias: Float[Tensor, " outs"]
 
 def _data(context: Any, builder: Any, kind: Any, value: Any) -> Any:
     return context.make_array(kind)(context, builder, value).data
-
-
-def _everywhere(builder: Any, value: Any) -> Any:
-    """A register that holds one number in all lanes."""
-    one = builder.insert_element(ir.Constant(_REGISTER, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    lanes = ir.Constant(ir.VectorType(ir.IntType(32), int(LANES)), None)
-    return builder.shuffle_vector(one, one, lanes)
 
 
 @_intrinsic
@@ -77,7 +71,7 @@ def dense(typing: Any, layer: Any, at: Any, x: Any, y: Any, sizes: Any, rectifie
 
         def scalars(offset: Any) -> list[Any]:
             found = [builder.load(builder.gep(begin, [builder.add(offset, number(n))])) for n in range(TOGETHER)]
-            return [_everywhere(builder, value) for value in found]
+            return [everywhere(builder, value) for value in found]
 
         with cgutils.for_range_slice(builder, number(0), outputs, number(TOGETHER), intp=_NUMBER) as (first, _):
             block = builder.mul(first, builder.add(inputs, number(1)))

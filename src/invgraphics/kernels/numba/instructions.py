@@ -1,5 +1,5 @@
-"""Instructions that Numba has no words for: one rounding for a product and a sum, two features at a time, the lowest bit
-of a word, and memory that will be needed soon.
+"""Instructions that Numba has no words for: one rounding for a product and a sum, two features at a time, the bits of a
+word, and memory that will be needed soon.
 
 A table of two features per entry holds both in eight consecutive bytes, which one instruction reads or writes. Numba leaves
 LLVM's search for such pairs off, so they are written out here.
@@ -93,6 +93,16 @@ def lowest_bit(typing: Any, word: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
 
     return types.uint64(types.uint64), generate
+
+
+@_intrinsic
+def count_bits(typing: Any, word: Any) -> Any:
+    """How many bits of a uint64 are set."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return types.int64(types.uint64), generate
 
 
 @_intrinsic

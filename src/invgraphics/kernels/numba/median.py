@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.binning import FEATURES, OPACITY, POWER_XX, POWER_XY, POWER_YY
+from invgraphics.kernels.numba.binning import FEATURES
 from invgraphics.kernels.numba.instructions import lowest_bit
-from invgraphics.kernels.numba.raster import AHEAD, BLOCK, BLOCKS, EDGE, inside, measure, placed
-from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, parallel, prange
+from invgraphics.kernels.numba.lanes import any_of, load, store, where
+from invgraphics.kernels.numba.raster import AHEAD, BLOCK, BLOCKS, EDGE, inside, measure, pixels, placed, response_of, shape_of
+from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN
 
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
@@ -15,38 +16,36 @@ _ONE, _ZERO, _HALF = np.float32(1.0), np.float32(0.0), np.float32(0.5)
 
 
 @inlined
-def _hide(transmittance, distance, base, rows, r, dx0, dy0):
-    """Lower the transmittance of one block; where it crosses 1/2, note the footprint's distance. Returns the open pixels."""
-    xx, xy, yy = rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]
-    still_open = _ZERO
-    for lane in range(LANES):
-        dx = dx0 + np.float32(lane & index(3))
-        dy = dy0 + np.float32(lane >> index(2))
-        alpha = min(rows[r, OPACITY] * exp2(xx * dx * dx + xy * dx * dy + yy * dy * dy), _ALPHA_MAX)
-        alpha = alpha if alpha >= _ALPHA_MIN else _ZERO
-        before = transmittance[base + lane]
+def _hide(transmittance, distance, rows, r, blocks, x0, y0):
+    """Lower the transmittance of blocks, and note the distance where it crosses 1/2; returns those without open pixels."""
+    shape, opacity = shape_of(rows, r)
+    across, down = pixels()
+    closed = index(0)
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - index(1)
+        left, top = placed(rows, r, x0, y0, block)
+        dx, dy, base = across + left, down + top, block * LANES
+        response = response_of(shape, opacity, dx, dy)
+        alpha = min(where(response >= _ALPHA_MIN, response, _ZERO), _ALPHA_MAX)
+        before = load(transmittance, base)
         after = before * (_ONE - alpha)
         here = rows[r, FEATURES] + rows[r, FEATURES + 1] * dx + rows[r, FEATURES + 2] * dy
-        distance[base + lane] = here if before > _HALF and after <= _HALF else distance[base + lane]
-        transmittance[base + lane] = after
-        still_open += _ONE if after > _HALF else _ZERO
-    return still_open
+        store(distance, base, where((before > _HALF) & (after <= _HALF), here, load(distance, base)))
+        store(transmittance, base, after)
+        closed |= index(0) if any_of(after > _HALF) else index(1) << block
+    return closed
 
 
 @inlined
-def _walk(rows, entries, first, last, x0, y0, edge, transmittance, distance, is_open, touched):
+def _walk(rows, entries, first, last, x0, y0, transmittance, distance, is_open, touched):
     """Walk a tile's footprints front to back until no pixel is open."""
     for begin in range(first, last, AHEAD):
         end = min(begin + AHEAD, last)
-        measure(rows, entries, begin, end, np.float32(x0), np.float32(y0), edge, touched)
+        measure(rows, entries, begin, end, np.float32(x0), np.float32(y0), is_open, touched)
         for entry in range(begin, end):
             r, blocks = index(entries[index(entry)]), touched[index(entry)] & is_open
-            while blocks:
-                block = lowest_bit(blocks)
-                dx, dy = placed(rows, r, x0, y0, block)
-                if _hide(transmittance, distance, block * LANES, rows, r, dx, dy) == _ZERO:
-                    is_open ^= index(1) << block
-                blocks &= blocks - index(1)
+            is_open ^= _hide(transmittance, distance, rows, r, blocks, x0, y0)
         if is_open == 0:
             break
 
@@ -65,7 +64,7 @@ def median(rows, entries, starts, bounds, edge, columns, touched, depth):
             transmittance[:] = _ONE
             distance[:] = np.inf
             first, last, blocks = starts[tile], starts[tile + 1], inside(x0, y0, edge, width, height)
-            _walk(rows, entries, first, last, x0, y0, edge, transmittance, distance, blocks, touched)
+            _walk(rows, entries, first, last, x0, y0, transmittance, distance, blocks, touched)
             for y in range(y0, min(y0 + edge * BLOCK, height)):
                 for x in range(x0, min(x0 + edge * BLOCK, width)):
                     block = (y - y0) // BLOCK * EDGE + (x - x0) // BLOCK

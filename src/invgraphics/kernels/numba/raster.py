@@ -20,11 +20,13 @@ from invgraphics.kernels.numba.binning import (
     POWER_XY,
     POWER_YY,
     SHEAR,
+    SLACK,
     WIDEST,
-    chord,
+    half_span,
 )
-from invgraphics.kernels.numba.instructions import lowest_bit, prefetch
-from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, parallel, prange
+from invgraphics.kernels.numba.instructions import count_bits, lowest_bit, prefetch
+from invgraphics.kernels.numba.lanes import any_of, bits_below, counting, exp2_of, load, store, where
+from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 BLOCK = 4
@@ -38,33 +40,33 @@ AHEAD = 16
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
 _STOP = np.float32(TRANSMITTANCE_MIN)
 _ONE, _ZERO = np.float32(1.0), np.float32(0.0)
-_NO_FEATURES = (_ZERO, _ZERO, _ZERO)
 
 
 @inlined
-def measure(rows, entries, begin, end, x0, y0, edge, touched):
-    """Write to ``touched`` which blocks of a tile a few footprints touch, before any of them is drawn.
+def measure(rows, entries, begin, end, x0, y0, blocks, touched):
+    """Write to ``touched`` which of a tile's ``blocks`` a few footprints touch, before any of them is drawn.
 
-    Otherwise a processor would guess how long every row is, and wait for its square roots to learn that it was wrong.
+    Otherwise a processor would guess how long every row is, and wait for its square roots to learn that it was wrong. Half of
+    the lanes find how many blocks of each row begin before the ellipse ends on the right; the others how many end before it
+    begins on the left, as if it were turned by 180 degrees.
     """
-    quarter, most = np.float32(1.0 / BLOCK), np.float32(edge)
-    before, after = np.float32(0.5 - BLOCK) * quarter, np.float32(-0.5) * quarter + _ONE
+    numbers, height, half = counting(), np.float32(BLOCK - 1), np.float32(0.5)
+    turned = numbers >= np.float32(EDGE)
+    side = where(turned, -_ONE, _ONE)
+    row = where(turned, numbers - np.float32(EDGE), numbers) * np.float32(BLOCK) + half
+    top = where(turned, -row - height, row)
     for entry in range(begin, end):
         prefetch(rows, index(entries[index(min(entry + AHEAD, len(entries) - 1))]))
         r = index(entries[index(entry)])
-        x, y, highest = (rows[r, MEAN_X] - x0) * quarter, rows[r, MEAN_Y] - y0, rows[r, HIGHEST]
+        x, y, highest = rows[r, MEAN_X] - x0, rows[r, MEAN_Y] - y0, rows[r, HIGHEST]
         shape = rows[r, WIDEST], highest, rows[r, SHEAR], rows[r, ASPECT]
-        blocks = index(0)
-        for j in range(edge):
-            low = np.float32(np.int32(j)) * np.float32(BLOCK) + np.float32(0.5) - y
-            high = low + np.float32(BLOCK - 1)
-            left, right = chord(shape, low, high)
-            first = np.int32(np.ceil(min(max(x + left * quarter + before, _ZERO), most)))
-            past = np.int32(np.floor(max(min(x + right * quarter + after, most), _ZERO)))
-            row = max(np.int32(1 << past) - np.int32(1 << first), np.int32(0))
-            row = row if low <= highest and high >= -highest else np.int32(0)
-            blocks |= index(row) << index(j * EDGE)
-        touched[index(entry)] = blocks
+        low = top - side * y
+        high = low + height
+        width, middle = half_span(shape, min(max(low, shape[0]), high))
+        reached = np.floor((middle + width + side * x + (height + half + SLACK)) * np.float32(1.0 / BLOCK))
+        counts = min(max(side * reached, _ZERO), np.float32(EDGE))
+        begun, passed = bits_below(where((low <= highest) & (high >= -highest), counts, _ZERO))
+        touched[index(entry)] = begun & ~passed & blocks
 
 
 @inlined
@@ -73,6 +75,14 @@ def placed(rows, r, x0, y0, block):
     dx = np.float32(np.int32(x0) + np.int32(block % index(EDGE)) * np.int32(BLOCK)) + np.float32(0.5) - rows[r, MEAN_X]
     dy = np.float32(np.int32(y0) + np.int32(block // index(EDGE)) * np.int32(BLOCK)) + np.float32(0.5) - rows[r, MEAN_Y]
     return dx, dy
+
+
+@inlined
+def pixels():
+    """How far each of a block's pixels lies from its first, across and down."""
+    numbers = counting()
+    down = np.floor(numbers / np.float32(BLOCK))
+    return numbers - down * np.float32(BLOCK), down
 
 
 @inlined
@@ -88,6 +98,7 @@ def inside(x0, y0, edge, width, height):
 @inlined
 def _open_tile(state, blocks, x0, y0, width, height, stride):
     """Full transmittance on every pixel of the image, and none (-1 marks a finished pixel) outside."""
+    across, down = pixels()
     while blocks:
         block = lowest_bit(blocks)
         blocks &= blocks - index(1)
@@ -95,93 +106,71 @@ def _open_tile(state, blocks, x0, y0, width, height, stride):
         state[base : base + stride] = _ZERO
         right = np.int32(width - x0) - np.int32(block % index(EDGE)) * np.int32(BLOCK)
         below = np.int32(height - y0) - np.int32(block // index(EDGE)) * np.int32(BLOCK)
-        for lane in range(BLOCK * BLOCK):
-            # No branch: vector registers hold a whole row of a block.
-            outside = (np.int32(lane % BLOCK) >= right) | (np.int32(lane // BLOCK) >= below)
-            state[base + index(lane)] = -_ONE if outside else _ONE
+        in_image = (across < np.float32(right)) & (down < np.float32(below))
+        store(state, base, where(in_image, _ONE, -_ONE))
 
 
 @inlined
-def _blend(state, base, rows, r, dx0, dy0, triples, fused):
-    """Composite one footprint onto one block; returns how many of its pixels are unfinished (as a float: it vectorises).
+def response_of(shape, opacity, dx, dy):
+    """What a footprint answers with to each pixel of a block, at ``dx`` and ``dy`` from its mean."""
+    xx, xy, yy = shape
+    return opacity * exp2_of((xx * dx + xy * dy) * dx + yy * dy * dy)
 
-    ``fused`` is how many of the triples of channels the loop takes along: a literal, for which LLVM drops what is not used.
-    """
-    xx, xy, yy = rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]
-    opacity = rows[r, OPACITY]
-    first, second, third = _three_features(rows, r, 0), _NO_FEATURES, _NO_FEATURES
-    if fused > 1:
-        second = _three_features(rows, r, 1)
-    if fused > 2:
-        third = _three_features(rows, r, 2)
-    unfinished = _ZERO
-    for lane in range(LANES):
-        dx = dx0 + np.float32(lane & index(3))
-        dy = dy0 + np.float32(lane >> index(2))
-        response = opacity * exp2(xx * dx * dx + xy * dx * dy + yy * dy * dy)
-        alpha = min(response if response >= _ALPHA_MIN else _ZERO, _ALPHA_MAX)
-        transmittance = state[base + lane]
+
+@inlined
+def shape_of(rows, r):
+    """The exponent's coefficients of a footprint, and its opacity."""
+    return (rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]), rows[r, OPACITY]
+
+
+@inlined
+def _draw(state, stride, rows, r, blocks, x0, y0, channels):
+    """Composite one footprint onto blocks of a tile; returns those whose pixels are all finished by then."""
+    shape, opacity = shape_of(rows, r)
+    red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
+    across, down = pixels()
+    finished = index(0)
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - index(1)
+        left, top = placed(rows, r, x0, y0, block)
+        response = response_of(shape, opacity, across + left, down + top)
+        alpha = min(where(response >= _ALPHA_MIN, response, _ZERO), _ALPHA_MAX)
+        base = block * stride
+        transmittance = load(state, base)
         weight = transmittance * alpha
         after = transmittance - weight
         # Finished pixels carry their final transmittance with a minus sign, so they stay below the limit.
         goes_on = after >= _STOP
-        weight = weight if goes_on else _ZERO
-        state[base + lane] = after if goes_on else -abs(transmittance)
-        state[base + LANES + lane] = weight
-        _add(state, base + index(2) * LANES + lane, weight, first)
-        if fused > 1:
-            _add(state, base + index(5) * LANES + lane, weight, second)
-        if fused > 2:
-            _add(state, base + index(8) * LANES + lane, weight, third)
-        unfinished += _ONE if goes_on else _ZERO
-    for k in range(fused, triples):
-        more = _three_features(rows, r, k)
-        for lane in range(LANES):
-            _add(state, base + index(2 + 3 * k) * LANES + lane, state[base + LANES + lane], more)
-    return unfinished
+        weight = where(goes_on, weight, _ZERO)
+        store(state, base, where(goes_on, after, -abs(transmittance)))
+        at = base + LANES
+        store(state, at, load(state, at) + weight * red)
+        store(state, at + LANES, load(state, at + LANES) + weight * green)
+        store(state, at + LANES + LANES, load(state, at + LANES + LANES) + weight * blue)
+        for k in range(3, channels):
+            at = base + index(1 + k) * LANES
+            store(state, at, load(state, at) + weight * rows[r, index(FEATURES + k)])
+        finished |= index(0) if any_of(goes_on) else index(1) << block
+    return finished
 
 
 @inlined
-def _three_features(rows, r, k):
-    """A triple of a footprint's features."""
-    column = index(FEATURES + 3 * k)
-    return rows[r, column], rows[r, column + index(1)], rows[r, column + index(2)]
-
-
-@inlined
-def _add(state, at, weight, values):
-    """Add three weighted channels of one pixel to its sums."""
-    state[at] += weight * values[0]
-    state[at + LANES] += weight * values[1]
-    state[at + LANES + LANES] += weight * values[2]
-
-
-@inlined
-def _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, touched, ends):
+def _composite_tile(rows, entries, first, last, x0, y0, channels, state, alive, touched, ends):
     """Walk a tile's footprints front to back until all its pixels are finished; returns the number of blocks visited."""
-    stride = LANES * index(2 + 3 * triples)
+    stride = LANES * index(1 + channels)
     visits = 0
     for begin in range(first, last, AHEAD):
         end = min(begin + AHEAD, last)
-        measure(rows, entries, begin, end, np.float32(x0), np.float32(y0), edge, touched)
+        measure(rows, entries, begin, end, np.float32(x0), np.float32(y0), alive, touched)
         for entry in range(begin, end):
-            r, blocks = index(entries[index(entry)]), touched[index(entry)] & alive
-            while blocks:
-                block = lowest_bit(blocks)
-                dx, dy = placed(rows, r, x0, y0, block)
-                visits += 1
-                base = block * stride
-                # Colours alone, with a depth, and with a normal: each has a loop of its own.
-                if triples == 1:
-                    unfinished = _blend(state, base, rows, r, dx, dy, triples, 1)
-                elif triples == 2:
-                    unfinished = _blend(state, base, rows, r, dx, dy, triples, 2)
-                else:
-                    unfinished = _blend(state, base, rows, r, dx, dy, triples, 3)
-                if unfinished == 0:
-                    alive ^= index(1) << block
-                    ends[block] = entry + 1
-                blocks &= blocks - index(1)
+            blocks = touched[index(entry)] & alive
+            visits += count_bits(blocks)
+            finished = _draw(state, stride, rows, index(entries[index(entry)]), blocks, x0, y0, channels)
+            alive ^= finished
+            while finished:
+                ends[lowest_bit(finished)] = entry + 1
+                finished &= finished - index(1)
         if alive == 0:
             break
     return visits
@@ -200,12 +189,12 @@ def _write_tile(state, x0, y0, edge, stride, image, alpha):
                     at = index(j * EDGE + i) * stride + index(row * BLOCK + column)
                     alpha[y, x] = _ONE - abs(state[at])
                     if channels == 3:
-                        image[y, x, index(0)] = state[at + index(2) * LANES]
-                        image[y, x, index(1)] = state[at + index(3) * LANES]
-                        image[y, x, index(2)] = state[at + index(4) * LANES]
+                        image[y, x, index(0)] = state[at + LANES]
+                        image[y, x, index(1)] = state[at + index(2) * LANES]
+                        image[y, x, index(2)] = state[at + index(3) * LANES]
                     else:
                         for k in range(channels):
-                            image[y, x, index(k)] = state[at + index(2 + k) * LANES]
+                            image[y, x, index(k)] = state[at + index(1 + k) * LANES]
 
 
 @parallel
@@ -226,8 +215,9 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, touche
         work: output, blocks visited per tile.
     """
     height, width = alpha.shape
-    triples = (rows.shape[1] - FEATURES) // 3
-    stride = LANES * index(2 + 3 * triples)
+    # Features were filled up to a multiple of three.
+    channels = rows.shape[1] - FEATURES
+    stride = LANES * index(1 + channels)
     for job in prange(len(bounds) - 1):
         state = np.empty(BLOCKS * stride, np.float32)
         for tile in range(bounds[job], bounds[job + 1]):
@@ -236,5 +226,5 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, touche
             _open_tile(state, alive, x0, y0, width, height, stride)
             first, last = starts[tile], starts[tile + 1]
             ends[tile, :] = last
-            work[tile] = _composite_tile(rows, entries, first, last, x0, y0, edge, triples, state, alive, touched, ends[tile])
+            work[tile] = _composite_tile(rows, entries, first, last, x0, y0, channels, state, alive, touched, ends[tile])
             _write_tile(state, x0, y0, edge, stride, image, alpha)

@@ -10,27 +10,21 @@ import numpy as np
 
 from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, OPACITY, POWER_XX, POWER_XY, POWER_YY
 from invgraphics.kernels.numba.instructions import SOON, lowest_bit, prefetch
-from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, inside, placed
-from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, parallel, prange, share
+from invgraphics.kernels.numba.lanes import load, spread, store, total, totals, where
+from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, inside, pixels, placed, response_of, shape_of
+from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 # What a block holds for each of its pixels, LANES values each: transmittance, the loss's derivative along what is still to be
-# composited, gradient of alpha, gradient along the current footprint's features beyond the first three, gradients of the
-# picture's channels.
-_T, _BEHIND, _ALPHA, _ALONG, _PICTURE = (index(slot) * LANES for slot in range(5))
+# composited, gradient of alpha, gradients of the picture's channels.
+_T, _BEHIND, _ALPHA, _PICTURE = (index(slot) * LANES for slot in range(4))
 
-# What is summed per footprint, before the features: v = dL/dalpha alpha times 1, x, y, x², x y, y².
+# What is summed per footprint: v = dL/dalpha alpha times 1, x, y, x², x y, y²; then the gradients of its first three features,
+# then the absolute ones where they are wanted. These fill a register; the gradients of further features follow it.
 MOMENTS = 6
-FIRST_SUMS = MOMENTS + 3
-"""Sums that are kept lane by lane while a footprint is on a tile: adding lanes up once is cheaper than for every block."""
-HALF = LANES // index(2)
-"""Lanes of those sums: the pixels of half a block."""
-_DOWN = np.float32(BLOCK // 2)
-"""Pixels from the upper half of a block to the lower."""
+_ABSOLUTE = MOMENTS + 3
 PULLS = 2
-"""Further sums, behind those of the features, where absolute gradients are wanted."""
-_V, _WEIGHT, _ROOM = (index(FIRST_SUMS + PULLS) * HALF + index(slot) * LANES for slot in range(3))
-"""Behind those lanes: v and weight that the current footprint has in each pixel of the current block."""
+"""How many absolute gradients there are."""
 
 # What few fits need must not slow down the others. A switch is a tuple whose length says whether it is on: Numba compiles the
 # kernel anew for each length, and LLVM drops the code of what is off.
@@ -79,122 +73,66 @@ def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_
                         for k in range(channels):
                             behind += _hand_over(state, at, image, image_gradient, y, x, index(k))
                     state[at + _T], state[at + _BEHIND] = _ONE, behind
-                    state[at + _ALPHA], state[at + _ALONG] = gradient, gradient
+                    state[at + _ALPHA] = gradient
 
 
 @inlined
-def _unblend(state, lanes, base, rows, r, dx0, dy0, rank, receivers):
-    """Repeat one footprint's blending onto one block: what it has there is left behind the lanes.
+def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, absolute, receivers):
+    """Repeat one footprint's blending onto blocks of a tile, and add what it receives from them to its row of ``sums``.
 
-    With ``receivers`` on, ``rank`` is where the block counts the footprints that each of its pixels has seen.
+    With ``receivers`` on, a block counts at its end the footprints that each of its pixels has seen.
     """
-    xx, xy, yy = rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]
-    opacity = rows[r, OPACITY]
+    shape, opacity = shape_of(rows, r)
+    xx, xy, yy = conic(rows, r)
     red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
-    for lane in range(LANES):
-        dx = dx0 + np.float32(lane & index(3))
-        dy = dy0 + np.float32(lane >> index(2))
-        response = opacity * exp2(xx * dx * dx + xy * dx * dy + yy * dy * dy)
-        response = response if response >= _ALPHA_MIN else _ZERO
+    (across, down), none = pixels(), spread(_ZERO)
+    sum_1 = sum_x = sum_y = sum_xx = sum_xy = sum_yy = sum_red = sum_green = sum_blue = pull_x = pull_y = none
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - index(1)
+        left, top = placed(rows, r, x0, y0, block)
+        dx, dy = across + left, down + top
+        response = response_of(shape, opacity, dx, dy)
+        response = where(response >= _ALPHA_MIN, response, _ZERO)
         alpha = min(response, _ALPHA_MAX)
-        transmittance = state[base + lane]
+        base = block * stride
+        transmittance = load(state, base)
         weight = transmittance * alpha
         after = transmittance - weight
         goes_on = after >= _STOP
-        weight = weight if goes_on else _ZERO
-        g_red = state[base + _PICTURE + lane]
-        g_green = state[base + _PICTURE + LANES + lane]
-        g_blue = state[base + _PICTURE + LANES + LANES + lane]
-        along = state[base + _ALONG + lane] + g_red * red + g_green * green + g_blue * blue
-        behind = state[base + _BEHIND + lane] - weight * along
-        state[base + _BEHIND + lane] = behind
-        state[base + lane] = after if goes_on else -abs(transmittance)
+        weight = where(goes_on, weight, _ZERO)
+        store(state, base, where(goes_on, after, -abs(transmittance)))
+        at = base + _PICTURE
+        to_red, to_green, to_blue = load(state, at), load(state, at + LANES), load(state, at + LANES + LANES)
+        along = load(state, base + _ALPHA) + to_red * red + to_green * green + to_blue * blue
+        for k in range(3, channels):
+            along += load(state, at + index(k) * LANES) * rows[r, index(FEATURES + k)]
+        behind = load(state, base + _BEHIND) - weight * along
+        store(state, base + _BEHIND, behind)
         # alpha raises its own contribution and hides what is behind; where it is clamped or skipped it does not change.
         v = response * (transmittance * along - behind / (_ONE - alpha))
-        v = v if goes_on else _ZERO
-        v = v if response < _ALPHA_MAX else _ZERO
+        v = where(goes_on & (response < _ALPHA_MAX), v, _ZERO)
         if len(receivers) == ON:
-            seen = state[rank + lane] + (_ONE if alpha > _ZERO else _ZERO)
-            state[rank + lane] = seen
-            v = v if seen <= receivers[0] else _ZERO
-            weight = weight if seen <= receivers[0] else _ZERO
-        lanes[_WEIGHT + lane] = weight
-        lanes[_V + lane] = v
-
-
-@inlined
-def _sum(state, lanes, half, base, rows, r, dx0, dy0, absolute):
-    """Add what the footprint has on the block to its sums, lane by lane, the upper half and the lower to the same ones.
-
-    ``half`` is `HALF` where the compiler cannot see it: it would unroll the loop, and then find no vectors in it.
-    """
-    for lane in range(half):
-        dx = dx0 + np.float32(lane & index(3))
-        dy = dy0 + np.float32(lane >> index(2))
-        below = dy + _DOWN
-        v, w = lanes[_V + lane], lanes[_V + HALF + lane]
-        both, vy, wy = v + w, v * dy, w * below
-        y = vy + wy
-        lanes[lane] += both
-        lanes[HALF + lane] += both * dx
-        lanes[index(2) * HALF + lane] += y
-        lanes[index(3) * HALF + lane] += both * dx * dx
-        lanes[index(4) * HALF + lane] += y * dx
-        lanes[index(5) * HALF + lane] += vy * dy + wy * below
-        first, second = lanes[_WEIGHT + lane], lanes[_WEIGHT + HALF + lane]
-        at = base + _PICTURE + lane
-        lanes[index(6) * HALF + lane] += first * state[at] + second * state[at + HALF]
-        lanes[index(7) * HALF + lane] += first * state[at + LANES] + second * state[at + LANES + HALF]
-        at += index(2) * LANES
-        lanes[index(8) * HALF + lane] += first * state[at] + second * state[at + HALF]
+            rank = base + stride - LANES
+            seen = load(state, rank) + where(alpha > _ZERO, _ONE, _ZERO)
+            store(state, rank, seen)
+            v, weight = where(seen <= receivers[0], v, _ZERO), where(seen <= receivers[0], weight, _ZERO)
+        vx, vy = v * dx, v * dy
+        sum_1, sum_x, sum_y = sum_1 + v, sum_x + vx, sum_y + vy
+        sum_xx, sum_xy, sum_yy = sum_xx + vx * dx, sum_xy + vx * dy, sum_yy + vy * dy
+        sum_red, sum_green, sum_blue = sum_red + weight * to_red, sum_green + weight * to_green, sum_blue + weight * to_blue
         if len(absolute) == ON:
-            xx, xy, yy = conic(rows, r)
-            vx, wx = v * dx, w * dx
-            lanes[index(9) * HALF + lane] += abs(xx * vx + xy * vy) + abs(xx * wx + xy * wy)
-            lanes[index(10) * HALF + lane] += abs(xy * vx + yy * vy) + abs(xy * wx + yy * wy)
+            pull_x, pull_y = pull_x + abs(xx * vx + xy * vy), pull_y + abs(xy * vx + yy * vy)
+        for k in range(3, channels):
+            sums[r, LANES + index(k - 3)] += total(weight * load(state, at + index(k) * LANES))
+    found = totals((sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy, sum_red, sum_green, sum_blue, pull_x, pull_y))
+    own = r * index(sums.shape[1])
+    store(sums, own, load(sums, own) + found)
 
 
 @inlined
-def _look_along(state, base, rows, r, triples):
-    """Gradient of alpha plus the dot product of the picture's gradients and the features beyond the first three."""
-    for lane in range(LANES):
-        state[base + _ALONG + lane] = state[base + _ALPHA + lane]
-    for k in range(3, 3 * triples):
-        value = rows[r, index(FEATURES + k)]
-        channel = _PICTURE + index(k) * LANES
-        for lane in range(LANES):
-            state[base + _ALONG + lane] += state[base + channel + lane] * value
-
-
-@inlined
-def _sum_further(state, lanes, base, sums, r, triples):
-    """Gradients of the features beyond the first three."""
-    for k in range(3, 3 * triples):
-        channel = _PICTURE + index(k) * LANES
-        total = _ZERO
-        for lane in range(LANES):
-            total += lanes[_WEIGHT + lane] * state[base + channel + lane]
-        sums[r, index(MOMENTS + k)] += total
-
-
-@inlined
-def _add_up(lanes, half, sums, r, absolute):
-    """Move a footprint's sums from the lanes, which are cleared, to its row."""
-    for k in range(FIRST_SUMS + (PULLS if len(absolute) == ON else 0)):
-        total = _ZERO
-        for lane in range(half):
-            total += lanes[index(k) * HALF + lane]
-            lanes[index(k) * HALF + lane] = _ZERO
-        to = k if k < FIRST_SUMS else sums.shape[1] - PULLS + k - FIRST_SUMS
-        sums[r, index(to)] += total
-
-
-@inlined
-def _walk_tile(
-    rows, entries, first, last, x0, y0, triples, state, lanes, stride, alive, touched, ends, sums, absolute, receivers
-):  # fmt: skip
+def _walk_tile(rows, entries, first, last, x0, y0, channels, state, stride, alive, touched, ends, sums, absolute, receivers):
     """Walk a tile's footprints front to back and add what each of them receives to ``sums``."""
-    half = index(len(lanes) // (_ROOM // HALF))
     for entry in range(first, last):
         if not alive:
             break
@@ -203,20 +141,12 @@ def _walk_tile(
         prefetch(sums, ahead)
         r, blocks = index(entries[index(entry)]), touched[index(entry)] & alive
         if blocks:
+            _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, absolute, receivers)
             while blocks:
                 block = lowest_bit(blocks)
-                base = block * stride
-                dx, dy = placed(rows, r, x0, y0, block)
-                if triples > 1:
-                    _look_along(state, base, rows, r, triples)
-                _unblend(state, lanes, base, rows, r, dx, dy, base + stride - LANES, receivers)
-                _sum(state, lanes, half, base, rows, r, dx, dy, absolute)
-                if triples > 1:
-                    _sum_further(state, lanes, base, sums, r, triples)
+                blocks &= blocks - index(1)
                 if entry + 1 == ends[block]:
                     alive ^= index(1) << block
-                blocks &= blocks - index(1)
-            _add_up(lanes, half, sums, r, absolute)
 
 
 @parallel
@@ -224,16 +154,16 @@ def walk_back(
     rows, entries, starts, bounds, edge, columns, touched, ends, image, alpha, image_gradient, alpha_gradient, sums, absolute,
     receivers,
 ):  # fmt: skip
-    """Per job and packed footprint, the sums from which `gather` makes gradients (arguments as in `rasterise`).
+    """Per job and packed footprint, the sums from which `gather` makes gradients (other arguments as in `rasterise`).
 
     Two switches: ``absolute`` adds `PULLS` sums of absolute gradients; ``receivers`` lets only so many footprints of a pixel,
     from the front, receive its gradient.
     """
     height, width = alpha.shape
-    triples = (rows.shape[1] - FEATURES) // 3
-    stride = _PICTURE + LANES * index(3 * triples + (1 if len(receivers) == ON else 0))
+    channels = rows.shape[1] - FEATURES
+    stride = _PICTURE + LANES * index(channels + (1 if len(receivers) == ON else 0))
     for job in prange(len(bounds) - 1):
-        state, lanes = np.empty(BLOCKS * stride, np.float32), np.zeros(_ROOM, np.float32)
+        state = np.empty(BLOCKS * stride, np.float32)
         own = sums[job]
         own[:] = _ZERO
         for tile in range(bounds[job], bounds[job + 1]):
@@ -241,7 +171,7 @@ def walk_back(
                 x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
                 _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient)
                 _walk_tile(
-                    rows, entries, starts[tile], starts[tile + 1], x0, y0, triples, state, lanes, stride,
+                    rows, entries, starts[tile], starts[tile + 1], x0, y0, channels, state, stride,
                     inside(x0, y0, edge, width, height), touched, ends[tile], own, absolute, receivers,
                 )  # fmt: skip
 
@@ -266,6 +196,6 @@ def gather(order, rows, sums, means, conics, opacities, features, pulls):
             conics[i, 0], conics[i, 1], conics[i, 2] = -_HALF * s[3], -s[4], -_HALF * s[5]
             opacities[i] = s[0] / rows[r, OPACITY] if s[0] != _ZERO else _ZERO
             for k in range(features.shape[1]):
-                features[i, k] = s[MOMENTS + k]
+                features[i, k] = s[MOMENTS + k] if k < 3 else s[LANES + index(k - 3)]
             if len(pulls):
-                pulls[i, 0], pulls[i, 1] = s[len(s) - 2], s[len(s) - 1]
+                pulls[i, 0], pulls[i, 1] = s[_ABSOLUTE], s[_ABSOLUTE + 1]

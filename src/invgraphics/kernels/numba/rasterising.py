@@ -13,8 +13,8 @@ from invgraphics.kernels import reference
 from invgraphics.kernels.numba.binning import FEATURES, Packed, pack
 from invgraphics.kernels.numba.median import median
 from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, rasterise
-from invgraphics.kernels.numba.raster_backward import MOMENTS, OFF, ON, PULLS, gather, walk_back
-from invgraphics.kernels.numba.runtime import array, once_differentiable, scratch, split_by_work, threads
+from invgraphics.kernels.numba.raster_backward import OFF, ON, PULLS, gather, walk_back
+from invgraphics.kernels.numba.runtime import LANES, array, once_differentiable, scratch, split_by_work, threads
 from invgraphics.kernels.types import Footprints
 
 TILE = EDGE * BLOCK
@@ -64,8 +64,7 @@ class _Rasterise(torch.autograd.Function):
         bounds = _bounds(work)
         absolute = ctx.needs_input_grad[4]
         rows = packed.rows
-        width = MOMENTS + rows.shape[1] - FEATURES + (PULLS if absolute else 0)
-        shape = (len(bounds) - 1, len(rows), width)
+        shape = (len(bounds) - 1, len(rows), int(LANES) + rows.shape[1] - FEATURES - 3)
         sums = scratch("splat sums", int(np.prod(shape))).reshape(shape)
         walk_back(
             rows,

@@ -1,0 +1,249 @@
+"""A vector register as a value: `LANES` numbers that Numba's kernels add, multiply and compare like one.
+
+Numba's loops over the lanes of a scratch array are found by LLVM and become the same instructions, but every sum then lives in
+memory. A value of this type stays in a register for as long as it is used, and a kernel reads as if it handled one pixel.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import extending
+from numba.core import cgutils, types
+from numba.core.datamodel import models
+from numba.core.typeconv import Conversion
+from numba.core.typing import templates
+
+from invgraphics.kernels.numba.runtime import LANES, exp2_fraction, inlined
+
+_WIDTH = int(LANES)
+_WORD = ir.IntType(32)
+
+# Drops the first parameter, in a way that no checker can follow.
+_intrinsic: Any = extending.intrinsic
+
+
+class _Register(types.Type):
+    """`LANES` values side by side."""
+
+    def __init__(self, name: str, element: Any) -> None:
+        super().__init__(name)
+        self.layout = ir.VectorType(element, _WIDTH)
+
+    def can_convert_from(self, typingctx: Any, other: Any) -> Any:
+        """A number can stand for itself in all lanes."""
+        return Conversion.safe if self is lanes and other == types.float32 else None
+
+
+lanes = _Register("lanes", ir.FloatType())
+"""`LANES` numbers (float32)."""
+mask = _Register("mask", ir.IntType(1))
+"""What comparing them gives."""
+
+
+@extending.register_model(_Register)
+class _Model(models.PrimitiveModel):
+    def __init__(self, dmm: Any, kind: _Register) -> None:
+        super().__init__(dmm, kind, kind.layout)
+
+
+def everywhere(builder: Any, value: Any) -> Any:
+    """A register that holds one number in all lanes."""
+    one = builder.insert_element(ir.Constant(lanes.layout, ir.Undefined), value, ir.Constant(_WORD, 0))
+    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(_WORD, _WIDTH), None))
+
+
+@extending.lower_cast(types.float32, _Register)
+def _from_number(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
+    return everywhere(builder, value)
+
+
+def _define(function: Any, result: _Register, operands: tuple[_Register, ...], generate: Callable[..., Any]) -> None:
+    """Say what a Python operator means for registers; ``generate`` gets the builder and the operands."""
+    signature = templates.signature(result, *operands)
+    templates.infer_global(function)(type("Rule", (templates.ConcreteTemplate,), {"cases": [signature]}))
+
+    def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return generate(builder, *arguments)
+
+    extending.lower_builtin(function, *signature.args)(lower)
+
+
+def _apply(name: str) -> Callable[..., Any]:
+    """A function of LLVM's own, lane by lane."""
+    kind, name = ir.FunctionType(lanes.layout, [lanes.layout]), f"llvm.{name}.v{_WIDTH}f32"
+    return lambda builder, value: builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
+
+
+def _select(comparison: str) -> Callable[..., Any]:
+    return lambda builder, a, b: builder.select(builder.fcmp_ordered(comparison, a, b), a, b)
+
+
+for _function in (operator.add, operator.iadd):
+    _define(_function, lanes, (lanes, lanes), lambda builder, a, b: builder.fadd(a, b))
+_define(operator.sub, lanes, (lanes, lanes), lambda builder, a, b: builder.fsub(a, b))
+_define(operator.mul, lanes, (lanes, lanes), lambda builder, a, b: builder.fmul(a, b))
+_define(operator.truediv, lanes, (lanes, lanes), lambda builder, a, b: builder.fdiv(a, b))
+_define(operator.neg, lanes, (lanes,), lambda builder, a: builder.fneg(a))
+_define(abs, lanes, (lanes,), _apply("fabs"))
+_define(np.floor, lanes, (lanes,), _apply("floor"))
+_define(np.sqrt, lanes, (lanes,), _apply("sqrt"))
+# Of a number and NaN, the second operand.
+_define(min, lanes, (lanes, lanes), _select("<"))
+_define(max, lanes, (lanes, lanes), _select(">"))
+for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
+    _define(_function, mask, (lanes, lanes), lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
+_define(operator.and_, mask, (mask, mask), lambda builder, a, b: builder.and_(a, b))
+
+
+def _place(context: Any, builder: Any, kind: Any, flat: Any, at: Any) -> Any:
+    data = context.make_array(kind)(context, builder, flat).data
+    return builder.bitcast(builder.gep(data, [at]), lanes.layout.as_pointer())
+
+
+@_intrinsic
+def load(typing: Any, flat: Any, at: Any) -> Any:
+    """`LANES` numbers of a flat array from ``at`` (uint64) on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(_place(context, builder, signature.args[0], *arguments), align=4)
+
+    return lanes(flat, types.uint64), generate
+
+
+@_intrinsic
+def store(typing: Any, flat: Any, at: Any, value: Any) -> Any:
+    """Write `LANES` numbers to a flat array from ``at`` (uint64) on."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.store(arguments[2], _place(context, builder, signature.args[0], *arguments[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(flat, types.uint64, lanes), generate
+
+
+@_intrinsic
+def where(typing: Any, condition: Any, yes: Any, no: Any) -> Any:
+    """``yes`` in the lanes where the condition holds, ``no`` in the others."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(*arguments)
+
+    return lanes(mask, lanes, lanes), generate
+
+
+@_intrinsic
+def any_of(typing: Any, condition: Any) -> Any:
+    """Whether a condition holds in any lane."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        bits = builder.bitcast(arguments[0], ir.IntType(_WIDTH))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+    return types.boolean(mask), generate
+
+
+@_intrinsic
+def counting(typing: Any) -> Any:
+    """0, 1, 2, ... in the lanes."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return ir.Constant(lanes.layout, [float(lane) for lane in range(_WIDTH)])
+
+    return lanes(), generate
+
+
+@_intrinsic
+def spread(typing: Any, value: Any) -> Any:
+    """A number in all lanes."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return arguments[0]
+
+    return lanes(lanes), generate
+
+
+@_intrinsic
+def bits_below(typing: Any, counts: Any) -> Any:
+    """Per lane a byte whose lowest ``counts`` bits are set (whole numbers, 0 to 8); 8 lanes are a word (uint64)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        words, bytes_ = ir.VectorType(_WORD, _WIDTH), ir.VectorType(ir.IntType(8), _WIDTH)
+        ones = ir.Constant(words, [1] * _WIDTH)
+        bits = builder.sub(builder.shl(ones, builder.fptosi(arguments[0], words)), ones)
+        pair = builder.bitcast(builder.trunc(bits, bytes_), ir.VectorType(ir.IntType(64), 2))
+        found = [builder.extract_element(pair, ir.Constant(_WORD, k)) for k in range(2)]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    return types.UniTuple(types.uint64, 2)(lanes), generate
+
+
+@_intrinsic
+def _power_of_two(typing: Any, whole: Any) -> Any:
+    """``2**whole`` for whole numbers in [-126, 127]: the exponent of a float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        words = ir.VectorType(_WORD, _WIDTH)
+        bits = builder.add(builder.fptosi(arguments[0], words), ir.Constant(words, [127] * _WIDTH))
+        return builder.bitcast(builder.shl(bits, ir.Constant(words, [23] * _WIDTH)), lanes.layout)
+
+    return lanes(lanes), generate
+
+
+@inlined
+def exp2_of(x):
+    """`runtime.exp2` of every lane."""
+    x = max(x, np.float32(-126.0))
+    whole = np.floor(x + np.float32(0.5))
+    return (exp2_fraction(x - whole) + np.float32(1.0)) * _power_of_two(whole)
+
+
+def _paired(builder: Any, first: Any, second: Any, held: int) -> Any:
+    """Both of two rows in one: of the sums that each holds, in equal parts of its lanes, the halves of a part are added."""
+    part = _WIDTH // held
+    starts = range(0, 2 * _WIDTH, part)
+
+    def halves(begin: int) -> Any:
+        chosen = [start + begin + lane for start in starts for lane in range(part // 2)]
+        return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(_WORD, _WIDTH), chosen))
+
+    return builder.fadd(halves(0), halves(part // 2))
+
+
+def _summed(builder: Any, rows: list[Any]) -> Any:
+    """The sums of the rows, in the first lanes of one."""
+    rows = rows + [ir.Constant(lanes.layout, None)] * (_WIDTH - len(rows))
+    held = 1
+    while held < _WIDTH:
+        rows = [_paired(builder, *rows[k : k + 2], held) for k in range(0, len(rows), 2)]
+        held *= 2
+    return rows[0]
+
+
+@_intrinsic
+def total(typing: Any, value: Any) -> Any:
+    """The sum over the lanes."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.extract_element(_summed(builder, [arguments[0]]), ir.Constant(_WORD, 0))
+
+    return types.float32(lanes), generate
+
+
+@_intrinsic
+def totals(typing: Any, values: Any) -> Any:
+    """The sums over the lanes of up to `LANES` registers, in the first lanes of one; the others hold 0.
+
+    Registers are added up in pairs, each of which then takes half the room: that takes a quarter of the instructions of summing
+    one after the other.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        rows = [builder.extract_value(arguments[0], k) for k in range(values.count)]
+        return _summed(builder, rows)
+
+    return lanes(values), generate
