@@ -1,5 +1,7 @@
 """Losses, optimiser, batches, budget and checkpoint, each against an independent route."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from invgraphics.errors import InputError
 from invgraphics.training import checkpoint
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
-from invgraphics.training.losses import CoarseConfig, DistortionConfig, PhotometricConfig, SsimConfig
+from invgraphics.training.losses import CoarseConfig, DistortionConfig, PhotometricConfig, SsimConfig, picture_of
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 
 BOX = Bounds(-torch.ones(3), torch.ones(3))
@@ -40,6 +42,13 @@ def test_photometric_distances() -> None:
     small = difference.abs() < 0.1
     huber = 10 * torch.where(small, difference**2 / 2, 0.1 * (difference.abs() - 0.05)).mean()
     assert PhotometricConfig(1.0, "huber").build()(picture, Trace(), batch, CTX) == pytest.approx(float(huber), rel=1e-5)
+
+
+def test_one_picture_for_all_losses_of_a_step() -> None:
+    picture, batch = _rendering(7)
+    assert picture_of(picture, batch) is picture_of(picture, batch)
+    other = replace(batch, background=torch.zeros(3))
+    torch.testing.assert_close(picture_of(picture, other), picture.rgb)
 
 
 def test_coarse_loss_is_the_level_composited_by_hand() -> None:

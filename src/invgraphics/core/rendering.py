@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.compositing import over
 from invgraphics.core.samples import FieldValues, Samples
 
 
@@ -31,7 +32,7 @@ class Rendering:
 
     def over(self, background: Float[Tensor, 3] | Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
         """The picture in front of ``background``: the only place where a background is applied."""
-        return self.rgb + (1 - self.alpha[..., None]) * background
+        return over(self.rgb, self.alpha, background)
 
     def reshape(self, *shape: int) -> Rendering:
         """The same pixels in another arrangement, for instance ``(height, width)``."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
+from invgraphics.core.compositing import straight_over
 
 Pixels = UInt8[Tensor, "h w c"] | Float[Tensor, "h w c"]
 
@@ -61,8 +62,7 @@ class View:
         """The photograph in front of ``background``."""
         if self.alpha is None:
             return self.colour(index)
-        alpha = self.opacity(index)[..., None]
-        return self.colour(index) * alpha + (1 - alpha) * background
+        return straight_over(self.colour(index), self.opacity(index), background)
 
 
 def _floats(values: Tensor) -> Tensor:

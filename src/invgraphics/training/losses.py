@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,17 @@ from invgraphics.core import Batch, Context, Rendering, Trace
 Loss = Callable[[Rendering, Trace, Batch, Context], Tensor]
 
 Distance = Literal["mse", "l1", "huber"]
+
+_pictures: WeakKeyDictionary[Rendering, tuple[Tensor, Tensor]] = WeakKeyDictionary()
+
+
+def picture_of(rendering: Rendering, batch: Batch) -> Float[Tensor, "*p 3"]:
+    """The rendering in front of its batch's background; made once for all losses of a step."""
+    background, picture = _pictures.get(rendering, (None, batch.background))
+    if background is not batch.background:
+        picture = rendering.over(batch.background)
+        _pictures[rendering] = batch.background, picture
+    return picture
 
 
 def distance(kind: Distance, prediction: Float[Tensor, "*p 3"], target: Float[Tensor, "*p 3"]) -> Float[Tensor, ""]:
@@ -44,7 +56,7 @@ class PhotometricConfig:
         """The loss as a function."""
 
         def loss(rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Tensor:
-            return self.weight * distance(self.distance, rendering.over(batch.background), batch.target)
+            return self.weight * distance(self.distance, picture_of(rendering, batch), batch.target)
 
         return loss
 
@@ -90,7 +102,7 @@ class SsimConfig:
         """The loss as a function."""
 
         def loss(rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Tensor:
-            return self.weight * (1 - kernels.ssim(rendering.over(batch.background), batch.target))
+            return self.weight * (1 - kernels.ssim(picture_of(rendering, batch), batch.target))
 
         return loss
 
