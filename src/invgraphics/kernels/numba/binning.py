@@ -106,10 +106,22 @@ def _drawable(x, y, xx, yy, det):
     return inside and regular and max(xx, yy) < np.float32(1.0) / SMALLEST
 
 
+@inlined
+def _tile_rows(rows, r, tile, count):
+    # A tile's pixel centres begin and end half a pixel inside it.
+    half = np.float32(0.5)
+    return _tiles(rows[r, MEAN_Y] - rows[r, HIGHEST] + half, rows[r, MEAN_Y] + rows[r, HIGHEST] - half, tile, count)
+
+
 @parallel
-def _pack(order, means, conics, opacities, features, rows, jobs):
-    """Gather footprints front to back; those that cannot be drawn get an ellipse of negative height."""
+def _pack(order, means, conics, opacities, features, tile, columns, lines, rows, most):
+    """Gather footprints front to back; those that cannot be drawn get an ellipse of negative height.
+
+    ``most`` receives, per job, in how many tiles its footprints' boxes lie: they touch no more.
+    """
+    jobs, edge, half = len(most), np.float32(tile), np.float32(0.5)
     for job in prange(jobs):
+        total = 0
         for r in range(share(len(order), jobs, job), share(len(order), jobs, job + 1)):
             ahead = index(order[min(r + SOON, len(order) - 1)])
             prefetch(means, ahead)
@@ -130,9 +142,15 @@ def _pack(order, means, conics, opacities, features, rows, jobs):
                 rows[r, HIGHEST] = np.sqrt(a) * size * np.float32(1.00001) + SLACK
                 rows[r, SHEAR] = -b / a
                 rows[r, ASPECT] = np.sqrt(det) / a
+                # No chord of the ellipse that high reaches farther.
+                wide = rows[r, HIGHEST] * np.sqrt(c / a) * np.float32(1.00001) + SLACK + SLACK
+                left, right = _tiles(means[i, 0] - wide + half, means[i, 0] + wide - half, edge, columns)
+                top, bottom = _tile_rows(rows, r, edge, lines)
+                total += max(right - left + 1, 0) * max(bottom - top + 1, 0)
             rows[r, FEATURES:] = np.float32(0.0)
             for k in range(features.shape[1]):
                 rows[r, FEATURES + k] = features[i, k]
+        most[job] = total
 
 
 @inlined
@@ -155,13 +173,6 @@ def _chord(shape, low, high):
 
 
 @inlined
-def _tile_rows(rows, r, tile, count):
-    # A tile's pixel centres begin and end half a pixel inside it.
-    half = np.float32(0.5)
-    return _tiles(rows[r, MEAN_Y] - rows[r, HIGHEST] + half, rows[r, MEAN_Y] + rows[r, HIGHEST] - half, tile, count)
-
-
-@inlined
 def _tile_columns(rows, r, y, tile, count):
     """Tiles of tile row ``y`` that the ellipse touches (between the first and the last pixel centre)."""
     low = y * tile + np.float32(0.5) - rows[r, MEAN_Y]
@@ -172,19 +183,26 @@ def _tile_columns(rows, r, y, tile, count):
 
 
 @parallel
-def _count(rows, tile, columns, lines, counts):
-    """Per job, how many of its footprints touch each tile."""
+def _count(rows, tile, columns, lines, counts, pairs, found):
+    """Per job, how many of its footprints touch each tile; and all pairs of a tile and a footprint that touches it."""
     jobs, m = counts.shape[0], rows.shape[0]
     edge = np.float32(tile)
     for job in prange(jobs):
         counts[job, :] = 0
+        number = 0
         for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
             if rows[r, HIGHEST] > 0:
                 top, bottom = _tile_rows(rows, r, edge, lines)
                 for y in range(top, bottom + 1):
                     first, last = _tile_columns(rows, r, np.float32(y), edge, columns)
                     for x in range(first, last + 1):
-                        counts[job, index(y * columns + x)] += 1
+                        # Always so, but for what rounding might do.
+                        if number < pairs.shape[2]:
+                            t = y * columns + x
+                            counts[job, index(t)] += 1
+                            pairs[job, 0, index(number)], pairs[job, 1, index(number)] = t, r
+                            number += 1
+        found[job] = number
 
 
 @serial
@@ -202,20 +220,14 @@ def _running_totals(counts, starts):
 
 
 @parallel
-def _list(rows, tile, columns, lines, places, entries):
+def _list(pairs, found, places, entries):
     """Write each footprint to the tiles it touches; ``places`` says where each job's next entry of a tile goes."""
-    jobs, m = places.shape[0], rows.shape[0]
-    edge = np.float32(tile)
-    for job in prange(jobs):
-        for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
-            if rows[r, HIGHEST] > 0:
-                top, bottom = _tile_rows(rows, r, edge, lines)
-                for y in range(top, bottom + 1):
-                    first, last = _tile_columns(rows, r, np.float32(y), edge, columns)
-                    for x in range(first, last + 1):
-                        place = places[job, index(y * columns + x)]
-                        places[job, index(y * columns + x)] = place + 1
-                        entries[index(place)] = r
+    for job in prange(len(found)):
+        for k in range(found[job]):
+            t = index(pairs[job, 0, index(k)])
+            place = places[job, t]
+            places[job, t] = place + 1
+            entries[index(place)] = pairs[job, 1, index(k)]
 
 
 def pack(footprints: Footprints, features: Float[Tensor, "n c"], columns: int, lines: int, tile: int) -> Packed:
@@ -225,12 +237,15 @@ def pack(footprints: Footprints, features: Float[Tensor, "n c"], columns: int, l
     # Features are handled three at a time.
     rows = np.empty((len(order), FEATURES + 3 * -(-features.shape[1] // 3)), np.float32)
     means, conics, opacities = array(footprints.means2d), array(footprints.conics), array(footprints.opacities)
-    _pack(order, means, conics, opacities, array(features), rows, jobs)
+    most, found = np.empty(jobs, np.int64), np.empty(jobs, np.int64)
+    _pack(order, means, conics, opacities, array(features), tile, columns, lines, rows, most)
     counts = scratch("tile counts", jobs * columns * lines, np.int64).reshape(jobs, columns * lines)
     starts = np.empty(columns * lines + 1, np.int64)
-    _count(rows, tile, columns, lines, counts)
+    room = int(most.max())
+    pairs = scratch("tile pairs", jobs * 2 * room, np.int32).reshape(jobs, 2, room)
+    _count(rows, tile, columns, lines, counts, pairs, found)
     entries = np.empty(_running_totals(counts, starts), np.int32)
-    _list(rows, tile, columns, lines, counts, entries)
+    _list(pairs, found, counts, entries)
     return Packed(order, rows, entries, starts)
 
 

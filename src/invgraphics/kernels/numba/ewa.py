@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from invgraphics.kernels.numba.harmonics import harmonics
+from invgraphics.kernels.numba.layouts import read_1, read_3, read_4, write_1, write_2, write_3
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, log2, parallel, prange, share
 from invgraphics.kernels.reference.splat_project import ILL_CONDITIONED, MARGIN, NEAR
 from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN
@@ -28,20 +29,6 @@ _NEAR, _MARGIN, _THIN = np.float32(NEAR), np.float32(MARGIN), np.float32(ILL_CON
 _TINY, _EPSILON = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
 _TWO_LN_2, _PER_ALPHA_MIN = np.float32(2 * np.log(2)), np.float32(1 / ALPHA_MIN)
 _NORM_MIN, _FADE_MIN = np.float32(1e-12), np.float32(FADE_MIN)
-
-
-@inlined
-def load(lanes, slot, values, i):
-    """Copy the columns of row ``i`` to a lane, given as the place of its first slot."""
-    for k in range(values.shape[1]):
-        lanes[slot + index(k) * LANES] = values[i, index(k)]
-
-
-@inlined
-def store(lanes, slot, values, i):
-    """Copy a lane to the columns of row ``i``."""
-    for k in range(values.shape[1]):
-        values[i, index(k)] = lanes[slot + index(k) * LANES]
 
 
 @inlined
@@ -260,18 +247,19 @@ def project(
         end = share(n, jobs, job + 1)
         for begin in range(share(n, jobs, job), end, GROUP):
             count = min(GROUP, end - begin)
-            for lane in range(count):
-                i, at = index(begin + lane), index(lane)
-                load(lanes, MEAN + at, means, i)
-                load(lanes, QUATERNION + at, quaternions, i)
-                load(lanes, SCALE + at, scales, i)
-                lanes[_OPACITY + at] = opacities[i]
+            i = index(begin)
+            read_3(means, i, count, lanes, MEAN)
+            read_4(quaternions, i, count, lanes, QUATERNION)
+            read_3(scales, i, count, lanes, SCALE)
+            read_1(opacities, i, count, lanes, _OPACITY)
             for lane in range(LANES):
                 _project_lane(view, dilation, compensate, lanes, lane)
+            write_1(depths, i, count, lanes, _DEPTH)
+            write_1(radii, i, count, lanes, _RADIUS)
+            write_1(fades, i, count, lanes, _FADE)
+            write_2(means2d, i, count, lanes, _SCREEN)
+            write_3(conics, i, count, lanes, _CONIC)
+            write_3(planes, i, count, lanes, _PLANE)
             for lane in range(count):
                 i, at = index(begin + lane), index(lane)
-                depths[i], radii[i], fades[i] = lanes[_DEPTH + at], lanes[_RADIUS + at], lanes[_FADE + at]
-                store(lanes, _SCREEN + at, means2d, i)
-                store(lanes, _CONIC + at, conics, i)
-                store(lanes, _PLANE + at, planes, i)
                 rgb[i, 0], rgb[i, 1], rgb[i, 2] = _colour(lanes, at, sh, i)

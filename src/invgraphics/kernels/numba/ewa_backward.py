@@ -15,7 +15,6 @@ from invgraphics.kernels.numba.ewa import (
     dot,
     fade_of,
     four,
-    load,
     matrix_of,
     normalised,
     put,
@@ -23,10 +22,10 @@ from invgraphics.kernels.numba.ewa import (
     scaled_axes,
     scaled_columns,
     screen_axes,
-    store,
     three,
 )
 from invgraphics.kernels.numba.harmonics import harmonics, harmonics_gradient
+from invgraphics.kernels.numba.layouts import read_1, read_2, read_3, read_4, write_3, write_4
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import FADE_MIN
 
@@ -212,17 +211,16 @@ def project_back(
         end = share(n, jobs, job + 1)
         for begin in range(share(n, jobs, job), end, GROUP):
             count = min(GROUP, end - begin)
-            # The last group may be short: what its other lanes still hold must not count.
-            lanes[_SEEN : _SEEN + LANES] = _ZERO
-            for lane in range(count):
-                i, at = index(begin + lane), index(lane)
-                load(lanes, MEAN + at, means, i)
-                load(lanes, QUATERNION + at, quaternions, i)
-                load(lanes, SCALE + at, scales, i)
-                load(lanes, _CONIC + at, conics, i)
-                load(lanes, _TO_SCREEN + at, to_means2d, i)
-                load(lanes, _TO_CONIC + at, to_conics, i)
-                lanes[_SEEN + at], lanes[_TO_DEPTH + at], lanes[_TO_FADE + at] = radii[i], to_depths[i], to_fades[i]
+            i = index(begin)
+            read_3(means, i, count, lanes, MEAN)
+            read_4(quaternions, i, count, lanes, QUATERNION)
+            read_3(scales, i, count, lanes, SCALE)
+            read_3(conics, i, count, lanes, _CONIC)
+            read_1(radii, i, count, lanes, _SEEN)
+            read_2(to_means2d, i, count, lanes, _TO_SCREEN)
+            read_3(to_conics, i, count, lanes, _TO_CONIC)
+            read_1(to_depths, i, count, lanes, _TO_DEPTH)
+            read_1(to_fades, i, count, lanes, _TO_FADE)
             for lane in range(LANES):
                 _look(view, lanes, lane)
             for lane in range(count):
@@ -231,10 +229,8 @@ def project_back(
                 _back_lane(view, dilation, compensate, lanes, lane)
             for k in range(12 * GROUP):
                 shares[k] += lanes[_POSE + index(k)]
-            for lane in range(count):
-                i, at = index(begin + lane), index(lane)
-                store(lanes, _TO_MEAN + at, to_means, i)
-                store(lanes, _TO_QUATERNION + at, to_quaternions, i)
-                store(lanes, _TO_SCALE + at, to_scales, i)
+            write_3(to_means, i, count, lanes, _TO_MEAN)
+            write_4(to_quaternions, i, count, lanes, _TO_QUATERNION)
+            write_3(to_scales, i, count, lanes, _TO_SCALE)
         for k in range(12):
             pose[job, k] = shares[k * GROUP : (k + 1) * GROUP].sum()

@@ -23,8 +23,10 @@ from invgraphics.kernels.numba.runtime import LANES, exp2_fraction, inlined
 _WIDTH = int(LANES)
 _WORD = ir.IntType(32)
 
-# Drops the first parameter, in a way that no checker can follow.
+# All decorate in ways that no checker can follow.
 _intrinsic: Any = extending.intrinsic
+_lower_cast: Any = extending.lower_cast
+_infer_global: Any = templates.infer_global
 
 
 class _Register(types.Type):
@@ -57,7 +59,7 @@ def everywhere(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(_WORD, _WIDTH), None))
 
 
-@extending.lower_cast(types.float32, _Register)
+@_lower_cast(types.float32, _Register)
 def _from_number(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
     return everywhere(builder, value)
 
@@ -65,7 +67,7 @@ def _from_number(context: Any, builder: Any, source: Any, target: Any, value: An
 def _define(function: Any, result: _Register, operands: tuple[_Register, ...], generate: Callable[..., Any]) -> None:
     """Say what a Python operator means for registers; ``generate`` gets the builder and the operands."""
     signature = templates.signature(result, *operands)
-    templates.infer_global(function)(type("Rule", (templates.ConcreteTemplate,), {"cases": [signature]}))
+    _infer_global(function)(type("Rule", (templates.ConcreteTemplate,), {"cases": [signature]}))
 
     def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return generate(builder, *arguments)
@@ -91,6 +93,7 @@ _define(operator.truediv, lanes, (lanes, lanes), lambda builder, a, b: builder.f
 _define(operator.neg, lanes, (lanes,), lambda builder, a: builder.fneg(a))
 _define(abs, lanes, (lanes,), _apply("fabs"))
 _define(np.floor, lanes, (lanes,), _apply("floor"))
+_define(np.rint, lanes, (lanes,), _apply("rint"))
 _define(np.sqrt, lanes, (lanes,), _apply("sqrt"))
 # Of a number and NaN, the second operand.
 _define(min, lanes, (lanes, lanes), _select("<"))
@@ -198,7 +201,7 @@ def _power_of_two(typing: Any, whole: Any) -> Any:
 def exp2_of(x):
     """`runtime.exp2` of every lane."""
     x = max(x, np.float32(-126.0))
-    whole = np.floor(x + np.float32(0.5))
+    whole = np.rint(x)
     return (exp2_fraction(x - whole) + np.float32(1.0)) * _power_of_two(whole)
 
 

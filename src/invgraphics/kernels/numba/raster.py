@@ -26,6 +26,7 @@ from invgraphics.kernels.numba.binning import (
 )
 from invgraphics.kernels.numba.instructions import count_bits, lowest_bit, prefetch
 from invgraphics.kernels.numba.lanes import any_of, bits_below, counting, exp2_of, load, store, where
+from invgraphics.kernels.numba.layouts import write_colour_block, write_grey_block
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
@@ -177,24 +178,27 @@ def _composite_tile(rows, entries, first, last, x0, y0, channels, state, alive, 
 
 
 @inlined
-def _write_tile(state, x0, y0, edge, stride, image, alpha):
+def _write_tile(state, blocks, x0, y0, stride, image, alpha):
     """Copy a tile's sums into the picture."""
     height, width, channels = image.shape
-    for j in range(edge):
-        for i in range(edge):
-            left, top = x0 + i * BLOCK, y0 + j * BLOCK
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - index(1)
+        base = block * stride
+        left = x0 + np.int64(block % index(EDGE)) * BLOCK
+        top = y0 + np.int64(block // index(EDGE)) * BLOCK
+        if channels == 3 and left + BLOCK <= width and top + BLOCK <= height:
+            write_grey_block(alpha, index(top), index(left), (_ONE - abs(load(state, base)),))
+            at = base + LANES
+            colour = load(state, at), load(state, at + LANES), load(state, at + LANES + LANES)
+            write_colour_block(image, index(top), index(left), colour)
+        else:
             for row in range(min(BLOCK, height - top)):
                 for column in range(min(BLOCK, width - left)):
-                    y, x = index(top + row), index(left + column)
-                    at = index(j * EDGE + i) * stride + index(row * BLOCK + column)
+                    y, x, at = index(top + row), index(left + column), base + index(row * BLOCK + column)
                     alpha[y, x] = _ONE - abs(state[at])
-                    if channels == 3:
-                        image[y, x, index(0)] = state[at + LANES]
-                        image[y, x, index(1)] = state[at + index(2) * LANES]
-                        image[y, x, index(2)] = state[at + index(3) * LANES]
-                    else:
-                        for k in range(channels):
-                            image[y, x, index(k)] = state[at + index(1 + k) * LANES]
+                    for k in range(channels):
+                        image[y, x, index(k)] = state[at + index(1 + k) * LANES]
 
 
 @parallel
@@ -222,9 +226,9 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, touche
         state = np.empty(BLOCKS * stride, np.float32)
         for tile in range(bounds[job], bounds[job + 1]):
             x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
-            alive = inside(x0, y0, edge, width, height)
-            _open_tile(state, alive, x0, y0, width, height, stride)
+            blocks = inside(x0, y0, edge, width, height)
+            _open_tile(state, blocks, x0, y0, width, height, stride)
             first, last = starts[tile], starts[tile + 1]
             ends[tile, :] = last
-            work[tile] = _composite_tile(rows, entries, first, last, x0, y0, channels, state, alive, touched, ends[tile])
-            _write_tile(state, x0, y0, edge, stride, image, alpha)
+            work[tile] = _composite_tile(rows, entries, first, last, x0, y0, channels, state, blocks, touched, ends[tile])
+            _write_tile(state, blocks, x0, y0, stride, image, alpha)

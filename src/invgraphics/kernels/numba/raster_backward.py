@@ -11,6 +11,7 @@ import numpy as np
 from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, OPACITY, POWER_XX, POWER_XY, POWER_YY
 from invgraphics.kernels.numba.instructions import SOON, lowest_bit, prefetch
 from invgraphics.kernels.numba.lanes import load, spread, store, total, totals, where
+from invgraphics.kernels.numba.layouts import read_colour_block, read_grey_block
 from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, inside, pixels, placed, response_of, shape_of
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -43,37 +44,38 @@ def conic(rows, r):
 
 
 @inlined
-def _hand_over(state, at, image, gradient, y, x, k):
-    """Copy a channel's gradient to its pixel's place; returns the loss's derivative along the whole channel."""
-    state[at + _PICTURE + k * LANES] = gradient[y, x, k]
-    return gradient[y, x, k] * image[y, x, k]
-
-
-@inlined
-def _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient):
+def _open_tile(state, blocks, x0, y0, stride, image, alpha, image_gradient, alpha_gradient):
     """Load a tile's gradients, and the derivative along the whole of each pixel."""
     height, width, channels = image.shape
-    state[:] = _ZERO
-    for j in range(edge):
-        for i in range(edge):
-            left, top = x0 + i * BLOCK, y0 + j * BLOCK
-            base = index(j * EDGE + i) * stride
-            # Pixels outside the image count as finished.
-            state[base : base + LANES] = -_ONE
-            for row in range(min(BLOCK, height - top)):
-                for column in range(min(BLOCK, width - left)):
-                    y, x, at = index(top + row), index(left + column), base + index(row * BLOCK + column)
-                    gradient = alpha_gradient[y, x]
-                    behind = gradient * alpha[y, x]
-                    if channels == 3:
-                        behind += _hand_over(state, at, image, image_gradient, y, x, index(0))
-                        behind += _hand_over(state, at, image, image_gradient, y, x, index(1))
-                        behind += _hand_over(state, at, image, image_gradient, y, x, index(2))
-                    else:
-                        for k in range(channels):
-                            behind += _hand_over(state, at, image, image_gradient, y, x, index(k))
-                    state[at + _T], state[at + _BEHIND] = _ONE, behind
-                    state[at + _ALPHA] = gradient
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - index(1)
+        base = block * stride
+        left = x0 + np.int64(block % index(EDGE)) * BLOCK
+        top = y0 + np.int64(block // index(EDGE)) * BLOCK
+        state[base : base + stride] = _ZERO
+        if channels == 3 and left + BLOCK <= width and top + BLOCK <= height:
+            y, x, at = index(top), index(left), base + _PICTURE
+            gradient, colour = read_colour_block(image_gradient, y, x), read_colour_block(image, y, x)
+            (to_alpha,), (opacity,) = read_grey_block(alpha_gradient, y, x), read_grey_block(alpha, y, x)
+            behind = to_alpha * opacity + gradient[0] * colour[0] + gradient[1] * colour[1] + gradient[2] * colour[2]
+            store(state, base + _T, spread(_ONE))
+            store(state, base + _BEHIND, behind)
+            store(state, base + _ALPHA, to_alpha)
+            store(state, at, gradient[0])
+            store(state, at + LANES, gradient[1])
+            store(state, at + LANES + LANES, gradient[2])
+            continue
+        # Pixels outside the image count as finished.
+        store(state, base + _T, spread(-_ONE))
+        for row in range(min(BLOCK, height - top)):
+            for column in range(min(BLOCK, width - left)):
+                y, x, at = index(top + row), index(left + column), base + index(row * BLOCK + column)
+                behind = alpha_gradient[y, x] * alpha[y, x]
+                for k in range(channels):
+                    state[at + _PICTURE + index(k) * LANES] = image_gradient[y, x, index(k)]
+                    behind += image_gradient[y, x, index(k)] * image[y, x, index(k)]
+                state[at + _T], state[at + _BEHIND], state[at + _ALPHA] = _ONE, behind, alpha_gradient[y, x]
 
 
 @inlined
@@ -169,10 +171,11 @@ def walk_back(
         for tile in range(bounds[job], bounds[job + 1]):
             if starts[tile] < starts[tile + 1]:
                 x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
-                _open_tile(state, x0, y0, edge, stride, image, alpha, image_gradient, alpha_gradient)
+                blocks = inside(x0, y0, edge, width, height)
+                _open_tile(state, blocks, x0, y0, stride, image, alpha, image_gradient, alpha_gradient)
                 _walk_tile(
                     rows, entries, starts[tile], starts[tile + 1], x0, y0, channels, state, stride,
-                    inside(x0, y0, edge, width, height), touched, ends[tile], own, absolute, receivers,
+                    blocks, touched, ends[tile], own, absolute, receivers,
                 )  # fmt: skip
 
 

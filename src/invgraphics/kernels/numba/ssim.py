@@ -12,7 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.kernels import reference
+from invgraphics.kernels.numba.lanes import counting, load, spread, store, total, where
 from invgraphics.kernels.numba.runtime import (
+    LANES,
     array,
     index,
     inlined,
@@ -30,62 +33,45 @@ _OFFSETS = np.arange(WINDOW) - REACH
 _WINDOW = np.exp(-0.5 * (_OFFSETS / SIGMA) ** 2)
 _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
 
+GROUP = int(LANES)
+"""`LANES` for arithmetic with signed numbers, which Numba would turn into floats."""
 _C1, _C2 = np.float32(C1), np.float32(C2)
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 
 @inlined
-def _add_moments(weight, x, y, mx, my, mxx, myy, mxy, margin):
-    """Add a weighted row to the running moments, which have a margin at both ends."""
-    for number in range(len(x)):
-        i = index(number)
-        at = i + margin
-        a, b = x[i], y[i]
-        wa, wb = weight * a, weight * b
-        mx[at] += wa
-        my[at] += wb
-        mxx[at] += wa * a
-        myy[at] += wb * b
-        mxy[at] += wa * b
+def _place(begin, width):
+    """Where a register begins that would begin at ``begin`` if the row went on; the last may begin earlier."""
+    return index(min(begin, width - GROUP))
 
 
 @inlined
-def _add_row(weight, x, to, margin):
-    for number in range(len(x)):
-        i = index(number)
-        to[i + margin] += weight * x[i]
+def _rows_of(row, height):
+    """First row of the window around a row that lies in the image, and the first behind it, counted in the window."""
+    return max(0, REACH - row), min(WINDOW, height + REACH - row)
 
 
 @inlined
-def _blur_along(row, channels, window, out):
-    """Weighted mean along a row with margins."""
-    for number in range(len(out)):
-        i = index(number)
-        total = _ZERO
-        for k in range(WINDOW):
-            total += window[index(k)] * row[i + index(k) * channels]
-        out[i] = total
+def _blur_along(row, at, channels, window):
+    """Weighted mean along a flat row with margins."""
+    sums = spread(_ZERO)
+    for k in range(WINDOW):
+        sums += window[index(k)] * load(row, at + index(k) * channels)
+    return sums
 
 
 @inlined
-def _compare(blurred, to_mean, to_variance, to_covariance):
-    """Sum of a row's similarities; replaces the row's derivatives along mean, variance and covariance."""
-    total = 0.0
-    for number in range(blurred.shape[1]):
-        i = index(number)
-        mx, my = blurred[0, i], blurred[1, i]
-        variances = blurred[2, i] - mx * mx + blurred[3, i] - my * my
-        covariance = blurred[4, i] - mx * my
-        a1, a2 = _TWO * mx * my + _C1, _TWO * covariance + _C2
-        b1, b2 = mx * mx + my * my + _C1, variances + _C2
-        inverse = _ONE / (b1 * b2)
-        similarity = a1 * a2 * inverse
-        along_variance, along_covariance = -similarity * b1 * inverse, _TWO * a1 * inverse
-        # The mean enters the variance as -mx² and the covariance as -mx my.
-        along_mean = _TWO * (my * a2 * inverse - mx * similarity * b2 * inverse - mx * along_variance) - my * along_covariance
-        to_mean[i], to_variance[i], to_covariance[i] = along_mean, along_variance, along_covariance
-        total += similarity
-    return total
+def _compare(mx, my, squares, product):
+    """Similarities from the local means of x, y, x² + y² and x y; and their derivatives along mean, variance, covariance."""
+    variances, covariance = squares - mx * mx - my * my, product - mx * my
+    a1, a2 = _TWO * mx * my + _C1, _TWO * covariance + _C2
+    b1, b2 = mx * mx + my * my + _C1, variances + _C2
+    inverse = _ONE / (b1 * b2)
+    similarity = a1 * a2 * inverse
+    along_variance, along_covariance = -similarity * b1 * inverse, _TWO * a1 * inverse
+    # The mean enters the variance as -mx² and the covariance as -mx my.
+    along_mean = _TWO * (my * a2 * inverse - mx * similarity * b2 * inverse - mx * along_variance) - my * along_covariance
+    return similarity, along_mean, along_variance, along_covariance
 
 
 @parallel
@@ -93,45 +79,69 @@ def compare_rows(x, y, channels, window, jobs, derivatives, totals):
     """Sum of similarities per row, and the derivatives of each along the local mean, variance and covariance."""
     height, width = x.shape
     margin = index(REACH) * channels
+    stride, plane = index(width) + margin + margin, index(height) * index(width)
     for job in prange(jobs):
-        moments = np.zeros((5, width + 2 * REACH * channels), np.float32)
-        blurred = np.empty((5, width), np.float32)
+        moments = np.zeros(4 * stride, np.float32)
         for row in range(share(height, jobs, job), share(height, jobs, job + 1)):
-            moments[:, REACH * channels : REACH * channels + width] = _ZERO
-            for k in range(max(0, REACH - row), min(WINDOW, height + REACH - row)):
-                r = row + k - REACH
-                m = moments
-                _add_moments(window[k], x[r], y[r], m[0], m[1], m[2], m[3], m[4], margin)
-            for q in range(5):
-                _blur_along(moments[q], index(channels), window, blurred[q])
-            totals[row] = _compare(blurred, derivatives[0, row], derivatives[1, row], derivatives[2, row])
-
-
-@inlined
-def _combine(blurred, x, y, scale, out):
-    """Chain rule from the blurred moments to the image: the blur is its own adjoint."""
-    for number in range(len(out)):
-        i = index(number)
-        out[i] = scale * (blurred[0, i] + _TWO * x[i] * blurred[1, i] + y[i] * blurred[2, i])
+            first, past = _rows_of(row, height)
+            for begin in range(0, width, GROUP):
+                i = _place(begin, width)
+                mx = my = squares = product = spread(_ZERO)
+                for k in range(first, past):
+                    at = index(row + k - REACH) * index(width) + i
+                    a, b, weight = load(x, at), load(y, at), window[index(k)]
+                    wa, wb = weight * a, weight * b
+                    mx, my, squares, product = mx + wa, my + wb, squares + wa * a + wb * b, product + wa * b
+                at = i + margin
+                store(moments, at, mx)
+                store(moments, at + stride, my)
+                store(moments, at + stride + stride, squares)
+                store(moments, at + stride + stride + stride, product)
+            sums = spread(_ZERO)
+            for begin in range(0, width, GROUP):
+                i = _place(begin, width)
+                mx, my = _blur_along(moments, i, channels, window), _blur_along(moments, i + stride, channels, window)
+                squares = _blur_along(moments, i + stride + stride, channels, window)
+                product = _blur_along(moments, i + stride + stride + stride, channels, window)
+                similarity, along_mean, along_variance, along_covariance = _compare(mx, my, squares, product)
+                at = index(row) * index(width) + i
+                store(derivatives, at, along_mean)
+                store(derivatives, at + plane, along_variance)
+                store(derivatives, at + plane + plane, along_covariance)
+                # Lanes that the register before has counted already are left out.
+                sums += where(counting() >= np.float32(begin - np.int64(i)), similarity, _ZERO)
+            totals[row] = total(sums)
 
 
 @parallel
 def gather_rows(x, y, channels, window, jobs, derivatives, gradient):
-    """Gradient of the mean similarity along ``x``."""
+    """Gradient of the mean similarity along ``x``: the blur is its own adjoint."""
     height, width = x.shape
     margin = index(REACH) * channels
+    stride, plane = index(width) + margin + margin, index(height) * index(width)
     scale = np.float32(1.0 / (height * width))
     for job in prange(jobs):
-        sums = np.zeros((3, width + 2 * REACH * channels), np.float32)
-        blurred = np.empty((3, width), np.float32)
+        sums = np.zeros(3 * stride, np.float32)
         for row in range(share(height, jobs, job), share(height, jobs, job + 1)):
-            sums[:, REACH * channels : REACH * channels + width] = _ZERO
-            for k in range(max(0, REACH - row), min(WINDOW, height + REACH - row)):
-                for q in range(3):
-                    _add_row(window[k], derivatives[q, row + k - REACH], sums[q], margin)
-            for q in range(3):
-                _blur_along(sums[q], index(channels), window, blurred[q])
-            _combine(blurred, x[row], y[row], scale, gradient[row])
+            first, past = _rows_of(row, height)
+            for begin in range(0, width, GROUP):
+                i = _place(begin, width)
+                mean = variance = covariance = spread(_ZERO)
+                for k in range(first, past):
+                    at, weight = index(row + k - REACH) * index(width) + i, window[index(k)]
+                    mean += weight * load(derivatives, at)
+                    variance += weight * load(derivatives, at + plane)
+                    covariance += weight * load(derivatives, at + plane + plane)
+                at = i + margin
+                store(sums, at, mean)
+                store(sums, at + stride, variance)
+                store(sums, at + stride + stride, covariance)
+            for begin in range(0, width, GROUP):
+                i = _place(begin, width)
+                mean, variance = _blur_along(sums, i, channels, window), _blur_along(sums, i + stride, channels, window)
+                covariance = _blur_along(sums, i + stride + stride, channels, window)
+                at = index(row) * index(width) + i
+                store(gradient, at, scale * (mean + _TWO * load(x, at) * variance + load(y, at) * covariance))
 
 
 class _Ssim(torch.autograd.Function):
@@ -159,5 +169,7 @@ class _Ssim(torch.autograd.Function):
 
 
 def ssim(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """See `invgraphics.kernels.ssim`."""
+    """See `invgraphics.kernels.ssim`; pictures narrower than a register are left to the reference."""
+    if image.shape[1] * image.shape[2] < GROUP:
+        return reference.ssim(image, target)
     return _Ssim.apply(image, target)
