@@ -54,15 +54,14 @@ class _Project(torch.autograd.Function):
         inputs = (array(x) for x in (means, quaternions, scales, sh, radii, conics, rgb))
         outputs = (result.numpy() for result in results)
         project_back(ctx.view, np.float32(ctx.dilation), ctx.compensate, *inputs, *map(array, received), *outputs, poses)
-        results.append(_pose_gradient(poses, pose))
+        along_pose = _pose_gradient(poses, pose) if ctx.needs_input_grad[4] else None
         if to_planes is not None:
             gaussians = Gaussians(means, quaternions, scales, opacities, sh)
-            for result, extra in zip(
-                results, _through_planes(gaussians, ctx.camera, ctx.dilation, to_planes, radii), strict=True
-            ):
-                if extra is not None:
+            extras = _through_planes(gaussians, ctx.camera, ctx.dilation, to_planes, radii)
+            for result, extra in zip((*results, along_pose), extras, strict=True):
+                if result is not None and extra is not None:
                     result.add_(extra)
-        return (*results, None, None, None, None)
+        return (*results, along_pose, None, None, None, None)
 
 
 def _flat(camera: Camera) -> tuple[np.float32, ...]:
