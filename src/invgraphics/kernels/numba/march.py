@@ -21,6 +21,11 @@ ROOM = 1 << 22
 MARGIN = np.float32(1e-2)
 """Share of a step by which a leap over an empty cell ends early, so that rounding never leaps into the next cell."""
 
+ROUNDING = np.float32(1e-6)
+"""Several times the relative rounding error of a float32."""
+NEARLY_HALF = np.float32(0.49)
+"""Steps from a step's middle to its end, less what a leap may be too short by."""
+
 BLOCKS = 32
 """Most blocks along the grid's edge; their edges are powers of two, ``1 << shift`` cells long."""
 
@@ -117,11 +122,12 @@ def walk_ray(origin, direction, first, taken, t, far, occupied, gaps, shift, box
                     out = min(out, _way_out(uz, z, cells, cell, pace_z))
                     free = min(middle + out - MARGIN * (end - t), far)
                     if cone == _ZERO:
-                        # To the step before the one that holds the wall; the comparison with ``free`` settles the rest.
-                        leap = np.int64((free - first) * per_step) - 1
+                        # To the first step whose middle is past the wall, or the one before; the comparison settles it.
+                        error = ROUNDING * (abs(first) + abs(free))
+                        leap = np.int64((free - first - error) * per_step + NEARLY_HALF)
                         if leap > taken + 1:
                             taken = leap - 1
-                            end = first + np.float32(leap) * step
+                            end = min(first + np.float32(leap) * step, far)
         t = end
         taken += 1
     return kept, taken, t

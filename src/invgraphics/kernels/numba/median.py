@@ -9,9 +9,9 @@ from invgraphics.kernels.numba.instructions import lowest_bit
 from invgraphics.kernels.numba.lanes import any_of, load, store, where
 from invgraphics.kernels.numba.raster import AHEAD, BLOCK, BLOCKS, EDGE, inside, measure, pixels, placed, response_of, shape_of
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange
-from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN
+from invgraphics.kernels.types import ALPHA_MAX
 
-_ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
+_ALPHA_MAX = np.float32(ALPHA_MAX)
 _ONE, _ZERO, _HALF = np.float32(1.0), np.float32(0.0), np.float32(0.5)
 
 
@@ -26,10 +26,8 @@ def _hide(transmittance, distance, rows, r, blocks, x0, y0):
         blocks &= blocks - index(1)
         left, top = placed(rows, r, x0, y0, block)
         dx, dy, base = across + left, down + top, block * LANES
-        response = response_of(shape, opacity, dx, dy)
-        alpha = min(where(response >= _ALPHA_MIN, response, _ZERO), _ALPHA_MAX)
         before = load(transmittance, base)
-        after = before * (_ONE - alpha)
+        after = before * (_ONE - min(response_of(shape, opacity, dx, dy), _ALPHA_MAX))
         here = rows[r, FEATURES] + rows[r, FEATURES + 1] * dx + rows[r, FEATURES + 2] * dy
         store(distance, base, where((before > _HALF) & (after <= _HALF), here, load(distance, base)))
         store(transmittance, base, after)

@@ -113,15 +113,32 @@ def _open_tile(state, blocks, x0, y0, width, height, stride):
 
 @inlined
 def response_of(shape, opacity, dx, dy):
-    """What a footprint answers with to each pixel of a block, at ``dx`` and ``dy`` from its mean."""
+    """What a footprint answers with to each pixel of a block, at ``dx`` and ``dy`` from its mean; 0 where it cannot be seen."""
     xx, xy, yy = shape
-    return opacity * exp2_of((xx * dx + xy * dy) * dx + yy * dy * dy)
+    response = opacity * exp2_of((xx * dx + xy * dy) * dx + yy * dy * dy)
+    return where(response >= _ALPHA_MIN, response, _ZERO)
 
 
 @inlined
 def shape_of(rows, r):
     """The exponent's coefficients of a footprint, and its opacity."""
     return (rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]), rows[r, OPACITY]
+
+
+@inlined
+def blended(state, base, response):
+    """Composite a footprint onto a block, whose transmittance is in ``state``.
+
+    Returns alpha, the transmittance before, the footprint's weight, and which pixels go on.
+    """
+    alpha = min(response, _ALPHA_MAX)
+    transmittance = load(state, base)
+    weight = transmittance * alpha
+    after = transmittance - weight
+    # Finished pixels carry their final transmittance with a minus sign, so they stay below the limit.
+    goes_on = after >= _STOP
+    store(state, base, where(goes_on, after, -abs(transmittance)))
+    return alpha, transmittance, where(goes_on, weight, _ZERO), goes_on
 
 
 @inlined
@@ -135,16 +152,8 @@ def _draw(state, stride, rows, r, blocks, x0, y0, channels):
         block = lowest_bit(blocks)
         blocks &= blocks - index(1)
         left, top = placed(rows, r, x0, y0, block)
-        response = response_of(shape, opacity, across + left, down + top)
-        alpha = min(where(response >= _ALPHA_MIN, response, _ZERO), _ALPHA_MAX)
         base = block * stride
-        transmittance = load(state, base)
-        weight = transmittance * alpha
-        after = transmittance - weight
-        # Finished pixels carry their final transmittance with a minus sign, so they stay below the limit.
-        goes_on = after >= _STOP
-        weight = where(goes_on, weight, _ZERO)
-        store(state, base, where(goes_on, after, -abs(transmittance)))
+        _, _, weight, goes_on = blended(state, base, response_of(shape, opacity, across + left, down + top))
         at = base + LANES
         store(state, at, load(state, at) + weight * red)
         store(state, at + LANES, load(state, at + LANES) + weight * green)

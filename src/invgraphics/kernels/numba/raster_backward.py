@@ -12,9 +12,9 @@ from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, OPACITY, POW
 from invgraphics.kernels.numba.instructions import SOON, lowest_bit, prefetch
 from invgraphics.kernels.numba.lanes import load, spread, store, total, totals, where
 from invgraphics.kernels.numba.layouts import read_colour_block, read_grey_block
-from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, inside, pixels, placed, response_of, shape_of
+from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, blended, inside, pixels, placed, response_of, shape_of
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange, share
-from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from invgraphics.kernels.types import ALPHA_MAX
 
 # What a block holds for each of its pixels, LANES values each: transmittance, the loss's derivative along what is still to be
 # composited, gradient of alpha, gradients of the picture's channels.
@@ -31,8 +31,7 @@ PULLS = 2
 # kernel anew for each length, and LLVM drops the code of what is off.
 OFF, ON = 1, 2
 
-_ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
-_STOP = np.float32(TRANSMITTANCE_MIN)
+_ALPHA_MAX = np.float32(ALPHA_MAX)
 _ONE, _HALF, _ZERO = np.float32(1.0), np.float32(0.5), np.float32(0.0)
 _TO_CONIC = _ONE / HALF_LOG2E
 
@@ -94,16 +93,8 @@ def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, absolute, r
         blocks &= blocks - index(1)
         left, top = placed(rows, r, x0, y0, block)
         dx, dy = across + left, down + top
-        response = response_of(shape, opacity, dx, dy)
-        response = where(response >= _ALPHA_MIN, response, _ZERO)
-        alpha = min(response, _ALPHA_MAX)
-        base = block * stride
-        transmittance = load(state, base)
-        weight = transmittance * alpha
-        after = transmittance - weight
-        goes_on = after >= _STOP
-        weight = where(goes_on, weight, _ZERO)
-        store(state, base, where(goes_on, after, -abs(transmittance)))
+        response, base = response_of(shape, opacity, dx, dy), block * stride
+        alpha, transmittance, weight, goes_on = blended(state, base, response)
         at = base + _PICTURE
         to_red, to_green, to_blue = load(state, at), load(state, at + LANES), load(state, at + LANES + LANES)
         along = load(state, base + _ALPHA) + to_red * red + to_green * green + to_blue * blue
