@@ -53,7 +53,7 @@ class _Model(models.PrimitiveModel):
         super().__init__(dmm, kind, kind.layout)
 
 
-def everywhere(builder: Any, value: Any) -> Any:
+def _everywhere(builder: Any, value: Any) -> Any:
     """A register that holds one number in all lanes."""
     one = builder.insert_element(ir.Constant(lanes.layout, ir.Undefined), value, ir.Constant(_WORD, 0))
     return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(_WORD, _WIDTH), None))
@@ -61,7 +61,7 @@ def everywhere(builder: Any, value: Any) -> Any:
 
 @_lower_cast(types.float32, _Register)
 def _from_number(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
-    return everywhere(builder, value)
+    return _everywhere(builder, value)
 
 
 def _define(function: Any, result: _Register, operands: tuple[_Register, ...], generate: Callable[..., Any]) -> None:
