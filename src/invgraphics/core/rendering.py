@@ -31,7 +31,7 @@ class Rendering:
     normal: Float[Tensor, "*p 3"] | None = None
 
     def over(self, background: Float[Tensor, 3] | Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-        """The picture in front of ``background``: the only place where a background is applied."""
+        """The picture in front of ``background``."""
         return over(self.rgb, self.alpha, background)
 
     def reshape(self, *shape: int) -> Rendering:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from invgraphics import kernels
 from invgraphics.core import Batch, Context, Rendering, Trace
+from invgraphics.core.compositing import over
 
 Loss = Callable[[Rendering, Trace, Batch, Context], Tensor]
 
@@ -81,7 +82,7 @@ class CoarseConfig:
                     continue
                 weighted = torch.cat([level.weights[:, None] * level.values.radiance, level.weights[:, None]], dim=1)
                 sums = weighted.new_zeros(len(batch.target), 4).index_add(0, level.samples.ray, weighted)
-                colour = sums[:, :3] + (1 - sums[:, 3:]) * batch.background
+                colour = over(sums[:, :3], sums[:, 3], batch.background)
                 total = total + (colour - batch.target).square().mean()
             return self.weight * total
 

@@ -10,15 +10,13 @@ import numpy as np
 
 from invgraphics.kernels.numba.harmonics import harmonics
 from invgraphics.kernels.numba.layouts import read_1, read_3, read_4, write_1, write_2, write_3
-from invgraphics.kernels.numba.runtime import LANES, index, inlined, log2, parallel, prange, share
+from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined, log2, parallel, prange, share
 from invgraphics.kernels.reference.splat_project import ILL_CONDITIONED, MARGIN, NEAR
 from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN
 
 # A camera as a flat tuple: rotation to the world row by row, position, focal lengths, principal point, width, height.
 ROTATION, POSITION, FOCAL, CENTRE, SIZE, VIEW = 0, 9, 12, 14, 16, 18
 
-GROUP = int(LANES)
-"""`LANES` for arithmetic with signed numbers, which Numba would turn into floats."""
 # Slots of a group of primitives, LANES values each.
 MEAN, QUATERNION, SCALE, _OPACITY = (index(slot) * LANES for slot in (0, 3, 7, 10))
 _DEPTH, _RADIUS, _FADE, _SCREEN, _CONIC, _PLANE = (index(slot) * LANES for slot in (11, 12, 13, 14, 16, 19))
@@ -29,6 +27,14 @@ _NEAR, _MARGIN, _THIN = np.float32(NEAR), np.float32(MARGIN), np.float32(ILL_CON
 _TINY, _EPSILON = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
 _TWO_LN_2, _PER_ALPHA_MIN = np.float32(2 * np.log(2)), np.float32(1 / ALPHA_MIN)
 _NORM_MIN, _FADE_MIN = np.float32(1e-12), np.float32(FADE_MIN)
+
+
+@inlined
+def read_primitives(means, quaternions, scales, i, count, lanes):
+    """Read ``count`` primitives from the ``i``-th on."""
+    read_3(means, i, count, lanes, MEAN)
+    read_4(quaternions, i, count, lanes, QUATERNION)
+    read_3(scales, i, count, lanes, SCALE)
 
 
 @inlined
@@ -248,9 +254,7 @@ def project(
         for begin in range(share(n, jobs, job), end, GROUP):
             count = min(GROUP, end - begin)
             i = index(begin)
-            read_3(means, i, count, lanes, MEAN)
-            read_4(quaternions, i, count, lanes, QUATERNION)
-            read_3(scales, i, count, lanes, SCALE)
+            read_primitives(means, quaternions, scales, i, count, lanes)
             read_1(opacities, i, count, lanes, _OPACITY)
             for lane in range(LANES):
                 _project_lane(view, dilation, compensate, lanes, lane)

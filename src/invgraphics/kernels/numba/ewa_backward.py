@@ -6,7 +6,6 @@ import numpy as np
 
 from invgraphics.kernels.numba.ewa import (
     FOCAL,
-    GROUP,
     MEAN,
     QUATERNION,
     SCALE,
@@ -18,6 +17,7 @@ from invgraphics.kernels.numba.ewa import (
     matrix_of,
     normalised,
     put,
+    read_primitives,
     rotation_of,
     scaled_axes,
     scaled_columns,
@@ -25,8 +25,8 @@ from invgraphics.kernels.numba.ewa import (
     three,
 )
 from invgraphics.kernels.numba.harmonics import harmonics, harmonics_gradient
-from invgraphics.kernels.numba.layouts import read_1, read_2, read_3, read_4, write_3, write_4
-from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange, share
+from invgraphics.kernels.numba.layouts import read_1, read_2, read_3, write_3, write_4
+from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import FADE_MIN
 
 # Slots of a group of primitives behind what the forward pass reads: its results, their gradients, ...
@@ -212,9 +212,7 @@ def project_back(
         for begin in range(share(n, jobs, job), end, GROUP):
             count = min(GROUP, end - begin)
             i = index(begin)
-            read_3(means, i, count, lanes, MEAN)
-            read_4(quaternions, i, count, lanes, QUATERNION)
-            read_3(scales, i, count, lanes, SCALE)
+            read_primitives(means, quaternions, scales, i, count, lanes)
             read_3(conics, i, count, lanes, _CONIC)
             read_1(radii, i, count, lanes, _SEEN)
             read_2(to_means2d, i, count, lanes, _TO_SCREEN)

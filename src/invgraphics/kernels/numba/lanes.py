@@ -18,9 +18,8 @@ from numba.core.datamodel import models
 from numba.core.typeconv import Conversion
 from numba.core.typing import templates
 
-from invgraphics.kernels.numba.runtime import LANES, exp2_fraction, inlined
+from invgraphics.kernels.numba.runtime import GROUP, exp2_fraction, inlined
 
-_WIDTH = int(LANES)
 _WORD = ir.IntType(32)
 
 # All decorate in ways that no checker can follow.
@@ -34,7 +33,7 @@ class _Register(types.Type):
 
     def __init__(self, name: str, element: Any) -> None:
         super().__init__(name)
-        self.layout = ir.VectorType(element, _WIDTH)
+        self.layout = ir.VectorType(element, GROUP)
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
         """A number can stand for itself in all lanes."""
@@ -53,15 +52,10 @@ class _Model(models.PrimitiveModel):
         super().__init__(dmm, kind, kind.layout)
 
 
-def _everywhere(builder: Any, value: Any) -> Any:
-    """A register that holds one number in all lanes."""
-    one = builder.insert_element(ir.Constant(lanes.layout, ir.Undefined), value, ir.Constant(_WORD, 0))
-    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(_WORD, _WIDTH), None))
-
-
 @_lower_cast(types.float32, _Register)
 def _from_number(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
-    return _everywhere(builder, value)
+    one = builder.insert_element(ir.Constant(lanes.layout, ir.Undefined), value, ir.Constant(_WORD, 0))
+    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(_WORD, GROUP), None))
 
 
 def _define(function: Any, result: _Register, operands: tuple[_Register, ...], generate: Callable[..., Any]) -> None:
@@ -77,7 +71,7 @@ def _define(function: Any, result: _Register, operands: tuple[_Register, ...], g
 
 def _apply(name: str) -> Callable[..., Any]:
     """A function of LLVM's own, lane by lane."""
-    kind, name = ir.FunctionType(lanes.layout, [lanes.layout]), f"llvm.{name}.v{_WIDTH}f32"
+    kind, name = ir.FunctionType(lanes.layout, [lanes.layout]), f"llvm.{name}.v{GROUP}f32"
     return lambda builder, value: builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
 
 
@@ -144,7 +138,7 @@ def any_of(typing: Any, condition: Any) -> Any:
     """Whether a condition holds in any lane."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        bits = builder.bitcast(arguments[0], ir.IntType(_WIDTH))
+        bits = builder.bitcast(arguments[0], ir.IntType(GROUP))
         return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
     return types.boolean(mask), generate
@@ -155,7 +149,7 @@ def counting(typing: Any) -> Any:
     """0, 1, 2, ... in the lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return ir.Constant(lanes.layout, [float(lane) for lane in range(_WIDTH)])
+        return ir.Constant(lanes.layout, [float(lane) for lane in range(GROUP)])
 
     return lanes(), generate
 
@@ -175,8 +169,8 @@ def bits_below(typing: Any, counts: Any) -> Any:
     """Per lane a byte whose lowest ``counts`` bits are set (whole numbers, 0 to 8); 8 lanes are a word (uint64)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        words, bytes_ = ir.VectorType(_WORD, _WIDTH), ir.VectorType(ir.IntType(8), _WIDTH)
-        ones = ir.Constant(words, [1] * _WIDTH)
+        words, bytes_ = ir.VectorType(_WORD, GROUP), ir.VectorType(ir.IntType(8), GROUP)
+        ones = ir.Constant(words, [1] * GROUP)
         bits = builder.sub(builder.shl(ones, builder.fptosi(arguments[0], words)), ones)
         pair = builder.bitcast(builder.trunc(bits, bytes_), ir.VectorType(ir.IntType(64), 2))
         found = [builder.extract_element(pair, ir.Constant(_WORD, k)) for k in range(2)]
@@ -190,9 +184,9 @@ def _power_of_two(typing: Any, whole: Any) -> Any:
     """``2**whole`` for whole numbers in [-126, 127]: the exponent of a float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        words = ir.VectorType(_WORD, _WIDTH)
-        bits = builder.add(builder.fptosi(arguments[0], words), ir.Constant(words, [127] * _WIDTH))
-        return builder.bitcast(builder.shl(bits, ir.Constant(words, [23] * _WIDTH)), lanes.layout)
+        words = ir.VectorType(_WORD, GROUP)
+        bits = builder.add(builder.fptosi(arguments[0], words), ir.Constant(words, [127] * GROUP))
+        return builder.bitcast(builder.shl(bits, ir.Constant(words, [23] * GROUP)), lanes.layout)
 
     return lanes(lanes), generate
 
@@ -207,21 +201,21 @@ def exp2_of(x):
 
 def _paired(builder: Any, first: Any, second: Any, held: int) -> Any:
     """Both of two rows in one: of the sums that each holds, in equal parts of its lanes, the halves of a part are added."""
-    part = _WIDTH // held
-    starts = range(0, 2 * _WIDTH, part)
+    part = GROUP // held
+    starts = range(0, 2 * GROUP, part)
 
     def halves(begin: int) -> Any:
         chosen = [start + begin + lane for start in starts for lane in range(part // 2)]
-        return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(_WORD, _WIDTH), chosen))
+        return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(_WORD, GROUP), chosen))
 
     return builder.fadd(halves(0), halves(part // 2))
 
 
 def _summed(builder: Any, rows: list[Any]) -> Any:
     """The sums of the rows, in the first lanes of one."""
-    rows = rows + [ir.Constant(lanes.layout, None)] * (_WIDTH - len(rows))
+    rows = rows + [ir.Constant(lanes.layout, None)] * (GROUP - len(rows))
     held = 1
-    while held < _WIDTH:
+    while held < GROUP:
         rows = [_paired(builder, *rows[k : k + 2], held) for k in range(0, len(rows), 2)]
         held *= 2
     return rows[0]

@@ -13,9 +13,8 @@ from numba import extending
 from numba.core import cgutils, types
 
 from invgraphics.kernels.numba.lanes import lanes
-from invgraphics.kernels.numba.runtime import LANES
+from invgraphics.kernels.numba.runtime import GROUP
 
-_GROUP = int(LANES)
 _EDGE = 4
 """Edge of a block: its pixels are the lanes."""
 _WORD, _LONG = ir.IntType(32), ir.IntType(64)
@@ -37,16 +36,16 @@ def _picked(builder: Any, first: Any, second: Any, places: Iterable[int]) -> Any
 
 def _apart(builder: Any, whole: Any, columns: int) -> list[Any]:
     """The registers whose lanes take turns in a vector."""
-    return [_picked(builder, whole, None, range(k, columns * _GROUP, columns)) for k in range(columns)]
+    return [_picked(builder, whole, None, range(k, columns * GROUP, columns)) for k in range(columns)]
 
 
 def _together(builder: Any, registers: list[Any]) -> Any:
     """Inverse of `_apart`."""
-    columns, group = len(registers), range(2 * _GROUP)
+    columns, group = len(registers), range(2 * GROUP)
     if columns == 1:
         return registers[0]
     parts = [_picked(builder, registers[k], (registers[k + 1 :] or [None])[0], group) for k in range(0, columns, 2)]
-    turns = (lane % columns * _GROUP + lane // columns for lane in range(columns * _GROUP))
+    turns = (lane % columns * GROUP + lane // columns for lane in range(columns * GROUP))
     return _picked(builder, parts[0], (parts[1:] or [None])[0], turns)
 
 
@@ -69,7 +68,7 @@ def _copy(builder: Any, target: Any, source: Any, numbers: Any) -> None:
 
 def _row_access(columns: int) -> tuple[Any, Any]:
     """Reading and writing rows of so many columns."""
-    numbers = columns * _GROUP
+    numbers = columns * GROUP
 
     def parts(context: Any, builder: Any, kinds: Any, arguments: Any) -> tuple[Any, Any, Any, Any, list[Any]]:
         """Where the rows begin, how many numbers there are and whether they are all, room for them, and the slots."""
@@ -77,7 +76,7 @@ def _row_access(columns: int) -> tuple[Any, Any]:
         room = cgutils.alloca_once(builder, ir.FloatType(), size=ir.Constant(_LONG, numbers))
         count = builder.mul(arguments[2], ir.Constant(_LONG, columns))
         first, _ = _place(context, builder, kinds[3], arguments[3], [arguments[4]])
-        slots = [_vector_at(builder, builder.gep(first, [ir.Constant(_LONG, k * _GROUP)]), _GROUP) for k in range(columns)]
+        slots = [_vector_at(builder, builder.gep(first, [ir.Constant(_LONG, k * GROUP)]), GROUP) for k in range(columns)]
         return pointer, count, builder.icmp_signed("==", count, ir.Constant(_LONG, numbers)), room, slots
 
     @_intrinsic

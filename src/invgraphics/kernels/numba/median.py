@@ -5,9 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from invgraphics.kernels.numba.binning import FEATURES
-from invgraphics.kernels.numba.instructions import lowest_bit
 from invgraphics.kernels.numba.lanes import any_of, load, store, where
-from invgraphics.kernels.numba.raster import AHEAD, BLOCK, BLOCKS, EDGE, inside, measure, pixels, placed, response_of, shape_of
+from invgraphics.kernels.numba.raster import (
+    AHEAD,
+    BLOCK,
+    BLOCKS,
+    EDGE,
+    first_of,
+    inside,
+    measure,
+    pixels,
+    placed,
+    response_of,
+    shape_of,
+)
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange
 from invgraphics.kernels.types import ALPHA_MAX
 
@@ -22,8 +33,7 @@ def _hide(transmittance, distance, rows, r, blocks, x0, y0):
     across, down = pixels()
     closed = index(0)
     while blocks:
-        block = lowest_bit(blocks)
-        blocks &= blocks - index(1)
+        block, blocks = first_of(blocks)
         left, top = placed(rows, r, x0, y0, block)
         dx, dy, base = across + left, down + top, block * LANES
         before = load(transmittance, base)

@@ -1,8 +1,7 @@
 """Front-to-back compositing of footprints, forward.
 
 Tiles are walked in blocks of 4 x 4 pixels, whose 16 lanes fill one or two vector registers. A tile's state lies in one flat
-scratch array, block after block, so that it stays in the L1 cache. A set of a tile's blocks is a word with a bit for
-each; ``blocks & (blocks - 1)`` leaves out the first.
+scratch array, block after block, so that it stays in the L1 cache. A set of a tile's blocks is a word with a bit for each.
 """
 
 from __future__ import annotations
@@ -71,11 +70,23 @@ def measure(rows, entries, begin, end, x0, y0, blocks, touched):
 
 
 @inlined
+def first_of(blocks):
+    """The first of a set of blocks, and the set of all others."""
+    return lowest_bit(blocks), blocks & (blocks - index(1))
+
+
+@inlined
+def corner(x0, y0, block):
+    """First pixel of a block of the tile that begins there."""
+    return x0 + np.int64(block % index(EDGE)) * BLOCK, y0 + np.int64(block // index(EDGE)) * BLOCK
+
+
+@inlined
 def placed(rows, r, x0, y0, block):
     """From a footprint's mean to a block's first pixel centre."""
-    dx = np.float32(np.int32(x0) + np.int32(block % index(EDGE)) * np.int32(BLOCK)) + np.float32(0.5) - rows[r, MEAN_X]
-    dy = np.float32(np.int32(y0) + np.int32(block // index(EDGE)) * np.int32(BLOCK)) + np.float32(0.5) - rows[r, MEAN_Y]
-    return dx, dy
+    left, top = corner(x0, y0, block)
+    half = np.float32(0.5)
+    return np.float32(left) + half - rows[r, MEAN_X], np.float32(top) + half - rows[r, MEAN_Y]
 
 
 @inlined
@@ -101,13 +112,11 @@ def _open_tile(state, blocks, x0, y0, width, height, stride):
     """Full transmittance on every pixel of the image, and none (-1 marks a finished pixel) outside."""
     across, down = pixels()
     while blocks:
-        block = lowest_bit(blocks)
-        blocks &= blocks - index(1)
+        block, blocks = first_of(blocks)
         base = block * stride
         state[base : base + stride] = _ZERO
-        right = np.int32(width - x0) - np.int32(block % index(EDGE)) * np.int32(BLOCK)
-        below = np.int32(height - y0) - np.int32(block // index(EDGE)) * np.int32(BLOCK)
-        in_image = (across < np.float32(right)) & (down < np.float32(below))
+        left, top = corner(x0, y0, block)
+        in_image = (across < np.float32(width - left)) & (down < np.float32(height - top))
         store(state, base, where(in_image, _ONE, -_ONE))
 
 
@@ -149,8 +158,7 @@ def _draw(state, stride, rows, r, blocks, x0, y0, channels):
     across, down = pixels()
     finished = index(0)
     while blocks:
-        block = lowest_bit(blocks)
-        blocks &= blocks - index(1)
+        block, blocks = first_of(blocks)
         left, top = placed(rows, r, x0, y0, block)
         base = block * stride
         _, _, weight, goes_on = blended(state, base, response_of(shape, opacity, across + left, down + top))
@@ -179,8 +187,8 @@ def _composite_tile(rows, entries, first, last, x0, y0, channels, state, alive, 
             finished = _draw(state, stride, rows, index(entries[index(entry)]), blocks, x0, y0, channels)
             alive ^= finished
             while finished:
-                ends[lowest_bit(finished)] = entry + 1
-                finished &= finished - index(1)
+                block, finished = first_of(finished)
+                ends[block] = entry + 1
         if alive == 0:
             break
     return visits
@@ -191,11 +199,9 @@ def _write_tile(state, blocks, x0, y0, stride, image, alpha):
     """Copy a tile's sums into the picture."""
     height, width, channels = image.shape
     while blocks:
-        block = lowest_bit(blocks)
-        blocks &= blocks - index(1)
+        block, blocks = first_of(blocks)
         base = block * stride
-        left = x0 + np.int64(block % index(EDGE)) * BLOCK
-        top = y0 + np.int64(block // index(EDGE)) * BLOCK
+        left, top = corner(x0, y0, block)
         if channels == 3 and left + BLOCK <= width and top + BLOCK <= height:
             write_grey_block(alpha, index(top), index(left), (_ONE - abs(load(state, base)),))
             at = base + LANES

@@ -9,10 +9,21 @@ from __future__ import annotations
 import numpy as np
 
 from invgraphics.kernels.numba.binning import FEATURES, HALF_LOG2E, OPACITY, POWER_XX, POWER_XY, POWER_YY
-from invgraphics.kernels.numba.instructions import SOON, lowest_bit, prefetch
+from invgraphics.kernels.numba.instructions import SOON, prefetch
 from invgraphics.kernels.numba.lanes import load, spread, store, total, totals, where
 from invgraphics.kernels.numba.layouts import read_colour_block, read_grey_block
-from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, blended, inside, pixels, placed, response_of, shape_of
+from invgraphics.kernels.numba.raster import (
+    BLOCK,
+    BLOCKS,
+    blended,
+    corner,
+    first_of,
+    inside,
+    pixels,
+    placed,
+    response_of,
+    shape_of,
+)
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange, share
 from invgraphics.kernels.types import ALPHA_MAX
 
@@ -47,11 +58,9 @@ def _open_tile(state, blocks, x0, y0, stride, image, alpha, image_gradient, alph
     """Load a tile's gradients, and the derivative along the whole of each pixel."""
     height, width, channels = image.shape
     while blocks:
-        block = lowest_bit(blocks)
-        blocks &= blocks - index(1)
+        block, blocks = first_of(blocks)
         base = block * stride
-        left = x0 + np.int64(block % index(EDGE)) * BLOCK
-        top = y0 + np.int64(block // index(EDGE)) * BLOCK
+        left, top = corner(x0, y0, block)
         state[base : base + stride] = _ZERO
         if channels == 3 and left + BLOCK <= width and top + BLOCK <= height:
             y, x, at = index(top), index(left), base + _PICTURE
@@ -78,19 +87,20 @@ def _open_tile(state, blocks, x0, y0, stride, image, alpha, image_gradient, alph
 
 
 @inlined
-def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, absolute, receivers):
+def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, ends, past, absolute, receivers):
     """Repeat one footprint's blending onto blocks of a tile, and add what it receives from them to its row of ``sums``.
 
+    Returns the blocks that it finished: those that end at ``past``.
     With ``receivers`` on, a block counts at its end the footprints that each of its pixels has seen.
     """
     shape, opacity = shape_of(rows, r)
     xx, xy, yy = conic(rows, r)
     red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
     (across, down), none = pixels(), spread(_ZERO)
+    finished = index(0)
     sum_1 = sum_x = sum_y = sum_xx = sum_xy = sum_yy = sum_red = sum_green = sum_blue = pull_x = pull_y = none
     while blocks:
-        block = lowest_bit(blocks)
-        blocks &= blocks - index(1)
+        block, blocks = first_of(blocks)
         left, top = placed(rows, r, x0, y0, block)
         dx, dy = across + left, down + top
         response, base = response_of(shape, opacity, dx, dy), block * stride
@@ -118,9 +128,11 @@ def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, absolute, r
             pull_x, pull_y = pull_x + abs(xx * vx + xy * vy), pull_y + abs(xy * vx + yy * vy)
         for k in range(3, channels):
             sums[r, LANES + index(k - 3)] += total(weight * load(state, at + index(k) * LANES))
+        finished |= index(1) << block if ends[block] == past else index(0)
     found = totals((sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy, sum_red, sum_green, sum_blue, pull_x, pull_y))
     own = r * index(sums.shape[1])
     store(sums, own, load(sums, own) + found)
+    return finished
 
 
 @inlined
@@ -134,12 +146,7 @@ def _walk_tile(rows, entries, first, last, x0, y0, channels, state, stride, aliv
         prefetch(sums, ahead)
         r, blocks = index(entries[index(entry)]), touched[index(entry)] & alive
         if blocks:
-            _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, absolute, receivers)
-            while blocks:
-                block = lowest_bit(blocks)
-                blocks &= blocks - index(1)
-                if entry + 1 == ends[block]:
-                    alive ^= index(1) << block
+            alive ^= _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, ends, entry + 1, absolute, receivers)
 
 
 @parallel

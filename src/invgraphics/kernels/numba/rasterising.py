@@ -14,7 +14,7 @@ from invgraphics.kernels.numba.binning import FEATURES, Packed, pack
 from invgraphics.kernels.numba.median import median
 from invgraphics.kernels.numba.raster import BLOCK, BLOCKS, EDGE, rasterise
 from invgraphics.kernels.numba.raster_backward import OFF, ON, PULLS, gather, walk_back
-from invgraphics.kernels.numba.runtime import LANES, array, once_differentiable, scratch, split_by_work, threads
+from invgraphics.kernels.numba.runtime import GROUP, array, once_differentiable, scratch, split_by_work, threads
 from invgraphics.kernels.types import Footprints
 
 TILE = EDGE * BLOCK
@@ -64,7 +64,7 @@ class _Rasterise(torch.autograd.Function):
         bounds = _bounds(work)
         absolute = ctx.needs_input_grad[4]
         rows = packed.rows
-        shape = (len(bounds) - 1, len(rows), int(LANES) + rows.shape[1] - FEATURES - 3)
+        shape = (len(bounds) - 1, len(rows), GROUP + rows.shape[1] - FEATURES - 3)
         sums = scratch("splat sums", int(np.prod(shape))).reshape(shape)
         walk_back(
             rows,

@@ -136,6 +136,8 @@ index = np.uintp
 
 LANES = index(16)
 """What hot loops handle at once, side by side in one flat scratch array: one or two vector registers of float32."""
+GROUP = int(LANES)
+"""`LANES` for arithmetic with signed numbers, which Numba would turn into floats."""
 
 
 def threads() -> int:

@@ -15,7 +15,7 @@ from torch import Tensor
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.lanes import counting, load, spread, store, total, where
 from invgraphics.kernels.numba.runtime import (
-    LANES,
+    GROUP,
     array,
     index,
     inlined,
@@ -33,8 +33,6 @@ _OFFSETS = np.arange(WINDOW) - REACH
 _WINDOW = np.exp(-0.5 * (_OFFSETS / SIGMA) ** 2)
 _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
 
-GROUP = int(LANES)
-"""`LANES` for arithmetic with signed numbers, which Numba would turn into floats."""
 _C1, _C2 = np.float32(C1), np.float32(C2)
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
