@@ -27,7 +27,7 @@ MOST_FOR_REFERENCE = 50_000 * 400 * 400
 
 SSIM_WIDTHS, QUICK_SSIM_WIDTHS = (100, 200, 400, 800), (100, 400)
 SSIM_FLOPS = {FORWARD: 4 * 2 * 11 * 2, BOTH: (4 + 3) * 2 * 11 * 2}
-"""Per pixel and channel: four moments (x, y, x² + y², x y) are blurred forward, three gradients backward, by 11 taps in x and in y."""
+"""Per pixel and channel: four moments are blurred forward, three gradients backward, by 11 taps in x and in y."""
 
 GAUSSIAN_FLOATS, FOOTPRINT_FLOATS = 3 + 4 + 3 + 1 + 48, 2 + 3 + 1 + 1 + 3 + 1 + 3
 """What projecting reads and writes per Gaussian of SH degree 3."""
