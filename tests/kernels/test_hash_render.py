@@ -107,6 +107,15 @@ def test_rays_do_not_depend_on_each_other_nor_on_the_threads() -> None:
     torch.testing.assert_close(results[0][0][some], results[2][0], rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("width", [1, 7, 8, 20, 33, 10_000])
+def test_pictures_of_any_width_have_every_ray_once(width: int) -> None:
+    bounds, rays, occupied = setting()
+    call = rays, occupied, bounds, MarchSteps(0.03), hash_field(), 1e-3, 0.0
+    in_order, by_blocks = numba.hash_render(*call), numba.hash_render(*call, width)
+    assert torch.equal(by_blocks[1], in_order[1])
+    torch.testing.assert_close(by_blocks[0], in_order[0], rtol=0, atol=1e-5)
+
+
 def test_nothing_to_see_and_bad_numbers() -> None:
     bounds, rays, occupied = setting(rays=9)
     field, steps = hash_field(), MarchSteps(0.03)

@@ -48,6 +48,25 @@ def test_arithmetic() -> None:
 
 
 @compiled
+def _places(cube, at, out):
+    x, y, z = lanes.load(at, index(0)), lanes.load(at, LANES), lanes.load(at, LANES + LANES)
+    found = lanes.look_up(cube, x, y, z)
+    lanes.put(out, x * np.float32(5.0) + y, found)
+
+
+def test_places_in_arrays() -> None:
+    rng = np.random.default_rng(0)
+    cube = rng.integers(-128, 128, (5, 5, 5)).astype(np.int8)
+    # No two lanes write to the same place, or the last would win.
+    x, y = np.divmod(rng.permutation(25)[:GROUP], 5)
+    z, out = rng.integers(0, 5, GROUP), np.full(25, 1000, np.float32)
+    _places(cube, np.concatenate([x, y, z]).astype(np.float32), out)
+    expected = np.full((5, 5), 1000, np.float32)
+    expected[x, y] = cube[x, y, z]
+    np.testing.assert_array_equal(out, expected.reshape(-1))
+
+
+@compiled
 def _functions(x, out):
     value = lanes.load(x, index(0))
     lanes.store(out, index(0), lanes.exp2_of(value))

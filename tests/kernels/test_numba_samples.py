@@ -44,7 +44,9 @@ CORNERS = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 1.0, 0.0], [-3.0
     ],
 )
 def test_hash_encoding(grid):
-    unit, table = torch.cat([POINTS, CORNERS]), torch.randn(grid.entries, grid.features)
+    # More than one thread's chunk, and no whole number of blocks.
+    many = torch.rand(9001, 3, generator=torch.Generator().manual_seed(6))
+    unit, table = torch.cat([POINTS, CORNERS, many]), torch.randn(grid.entries, grid.features)
     assert_equal(lambda u, t: numba.hash_encode(u, t, grid), lambda u, t: reference.hash_encode(u, t, grid), [unit, table])
 
 

@@ -92,6 +92,7 @@ def hash_render(
     field: HashField,
     transmittance: float = 0.0,
     unseen: float = 0.0,
+    width: int = 0,
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
     """Volume rendering of a hash grid and its networks, in one pass. Not differentiable.
 
@@ -103,11 +104,13 @@ def hash_render(
         field: what is there.
         transmittance: a ray may stop when less than this share of its light is left.
         unseen: most that all samples together that are not asked for their colour may contribute to a ray, in [0, 1].
+        width: of the picture whose pixels the rays are, row by row, 0 if there is none: neighbours are looked at together,
+            which is faster and changes nothing else.
 
     Returns:
         Sums of w * (radiance, distance), and of w, per ray (see `composite`).
     """
-    return choose("hash_render", rays.origins)(rays, occupied, bounds, steps, field, transmittance, unseen)
+    return choose("hash_render", rays.origins)(rays, occupied, bounds, steps, field, transmittance, unseen, width)
 
 
 def composite(

@@ -88,7 +88,8 @@ class Volumetric(RayRenderer):
         if parts is None or sampler.config.stop == "never" or not kernels.compiled("hash_render", parts.table):
             return None
         rays, given = camera.rays(), (sampler.occupied, ctx.bounds, sampler.steps(ctx), parts)
-        sums, alpha = kernels.hash_render(ctx.bounds.clip(rays), *given, sampler.config.transmittance, UNSEEN)
+        limits = sampler.config.transmittance, UNSEEN
+        sums, alpha = kernels.hash_render(ctx.bounds.clip(rays), *given, *limits, camera.width)
         flat = picture(sums[:, :3], alpha, sums[:, 3], None, rays.far)
         return flat.reshape(camera.height, camera.width)
 

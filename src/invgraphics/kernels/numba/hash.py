@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.hash_cells import BLOCK, CHUNK, ZERO, at_vertices, blend, locate, rows_of, spread
+from invgraphics.kernels.numba.hash_cells import BLOCK, CHUNK, ZERO, ask_for, at_vertices, blend, locate, rows_of, spread
 from invgraphics.kernels.numba.hash_slope import locate_back, rise, rise_back
 from invgraphics.kernels.numba.instructions import blend_pair, spread_pair
 from invgraphics.kernels.numba.runtime import array, index, inlined, once_differentiable, parallel, prange, share, threads
@@ -60,16 +60,23 @@ def encode(planes, table, width, cells, offsets, masks, jobs, out):
     """Features of all levels at each point; ``table`` is flat."""
     x, y, z = planes[0], planes[1], planes[2]
     for job in prange(jobs):
-        entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        entries, weights = np.empty((2, 8 * BLOCK), np.uint32), np.empty((2, 8 * BLOCK), np.float32)
         begin, end = share(len(x), jobs, job), share(len(x), jobs, job + 1)
         for chunk in range(begin, end, CHUNK):
             until = min(chunk + CHUNK, end)
             for number in range(len(cells)):
                 level, column = (cells[number], offsets[number], masks[number]), index(number) * width
-                for first in range(chunk, until, BLOCK):
-                    block = index(first), min(BLOCK, until - first)
-                    locate(x, y, z, block, level, entries, weights)
-                    _gather(table, entries, weights, block, column, width, out)
+                for first in range(chunk, until + BLOCK, BLOCK):
+                    # A block's entries are asked for before those of the block before it are read.
+                    if first < until:
+                        block, place = (index(first), min(BLOCK, until - first)), first // BLOCK % 2
+                        locate(x, y, z, block, level, entries[place], weights[place])
+                        if width == TWO:
+                            ask_for(table, entries[place], block[1])
+                    if first > chunk:
+                        before, place = first - BLOCK, (first // BLOCK - 1) % 2
+                        block = index(before), min(BLOCK, until - before)
+                        _gather(table, entries[place], weights[place], block, column, width, out)
 
 
 @parallel

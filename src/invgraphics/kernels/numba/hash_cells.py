@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.instructions import fma
+from invgraphics.kernels.numba.instructions import fma, prefetch_pair
 from invgraphics.kernels.numba.runtime import index, inlined, ordered
 from invgraphics.kernels.reference.hash import PRIMES
 
@@ -123,6 +123,17 @@ def locate(x, y, z, block, level, entries, weights):
             (i, a), (j, b), (k, c) = axis(x[first + n], cells), axis(y[first + n], cells), axis(z[first + n], cells)
             _put(entries, n, _from(offset, _hashed(i, j, k, mask)))
             _put(weights, n, weights_of((a, b, c)))
+
+
+@inlined
+def ask_for(table, entries, count):
+    """Have the entries of so many points of a block fetched, which a processor foresees only a few points ahead.
+
+    Of two vertices that are neighbours along x, one is asked for: their entries nearly always share a cache line.
+    """
+    for vertex in range(0, 8, 2):
+        for number in range(count):
+            prefetch_pair(table, entries[index(vertex * BLOCK) + index(number)])
 
 
 @inlined

@@ -14,15 +14,8 @@ from invgraphics.kernels.numba.composite import absorb
 from invgraphics.kernels.numba.dense import POINTS
 from invgraphics.kernels.numba.hash import levels_of
 from invgraphics.kernels.numba.hash_cells import BLOCK
-from invgraphics.kernels.numba.hash_places import (
-    ACTIVATIONS,
-    density_of,
-    encode,
-    fill,
-    outputs_of,
-    packed_network,
-    places,
-)
+from invgraphics.kernels.numba.hash_field import ACTIVATIONS, density_of, encode, outputs_of, packed_network
+from invgraphics.kernels.numba.hash_places import EDGE, fill, no_rays, step_of, stop
 from invgraphics.kernels.numba.march import ROOM, longest, packed, surroundings
 from invgraphics.kernels.numba.runtime import array, inlined, parallel, prange, scratch, threads
 from invgraphics.kernels.types import HashField, March, MarchSteps
@@ -30,39 +23,37 @@ from invgraphics.kernels.types import HashField, March, MarchSteps
 
 @inlined
 def _keep(s, said, way, far, settings, rows, counts):
-    """Write down the step of place ``s``, and let its ray go on if light is left behind it."""
+    """Write down the step of slot ``s``, of which ``said`` was said, and let its ray go on if light is left behind it."""
     activation, bias, opaque = settings
-    which, t0, t1, kept, done, _, resume, light, _, _ = way
-    r, begin, end = which[s], t0[s, done[s]], t1[s, done[s]]
-    done[s] += 1
+    r = way.which[s]
+    begin, end = step_of(way, s)
+    way.done[s] += 1
     rows[0, r, counts[r]], rows[1, r, counts[r]] = begin, end
     counts[r] += 1
-    passed, _ = absorb(density_of(said[s] + bias, activation) * (end - begin))
-    light[s] *= passed
-    if light[s] < opaque:
-        done[s], resume[s] = kept[s], far[r]
+    passed, _ = absorb(density_of(said + bias, activation) * (end - begin))
+    way.light[s] *= passed
+    if way.light[s] < opaque:
+        stop(way, s, far)
 
 
 @parallel
-def reach(lines, space, table, levels, geometry, settings, jobs, rows, counts):
+def reach(rays, space, table, levels, geometry, settings, jobs, rows, counts):
     """Steps of every ray that light reaches, in ``rows``: begin and end; ``counts`` of them, which are 0 before.
 
     Arguments as in `hash_render.render`; ``settings`` are activation, bias and least transmittance.
     """
     sizes = geometry[1]
     for job in prange(jobs):
-        entries, shares = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        entries, shares = np.empty((2, 8 * BLOCK), np.uint32), np.empty((2, 8 * BLOCK), np.float32)
         points, room = np.zeros((3, POINTS), np.float32), sizes.max() * POINTS
         x, odd, even = np.zeros(room, np.float32), np.zeros(room, np.float32), np.zeros(room, np.float32)
-        way, taken, busy = places(), 0, True
-        which = way[0]
-        while busy:
-            taken, busy = fill(taken, (job, jobs), lines, space, way, points)
+        way = no_rays()
+        while fill((job, jobs, EDGE), rays, space, way, points):
             encode(table, levels, points, entries, shares, x)
             said = outputs_of(geometry, x, odd, even)
-            for s in range(POINTS):
-                if which[s] >= 0:
-                    _keep(s, said, way, lines[3], settings, rows, counts)
+            for p in range(POINTS):
+                if way.slots[p] >= 0:
+                    _keep(way.slots[p], said[p], way, rays[3], settings, rows, counts)
 
 
 @torch.no_grad()
@@ -78,8 +69,7 @@ def hash_march(
     """See `invgraphics.kernels.hash_march`; endless space, steps that grow and other widths are left to the reference."""
     if field.table.shape[1] != 2 or steps.cone > 0 or bounds.space != "box":
         return reference.hash_march(rays, occupied, bounds, steps, field, start, transmittance)
-    box, cells, gaps, shift = surroundings(occupied, bounds)
-    space = cells, gaps, shift, box, False, np.float32(steps.step), np.float32(0)
+    space = surroundings(occupied, bounds, steps)
     # The first output alone: nobody asks for a colour.
     *hidden, (weight, bias) = field.geometry
     model = array(field.table).reshape(-1), levels_of(field.grid), packed_network((*hidden, (weight[:1], bias[:1])))

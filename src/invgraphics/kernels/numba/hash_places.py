@@ -1,166 +1,242 @@
-"""Many rays under way through a hash grid at once: what pictures in one pass and marches that stop have in common.
+"""Many rays under way at once: what pictures of hash grids in one pass and marches that stop have in common.
 
 A job keeps `POINTS` rays in as many places and looks at the next occupied step of all of them. A ray that has met something
-opaque, or has left, makes room for another one at once.
+opaque, or has left, makes room for another one at once. Rays whose steps are used up wait until there are `LANES` of them, or
+are joined by new ones, and walk on together.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from torch import Tensor
 
-from invgraphics.kernels.numba.dense import POINTS, dense, packed_layer, padded
+from invgraphics.kernels.numba.dense import POINTS
 from invgraphics.kernels.numba.harmonics import harmonics
-from invgraphics.kernels.numba.hash_cells import at_vertices, locate
-from invgraphics.kernels.numba.instructions import blend_pair
-from invgraphics.kernels.numba.march import to_unit, walk_ray
-from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, log2
-from invgraphics.kernels.types import EXP_LIMIT
+from invgraphics.kernels.numba.lanes import load, store
+from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined
+from invgraphics.kernels.numba.walking import MARKS, NUMBERS, marks_of, no_ray, set_marks, set_ray, to_unit, walk_rays
 
-AHEAD = 8
+AHEAD = 16
 """Occupied steps of a ray that are found at once."""
-DEAL = 64
-"""Neighbouring rays that a job takes at once."""
-ACTIVATIONS = ("exp", "softplus", "relu")
-"""Of densities, by the numbers that kernels know them by."""
-_EXP, _SOFTPLUS = 0, 1
+ROW = AHEAD + 1
+"""A walk writes one more, of no meaning."""
+EDGE = 8
+"""Of a block of pixels whose rays a job takes at once."""
+BLOCK = EDGE * EDGE
+SLOTS = int(POINTS) + 4 * GROUP
+"""Rays under way: in places, ready for one, and waiting to walk on. The others are behind it."""
+READY, WAITING, WALKING, UNUSED, TAKEN = range(5)
+"""Lists of slots, and the number of rays that have been taken from the deal."""
 
-_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
-_LOG2E, _LN2 = np.float32(1 / np.log(2.0)), np.float32(np.log(2.0))
-_MOST = np.float32(EXP_LIMIT)
-_LARGEST = np.float32(80.0)
-"""Beyond this exp(-x) is nothing beside 1, and stays within float32."""
-
-
-@inlined
-def softplus(x):
-    """log(1 + exp(x))."""
-    return max(x, _ZERO) + log2(_ONE + exp2(-abs(x) * _LOG2E)) * _LN2
+_ZERO, _HALF = np.float32(0.0), np.float32(0.5)
+_ROOM = np.float32(AHEAD)
+_1, _2, _3, _4, _5 = (POINTS * index(k) for k in range(1, 6))
 
 
-@inlined
-def sigmoid(x):
-    """1 / (1 + exp(-x))."""
-    return _ONE / (_ONE + exp2(min(-x, _LARGEST) * _LOG2E))
+class Way(NamedTuple):
+    """Rays of a job that are under way, and lists of them.
 
-
-@inlined
-def density_of(raw, activation):
-    """The density that a network's output stands for; ``activation`` is one of `ACTIVATIONS`, by number."""
-    if activation == _EXP:
-        return exp2(min(raw, _MOST) * _LOG2E)
-    return softplus(raw) if activation == _SOFTPLUS else max(raw, _ZERO)
-
-
-@inlined
-def encode(table, levels, points, entries, weights, out):
-    """Features of `POINTS` positions, feature after feature."""
-    cells, offsets, masks = levels
-    for number in range(len(cells)):
-        level = cells[number], offsets[number], masks[number]
-        locate(points[0], points[1], points[2], (index(0), np.int64(POINTS)), level, entries, weights)
-        column = index(2 * number) * POINTS
-        for point in range(POINTS):
-            n = index(point)
-            low, high = blend_pair(table, at_vertices(entries, n), at_vertices(weights, n))
-            out[column + n], out[column + POINTS + n] = low, high
-
-
-@inlined
-def outputs_of(network, x, odd, even):
-    """The outputs of `POINTS` inputs; layers write to ``odd`` and ``even`` in turn."""
-    layers, sizes = network
-    at, last, source, target = index(0), len(sizes) - 1, x, odd
-    for number in range(len(sizes)):
-        size = index(sizes[number, 0]), index(sizes[number, 1])
-        dense(layers, at, source, target, size, number < last)
-        at += (size[0] + index(1)) * size[1]
-        source, target = target, even if number % 2 == 0 else odd
-    return source
-
-
-@inlined
-def places():
-    """`POINTS` places without a ray.
-
-    Their rays; begin and end of the steps found, how many there are and have been looked at; after how many of all steps and
-    where the ray goes on; what is left of its light, and what was left out of its picture; harmonics of its direction.
+    Attributes:
+        slots: where the ray of each place is kept, -1 for none.
+        middles: of the places' steps, distances.
+        lines: of the places' rays, origins and directions, number after number.
+        which: number of a slot's ray.
+        t0: begins of the steps found, `ROW` for each slot.
+        t1: their ends.
+        kept: how many there are.
+        done: how many have been looked at.
+        steps: how many of all steps have been walked.
+        resume: where the walk goes on.
+        light: what is left of it.
+        missed: weight that was left out of the ray's picture.
+        views: harmonics of the ray's direction.
+        lists: slots by what they wait for.
+        counts: lengths of the lists, and number of rays that have been taken from the deal.
+        walkers: `walking.NUMBERS` of each ray that walks.
+        marks: `walking.MARKS` of each.
     """
-    which, steps = np.full(POINTS, -1, np.int64), np.zeros(POINTS, np.int64)
-    kept, done = np.zeros(POINTS, np.int64), np.zeros(POINTS, np.int64)
-    t0, t1 = np.zeros((POINTS, AHEAD), np.float32), np.zeros((POINTS, AHEAD), np.float32)
-    resume, missed = np.zeros(POINTS, np.float32), np.zeros(POINTS, np.float32)
-    light, views = np.zeros(POINTS, np.float64), np.zeros(16 * POINTS, np.float32)
-    return which, t0, t1, kept, done, steps, resume, light, missed, views
+
+    slots: np.ndarray
+    middles: np.ndarray
+    lines: np.ndarray
+    which: np.ndarray
+    t0: np.ndarray
+    t1: np.ndarray
+    kept: np.ndarray
+    done: np.ndarray
+    steps: np.ndarray
+    resume: np.ndarray
+    light: np.ndarray
+    missed: np.ndarray
+    views: np.ndarray
+    lists: np.ndarray
+    counts: np.ndarray
+    walkers: np.ndarray
+    marks: np.ndarray
 
 
 @inlined
-def _ray_of(taken, job, jobs):
-    """The ray that a job takes after so many others."""
-    return (taken // DEAL * jobs + job) * DEAL + taken % DEAL
+def no_rays():
+    """`POINTS` places, all without a ray."""
+    way = Way(
+        np.full(POINTS, -1, np.int64), np.zeros(POINTS, np.float32), np.zeros(6 * POINTS, np.float32),
+        np.zeros(SLOTS, np.int64),
+        # One row more, for lanes that have no ray.
+        np.zeros((SLOTS + 1) * ROW, np.float32), np.zeros((SLOTS + 1) * ROW, np.float32),
+        np.zeros(SLOTS, np.int64), np.zeros(SLOTS, np.int64),
+        np.zeros(SLOTS, np.float32), np.zeros(SLOTS, np.float32), np.zeros(SLOTS, np.float64), np.zeros(SLOTS, np.float32),
+        np.zeros(16 * SLOTS, np.float32), np.zeros((UNUSED + 1, SLOTS), np.int64), np.zeros(TAKEN + 1, np.int64),
+        np.zeros(NUMBERS * GROUP, np.float32), np.zeros(MARKS * GROUP, np.float32),
+    )  # fmt: skip
+    for s in range(SLOTS):
+        _put(way, UNUSED, s)
+    return way
+
+
+@inlined
+def _put(way, name, s):
+    way.lists[name, way.counts[name]] = s
+    way.counts[name] += 1
+
+
+@inlined
+def _take(way, name):
+    way.counts[name] -= 1
+    return way.lists[name, way.counts[name]]
+
+
+@inlined
+def _next_ray(way, deal, count):
+    """Number of the next ray of the deal, -1 where there is none.
+
+    Jobs take blocks of a picture in turn, `EDGE` by `EDGE` pixels: neighbours meet the same cells and entries, and walk alike.
+    """
+    job, jobs, width = deal
+    across = (width + EDGE - 1) // EDGE
+    while True:
+        block, pixel = way.counts[TAKEN] // BLOCK * jobs + job, way.counts[TAKEN] % BLOCK
+        down = block // across
+        if down * EDGE * width >= count:
+            return -1
+        way.counts[TAKEN] += 1
+        column = (block - down * across) * EDGE + pixel % EDGE
+        r = (down * EDGE + pixel // EDGE) * width + column
+        if column < width and r < count:
+            return r
+
+
+@inlined
+def _start(way, deal, start):
+    """Take a new ray; returns its slot, -1 where there is none left or no room."""
+    r = _next_ray(way, deal, len(start)) if way.counts[UNUSED] > 0 else -1
+    if r < 0:
+        return -1
+    s = _take(way, UNUSED)
+    way.which[s], way.kept[s], way.steps[s], way.resume[s] = r, 0, _ZERO, start[r]
+    way.light[s], way.missed[s] = 1.0, _ZERO
+    return s
 
 
 @inlined
 def view_of(s):
-    """Where the harmonics of place ``s`` begin; they follow one another after `LANES` numbers."""
+    """Where the harmonics of slot ``s`` begin; they follow one another after `LANES` numbers."""
     return (index(s) // LANES) * index(16) * LANES + index(s) % LANES
 
 
 @inlined
-def _advance(s, taken, deal, lines, space, way):
-    """Find the next occupied steps for place ``s``, of its ray or of further ones; returns the rays taken by then."""
-    origins, directions, start, far = lines
-    occupied, gaps, shift, box, contracted, step, cone = space
-    which, t0, t1, kept, done, steps, resume, light, missed, views = way
-    job, jobs = deal
-    while done[s] == kept[s]:
-        r = which[s]
-        if r >= 0 and resume[s] < far[r]:
-            # The lattice is counted from the ray's start, so that these are the very steps of an ordinary march.
-            kept[s], steps[s], resume[s] = walk_ray(
-                origins[r], directions[r], start[r], steps[s], resume[s], far[r], occupied, gaps, shift, box, contracted, step,
-                cone, t0[s], t1[s],
-            )  # fmt: skip
-            done[s] = 0
-            direction = directions[r, 0], directions[r, 1], directions[r, 2]
-            harmonics(direction, views, view_of(s))
+def _gather(deal, rays, way):
+    """Let `LANES` rays get ready to walk: new ones, which are neighbours, unless enough others wait; returns how many."""
+    origins, directions, start, far = rays
+    n, enough = 0, way.counts[WAITING] >= GROUP
+    for lane in range(GROUP):
+        s = -1 if enough else _start(way, deal, start)
+        if s < 0 and way.counts[WAITING] > 0:
+            s = _take(way, WAITING)
+        if s < 0:
+            # The other lanes stand still, and write to a row of their own.
+            no_ray(way.walkers, way.marks, lane, SLOTS * ROW)
+            continue
+        r, n = way.which[s], n + 1
+        way.lists[WALKING, lane] = s
+        # The lattice is counted from the ray's start, so that these are the very steps of an ordinary march.
+        set_ray(way.walkers, lane, origins, directions, r, start[r], far[r])
+        set_marks(way.marks, lane, s * ROW, way.steps[s], way.resume[s])
+    return n
+
+
+@inlined
+def _walk_on(deal, rays, space, way):
+    """Find the next occupied steps of a few rays; whether there were any rays."""
+    n = _gather(deal, rays, way)
+    if n > 0:
+        walk_rays(way.walkers, way.marks, _ROOM, space, way.t0, way.t1)
+    for lane in range(n):
+        s = way.lists[WALKING, lane]
+        new = way.kept[s] == 0
+        way.kept[s], way.steps[s], way.resume[s] = marks_of(way.marks, lane)
+        way.done[s] = 0
+        if way.kept[s] > 0:
+            r = way.which[s]
+            if new:
+                harmonics((rays[1][r, 0], rays[1][r, 1], rays[1][r, 2]), way.views, view_of(s))
+            _put(way, READY, s)
         else:
-            r = _ray_of(taken, job, jobs)
-            if r >= len(far):
-                which[s] = -1
-                break
-            taken += 1
-            which[s], steps[s], resume[s], light[s], missed[s] = r, 0, start[r], 1.0, _ZERO
-    return taken
+            _put(way, UNUSED, s)
+    return n > 0
 
 
 @inlined
-def _position(s, way, lines, space, points):
-    """Where the step of place ``s`` has its middle, in the unit cube."""
-    origins, directions, box, contracted = lines[0], lines[1], space[3], space[4]
-    which, t0, t1, _, done, _, _, _, _, _ = way
-    r, t = which[s], (t0[s, done[s]] + t1[s, done[s]]) * _HALF
-    x, y, z = (
-        origins[r, 0] + t * directions[r, 0],
-        origins[r, 1] + t * directions[r, 1],
-        origins[r, 2] + t * directions[r, 2],
-    )
-    points[0, s], points[1, s], points[2, s] = to_unit(box, contracted, x, y, z)
+def _seat(p, deal, rays, space, way):
+    """Give place ``p`` another ray, one that has steps to look at; whether there is one."""
+    origins, directions, _, far = rays
+    s = way.slots[p]
+    if s >= 0:
+        _put(way, WAITING if way.resume[s] < far[way.which[s]] else UNUSED, s)
+        way.slots[p] = -1
+    while way.counts[READY] == 0:
+        if not _walk_on(deal, rays, space, way):
+            return False
+    s = _take(way, READY)
+    way.slots[p] = s
+    for axis in range(3):
+        way.lines[index(axis) * POINTS + index(p)] = origins[way.which[s], axis]
+        way.lines[index(3 + axis) * POINTS + index(p)] = directions[way.which[s], axis]
+    return True
 
 
 @inlined
-def fill(taken, deal, lines, space, way, points):
-    """Give every place its ray's next occupied step; returns the rays taken by then, and whether any has one."""
+def fill(deal, rays, space, way, points):
+    """Give every place the next occupied step of a ray, in the unit cube; whether any has one."""
     busy = False
-    for s in range(POINTS):
-        taken = _advance(s, taken, deal, lines, space, way)
-        if way[0][s] >= 0:
+    for p in range(POINTS):
+        s = way.slots[p]
+        if (s >= 0 and way.done[s] < way.kept[s]) or _seat(p, deal, rays, space, way):
+            begin, end = step_of(way, way.slots[p])
+            way.middles[p] = (begin + end) * _HALF
             busy = True
-            _position(s, way, lines, space, points)
-    return taken, busy
+    box, contracted = space[0], space[3]
+    for part in range(POINTS // LANES):
+        at = index(part) * LANES
+        t = load(way.middles, at)
+        x = load(way.lines, at) + t * load(way.lines, at + _3)
+        y = load(way.lines, at + _1) + t * load(way.lines, at + _4)
+        z = load(way.lines, at + _2) + t * load(way.lines, at + _5)
+        x, y, z = to_unit(box, contracted, x, y, z)
+        store(points, at, x)
+        store(points, at + _1, y)
+        store(points, at + _2, z)
+    return busy
 
 
-def packed_network(layers: tuple[tuple[Tensor, Tensor], ...]) -> tuple[np.ndarray, np.ndarray]:
-    """A network as kernels read it: its layers, and their inputs and padded outputs."""
-    sizes = np.array([(weight.shape[1], padded(len(weight))) for weight, _ in layers], np.int64)
-    return np.concatenate([packed_layer(weight, bias) for weight, bias in layers]), sizes
+@inlined
+def step_of(way, s):
+    """The step that the ray of slot ``s`` looks at, its begin and end."""
+    at = s * ROW + way.done[s]
+    return way.t0[at], way.t1[at]
+
+
+@inlined
+def stop(way, s, far):
+    """Let the ray of slot ``s`` go no farther."""
+    way.done[s], way.resume[s] = way.kept[s], far[way.which[s]]

@@ -18,18 +18,8 @@ from invgraphics.kernels.numba.composite import absorb
 from invgraphics.kernels.numba.dense import POINTS
 from invgraphics.kernels.numba.hash import levels_of
 from invgraphics.kernels.numba.hash_cells import BLOCK
-from invgraphics.kernels.numba.hash_places import (
-    ACTIVATIONS,
-    density_of,
-    encode,
-    fill,
-    outputs_of,
-    packed_network,
-    places,
-    sigmoid,
-    softplus,
-    view_of,
-)
+from invgraphics.kernels.numba.hash_field import ACTIVATIONS, density_of, encode, outputs_of, packed_network, sigmoid, softplus
+from invgraphics.kernels.numba.hash_places import EDGE, fill, no_rays, step_of, stop, view_of
 from invgraphics.kernels.numba.march import surroundings
 from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, parallel, prange, threads
 from invgraphics.kernels.types import HashField, MarchSteps
@@ -39,29 +29,29 @@ _ZERO, _HALF = np.float32(0.0), np.float32(0.5)
 
 @inlined
 def _meet(s, said, way, far, settings, sums, alpha):
-    """Composite the step of place ``s``; returns what its colour weighs, 0 if nobody will miss it."""
+    """Composite the step of slot ``s``, of which ``said`` was said; returns its colour's weight, 0 if nobody will miss it."""
     activation, bias, _, _, opaque, unseen = settings
-    which, t0, t1, kept, done, _, resume, light, missed, _ = way
-    r, begin, end = which[s], t0[s, done[s]], t1[s, done[s]]
-    done[s] += 1
-    passed, opacity = absorb(density_of(said[s] + bias, activation) * (end - begin))
-    weight = np.float32(light[s]) * opacity
-    light[s] *= passed
+    r = way.which[s]
+    begin, end = step_of(way, s)
+    way.done[s] += 1
+    passed, opacity = absorb(density_of(said + bias, activation) * (end - begin))
+    weight = np.float32(way.light[s]) * opacity
+    way.light[s] *= passed
     alpha[r] += weight
     sums[r, 3] += weight * ((begin + end) * _HALF)
-    if light[s] < opaque:
-        done[s], resume[s] = kept[s], far[r]
-    if missed[s] + weight <= unseen:
-        missed[s] += weight
+    if way.light[s] < opaque:
+        stop(way, s, far)
+    if way.missed[s] + weight <= unseen:
+        way.missed[s] += weight
         weight = _ZERO
     return weight
 
 
 @inlined
-def _ask(s, said, views, waiting, handed, harmonic, asked):
-    """Put what the colour network wants to know of place ``s`` at the end of the queue."""
+def _ask(p, s, said, views, waiting, handed, harmonic, asked):
+    """Put what the colour network wants to know of place ``p``, whose ray is in slot ``s``, at the end of the queue."""
     for k in range(handed):
-        asked[index(k) * POINTS + index(waiting)] = said[index(1 + k) * POINTS + index(s)]
+        asked[index(k) * POINTS + index(waiting)] = said[index(1 + k) * POINTS + index(p)]
     for k in range(harmonic):
         asked[index(handed + k) * POINTS + index(waiting)] = views[view_of(s) + index(k) * LANES]
 
@@ -78,18 +68,19 @@ def _answer(network, asked, odd, even, whose, weights, count, linear, sums):
 
 
 @parallel
-def render(lines, space, table, levels, geometry, colour, widest, settings, jobs, sums, alpha):
+def render(rays, space, table, levels, geometry, colour, widest, settings, width, jobs, sums, alpha):
     """Sums of w * (radiance, distance) and of w for every ray; both hold zeros.
 
     Args:
-        lines: origins, directions, start and far of the rays.
-        space: cells, what `surroundings` says of them, and the steps (see `walk_ray`).
+        rays: their origins, directions, starts and ends.
+        space: see `march.surroundings`.
         table: features, flat.
         levels: see `levels_of`.
         geometry: layers of the density's network as `packed_network`, and their inputs and padded outputs.
         colour: the same of the radiance's.
         widest: most inputs or outputs of any layer.
         settings: activation, bias, whether radiance is linear, bands, least transmittance, most weight of a ray to leave out.
+        width: pixels of a row of the picture.
         jobs: number of jobs.
         sums: output (n, 4).
         alpha: output (n,).
@@ -97,23 +88,22 @@ def render(lines, space, table, levels, geometry, colour, widest, settings, jobs
     linear, harmonic = settings[2], settings[3] * settings[3]
     handed = colour[1][0, 0] - harmonic
     for job in prange(jobs):
-        entries, shares = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        entries, shares = np.empty((2, 8 * BLOCK), np.uint32), np.empty((2, 8 * BLOCK), np.float32)
         points, room = np.zeros((3, POINTS), np.float32), widest * POINTS
         x, asked = np.zeros(room, np.float32), np.zeros(room, np.float32)
         odd, even = np.zeros(room, np.float32), np.zeros(room, np.float32)
         odd_colour, even_colour = np.zeros(room, np.float32), np.zeros(room, np.float32)
         whose, weights, waiting = np.zeros(POINTS, np.int64), np.zeros(POINTS, np.float32), 0
-        way, taken, busy = places(), 0, True
-        which, views = way[0], way[9]
-        while busy:
-            taken, busy = fill(taken, (job, jobs), lines, space, way, points)
+        way = no_rays()
+        while fill((job, jobs, width), rays, space, way, points):
             encode(table, levels, points, entries, shares, x)
             said = outputs_of(geometry, x, odd, even)
-            for s in range(POINTS):
-                weight = _meet(s, said, way, lines[3], settings, sums, alpha) if which[s] >= 0 else _ZERO
+            for p in range(POINTS):
+                s = way.slots[p]
+                weight = _meet(s, said[p], way, rays[3], settings, sums, alpha) if s >= 0 else _ZERO
                 if weight > _ZERO:
-                    _ask(s, said, views, waiting, handed, harmonic, asked)
-                    whose[waiting], weights[waiting] = which[s], weight
+                    _ask(p, s, said, way.views, waiting, handed, harmonic, asked)
+                    whose[waiting], weights[waiting] = way.which[s], weight
                     waiting += 1
                     if waiting == POINTS:
                         _answer(colour, asked, odd_colour, even_colour, whose, weights, waiting, linear, sums)
@@ -130,13 +120,12 @@ def hash_render(
     field: HashField,
     transmittance: float = 0.0,
     unseen: float = 0.0,
+    width: int = 0,
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
     """See `invgraphics.kernels.hash_render`; what has other than two features per entry is left to the reference."""
     if field.table.shape[1] != 2:
-        return reference.hash_render(rays, occupied, bounds, steps, field, transmittance, unseen)
-    box, cells, gaps, shift = surroundings(occupied, bounds)
+        return reference.hash_render(rays, occupied, bounds, steps, field, transmittance, unseen, width)
     lines = tuple(array(part) for part in (rays.origins, rays.directions, rays.near, rays.far))
-    space = cells, gaps, shift, box, bounds.space == "contracted", np.float32(steps.step), np.float32(steps.cone)
     geometry, colour = packed_network(field.geometry), packed_network(field.colour)
     settings = (
         ACTIVATIONS.index(field.density),
@@ -148,8 +137,8 @@ def hash_render(
     )
     widest = int(max(geometry[1].max(), colour[1].max()))
     sums, alpha = torch.zeros(len(rays), 4), torch.zeros(len(rays))
-    table = array(field.table).reshape(-1)
-    render(
-        lines, space, table, levels_of(field.grid), geometry, colour, widest, settings, threads(), sums.numpy(), alpha.numpy()
-    )
+    model = array(field.table).reshape(-1), levels_of(field.grid), geometry, colour, widest
+    space, outputs = surroundings(occupied, bounds, steps), (sums.numpy(), alpha.numpy())
+    # Rays of no picture are taken in order, as if rows were as wide as blocks.
+    render(lines, space, *model, settings, width or EDGE, threads(), *outputs)
     return sums, alpha

@@ -105,6 +105,15 @@ def count_bits(typing: Any, word: Any) -> Any:
     return types.int64(types.uint64), generate
 
 
+def _ask(builder: Any, place: Any) -> None:
+    """Have the cache line of a pointer fetched."""
+    pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+    ask = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
+    ask = cgutils.get_or_insert_function(builder.module, ask, "llvm.prefetch.p0")
+    # To read, to be kept in every cache, data.
+    builder.call(ask, [builder.bitcast(place, pointer), *(ir.Constant(number, n) for n in (0, 3, 1))])
+
+
 @_intrinsic
 def prefetch(typing: Any, array: Any, row: Any) -> Any:
     """Ask for the first and the last byte of a row (uint64) of a contiguous array, some time before it is read or written.
@@ -120,12 +129,21 @@ def prefetch(typing: Any, array: Any, row: Any) -> Any:
             width = builder.mul(width, builder.extract_value(found.shape, axis))
         first = builder.gep(found.data, [builder.mul(arguments[1], width)])
         last = builder.gep(first, [builder.sub(width, context.get_constant(types.intp, 1))])
-        pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
-        ask = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
-        ask = cgutils.get_or_insert_function(builder.module, ask, "llvm.prefetch.p0")
-        for place in (first, last):
-            # To read, to be kept in every cache, data.
-            builder.call(ask, [builder.bitcast(place, pointer), *(ir.Constant(number, n) for n in (0, 3, 1))])
+        _ask(builder, first)
+        _ask(builder, last)
         return context.get_dummy_value()
 
     return types.void(array, row), generate
+
+
+@_intrinsic
+def prefetch_pair(typing: Any, table: Any, entry: Any) -> Any:
+    """`prefetch` of both features of an entry (uint32) of a flat table."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        pairs = builder.bitcast(data, _PAIR.as_pointer())
+        _ask(builder, builder.gep(pairs, [builder.zext(arguments[1], ir.IntType(64))]))
+        return context.get_dummy_value()
+
+    return types.void(table, types.uint32), generate

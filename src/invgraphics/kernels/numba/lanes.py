@@ -123,6 +123,48 @@ def store(typing: Any, flat: Any, at: Any, value: Any) -> Any:
     return types.void(flat, types.uint64, lanes), generate
 
 
+def _each(builder: Any, values: Any) -> list[Any]:
+    """The lanes, one after the other."""
+    return [builder.extract_element(values, ir.Constant(_WORD, lane)) for lane in range(GROUP)]
+
+
+def _whole(builder: Any, values: Any) -> Any:
+    """Whole numbers as integers."""
+    return builder.fptosi(values, ir.VectorType(_WORD, GROUP))
+
+
+@_intrinsic
+def put(typing: Any, flat: Any, at: Any, value: Any) -> Any:
+    """Write each lane's number where ``at`` (lanes of whole numbers) says, lane after lane."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        for place, number in zip(_each(builder, _whole(builder, arguments[1])), _each(builder, arguments[2]), strict=True):
+            builder.store(number, builder.gep(data, [place]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(flat, lanes, lanes), generate
+
+
+@_intrinsic
+def look_up(typing: Any, cube: Any, x: Any, y: Any, z: Any) -> Any:
+    """What a contiguous cube of small integers (int8) holds at each lane's indices (whole numbers)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        found = context.make_array(signature.args[0])(context, builder, arguments[0])
+        edge = builder.trunc(builder.extract_value(found.shape, 2), _WORD)
+        edge = builder.insert_element(ir.Constant(ir.VectorType(_WORD, GROUP), ir.Undefined), edge, ir.Constant(_WORD, 0))
+        edge = builder.shuffle_vector(edge, edge, ir.Constant(ir.VectorType(_WORD, GROUP), None))
+        i, j, k = (_whole(builder, values) for values in arguments[1:])
+        flat = builder.add(builder.mul(builder.add(builder.mul(i, edge), j), edge), k)
+        bytes_ = ir.Constant(ir.VectorType(ir.IntType(8), GROUP), ir.Undefined)
+        for lane, place in enumerate(_each(builder, flat)):
+            bytes_ = builder.insert_element(bytes_, builder.load(builder.gep(found.data, [place])), ir.Constant(_WORD, lane))
+        return builder.sitofp(bytes_, lanes.layout)
+
+    return lanes(cube, lanes, lanes, lanes), generate
+
+
 @_intrinsic
 def where(typing: Any, condition: Any, yes: Any, no: Any) -> Any:
     """``yes`` in the lanes where the condition holds, ``no`` in the others."""

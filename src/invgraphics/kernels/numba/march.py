@@ -1,8 +1,4 @@
-"""Walking along rays through an occupancy grid.
-
-In plain IEEE arithmetic, operation for operation what `invgraphics.kernels.reference.march` does in float32, so that both keep
-the same intervals; but empty space is leapt over: a cell at a time near what is occupied, many blocks of cells farther away.
-"""
+"""Walks of many rays through an occupancy grid, and the map of the ways that they find."""
 
 from __future__ import annotations
 
@@ -13,124 +9,16 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.rays import Rays
-from invgraphics.kernels.numba.runtime import array, exact, exact_parallel, index, prange, scratch, serial, share, threads
+from invgraphics.kernels.numba.runtime import GROUP, array, exact_parallel, index, prange, scratch, serial, share, threads
+from invgraphics.kernels.numba.walking import MARKS, NUMBERS, OCCUPIED, marks_of, no_ray, set_marks, set_ray, walk_rays
 from invgraphics.kernels.types import March, MarchSteps
 
 ROOM = 1 << 22
 """Most intervals that one batch of rays may keep, which bounds memory."""
-MARGIN = np.float32(1e-2)
-"""Share of a step by which a leap over an empty cell ends early, so that rounding never leaps into the next cell."""
-
-ROUNDING = np.float32(1e-6)
-"""Several times the relative rounding error of a float32."""
-NEARLY_HALF = np.float32(0.49)
-"""Steps from a step's middle to its end, less what a leap may be too short by."""
+_ZERO = np.float32(0.0)
 
 BLOCKS = 32
 """Most blocks along the grid's edge; their edges are powers of two, ``1 << shift`` cells long."""
-
-_PARALLEL = np.float32(1e-20)
-"""Directions with less than this along an axis never reach a wall on it."""
-_ZERO, _ONE, _TWO = (np.float32(value) for value in (0.0, 1.0, 2.0))
-
-
-@exact
-def to_unit(box, contracted, x, y, z):
-    """`Bounds.to_unit`; ``box`` holds its centre and half edges."""
-    x, y, z = (x - box[0]) / box[3], (y - box[1]) / box[4], (z - box[2]) / box[5]
-    if contracted:
-        squared = x * x + y * y + z * z
-        if squared > _ONE:
-            norm = np.sqrt(squared)
-            scale = _TWO - _ONE / norm
-            x, y, z = scale * (x / norm), scale * (y / norm), scale * (z / norm)
-        x, y, z = x / _TWO, y / _TWO, z / _TWO
-    return (x + _ONE) / _TWO, (y + _ONE) / _TWO, (z + _ONE) / _TWO
-
-
-@exact
-def _cell(unit, resolution):
-    return min(max(np.int64(unit * np.float32(resolution)), 0), resolution - 1)
-
-
-@exact
-def _way_out(unit, first, cells, cell, pace):
-    """Distance along the ray to the far wall, on one axis, of ``cells`` cells from ``first`` on.
-
-    ``cell`` is a cell's edge in the unit cube, ``pace`` the distance along the ray per unit on this axis.
-    """
-    return (np.float32(first + cells if pace > _ZERO else first) * cell - unit) * pace
-
-
-@exact
-def _aligned(cell, shift, gap):
-    """First cell, on one axis, of the blocks less than ``gap`` away from a cell's own."""
-    return ((cell >> shift) - gap + 1) << shift
-
-
-@exact
-def _pace(direction, half):
-    """Distance along the ray per unit on one axis of the unit cube; next to endless where parallel."""
-    return (
-        _TWO * half / direction if abs(direction) > _PARALLEL else np.float32(np.copysign(_TWO * half / _PARALLEL, direction))
-    )
-
-
-@exact
-def walk_ray(origin, direction, first, taken, t, far, occupied, gaps, shift, box, contracted, step, cone, t0, t1):
-    """Keep intervals of one ray until ``far`` or until ``t0`` is full.
-
-    The ray began at ``first`` and is at ``t``, after ``taken`` steps. Returns how many intervals were kept, and both of these.
-    """
-    resolution = occupied.shape[0]
-    cell, per_step = _ONE / np.float32(resolution), _ONE / step
-    pace_x, pace_y, pace_z = _pace(direction[0], box[3]), _pace(direction[1], box[4]), _pace(direction[2], box[5])
-    kept = 0
-    free = -np.float32(np.inf)
-    while t < far and kept < len(t0):
-        # Without a cone the lattice is counted from the first step, so that leaping over steps changes no bit of the rest.
-        after = first + np.float32(taken + 1) * step if cone == _ZERO else t + max(cone * t, step)
-        if not after > t:
-            # The step is lost to rounding, or not a number.
-            return kept, taken, far
-        end = min(after, far)
-        middle = (t + end) / _TWO
-        if middle >= free:
-            ux, uy, uz = to_unit(
-                box,
-                contracted,
-                origin[0] + middle * direction[0],
-                origin[1] + middle * direction[1],
-                origin[2] + middle * direction[2],
-            )
-            if ux >= _ZERO and uy >= _ZERO and uz >= _ZERO and ux <= _ONE and uy <= _ONE and uz <= _ONE:
-                x, y, z = _cell(ux, resolution), _cell(uy, resolution), _cell(uz, resolution)
-                if occupied[index(x), index(y), index(z)]:
-                    t0[index(kept)], t1[index(kept)] = t, end
-                    kept += 1
-                elif not contracted:
-                    cells, gap = 1, np.int64(gaps[index(1 + (x >> shift)), index(1 + (y >> shift)), index(1 + (z >> shift))])
-                    if gap > 0:
-                        # All blocks less than ``gap`` away are empty too, on every side.
-                        cells = (2 * gap - 1) << shift
-                        x, y, z = (
-                            ((x >> shift) - gap + 1) << shift,
-                            ((y >> shift) - gap + 1) << shift,
-                            ((z >> shift) - gap + 1) << shift,
-                        )
-                    out = min(_way_out(ux, x, cells, cell, pace_x), _way_out(uy, y, cells, cell, pace_y))
-                    out = min(out, _way_out(uz, z, cells, cell, pace_z))
-                    free = min(middle + out - MARGIN * (end - t), far)
-                    if cone == _ZERO:
-                        # To the first step whose middle is past the wall, or the one before; the comparison settles it.
-                        error = ROUNDING * (abs(first) + abs(free))
-                        leap = np.int64((free - first - error) * per_step + NEARLY_HALF)
-                        if leap > taken + 1:
-                            taken = leap - 1
-                            end = min(first + np.float32(leap) * step, far)
-        t = end
-        taken += 1
-    return kept, taken, t
 
 
 @exact_parallel
@@ -173,15 +61,34 @@ def measure(gaps):
 
 
 @exact_parallel
-def walk(origins, directions, start, far, occupied, gaps, shift, box, contracted, step, cone, jobs, t0, t1, counts, resume):
-    """March all rays; ray i keeps ``counts[i]`` intervals, in row i of ``t0`` and ``t1``."""
+def draw_map(occupied, shift, gaps, ways):
+    """``ways``: for every cell `OCCUPIED`, or how many blocks away the nearest block with an occupied cell is."""
+    resolution = occupied.shape[0]
+    for x in prange(resolution):
+        for y in range(resolution):
+            for z in range(resolution):
+                gap = gaps[1 + (x >> shift), 1 + (y >> shift), 1 + (z >> shift)]
+                ways[x, y, z] = OCCUPIED if occupied[x, y, z] else gap
+
+
+@exact_parallel
+def walk(origins, directions, start, far, space, jobs, t0, t1, counts, resume):
+    """March all rays; ray i keeps ``counts[i]`` intervals, in row i of ``t0`` and ``t1``, which have a row to spare."""
+    n, width = len(start), t0.shape[1]
     for job in prange(jobs):
+        lines, marks = np.zeros(NUMBERS * GROUP, np.float32), np.zeros(MARKS * GROUP, np.float32)
         # Neighbouring rays cost alike: dealing them out in turn balances the jobs.
-        for i in range(job, len(start), jobs):
-            counts[i], _, resume[i] = walk_ray(
-                origins[i], directions[i], start[i], 0, start[i], far[i], occupied, gaps, shift, box, contracted, step, cone,
-                t0[i], t1[i],
-            )  # fmt: skip
+        for begin in range(job * GROUP, n, jobs * GROUP):
+            for lane in range(GROUP):
+                r = begin + lane
+                if r < n:
+                    set_ray(lines, lane, origins, directions, r, start[r], far[r])
+                    set_marks(marks, lane, r * width, _ZERO, start[r])
+                else:
+                    no_ray(lines, marks, lane, n * width)
+            walk_rays(lines, marks, np.float32(width - 1), space, t0.reshape(-1), t1.reshape(-1))
+            for lane in range(min(GROUP, n - begin)):
+                counts[begin + lane], _, resume[begin + lane] = marks_of(marks, lane)
 
 
 @exact_parallel
@@ -195,16 +102,23 @@ def gather(t0, t1, counts, ends, first_ray, jobs, ray, packed0, packed1):
                 ray[at], packed0[at], packed1[at] = first_ray + i, t0[i, k], t1[i, k]
 
 
-def surroundings(occupied: Bool[Tensor, "r r r"], bounds: Bounds) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """What a walk needs besides the ray: the box, its cells, blocks' distances to occupied ones, and the blocks' shift."""
-    box = array(torch.cat([bounds.centre, bounds.half]).float())
+def surroundings(
+    occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps
+) -> tuple[np.ndarray, np.ndarray, int, bool, np.float32, np.float32]:
+    """What a walk needs besides the rays.
+
+    The box (centre, half edges); of every cell whether it is occupied, or how many blocks away the nearest block with an
+    occupied cell is; the blocks' shift; whether space is contracted; the steps' length and the cone's slope.
+    """
+    box, contracted = array(torch.cat([bounds.centre, bounds.half]).float()), bounds.space == "contracted"
     cells = array(occupied)
     shift = max(0, (-(-len(cells) // BLOCKS) - 1).bit_length())
-    gaps = np.empty(3 * (2 - (-len(cells) >> shift),), np.int8)
+    gaps, ways = np.empty(3 * (2 - (-len(cells) >> shift),), np.int8), np.empty(cells.shape, np.int8)
     summarise(cells, shift, gaps)
-    if bounds.space == "box":
+    if not contracted:
         measure(gaps)
-    return box, cells, gaps, shift
+    draw_map(cells, shift, gaps, ways)
+    return box, ways, shift, contracted, np.float32(steps.step), np.float32(steps.cone)
 
 
 @torch.no_grad()
@@ -212,20 +126,19 @@ def ray_march(
     rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps, start: Float[Tensor, " n"]
 ) -> March:
     """See `invgraphics.kernels.ray_march`."""
-    box, cells, gaps, shift = surroundings(occupied, bounds)
+    space = surroundings(occupied, bounds, steps)
     resume = torch.empty(len(rays))
     parts = []
-    limit = _most(rays, start, steps)
-    batch = max(1, ROOM // max(limit, 1))
+    # A row has room for one interval more than it keeps.
+    width = 1 + _most(rays, start, steps)
+    batch = max(1, ROOM // width)
     for first in range(0, len(rays), batch):
         some = slice(first, min(first + batch, len(rays)))
         n = some.stop - first
-        t0 = scratch("march t0", n * limit).reshape(n, limit)
-        t1 = scratch("march t1", n * limit).reshape(n, limit)
+        t0, t1 = (scratch(name, (n + 1) * width).reshape(n + 1, width) for name in ("march t0", "march t1"))
         counts = np.empty(n, np.int64)
         lines = (array(x[some]) for x in (rays.origins, rays.directions, start, rays.far))
-        settings = (box, bounds.space == "contracted", np.float32(steps.step), np.float32(steps.cone), threads())
-        walk(*lines, cells, gaps, shift, *settings, t0, t1, counts, resume[some].numpy())
+        walk(*lines, space, threads(), t0, t1, counts, resume[some].numpy())
         parts.append(packed(t0, t1, counts, first))
     if not parts:
         return March(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0), resume)

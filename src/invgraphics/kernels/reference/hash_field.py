@@ -31,8 +31,9 @@ def hash_render(
     field: HashField,
     transmittance: float = 0.0,
     unseen: float = 0.0,
+    width: int = 0,
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-    """See `invgraphics.kernels.hash_render`; every occupied step is looked at, whatever may be left out."""
+    """See `invgraphics.kernels.hash_render`; every occupied step is looked at, whatever may be left out, in any order."""
     march = ray_march(rays, occupied, bounds, replace(steps, limit=ENDLESS), rays.near)
     density, radiance = _look(field, rays, bounds, march)
     channels = torch.cat([radiance, ((march.t0 + march.t1) / 2)[:, None]], dim=1)
