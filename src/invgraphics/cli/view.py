@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 import webbrowser
 from dataclasses import dataclass
@@ -61,7 +60,6 @@ class View:
             print(f"Looking at {' and '.join(map(str, runs))}: {url} (Ctrl-C ends)", flush=True)
             if self.open and _has_screen():
                 webbrowser.open(url)
-            signal.signal(signal.SIGTERM, signal.default_int_handler)  # pycolmap, which reads lenses, has taken it
             with contextlib.suppress(KeyboardInterrupt):
                 viewer.watch(self.live)
         return 0

@@ -57,7 +57,7 @@ def _model(path: Path) -> Path | None:
 
 
 def _read(model: Path) -> Any:
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     try:
         return pycolmap.Reconstruction(str(model))

@@ -38,7 +38,7 @@ class Lens:
         Raises:
             InputError: the model is unknown, is no perspective camera, or has another number of parameters.
         """
-        import pycolmap
+        from invgraphics.scenes.colmap_library import pycolmap
 
         known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
         if self.model not in known:

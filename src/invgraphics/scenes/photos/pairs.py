@@ -55,7 +55,7 @@ class Evidence:
 
 def read_evidence(path: Path, photos: Sequence[Prepared]) -> Evidence:
     """Read the data base."""
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     with pycolmap.Database.open(path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -71,7 +71,7 @@ def read_evidence(path: Path, photos: Sequence[Prepared]) -> Evidence:
 
 
 def _verified(database: Any) -> list[tuple[int, int, Any]]:
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     found = []
     ids, geometries = database.read_two_view_geometries()

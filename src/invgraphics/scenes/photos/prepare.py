@@ -162,7 +162,7 @@ def _exif(path: Path) -> dict[int, Any]:
 
 def _focal_share(path: Path) -> float | None:
     """Focal length over the longest side, as COLMAP reads it from EXIF (35 mm equivalent, focal plane, sensor data base)."""
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     try:
         camera = pycolmap.infer_camera_from_image(str(path))

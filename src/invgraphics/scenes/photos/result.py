@@ -87,7 +87,7 @@ def _move_points(image: Any, camera: Any, straight: Straight) -> None:
 
 
 def _make_pinhole(camera: Any, straight: Straight | None) -> None:
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     focal = (camera.focal_length_x, camera.focal_length_y) if straight is None else straight.focal
     centre = (camera.principal_point_x, camera.principal_point_y) if straight is None else straight.centre

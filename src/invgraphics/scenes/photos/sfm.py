@@ -25,7 +25,7 @@ _SMALLEST_MODEL = 3
 
 def enter(job: PhotoJob, photos: Sequence[Prepared], work: Path) -> None:
     """Write cameras and photographs into a data base, in order: threads that extract features would number them by chance."""
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     path = work / DATABASE
     with pycolmap.Database.open(path) as database:
@@ -42,7 +42,7 @@ def enter(job: PhotoJob, photos: Sequence[Prepared], work: Path) -> None:
 
 def extract(photos: Sequence[Prepared], work: Path, progress: Progress) -> None:
     """Add the SIFT features of photographs that have none yet to the data base."""
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     reader = pycolmap.ImageReaderOptions()
     if any(photo.masked for photo in photos):  # there is a mask for each, but reading them takes time
@@ -55,7 +55,7 @@ def extract(photos: Sequence[Prepared], work: Path, progress: Progress) -> None:
 
 def _reader(job: PhotoJob, members: Sequence[Prepared]) -> Any:
     """How COLMAP makes a group's camera: with the known focal length, or with a guess, which does not count as known."""
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     data_set = members[0].centre is not None
     reader = pycolmap.ImageReaderOptions()
@@ -81,7 +81,7 @@ def pairs(count: int, matching: str) -> list[tuple[int, int]]:
 
 def match(job: PhotoJob, photos: Sequence[Prepared], work: Path, progress: Progress) -> None:
     """Compare and verify all pairs that are asked for; those in the data base already are left alone."""
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     wanted = pairs(len(photos), job.matching)
     verification = pycolmap.TwoViewGeometryOptions()
@@ -97,7 +97,7 @@ def match(job: PhotoJob, photos: Sequence[Prepared], work: Path, progress: Progr
 
 def reconstruct(job: PhotoJob, photos: Sequence[Prepared], work: Path, progress: Progress) -> list[Any]:
     """Poses and points: separate pieces where the photographs do not hang together, the largest first."""
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     output = work / MODEL
     output.mkdir(exist_ok=True)

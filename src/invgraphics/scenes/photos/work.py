@@ -51,7 +51,7 @@ class Clock:
 
 def main(work: Path) -> None:
     """Do the whole work and leave it in ``work``/result."""
-    import pycolmap
+    from invgraphics.scenes.colmap_library import pycolmap
 
     pycolmap.logging.minloglevel = 2
     asked = json.loads((work / JOB).read_text(encoding="utf-8"))

@@ -1,0 +1,17 @@
+"""pycolmap, without what its import does to the process.
+
+COLMAP's logging takes SIGTERM as a crash: it prints a stack trace and dies, and a command could not save what it has computed.
+Whoever listened before gets the signal back here. This takes a second to import: do it where it is needed.
+"""
+
+import signal
+import threading
+
+import pycolmap
+
+__all__ = ["pycolmap"]
+
+_listener = signal.getsignal(signal.SIGTERM)
+# Python knows nothing of the change; only its main thread may speak of signals.
+if _listener is not None and threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGTERM, _listener)
