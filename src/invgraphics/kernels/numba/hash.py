@@ -21,6 +21,12 @@ UNIT, TWO = index(1), index(2)
 
 
 @inlined
+def _block(first, until):
+    """The block that begins with a point: that point, and how many there are."""
+    return index(first), min(BLOCK, until - first)
+
+
+@inlined
 def _gather(table, entries, weights, block, column, width, out):
     """Features of the points of a block; the usual two are read together."""
     first, count = block
@@ -69,13 +75,12 @@ def encode(planes, table, width, cells, offsets, masks, jobs, out):
                 for first in range(chunk, until + BLOCK, BLOCK):
                     # A block's entries are asked for before those of the block before it are read.
                     if first < until:
-                        block, place = (index(first), min(BLOCK, until - first)), first // BLOCK % 2
+                        block, place = _block(first, until), first // BLOCK % 2
                         locate(x, y, z, block, level, entries[place], weights[place])
                         if width == TWO:
                             ask_for(table, entries[place], block[1])
                     if first > chunk:
-                        before, place = first - BLOCK, (first // BLOCK - 1) % 2
-                        block = index(before), min(BLOCK, until - before)
+                        block, place = _block(first - BLOCK, until), (first // BLOCK - 1) % 2
                         _gather(table, entries[place], weights[place], block, column, width, out)
 
 
@@ -89,7 +94,7 @@ def encode_back(planes, gradient, width, cells, offsets, masks, jobs, to_table):
             level, column = (cells[number], offsets[number], masks[number]), index(number) * width
             to_table[index(offsets[number]) * width : index(offsets[number + 1]) * width] = ZERO
             for first in range(0, len(x), BLOCK):
-                block = index(first), min(BLOCK, len(x) - first)
+                block = _block(first, len(x))
                 locate(x, y, z, block, level, entries, weights)
                 _scatter(gradient, entries, weights, block, column, width, to_table)
 

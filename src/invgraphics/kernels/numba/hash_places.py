@@ -25,7 +25,7 @@ EDGE = 8
 """Of a block of pixels whose rays a job takes at once."""
 BLOCK = EDGE * EDGE
 SLOTS = int(POINTS) + 4 * GROUP
-"""Rays under way: in places, ready for one, and waiting to walk on. The others are behind it."""
+"""Room for rays under way. When `LANES` of them are to walk, none is ready for a place, and fewer than twice as many wait."""
 READY, WAITING, WALKING, UNUSED, TAKEN = range(5)
 """Lists of slots, and the number of rays that have been taken from the deal."""
 

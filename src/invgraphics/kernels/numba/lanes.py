@@ -21,6 +21,7 @@ from numba.core.typing import templates
 from invgraphics.kernels.numba.runtime import GROUP, exp2_fraction, inlined
 
 _WORD = ir.IntType(32)
+_WORDS = ir.VectorType(_WORD, GROUP)
 
 # All decorate in ways that no checker can follow.
 _intrinsic: Any = extending.intrinsic
@@ -52,10 +53,15 @@ class _Model(models.PrimitiveModel):
         super().__init__(dmm, kind, kind.layout)
 
 
+def _everywhere(builder: Any, value: Any) -> Any:
+    """A vector that holds one number in all lanes."""
+    one = builder.insert_element(ir.Constant(ir.VectorType(value.type, GROUP), ir.Undefined), value, ir.Constant(_WORD, 0))
+    return builder.shuffle_vector(one, one, ir.Constant(_WORDS, None))
+
+
 @_lower_cast(types.float32, _Register)
 def _from_number(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
-    one = builder.insert_element(ir.Constant(lanes.layout, ir.Undefined), value, ir.Constant(_WORD, 0))
-    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(_WORD, GROUP), None))
+    return _everywhere(builder, value)
 
 
 def _define(function: Any, result: _Register, operands: tuple[_Register, ...], generate: Callable[..., Any]) -> None:
@@ -130,7 +136,7 @@ def _each(builder: Any, values: Any) -> list[Any]:
 
 def _whole(builder: Any, values: Any) -> Any:
     """Whole numbers as integers."""
-    return builder.fptosi(values, ir.VectorType(_WORD, GROUP))
+    return builder.fptosi(values, _WORDS)
 
 
 @_intrinsic
@@ -152,9 +158,7 @@ def look_up(typing: Any, cube: Any, x: Any, y: Any, z: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         found = context.make_array(signature.args[0])(context, builder, arguments[0])
-        edge = builder.trunc(builder.extract_value(found.shape, 2), _WORD)
-        edge = builder.insert_element(ir.Constant(ir.VectorType(_WORD, GROUP), ir.Undefined), edge, ir.Constant(_WORD, 0))
-        edge = builder.shuffle_vector(edge, edge, ir.Constant(ir.VectorType(_WORD, GROUP), None))
+        edge = _everywhere(builder, builder.trunc(builder.extract_value(found.shape, 2), _WORD))
         i, j, k = (_whole(builder, values) for values in arguments[1:])
         flat = builder.add(builder.mul(builder.add(builder.mul(i, edge), j), edge), k)
         bytes_ = ir.Constant(ir.VectorType(ir.IntType(8), GROUP), ir.Undefined)
@@ -211,10 +215,9 @@ def bits_below(typing: Any, counts: Any) -> Any:
     """Per lane a byte whose lowest ``counts`` bits are set (whole numbers, 0 to 8); 8 lanes are a word (uint64)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        words, bytes_ = ir.VectorType(_WORD, GROUP), ir.VectorType(ir.IntType(8), GROUP)
-        ones = ir.Constant(words, [1] * GROUP)
-        bits = builder.sub(builder.shl(ones, builder.fptosi(arguments[0], words)), ones)
-        pair = builder.bitcast(builder.trunc(bits, bytes_), ir.VectorType(ir.IntType(64), 2))
+        ones = ir.Constant(_WORDS, [1] * GROUP)
+        bits = builder.sub(builder.shl(ones, _whole(builder, arguments[0])), ones)
+        pair = builder.bitcast(builder.trunc(bits, ir.VectorType(ir.IntType(8), GROUP)), ir.VectorType(ir.IntType(64), 2))
         found = [builder.extract_element(pair, ir.Constant(_WORD, k)) for k in range(2)]
         return context.make_tuple(builder, signature.return_type, found)
 
@@ -226,9 +229,8 @@ def _power_of_two(typing: Any, whole: Any) -> Any:
     """``2**whole`` for whole numbers in [-126, 127]: the exponent of a float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        words = ir.VectorType(_WORD, GROUP)
-        bits = builder.add(builder.fptosi(arguments[0], words), ir.Constant(words, [127] * GROUP))
-        return builder.bitcast(builder.shl(bits, ir.Constant(words, [23] * GROUP)), lanes.layout)
+        bits = builder.add(_whole(builder, arguments[0]), ir.Constant(_WORDS, [127] * GROUP))
+        return builder.bitcast(builder.shl(bits, ir.Constant(_WORDS, [23] * GROUP)), lanes.layout)
 
     return lanes(lanes), generate
 
@@ -248,7 +250,7 @@ def _paired(builder: Any, first: Any, second: Any, held: int) -> Any:
 
     def halves(begin: int) -> Any:
         chosen = [start + begin + lane for start in starts for lane in range(part // 2)]
-        return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(_WORD, GROUP), chosen))
+        return builder.shuffle_vector(first, second, ir.Constant(_WORDS, chosen))
 
     return builder.fadd(halves(0), halves(part // 2))
 

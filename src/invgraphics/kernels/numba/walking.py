@@ -79,7 +79,7 @@ def _aligned(x, edge, gap):
 def _pace(direction, half):
     """Distance along the ray per unit on one axis of the unit cube; next to endless where parallel."""
     endless = _TWO * half / _PARALLEL
-    straight = where(direction < _ZERO, spread(-endless), spread(endless))
+    straight = where(direction < _ZERO, -endless, endless)
     return where(abs(direction) > _PARALLEL, _TWO * half / direction, straight)
 
 
@@ -137,7 +137,7 @@ def _way_through(unit, cells, gap, grid, paces):
     cell, edge = _ONE / grid[0], grid[1]
     # All blocks less than ``gap`` away are empty too, on every side.
     wide = gap > _ZERO
-    count = where(wide, (_TWO * gap - _ONE) * edge, spread(_ONE))
+    count = where(wide, (_TWO * gap - _ONE) * edge, _ONE)
     x, y = where(wide, _aligned(x, edge, gap), x), where(wide, _aligned(y, edge, gap), y)
     z = where(wide, _aligned(z, edge, gap), z)
     out = min(_way_out(ux, x, count, cell, pace_x), _way_out(uy, y, count, cell, pace_y))
@@ -152,7 +152,7 @@ def walk_rays(lines, marks, room, space, t0, t1):
         lines: `NUMBERS` of each ray, number after number; a lane without a ray ends before it begins.
         marks: `MARKS` of each ray, which are brought up to date. A row has room for one interval more, of no meaning.
         room: most intervals (float32).
-        space: see `march.surroundings`, and the steps: their length and the cone's slope.
+        space: see `march.surroundings`.
         t0: begins of intervals, flat.
         t1: their ends.
     """
@@ -165,7 +165,7 @@ def walk_rays(lines, marks, room, space, t0, t1):
     going = (t < far) & (kept < room)
     while any_of(going):
         # Without a cone the lattice is counted from the first step, so that leaping over steps changes no bit of the rest.
-        after = first + (taken + _ONE) * step if cone == _ZERO else t + max(cone * t, spread(step))
+        after = first + (taken + _ONE) * step if cone == _ZERO else t + max(cone * t, step)
         # Otherwise the step is lost to rounding, or not a number, and the walk ends.
         moving = going & (after > t)
         end = min(after, far)
