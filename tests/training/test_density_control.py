@@ -184,3 +184,49 @@ def test_white_scenes_are_reset_when_growth_begins(background: float, lowered: b
     again.load_state_dict(hook.state_dict())
     again.after_step(state)
     assert float(torch.sigmoid(state.field.opacity_logits).min()) == pytest.approx(0.5)  # once only
+
+
+def test_growth_begins_by_steps_where_the_budget_is_long() -> None:
+    """At a hundredth of the fit nothing is due by progress; after 500 steps it is, once and for all."""
+    state = _state(3)
+    state.ctx = replace(state.ctx, progress=0.01)
+    hook = DensityControlConfig(every=10, threshold=1.0, start=0.05, start_steps=500).build()
+    state.step = 489
+    _pull(state, hook, [1.0] * 3)
+    hook.after_step(state)
+    assert state.field.primitive_count() == 3
+    state.step = 509
+    hook.after_step(state)
+    assert state.field.primitive_count() == 6
+
+
+@pytest.mark.parametrize(("risen", "most"), [(0.0, 4), (0.25, 8), (0.5, 16), (1.0, 16)])
+def test_the_limit_rises_by_equal_factors(risen: float, most: int) -> None:
+    """From 4 to 16 Gaussians within half of the fit: a quarter of it doubles them."""
+    state = _state(4)
+    hook = DensityControlConfig(every=10, threshold=1e-3, start=0.0, stop=1.1, pace=0.5, max_primitives=16).build()
+    state.ctx = replace(state.ctx, progress=0.0)
+    _pull(state, hook, [1.0] * 4)
+    hook.after_step(state)
+    assert state.field.primitive_count() == 4
+    state.ctx = replace(state.ctx, progress=risen)
+    for _ in range(3):
+        _pull(state, hook, [1.0] * state.field.primitive_count())
+        hook.after_step(state)
+    assert state.field.primitive_count() == most
+
+
+@pytest.mark.parametrize("opacity", [0.02, 0.5, 0.98])
+def test_a_clone_and_its_parent_together_look_like_the_parent(opacity: float) -> None:
+    """Two in one place transmit (1 - o)², which must be what one transmitted; others keep their opacity."""
+    state = _state(3)
+    with torch.no_grad():
+        state.field.opacity_logits[1] = math.log(opacity / (1 - opacity))
+    hook = DensityControlConfig(every=10, threshold=1.0, share_opacity=True).build()
+    _pull(state, hook, [0.0, 1.0, 0.0])
+    hook.after_step(state)
+    opacities = state.field.opacity_logits.detach().sigmoid()
+    assert len(opacities) == 4
+    assert float(opacities[1]) == pytest.approx(float(opacities[3]), rel=1e-6)
+    assert float((1 - opacities[1]) * (1 - opacities[3])) == pytest.approx(1 - opacity, rel=1e-4)
+    torch.testing.assert_close(opacities[[0, 2]], torch.full((2,), 0.5))

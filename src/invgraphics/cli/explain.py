@@ -98,6 +98,9 @@ def sentences(explanation: Explanation) -> list[str]:
         f"add up to {_colour(explanation.composited.tolist())}; the renderer's picture has "
         f"{_colour(explanation.rendered.tolist())} (largest difference {difference:.1e}), the truth {_colour(pixel['true'])}.",
     ]
+    if explanation.facts["dead"] is not None:
+        sentence = explanation.facts["dead"]["sentence"]
+        told.append(f"In the whole model, {sentence}")
     depths = {"mean": pixel["expected"], "median": pixel["median"], "true": pixel["true_depth"]}
     known = [f"{name} {value:.4g}" for name, value in depths.items() if value is not None]
     return [*told, f"Depth: {', '.join(known)}."] if known else told

@@ -7,6 +7,7 @@ coefficients in 3DGS files can be exchanged with ours. The functions are orthono
 from __future__ import annotations
 
 from math import pi, sqrt
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -77,8 +78,36 @@ def degree_of(coefficients: int) -> int:
 
 
 def evaluate(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """The functions with coefficients ``sh`` at one unit direction each. 3DGS adds 0.5 to get a colour; this does not."""
+    """The functions with coefficients ``sh`` at one unit direction each. `colour` makes radiance of it."""
     return torch.einsum("nk,nkc->nc", basis(directions, degree_of(sh.shape[1])), sh)
+
+
+def colour(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Radiance max(0, 0.5 + Σ c Y) at one unit direction each (3DGS), with the gradient of a projection onto [0, ∞).
+
+    Where a channel is cut off, a gradient that would raise it passes unchanged and one that would lower it further is zero, so
+    that gradient descent can bring a black primitive back.
+    """
+    return _NonNegative.apply(evaluate(sh, directions) + 0.5)  # type: ignore[no-any-return]
+
+
+class _NonNegative(torch.autograd.Function):
+    """``max(0, x)``; its backward pass drops only the descent steps that lead further below zero."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor) -> Tensor:
+        return x.clamp_min(0.0)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[0])
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
+        (x,), (gradient,) = ctx.saved_tensors, grad_outputs
+        return torch.where((x > 0) | (gradient < 0), gradient, 0.0)
 
 
 def rotate(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:

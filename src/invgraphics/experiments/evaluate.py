@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+import sys
 import time
 from math import ceil
 from pathlib import Path
@@ -21,6 +22,7 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.recipe import Method
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
+from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
 
 TIMED = 6
@@ -80,6 +82,9 @@ def evaluate(
             scores.append(score(picture, view, scene, rules))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     per_view = statistics.median(seconds)
+    dead = dead_gaussians(field, [view.camera for view in scene.train])
+    if dead is not None and dead.share > DEAD_SHARE:
+        print(f"Warning: {dead.sentence()}", file=sys.stderr)
     quality, skipped = summarise(scores, rules)
     result = {
         "schema": 1,
@@ -96,6 +101,7 @@ def evaluate(
             "model_bytes": model_bytes(model),
             "parameters": parameter_count(model),
             "primitives": field.primitive_count(),
+            "dead": None if dead is None else dead.share,
         },
         "quality": quality if posed is None else quality | posed.quality(),
         "skipped": skipped,

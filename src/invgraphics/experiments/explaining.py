@@ -17,6 +17,7 @@ from invgraphics.experiments.along import Contributions, Profile, along_ray
 from invgraphics.experiments.evaluate import display, render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.folder import write_json
+from invgraphics.training.limits import dead_gaussians
 
 Split = Literal["test", "train"]
 
@@ -160,10 +161,17 @@ def _facts(fitted: Fitted, request: ExplainRequest, view: View, found: Contribut
             "true_depth": None if view.depth is None else _number(view.depth[row, column]),
         },
         "contributions": _columns(found),
+        "dead": _dead(fitted),
         "profile": _profile(found.profile),
         "marched": _profile(found.marched),
         "passes": [{name: _row(value) for name, value in vars(one).items()} for one in found.passes],
     }
+
+
+def _dead(fitted: Fitted) -> dict[str, Any] | None:
+    """Share, number and causes of primitives that no gradient can change; ``None`` for fields without Gaussians."""
+    dead = dead_gaussians(fitted.field, [view.camera for view in fitted.scene.train])
+    return None if dead is None else {"share": _number(dead.share), "sentence": dead.sentence()}
 
 
 def _columns(found: Contributions) -> dict[str, list[Any] | None]:

@@ -19,6 +19,7 @@ from invgraphics.experiments.posed import carried, into_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.training import checkpoint
 from invgraphics.training.fit import Fit
+from invgraphics.training.limits import dead_gaussians
 
 MARKS = (0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Points of the fit at which the monitor looks."""
@@ -171,5 +172,8 @@ class Recorder:
         count = fit.plan.field.primitive_count()
         if count is not None:
             line["primitives"] = count
+        dead = dead_gaussians(fit.plan.field, [view.camera for view in fit.plan.scene.train])
+        if dead is not None:
+            line["dead"] = round(dead.share, 6)
         self._folder.append_history(line)
         return psnr

@@ -169,7 +169,7 @@ def normals(primitives: Primitives, encounters: Encounters, rays: Rays) -> Float
 
 
 def _colour(sh: Float[Tensor, "p c 3"], offset: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
-    return (harmonics.evaluate(sh, normalize(offset, dim=1)) + 0.5).clamp_min(0.0)
+    return harmonics.colour(sh, normalize(offset, dim=1))
 
 
 def _along(

@@ -9,6 +9,9 @@ from invgraphics.report.records import Comparison
 from invgraphics.report.summary import Row, Summary
 from invgraphics.report.wording import Quantity, budget_words, listing, times
 
+DEAD_SHARE = 0.01
+"""Share of primitives that no gradient can change above which the page warns."""
+
 
 def verdict(comparison: Comparison, summary: Summary) -> list[str]:
     """Sentences in order of importance. Each follows from the summary table alone."""
@@ -129,6 +132,10 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
         ]
         if below:
             sentences.append(f"{listing(below)} did not beat the trivial baseline '{reference[1].label}' in {column.label}.")
+    dead = [run for run in comparison.runs if (run.cost.get("dead") or 0) > DEAD_SHARE]
+    for run in dead:
+        share = f"{100 * (run.cost['dead'] or 0):.2g} %"
+        sentences.append(f"No gradient can change {share} of the primitives of {run.method} (seed {run.seed}).")
     short = [row.label for row in summary.methods if not row.complete]
     if short:
         words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"

@@ -98,6 +98,7 @@ COSTS = (
     Quantity("model_bytes", "Model", "MB", "lower", "cost", scale=1e-6),
     Quantity("parameters", "Params", "M", "none", "cost", scale=1e-6),
     Quantity("primitives", "Primitives", "", "none", "cost", decimals=0),
+    Quantity("dead", "Dead", "%", "none", "cost", scale=100, decimals=2),
 )
 """Costs in the order of the table; 1 MB = 10⁶ bytes."""
 

@@ -13,5 +13,6 @@ HOOKS = {
     "density_control": "invgraphics.training.density_control:DensityControlConfig",
     "relocation": "invgraphics.training.relocation:RelocationConfig",
     "smoothing": "invgraphics.training.smoothing:SmoothingConfig",
+    "limits": "invgraphics.training.limits:LimitsConfig",
     "sh_degree": "invgraphics.training.hooks:ShDegreeConfig",
 }

@@ -25,6 +25,7 @@ class DensityControlConfig:
 
     Attributes:
         start: progress at which growing begins (paper: 500 of 30,000 steps).
+        start_steps: steps after which it begins at the latest, however long the budget; 0 leaves it to ``start``.
         stop: progress at which it ends (paper: 15,000 of 30,000).
         every: steps between two rounds.
         threshold: mean norm of dL/d(NDC xy) above which a Gaussian grows.
@@ -36,11 +37,16 @@ class DensityControlConfig:
         white_reset: whether they are also pulled down at ``start`` where the scene's background is white, before splats of the
             background's colour settle in front of it.
         max_primitives: growth stops here; those with the largest gradients come first.
+        pace: progress, from the start of growth on, over which the limit on their number rises to ``max_primitives``, by equal
+            factors; 0 lets them grow as fast as their gradients say.
         clone: whether small Gaussians are cloned.
         split: whether large Gaussians are split.
+        share_opacity: whether a clone and its parent take opacities that together look like the parent's, 1 - √(1 - o) (Rota
+            Bulò et al. 2024, §3.3), rather than both keeping it (3DGS).
     """
 
     start: float = 1 / 60
+    start_steps: int = 0
     stop: float = 0.5
     every: int = 100
     threshold: float = 2e-4
@@ -51,8 +57,10 @@ class DensityControlConfig:
     resets: tuple[float, ...] = ()
     white_reset: bool = False
     max_primitives: int = 1_000_000
+    pace: float = 0.0
     clone: bool = True
     split: bool = True
+    share_opacity: bool = False
 
     def __post_init__(self) -> None:
         if self.every < 1 or self.max_primitives < 1:
@@ -105,7 +113,8 @@ class DensityControl(Hook):
         self._seen = torch.zeros(0)
         self._radius = torch.zeros(0)
         self._resets_done = 0
-        self._started = False
+        self._started = -1.0
+        self._first = 0
 
     @override
     def check(self, field: Field, renderer: Renderer) -> None:
@@ -128,16 +137,22 @@ class DensityControl(Hook):
     def after_step(self, state: FitState) -> None:
         config, progress = self._config, state.ctx.progress
         field = cast(Splats, state.field)
+        begins = self._started < 0 and self._begun(state)
+        if begins:
+            self._started = progress
         due = (state.step + 1) % config.every == 0 and len(self._pull) == len(field.means)
-        if due and config.start <= progress < config.stop:
+        if due and self._started >= 0 and progress < config.stop:
             self._regrow(state)
         if self._resets_done < len(config.resets) and progress >= config.resets[self._resets_done]:
             self._resets_done += 1
             self._reset(state)
-        if not self._started and progress >= config.start:
-            self._started = True
-            if config.white_reset and bool((state.scene.background >= 1).all()):
-                self._reset(state)
+        if begins and config.white_reset and bool((state.scene.background >= 1).all()):
+            self._reset(state)
+
+    def _begun(self, state: FitState) -> bool:
+        """Whether growth has begun: by progress, or by steps in budgets that are long."""
+        steps = self._config.start_steps
+        return state.ctx.progress >= self._config.start or (0 < steps <= state.step)
 
     @torch.no_grad()
     def _reset(self, state: FitState) -> None:
@@ -153,12 +168,21 @@ class DensityControl(Hook):
         keep = ~self._to_prune(field, largest, state.scene.extent)
         small = largest <= config.dense * state.scene.extent
         able = keep & torch.where(small, config.clone, config.split)
-        grows = self._to_grow(torch.where(able, pull, 0.0), config.max_primitives - int(keep.sum()))
+        grows = self._to_grow(torch.where(able, pull, 0.0), self._limit(state.ctx.progress, len(keep)) - int(keep.sum()))
         cloned, split = (grows & small).nonzero()[:, 0], (grows & ~small).nonzero()[:, 0]
         keep[split] = False
         if not bool(keep.any()) and len(split) == 0:
             keep[torch.argmax(field.opacity_logits)] = True  # a field of nothing could never grow again
         self._apply(state, keep.nonzero()[:, 0], cloned, split)
+
+    def _limit(self, progress: float, count: int) -> int:
+        """Most Gaussians there may be now: ``max_primitives``, approached from the first number by equal factors."""
+        config = self._config
+        self._first = self._first or count
+        if not config.pace or self._first >= config.max_primitives:
+            return config.max_primitives
+        risen = min(1.0, (progress - self._started) / config.pace)
+        return int(self._first * (config.max_primitives / self._first) ** risen)
 
     def _to_grow(self, pull: Float[Tensor, " n"], room: int) -> Bool[Tensor, " n"]:
         """Above the threshold; where room is short, the strongest only."""
@@ -186,6 +210,10 @@ class DensityControl(Hook):
         rows = torch.cat([keep, cloned, parts])
         new = {name: values[rows].clone() for name, values in old.items()}
         first = len(keep) + len(cloned)
+        if self._config.share_opacity:
+            pairs = torch.cat([torch.searchsorted(keep, cloned), torch.arange(len(keep), first, device=rows.device)])
+            half = 1 - (1 - new["opacity_logits"][pairs].sigmoid()).sqrt()
+            new["opacity_logits"][pairs] = torch.logit(half)
         offset = torch.randn(len(parts), 3, generator=state.ctx.generator).to(rows.device) * old["log_scales"][parts].exp()
         rotation = quaternion_to_matrix(old["quaternions"][parts])
         new["means"][first:] += (rotation @ offset[:, :, None])[:, :, 0]
@@ -201,9 +229,14 @@ class DensityControl(Hook):
     @override
     def state_dict(self) -> dict[str, Tensor]:
         gathered = {"pull": self._pull, "seen": self._seen, "radius": self._radius}
-        return gathered | {"resets_done": torch.tensor(self._resets_done), "started": torch.tensor(self._started)}
+        return gathered | {
+            "resets_done": torch.tensor(self._resets_done),
+            "started": torch.tensor(self._started),
+            "first": torch.tensor(self._first),
+        }
 
     @override
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self._pull, self._seen, self._radius = state["pull"], state["seen"], state["radius"]
-        self._resets_done, self._started = int(state["resets_done"]), bool(state["started"])
+        self._resets_done, self._started = int(state["resets_done"]), float(state["started"])
+        self._first = int(state["first"])

@@ -74,10 +74,16 @@ class ShDegreeConfig:
     Attributes:
         interval: progress between two bands.
         start: progress at which the first band beyond the constant one comes.
+        steps: most steps before each band, however long the budget (3DGS: 1000); 0 leaves it to ``start`` and ``interval``.
     """
 
     interval: float = 1 / 30
     start: float = 1 / 30
+    steps: int = 0
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise ValueError(f"'steps' must not be negative, not {self.steps}.")
 
     def build(self) -> Hook:
         """The hook."""
@@ -95,8 +101,10 @@ class _ShDegree(Hook):
 
     @override
     def before_step(self, state: FitState) -> None:
-        passed = state.ctx.progress - self._config.start
-        bands = 0 if passed < 0 else 1 + int(passed / max(self._config.interval, 1e-9))
+        config = self._config
+        passed = state.ctx.progress - config.start
+        bands = 0 if passed < 0 else 1 + int(passed / max(config.interval, 1e-9))
+        bands = max(bands, state.step // config.steps) if config.steps else bands
         limit: int = state.field.sh_degree  # type: ignore[assignment]
         state.field.active_degree = min(bands, limit)  # type: ignore[assignment]
 

@@ -15,6 +15,9 @@ from invgraphics.core import Camera, Field, Renderer
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState, Hook
 
+CHUNK = 4096
+"""Points that are projected into all cameras at once: few enough for the cache."""
+
 
 @dataclass(frozen=True)
 class SmoothingConfig:
@@ -80,13 +83,18 @@ def pixel_distances(points: Float[Tensor, "n 3"], cameras: Sequence[Camera], mar
 
     Points that no camera sees get the largest distance of those that are seen; 0 if none is.
     """
-    finest = torch.full_like(points[:, 0], torch.inf)
-    for camera in cameras:
-        here = camera.to(points.device)
-        pixels, z = here.project(points)
-        size = pixels.new_tensor([here.width, here.height])
-        inside = ((pixels >= -margin * size) & (pixels <= (1 + margin) * size)).all(dim=1) & (z > near)
-        finest = torch.where(inside, torch.minimum(finest, z / here.focal.max()), finest)
+    cameras = [camera.to(points.device) for camera in cameras]
+    world_to_cam = torch.stack([camera.world_to_cam[:3] for camera in cameras]).to(points)
+    focal, centre = (torch.stack(values).to(points) for values in zip(*((c.focal, c.centre) for c in cameras), strict=True))
+    size = points.new_tensor([[camera.width, camera.height] for camera in cameras])
+    # In units of depth: the tangents of the margins' edges.
+    lowest, highest = (-margin * size - centre) / focal, ((1 + margin) * size - centre) / focal
+    parts = []
+    for part in points.split(CHUNK):
+        x, y, z = (part @ row[:, :3].T + row[:, 3] for row in world_to_cam.unbind(dim=1))
+        inside = (x >= lowest[:, 0] * z) & (x <= highest[:, 0] * z) & (y >= lowest[:, 1] * z) & (y <= highest[:, 1] * z)
+        parts.append(torch.where(inside & (z > near), z / focal.amax(dim=1), torch.inf).amin(dim=1))
+    finest = torch.cat(parts) if parts else points[:, 0]
     seen = torch.isfinite(finest)
     largest = finest[seen].max() if bool(seen.any()) else finest.new_zeros(())
     return torch.where(seen, finest, largest)

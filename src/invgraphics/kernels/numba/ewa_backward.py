@@ -111,15 +111,22 @@ def _look(view, lanes, lane):
 
 
 @inlined
+def _through_cut(colour, gradient):
+    """Gradient through max(0, colour): where it is cut off, only what would raise it (see `core.harmonics.colour`)."""
+    return gradient if colour > _ZERO or gradient < _ZERO else _ZERO
+
+
+@inlined
 def _through_colour(lanes, at, i, sh, rgb, to_rgb, to_sh):
     """Write the gradients along a primitive's coefficients; those along its harmonics take the harmonics' place."""
     if lanes[_SEEN + at] == _ZERO:
         to_sh[i, :, :] = _ZERO
         return
-    # Colours are cut off at zero.
-    red = to_rgb[i, 0] if rgb[i, 0] > _ZERO else _ZERO
-    green = to_rgb[i, 1] if rgb[i, 1] > _ZERO else _ZERO
-    blue = to_rgb[i, 2] if rgb[i, 2] > _ZERO else _ZERO
+    red, green, blue = (
+        _through_cut(rgb[i, 0], to_rgb[i, 0]),
+        _through_cut(rgb[i, 1], to_rgb[i, 1]),
+        _through_cut(rgb[i, 2], to_rgb[i, 2]),
+    )
     for number in range(sh.shape[1]):
         k = index(number)
         weight = lanes[_HARMONICS + k * LANES + at]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
-from invgraphics.core.harmonics import evaluate
+from invgraphics.core.harmonics import colour
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN, Footprints
 
@@ -60,8 +60,7 @@ def visible_reach(opacities: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
 
 def colours(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
     """Colours towards the camera, cut off at zero."""
-    towards = torch.nn.functional.normalize(gaussians.means - camera.position, dim=1)
-    return (evaluate(gaussians.sh, towards) + 0.5).clamp_min(0.0)
+    return colour(gaussians.sh, torch.nn.functional.normalize(gaussians.means - camera.position, dim=1))
 
 
 def jacobian(mean: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3 3"]:

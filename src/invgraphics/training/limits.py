@@ -1,0 +1,173 @@
+"""Limits that keep every Gaussian trainable: bounds on opacity and scale, and a count of those that no gradient can change."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, cast
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from typing_extensions import override
+
+from invgraphics.core import Camera, Field, Quantity, Renderer
+from invgraphics.errors import InputError
+from invgraphics.kernels.types import ALPHA_MIN
+from invgraphics.training.hooks import FitState, Hook
+
+VANISHING_SLOPE = 2.0**-23
+"""Slope of the sigmoid, in float32, below which an opacity counts as saturated: the rounding of 1."""
+COLLAPSED = 1e-4
+"""Largest standard deviation, in pixels of the nearest training camera, below which a scale no longer changes a footprint: its
+square is lost beside the low-pass filter's 0.3 px² in float32."""
+SMALLEST = 1e-12
+"""Scale limit, local units, of a Gaussian at a camera's very position."""
+CHUNK = 1 << 15
+"""Points whose distances to all cameras are held at once."""
+
+
+class _Gaussians(Protocol):
+    means: Float[Tensor, "n 3"]
+    log_scales: Float[Tensor, "n 3"]
+    opacity_logits: Float[Tensor, " n"]
+
+
+@dataclass(frozen=True)
+class LimitsConfig:
+    """Projection of opacities and scales onto intervals in which gradients can move them, after every step.
+
+    Without it, long fits drive logits to where the float32 sigmoid has no slope, and scales to where the rasteriser's low-pass
+    filter hides them; density control then copies what can no longer change.
+
+    Attributes:
+        min_opacity: lowest opacity; the default lies between what the rasteriser still draws (1/255) and what density control
+            and relocation take for transparent (0.005).
+        max_opacity: highest opacity. The rasteriser clamps alpha at 0.99.
+        min_scale: lowest standard deviation along any axis, in pixels of the nearest training camera.
+        every: steps between two computations of the scale limits; there is one more after each change in number.
+    """
+
+    min_opacity: float = 0.0045
+    max_opacity: float = 0.99
+    min_scale: float = 0.1
+    every: int = 100
+
+    def __post_init__(self) -> None:
+        if not 0 < self.min_opacity < self.max_opacity < 1 or self.min_scale < 0 or self.every < 1:
+            raise ValueError(
+                "'min_opacity' and 'max_opacity' must ascend between 0 and 1, 'min_scale' at 0 or above, 'every' at 1 or above."
+            )
+
+    def build(self) -> Hook:
+        """The hook."""
+        return _Limits(self)
+
+
+class _Limits(Hook):
+    """Keeps the scale limits between their computations, so that a resumed fit repeats the same steps."""
+
+    def __init__(self, config: LimitsConfig) -> None:
+        self._config = config
+        self._log_limit = torch.zeros(0)
+
+    @override
+    def check(self, field: Field, renderer: Renderer) -> None:
+        if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "opacity_logits"):
+            raise InputError(f"The hook 'limits' needs Gaussians, which {type(field).__name__} does not have.")
+
+    @override
+    @torch.no_grad()
+    def after_step(self, state: FitState) -> None:
+        config, field = self._config, cast(_Gaussians, state.field)
+        field.opacity_logits.clamp_(_logit(config.min_opacity), _logit(config.max_opacity))
+        if config.min_scale:
+            if len(self._log_limit) != len(field.means) or state.step % config.every == 0:
+                cameras = [view.camera for view in state.scene.train]
+                self._log_limit = (config.min_scale * pixel_sizes(field.means, cameras)).clamp_min(SMALLEST).log()
+            torch.maximum(field.log_scales, self._log_limit[:, None], out=field.log_scales)
+
+    @override
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"log_limit": self._log_limit}
+
+    @override
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self._log_limit = state["log_limit"]
+
+
+def _logit(opacity: float) -> float:
+    return math.log(opacity / (1 - opacity))
+
+
+def pixel_sizes(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+    """Edge length of a pixel at each point, in the camera that is nearest in units of its focal length, whatever it faces.
+
+    A lower bound of what any of the cameras can resolve there, from distances alone.
+    """
+    position = torch.stack([camera.position for camera in cameras]).to(points)
+    focal = torch.stack([camera.focal.max() for camera in cameras]).to(points)
+    sizes = [_nearest(part, position, focal) for part in points.split(CHUNK)]
+    return torch.cat(sizes) if sizes else points[:, 0]
+
+
+def _nearest(points: Float[Tensor, "k 3"], position: Float[Tensor, "c 3"], focal: Float[Tensor, " c"]) -> Float[Tensor, " k"]:
+    """Smallest distance over focal length, by |p - c|² = |p|² - 2 p·c + |c|²."""
+    squared = points.square().sum(dim=1, keepdim=True) - 2 * points @ position.T + position.square().sum(dim=1)
+    return (squared.clamp_min(0.0) / focal.square()).amin(dim=1).sqrt()
+
+
+DEAD_SHARE = 0.01
+"""Share of dead Gaussians above which a fit is warned about."""
+
+
+@dataclass(frozen=True, eq=False)
+class DeadGaussians:
+    """Which of n Gaussians no gradient can change, by cause.
+
+    Attributes:
+        saturated: opacities whose sigmoid has no slope in float32.
+        faded: opacities below what the rasteriser draws.
+        collapsed: all three standard deviations vanish beside the low-pass filter.
+    """
+
+    saturated: Bool[Tensor, " n"]
+    faded: Bool[Tensor, " n"]
+    collapsed: Bool[Tensor, " n"]
+
+    @property
+    def any(self) -> Bool[Tensor, " n"]:
+        """Dead for one reason or another."""
+        return self.saturated | self.faded | self.collapsed
+
+    @property
+    def share(self) -> float:
+        """Part of all Gaussians that is dead, in [0, 1]."""
+        return float(self.any.float().mean()) if len(self.faded) else 0.0
+
+    def sentence(self) -> str:
+        """Share, number and causes in words."""
+        causes = {"saturated opacity": self.saturated, "too faint to be drawn": self.faded, "collapsed scales": self.collapsed}
+        parts = [f"{cause} {int(which.sum()):,}" for cause, which in causes.items()]
+        return f"no gradient can change {100 * self.share:.2g} % of {len(self.faded):,} Gaussians ({', '.join(parts)})."
+
+
+@torch.no_grad()
+def dead_gaussians(field: Field, cameras: Sequence[Camera]) -> DeadGaussians | None:
+    """Gaussians whose position, size, opacity or colour can no longer change; ``None`` for a field without Gaussians.
+
+    Args:
+        field: what is fitted, or was.
+        cameras: the training cameras.
+    """
+    if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "opacity_logits"):
+        return None
+    gaussians = cast(_Gaussians, field)
+    opacity = gaussians.opacity_logits.float().sigmoid()
+    largest = gaussians.log_scales.amax(dim=1).exp()
+    return DeadGaussians(
+        saturated=(opacity * (1 - opacity) < VANISHING_SLOPE) & (opacity > 0.5),
+        faded=opacity < ALPHA_MIN,
+        collapsed=largest < COLLAPSED * pixel_sizes(gaussians.means, cameras),
+    )
