@@ -111,7 +111,7 @@ def try_method(request: FitRequest, method: Method, scene: Scene) -> Cost:
 
 
 def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int, later: int = 0) -> Forecast:
-    """The forecast for missing runs with these costs, ``jobs`` at a time, of a study of ``runs``, ``later`` of them left out."""
+    """The forecast for missing runs with these costs, ``jobs`` at a time; a study has ``runs``, ``later`` of them left out."""
     seconds = sum(cost.seconds(budget) for cost, budget in costs) / jobs
     return Forecast(runs, len(costs), seconds, sum(cost.size for cost, _ in costs), later)
 

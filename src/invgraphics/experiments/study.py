@@ -58,13 +58,13 @@ class KnownDeviation:
 
     Attributes:
         cells: pattern of the cells' labels, for instance ``splatting/* fence@800 *`` (see `Cell.label`).
-        rule: that they break, see `invgraphics.report.rules`.
+        rule: that they break, one of `invgraphics.report.rules.RULES`.
         cause: why, one sentence.
         issue: where it is followed up: a number or a link.
     """
 
     cells: str
-    rule: str
+    rule: Literal["budget", "monitor", "views", "dead", "memory", "finite", "late"]
     cause: str
     issue: int | str = ""
 
