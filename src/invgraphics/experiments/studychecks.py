@@ -28,9 +28,9 @@ def completed(study: Study, where: str) -> Study:
         raise InputError(f"{where}: the design 'list' needs [[cells]] and no [factors], the others the contrary.")
     defaults = {name: value for name in SETTINGS if (value := getattr(study, name)) is not None}
     for name in dict.fromkeys(name for cell in cells for name in levels_of(cell)):
-        if path_of(name) == name and name in defaults:
-            base.setdefault(name, list(defaults[name]) if isinstance(defaults[name], tuple) else defaults[name])
         absent = [index for index, cell in enumerate(cells) if name not in cell]
+        if absent and name in defaults:
+            base.setdefault(name, list(defaults[name]) if isinstance(defaults[name], tuple) else defaults[name])
         if absent and name not in base:
             raise InputError(f"{where}: cell {absent[0] + 1} does not say '{name}', and neither does [base].")
         found = ([base[name]] if absent else []) + [cell[name] for cell in cells if name in cell]

@@ -32,6 +32,7 @@ def draw_curve_panels(panels: Mapping[str, Sequence[JudgedCell]], methods: Seque
             for one, points in lines:
                 _draw_line(axes, one, points, methods.index(one.cell.method))
             axes.set_xscale("log")
+            axes.xaxis.set_major_formatter(lambda seconds, _: f"{seconds:g}")
             axes.set_xlabel("seconds of optimisation")
             axes.set_ylabel("PSNR on monitored views (dB)")
             axes.set_title(title)

@@ -37,9 +37,19 @@ UNITS = ("dB", "", "", "s", "", "", "", "", "MB", "MB", "dB", "")
 
 @dataclass(frozen=True)
 class Field:
-    """A cell as it is shown: its place on the page, its score, where it leads, and its numbers under ``COLUMNS``."""
+    """A cell as it is shown.
+
+    Attributes:
+        judged: the cell and its verdicts.
+        name: its label without the method, and without the seed where all cells have the same.
+        anchor: its place on the page.
+        text: its score, or the word that stands there.
+        numbers: under ``COLUMNS``.
+        files: (name, link) of its run's records.
+    """
 
     judged: JudgedCell
+    name: str
     anchor: str
     text: str
     numbers: tuple[str, ...]
@@ -116,7 +126,7 @@ def write_verdict_report(study: Study, folder: Folder, source: Path) -> None:
         source: the study's own folder.
     """
     judged = judge(study.cells, study.known)
-    fields = tuple(_field(one, index, folder) for index, one in enumerate(judged))
+    fields = tuple(_field(one, _name(one.cell, study), f"cell-{index}", folder) for index, one in enumerate(judged))
     panels: dict[str, list[JudgedCell]] = {}
     for one in judged:
         panels.setdefault(_place(one.cell), []).append(one)
@@ -140,7 +150,12 @@ def _scene(cell: StudyCell) -> str:
     return cell.scene if cell.scene.startswith("$") else cell.scene.rstrip("/").rpartition("/")[2]
 
 
-def _field(one: JudgedCell, index: int, folder: Folder) -> Field:
+def _name(cell: StudyCell, study: Study) -> str:
+    name = cell.label.removeprefix(cell.method).strip()
+    return name.removesuffix(f"seed={cell.seed}").strip() if len(study.seeds) == 1 else name
+
+
+def _field(one: JudgedCell, name: str, anchor: str, folder: Folder) -> Field:
     cell, run = one.cell, one.cell.run
     psnr = psnr_of(cell)
     text = ABSENT if psnr is None else f"{psnr:.2f}"
@@ -148,7 +163,7 @@ def _field(one: JudgedCell, index: int, folder: Folder) -> Field:
     took, forecast = (ABSENT if value is None else duration(value) for value in (cell.seconds, cell.forecast))
     if run is None:
         rest = [ABSENT] * (len(COLUMNS) - 6)
-        return Field(one, f"cell-{index}", text, (ABSENT, cell.budget, ABSENT, ABSENT, took, forecast, *rest), ())
+        return Field(one, name, anchor, text, (ABSENT, cell.budget, ABSENT, ABSENT, took, forecast, *rest), ())
     worst, share = worst_view(run), dead_share(run)
     forecast_bytes = run.provenance.get("memory_forecast_bytes")
     numbers = (
@@ -167,7 +182,7 @@ def _field(one: JudgedCell, index: int, folder: Folder) -> Field:
     )
     names = [name for name in facts.RUN_FILES if (run.folder / name).is_file()]
     files = tuple((name, folder.publish(run.folder / name, f"runs/{cell.id}/{name}")) for name in names)
-    return Field(one, f"cell-{index}", text, numbers, files)
+    return Field(one, name, anchor, text, numbers, files)
 
 
 def _number(value: float | None, scale: float = 1.0) -> str:
@@ -180,8 +195,7 @@ def _matrix(study: Study, fields: Sequence[Field]) -> tuple[tuple[str, str, tupl
     order: dict[tuple[str, str], tuple[Any, ...]] = {}
     for field in fields:
         cell = field.judged.cell
-        rest = cell.label.removeprefix(cell.method).strip().partition(" ")[2]
-        rest = rest.removesuffix(f"seed={cell.seed}").strip() if len(study.seeds) == 1 else rest
+        rest = field.name.partition(" ")[2]
         key = (cell.scene, f"{cell.size + ' px, ' if cell.size else ''}{rest}")
         rows.setdefault(key, {})[cell.method] = field
         width = int(cell.size.partition(" ")[0]) if cell.size else 0
@@ -221,7 +235,7 @@ def _write_markdown(page: VerdictPage, folder: Folder) -> None:
             cause = (
                 f" Known cause: {verdict.cause}{f' (issue {verdict.issue})' if verdict.issue else ''}" if verdict.cause else ""
             )
-            lines.append(f"- {field.sign} {text(field.judged.cell.label)}: {text(verdict.sentence + cause)}")
+            lines.append(f"- {field.sign} {text(f'{field.judged.cell.method} {field.name}')}: {text(verdict.sentence + cause)}")
     lines += ["", "## Cells", "", f"PSNR in dB. {', '.join(f'{sign} {words}' for words, sign in STANDINGS.values())}.", ""]
     lines += [f"| scene | | {' | '.join(map(text, page.study.methods))} |", "|---" * (2 + len(page.study.methods)) + "|"]
     for scene, rest, fields in page.rows:
