@@ -57,6 +57,12 @@ class Ablate:
     """Force an implementation of the hot operations: numba, or reference (plain torch)."""
     checkpoint_every: Annotated[str, arg(metavar="30s|100steps")] = "30s"
     """How much work an interruption may cost."""
+    keep: bool = False
+    """Keep finished cells whose recipe, scene and request are the same although the code has changed since."""
+    cells: Annotated[str | None, arg(metavar="PATTERN", help_behavior_hint="(default: all)")] = None
+    """Run only the cells whose label METHOD SCENE@SIZE BUDGET seed=N fits, for instance 'splatting/* fence@400 *'."""
+    most_seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="(default: no limit)")] = None
+    """Leave fits with a longer budget for later."""
 
     def run(self) -> int:
         """Make what is missing; print what failed, and the page's path."""
@@ -80,6 +86,8 @@ class Ablate:
             Budget.parse(self.budget)
         if self.jobs < 1:
             raise InputError(f"--jobs cannot be {self.jobs}.", "Expected a number of fits, 1 or more.")
+        if self.most_seconds is not None and not self.most_seconds > 0:
+            raise InputError(f"--most-seconds cannot be {self.most_seconds:g}.", "Expected seconds of optimisation, above 0.")
         gpus = float(self.device == "cuda") if self.gpus is None else self.gpus
         views = None if self.test_views is None else parse_views(self.test_views) or "all"
         return AblateRequest(
@@ -96,6 +104,9 @@ class Ablate:
             device=self.device,
             kernels=self.kernels,
             checkpoint_every=self.checkpoint_every,
+            keep=self.keep,
+            cells=self.cells,
+            most_seconds=self.most_seconds,
         )
 
     def _confirm(self, forecast: Forecast) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,8 @@ from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.analyses import write_analyses
-from invgraphics.experiments.build import device_of, training_data
-from invgraphics.experiments.cells import Planned, make_plan
-from invgraphics.experiments.environment import environment
+from invgraphics.experiments.build import training_data
+from invgraphics.experiments.cells import Planned, make_plan, select
 from invgraphics.experiments.executors.base import INTERRUPTED, Executor, Outcome, Resources
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.folder import RunFolder
@@ -28,12 +27,14 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.renderings import check_eyes, rendered
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.experiments.study import Study, locate, name_of, read_study
-from invgraphics.metrics.protocols import protocol_named
-from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.experiments.studyrecord import RECORD, CellState, Record, summarise_study
+from invgraphics.scenes.open import SceneOptions, absent_data, open_scene
 from invgraphics.training.budget import Budget
 
-RECORD = "study.json"
-"""What a study's folder holds beside its runs: the design, and the state of every cell."""
+__all__ = ["RECORD", "ablate"]
+
+Size = int | tuple[int, int] | None
+"""Longest side in pixels, or (width, height)."""
 
 
 @dataclass
@@ -79,117 +80,92 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
     resources = Resources(jobs=request.jobs, threads=threads, gpus=request.gpus, address=request.address, logs=True)
     executor: Executor = plugins.load("executors", request.executor)(resources)
     plan = make_plan(study, request)
+    chosen = {planned.id for planned in select(plan, request)}
     folder = RunFolder(Path(request.out))
     folder.create()
     with folder.held():
-        record = Record(folder, _summary(study, name_of(path), request, resources), plan)
-        first, truths = _open_scenes(study, plan)
+        record = Record(folder, summarise_study(study, name_of(path), request, resources), plan)
         fits = {planned.id: planned for planned in plan}
-        missing = [planned for planned in fits.values() if not _is_finished(planned, truths[planned.cell.scene], threads)]
-        costs = _try_methods(missing, first)
-        forecast = total([(costs[p.cell.method], Budget.parse(p.fit.budget)) for p in missing], len(fits), request.jobs)
+        states = {name: _state(planned, request.keep, name in chosen) for name, planned in fits.items()}
+        samples, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
+        for name, planned in fits.items():
+            if states[name].status == "missing" and _is_finished(planned, truths[_place(planned)], threads):
+                states[name] = CellState("done")
+        missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
+        costs = _try_methods(missing, samples)
+        missing.sort(key=lambda planned: _expense(planned, study, costs))
+        expected = {planned.id: costs[_kind(planned)].seconds(Budget.parse(planned.fit.budget)) for planned in missing}
+        later = sum(state.status in ("later", "skipped") for state in states.values())
+        forecast = total([(costs[_kind(p)], Budget.parse(p.fit.budget)) for p in missing], len(fits), request.jobs, later)
         _check_disk(forecast, folder.root)
         confirm(forecast)
-        record.start({planned.id for planned in missing})
+        record.start(states | {name: CellState("missing", forecast=round(t, 1)) for name, t in expected.items()})
         write_analyses(study.analyses, folder.root)
-        _run(executor, missing, costs, (record, folder.root / "jobs"))
+        _run(executor, missing, expected, (record, folder.root / "jobs"))
         return folder.root, record.failed()
 
 
-class Record:
-    """``study.json``: what the study is, and how far each of its cells is."""
+def _state(planned: Planned, keep: bool, chosen: bool) -> CellState:
+    """How far a cell is, as far as that can be told without its scene.
 
-    def __init__(self, folder: RunFolder, summary: dict[str, Any], plan: list[Planned]) -> None:
-        """Take over what an earlier run of the same study recorded.
-
-        Raises:
-            InputError: the folder holds another study.
-        """
-        self._folder = folder
-        old = folder.read_json(RECORD) if (folder.root / RECORD).is_file() else {}
-        if old and old.get("name") != summary["name"]:
-            raise InputError(f"{folder.root} holds the study '{old.get('name')}'.", "Choose another --out.")
-        before = {entry["id"]: entry for entry in old.get("cells", [])}
-        self._cells = [_entry(planned, before.get(planned.id, {})) for planned in plan]
-        self._summary = summary
-
-    def start(self, missing: set[str]) -> None:
-        """Mark what is missing, and write."""
-        for entry in self._cells:
-            if entry["id"] in missing:
-                entry |= {"status": "missing", "error": None, "seconds": None}
-            else:
-                entry |= {"status": "done", "error": None}
-        self._write()
-
-    def note(self, outcome: Outcome) -> None:
-        """Write how a run ended into all cells that share it."""
-        for entry in self._cells:
-            if entry["id"] == Path(outcome.request.out).name:
-                entry["status"] = "failed" if outcome.status else "done"
-                entry["error"] = outcome.error or None
-                entry["seconds"] = round(outcome.seconds, 3)
-        self._write()
-
-    def failed(self) -> list[dict[str, Any]]:
-        """The cells that failed."""
-        return [entry for entry in self._cells if entry["status"] == "failed"]
-
-    def _write(self) -> None:
-        self._folder.write_json(RECORD, self._summary | {"cells": self._cells})
+    Args:
+        planned: the cell and its run.
+        keep: whether a finished run counts although the code has changed since: its folder's name tells recipe, scene and
+            request.
+        chosen: whether the cell is part of this command.
+    """
+    if keep and _is_kept(planned):
+        return CellState("done")
+    if reason := absent_data(planned.cell.scene):
+        return CellState("skipped", reason)
+    return CellState("missing" if chosen else "later")
 
 
-def _entry(planned: Planned, before: dict[str, Any]) -> dict[str, Any]:
-    cell = planned.cell
-    return {
-        "id": planned.id,
-        "scene": cell.scene,
-        "method": cell.method,
-        "seed": cell.seed,
-        "levels": cell.levels,
-        "run": f"runs/{planned.id}",
-        "status": "missing",
-        "error": None,
-        "seconds": before.get("seconds"),
-    }
+def _is_kept(planned: Planned) -> bool:
+    run = RunFolder(Path(planned.fit.out))
+    if not run.finished or not rendered(run, planned.fit, planned.method):
+        return False
+    return run.read_json("provenance.json").get("recipe_sha256") == planned.method.digest
 
 
-def _summary(study: Study, name: str, request: AblateRequest, resources: Resources) -> dict[str, Any]:
-    """Everything of ``study.json`` but the cells."""
-    keys = ("question", "design", "factors", "base", "scenes", "methods", "seeds", "budget", "preset", "size", "test_views")
-    keys += ("render_with", "analyses")
-    machine = environment(device_of(request.device))
-    machine |= {"threads": resources.threads, "executor": request.executor, "jobs": resources.jobs}
-    return {
-        "schema": 1,
-        "name": name,
-        **{key: getattr(study, key) for key in keys},
-        "approximations": [asdict(pair) for pair in study.approximations],
-        "protocol": asdict(protocol_named(study.protocol)),
-        "command": request.shell(),
-        "environment": machine,
-    }
+def _place(planned: Planned) -> tuple[str, Size]:
+    """What a cell's truth depends on."""
+    return planned.cell.scene, planned.fit.size
 
 
-def _open_scenes(study: Study, plan: list[Planned]) -> tuple[Scene, dict[str, TruthDigest]]:
-    """Open every scene once, rendering what has to be; the first one is kept, of the others the fingerprints.
+def _kind(planned: Planned) -> tuple[str, str, Size]:
+    """What a cell's cost depends on, as far as it is measured."""
+    return planned.cell.method, planned.method.preset, planned.fit.size
+
+
+def _expense(planned: Planned, study: Study, costs: dict[tuple[str, str, Size], Cost]) -> tuple[int, float, int]:
+    """Cheap cells come first; of several seeds, the first with all its cells."""
+    size = planned.fit.size
+    seconds = costs[_kind(planned)].fit_seconds(Budget.parse(planned.fit.budget))
+    return study.seeds.index(planned.cell.seed), seconds, max(size) if isinstance(size, tuple) else size or 0
+
+
+def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple[str, Size], TruthDigest]]:
+    """Open every scene once per size, rendering what has to be; one scene of each size is kept, of the others fingerprints.
 
     Raises:
         InputError: a scene cannot be used, or not with every level of the data's factors.
     """
-    views = None if study.test_views == "all" else study.test_views
-    first: Scene | None = None
+    samples: dict[Size, Scene] = {}
     truths = {}
-    for name in study.scenes:
+    for place in dict.fromkeys(map(_place, plan)):
+        name, size = place
+        group = [planned for planned in plan if _place(planned) == place]
         with Reporter(f"rendering {name}") as reporter:
-            options = SceneOptions(size=study.size, test_views=views)
+            options = SceneOptions(size=size, test_views=group[0].fit.test_views)
             scene = open_scene(name, options, lambda done, n, what, r=reporter: r.show(done / max(n, 1), what))
-        for data in dict.fromkeys(training_data(planned.fit) for planned in plan):
+        for data in dict.fromkeys(training_data(planned.fit) for planned in group):
             data.check(scene)
-        check_eyes(study.render_with, {planned.method.digest: planned.method for planned in plan}.values(), scene)
-        first, truths[name] = first or scene, TruthDigest.of(scene)
-    assert first is not None, "a study has at least one scene"
-    return first, truths
+        methods = {planned.method.digest: planned.method for planned in group}.values()
+        check_eyes(group[0].fit.render_with, methods, scene)
+        truths[place] = TruthDigest.of(scene)
+        samples.setdefault(size, scene)
+    return samples, truths
 
 
 def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
@@ -198,12 +174,12 @@ def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
     return same and rendered(run, planned.fit, planned.method)
 
 
-def _try_methods(missing: list[Planned], scene: Scene) -> dict[str, Cost]:
-    """What a run of each method costs, measured on one scene."""
-    costs: dict[str, Cost] = {}
+def _try_methods(missing: Sequence[Planned], samples: dict[Size, Scene]) -> dict[tuple[str, str, Size], Cost]:
+    """What a run of each method costs with each preset at each size, measured on one scene of that size."""
+    costs: dict[tuple[str, str, Size], Cost] = {}
     for planned in missing:
-        if planned.cell.method not in costs:
-            costs[planned.cell.method] = try_method(planned.fit, planned.method, scene)
+        if _kind(planned) not in costs:
+            costs[_kind(planned)] = try_method(planned.fit, planned.method, samples[planned.fit.size])
     return costs
 
 
@@ -213,11 +189,10 @@ def _check_disk(forecast: Forecast, folder: Path) -> None:
         raise InputError(f"The study will write {forecast.size / 1e9:.2g} GB, and {folder} has {free / 1e9:.2g} GB left.")
 
 
-def _run(executor: Executor, missing: list[Planned], costs: dict[str, Cost], files: tuple[Record, Path]) -> None:
+def _run(executor: Executor, missing: list[Planned], expected: dict[str, float], files: tuple[Record, Path]) -> None:
     """Run what is missing; ``files`` are the record, and the folder for jobs and their logs."""
     record, jobs = files
-    expected = {p.fit.out: costs[p.cell.method].seconds(Budget.parse(p.fit.budget)) for p in missing}
-    progress = _Progress(expected, time.monotonic())
+    progress = _Progress({p.fit.out: expected[p.id] for p in missing}, time.monotonic())
     fits = [planned.fit for planned in missing]
     with Reporter("study", quiet_seconds=0) as reporter, closing(executor.run(fits, jobs)) as outcomes:
         for outcome in outcomes:

@@ -44,9 +44,13 @@ class Cost:
 
     def seconds(self, budget: Budget) -> float:
         """Seconds of a run with this budget."""
+        return self.other + self.fit_seconds(budget)
+
+    def fit_seconds(self, budget: Budget) -> float:
+        """Seconds of the fit alone."""
         limits = [] if budget.seconds is None else [budget.seconds]
         limits += [] if budget.steps is None else [budget.steps * self.step]
-        return self.other + min(limits, default=0.0)
+        return min(limits, default=0.0)
 
 
 @dataclass(frozen=True)
@@ -58,12 +62,14 @@ class Forecast:
         missing: of them, still to be made.
         seconds: of all missing runs, on this machine.
         size: bytes that they will write.
+        later: of them, neither finished nor part of this command.
     """
 
     runs: int
     missing: int
     seconds: float
     size: int
+    later: int = 0
 
     @property
     def hours(self) -> float:
@@ -71,7 +77,8 @@ class Forecast:
         return self.seconds / 3600
 
     def __str__(self) -> str:
-        runs = f"{self.runs} runs, {self.runs - self.missing} of them finished"
+        runs = f"{self.runs} runs, {self.runs - self.missing - self.later} of them finished"
+        runs += f", {self.later} left out" if self.later else ""
         return f"{runs}; the rest takes about {duration(self.seconds)} and {self.size / 1e9:.2g} GB."
 
 
@@ -103,10 +110,10 @@ def try_method(request: FitRequest, method: Method, scene: Scene) -> Cost:
     return Cost(step, START_SECONDS + evaluation, size + PIXEL_BYTES * pixels * (1 + len(request.render_with)))
 
 
-def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int) -> Forecast:
-    """The forecast for missing runs with these costs, ``jobs`` at a time, in a study of ``runs``."""
+def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int, later: int = 0) -> Forecast:
+    """The forecast for missing runs with these costs, ``jobs`` at a time; a study has ``runs``, ``later`` of them left out."""
     seconds = sum(cost.seconds(budget) for cost, budget in costs) / jobs
-    return Forecast(runs, len(costs), seconds, sum(cost.size for cost, _ in costs))
+    return Forecast(runs, len(costs), seconds, sum(cost.size for cost, _ in costs), later)
 
 
 def duration(seconds: float) -> str:

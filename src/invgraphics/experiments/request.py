@@ -155,6 +155,9 @@ class AblateRequest:
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
         kernels: implementation to force; ``None`` for the best one here.
         checkpoint_every: for instance ``30s`` or ``100steps``.
+        keep: whether finished cells count although the code has changed since, if recipe, scene and request are the same.
+        cells: pattern of the labels of the cells to run (`invgraphics.experiments.cells.Planned.label`); ``None`` for all.
+        most_seconds: fits with a longer budget are left for later; ``None`` for none.
     """
 
     study: str
@@ -170,6 +173,9 @@ class AblateRequest:
     device: str | None = None
     kernels: str | None = None
     checkpoint_every: str = "30s"
+    keep: bool = False
+    cells: str | None = None
+    most_seconds: float | None = None
 
     def shell(self) -> str:
         """The command that makes this study."""
@@ -185,8 +191,11 @@ class AblateRequest:
             "--test-views": self.test_views,
             "--device": self.device,
             "--kernels": self.kernels,
+            "--cells": self.cells,
+            "--most-seconds": None if self.most_seconds is None else f"{self.most_seconds:g}",
         }
         words = [word for flag, value in given.items() if value is not None for word in (flag, str(value))]
+        words += ["--keep"] if self.keep else []
         return shlex.join(["invgraphics", "ablate", self.study, *words])
 
 

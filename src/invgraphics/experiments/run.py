@@ -24,10 +24,10 @@ from invgraphics.experiments.executors.local import WITH_PARENT
 from invgraphics.experiments.folder import RunFolder, write_json
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.posed import protocol_note
-from invgraphics.experiments.recorder import Cadence, Recorder
+from invgraphics.experiments.recorder import Cadence, Monitor, Recorder
 from invgraphics.experiments.renderings import check_eyes, render_missing
 from invgraphics.experiments.request import FitRequest
-from invgraphics.experiments.start import memory_forecast, started
+from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.scenes.corrupt import corrupt
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -73,8 +73,8 @@ def fit_run(request: FitRequest) -> Path:
             else:
                 folder.clear()
             describe(folder, request, method, (scene, shown), identity, device)
-            fit.rehearse()
-            print(_prediction(request, fit, method), file=sys.stderr)
+            forecast = _rehearse(folder, fit, method, memory)
+            print(_prediction(request, fit, forecast), file=sys.stderr)
             Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}", request.snapshots).run()
         spent = {"steps": fit.steps, "seconds": fit.seconds, "peak_memory_bytes": memory.peak_bytes}
         _evaluate(folder, scene, fit, request, method, spent)
@@ -91,16 +91,24 @@ def _check_existing(folder: RunFolder, request: FitRequest) -> None:
     folder.create()
 
 
-def _prediction(request: FitRequest, fit: Fit, method: recipe.Method) -> str:
-    """What the person is in for, said before the work starts.
+def _rehearse(folder: RunFolder, fit: Fit, method: recipe.Method, memory: PeakMemory) -> MemoryForecast:
+    """Take a step and a look of the monitor that count for nothing; the memory that they needed tells what the fit will need.
 
     Raises:
         InputError: the primitives would need more memory than the machine has.
     """
+    fit.rehearse()
+    Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
+    forecast = memory_forecast(fit.plan, method, memory.peak_bytes)
+    folder.write_json("provenance.json", folder.read_json("provenance.json") | {"memory_forecast_bytes": forecast.bytes})
+    return forecast
+
+
+def _prediction(request: FitRequest, fit: Fit, memory: MemoryForecast) -> str:
+    """What the person is in for, said before the work starts."""
     views = len(fit.plan.scene.test)
     seconds = expected_seconds(fit.plan.field, fit.plan.renderer, fit.plan.scene, fit.plan.device)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
-    memory = memory_forecast(fit.plan.field, method)
     return f"{request.method} on {fit.plan.scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}."
 
 

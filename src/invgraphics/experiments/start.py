@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from invgraphics.core import Field
+from invgraphics.core import RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.forecast import CHECKPOINT_COPIES
 from invgraphics.experiments.recipe import Method
+from invgraphics.metrics.cost import model_bytes
 from invgraphics.training.fit import Plan
 
 COPIES = 6
 """Of each primitive's values during a step: parameter, gradient, Adam's two moments; activated, and the gradient of that."""
 SCREEN_BYTES = 300
 """Of a primitive on the screen: footprint, its gradients, packed row and sums; rounded up from two threads."""
+PICTURE_BYTES = 300
+"""Of a pixel of a training picture: rendering, truth, SSIM's moments, and their gradients."""
+MARGIN = 1.25
+"""Memory that is freed and asked for again in other sizes leaves gaps."""
+BASE_BYTES = 30 * 10**6
+"""Of work arrays of threads and libraries, whatever the method."""
 
 
 def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
@@ -40,23 +48,56 @@ def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
     return replace(plan, field=config.converted(source_field, plan.scene).to(plan.device))
 
 
-def memory_forecast(field: Field, method: Method) -> str:
-    """What the most primitives that the fit may make will need, in words; nothing for fields without primitives.
+@dataclass(frozen=True)
+class MemoryForecast:
+    """What a fit will hold at most, above what its process held before it.
+
+    Attributes:
+        bytes: on the device that computes.
+        primitives: most that the fit may make; 0 for fields without primitives.
+    """
+
+    bytes: int
+    primitives: int
+
+    def __str__(self) -> str:
+        most = f"up to {self.primitives:,} primitives in " if self.primitives else ""
+        return f" with {most}about {self.bytes / 1e6:.0f} MB"
+
+
+def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
+    """What a fit will need: what it holds after a step and a look of the monitor, and what is still to come.
+
+    To come are primitives with their gradients, moments and footprints, pictures at full size where the fit begins with smaller
+    ones, and a checkpoint's copy of the parameters and their moments. Empty space is not known yet, so that rays are as full of
+    samples as they will ever be.
+
+    Args:
+        plan: of the fit.
+        method: its recipe.
+        held: bytes, of parameters, gradients, moments, samples and pictures.
 
     Raises:
-        InputError: more than this machine has.
+        InputError: the primitives need more than this machine has.
     """
-    now = field.primitive_count()
-    if not now:
-        return ""
-    most = max(now, *(int(getattr(hook, "max_primitives", 0)) for hook in method.recipe.hooks), 0)
-    row = sum(parameter[0].numel() * parameter.element_size() for parameter in field.parameters())
+    field = plan.field
+    now = field.primitive_count() or 0
+    most = max(now, *(int(getattr(hook, "max_primitives", 0)) for hook in method.recipe.hooks), 0) if now else 0
+    row = sum(parameter[0].numel() * parameter.element_size() for parameter in field.parameters()) if now else 0
     needed = most * (COPIES * row + SCREEN_BYTES)
-    on_gpu = next(field.parameters()).device.type == "cuda"
-    has = (
-        torch.cuda.get_device_properties(0).total_memory if on_gpu else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    )
+    has = _machine_bytes(next(field.parameters()).device) if now else needed
     if needed > has:
         sentence = f"{most:,} primitives need about {needed / 1e9:.1f} GB of memory, and this machine has {has / 1e9:.1f} GB."
         raise InputError(sentence, "Choose a lower --max-primitives.")
-    return f" with up to {most:,} primitives in about {needed / 1e6:.0f} MB"
+    growth = (most - now) * (COPIES * row + SCREEN_BYTES)
+    parameters = model_bytes(plan.modules.values()) + (most - now) * row
+    pixels = max(view.camera.width * view.camera.height for view in plan.scene.train)
+    pictures = 0 if isinstance(plan.renderer, RayRenderer) or plan.batches.resolution[0] == 1 else pixels * PICTURE_BYTES
+    total = MARGIN * held + growth + pictures + CHECKPOINT_COPIES * parameters + BASE_BYTES
+    return MemoryForecast(round(total), most)
+
+
+def _machine_bytes(device: torch.device) -> int:
+    if device.type == "cuda":
+        return torch.cuda.get_device_properties(0).total_memory
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

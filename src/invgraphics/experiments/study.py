@@ -1,36 +1,40 @@
 """Studies: a question, factors and their levels as data, and the cells that they expand to. Imports nothing heavy.
 
 A factor's name is the dotted path of what it sets: a key of the recipes (``field.encoding.log2_size``), a key of the training
-data (``data.train_views``, see `invgraphics.scenes.corrupt.TrainingData`), or ``budget``. A factor that only some methods have
-names them first, ``volumetric/hash:field.encoding.log2_size`` or ``volumetric/*:batches.rays``; cells of the other methods
-carry its base level in the table, and are not multiplied by it.
+data (``data.train_views``, see `invgraphics.scenes.corrupt.TrainingData`), or ``budget``, ``size`` or ``preset``. A factor that
+only some methods have names them first, ``volumetric/hash:field.encoding.log2_size`` or ``volumetric/*:batches.rays``; cells of
+the other methods carry its base level in the table, and are not multiplied by it.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
-import math
 import tomllib
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as default
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Literal
 
 from invgraphics.config import fill
 from invgraphics.data import find
 from invgraphics.errors import InputError
-from invgraphics.experiments.analyses import check_analyses
+from invgraphics.experiments.factors import (
+    BUDGET,
+    PRESET,
+    SETTINGS,
+    SIZE,
+    Levels,
+    covers,
+    in_scope,
+    levels_of,
+    override,
+    path_of,
+)
 from invgraphics.experiments.request import AblateRequest, FitRequest
-from invgraphics.training.budget import Budget
+from invgraphics.experiments.studychecks import checked, completed
 
 FILE = "study.toml"
-BUDGET = "budget"
-
-Levels = dict[str, Any]
-"""Factor -> level."""
 
 
 @dataclass(frozen=True)
@@ -49,19 +53,39 @@ class Approximation:
 
 
 @dataclass(frozen=True)
+class KnownDeviation:
+    """A verdict that is expected to be red, with its cause; the page still shows it.
+
+    Attributes:
+        cells: pattern of the cells' labels, for instance ``splatting/* fence@800 *`` (see `Cell.label`).
+        rule: that they break, one of `invgraphics.report.rules.RULES`.
+        cause: why, one sentence.
+        issue: where it is followed up: a number or a link.
+    """
+
+    cells: str
+    rule: Literal["budget", "monitor", "views", "dead", "memory", "finite", "late"]
+    cause: str
+    issue: int | str = ""
+
+
+@dataclass(frozen=True)
 class Study:
     """What a ``study.toml`` says.
 
     Attributes:
         question: what the study is to answer, one sentence.
-        scenes: built-in scenes or paths of data sets.
+        scenes: built-in scenes or paths of data sets. One that begins with a variable, ``$INVGRAPHICS_DATA/fox``, is left out
+            where that data is not there, and the record says why.
         methods: ``renderer/recipe``, or paths of recipes.
+        report: what the page is about: ``effects`` of the factors, or ``verdicts`` on every cell.
         design: ``factorial`` runs every combination of levels; ``one-at-a-time`` the base, and each other level of one factor
             with the rest at the base; ``list`` the ``cells``.
         factors: factor -> its levels; tables within are joined by dots. A ``list`` takes them from its cells.
         base: values that hold where nothing else is said, of factors and of other keys. A factor that is not in it has its
             first level as base.
-        cells: for ``list``: levels that differ from the base.
+        cells: for ``list``: levels that differ from the base, and ``scenes``, ``methods`` and ``seeds`` of its own where a cell
+            is not for all of the study's.
         seeds: each cell is fitted once per seed.
         budget: of each fit, ``60s`` or ``5000steps``.
         protocol: how to score.
@@ -71,11 +95,13 @@ class Study:
         render_with: renderers that show every fitted field besides its own (see `invgraphics.experiments.renderings`).
         approximations: pairs of these renderers whose pictures of the same fit are compared.
         analyses: computations beside the fits (see `invgraphics.experiments.analyses`).
+        known: for ``verdicts``: what is known to deviate, and why.
     """
 
     question: str
     scenes: tuple[str, ...]
     methods: tuple[str, ...]
+    report: Literal["effects", "verdicts"] = "effects"
     design: Literal["factorial", "one-at-a-time", "list"] = "factorial"
     factors: dict[str, Any] = default(default_factory=dict)
     base: dict[str, Any] = default(default_factory=dict)
@@ -89,6 +115,7 @@ class Study:
     render_with: tuple[str, ...] = ()
     approximations: tuple[Approximation, ...] = ()
     analyses: tuple[str, ...] = ()
+    known: tuple[KnownDeviation, ...] = ()
 
     def points(self) -> list[Levels]:
         """Every combination of levels that the design asks for, in the order of the factors; at least the base."""
@@ -98,12 +125,15 @@ class Study:
         if self.design == "one-at-a-time":
             others = [base | {name: level} for name, levels in self.factors.items() for level in levels if level != base[name]]
             return [base, *others]
-        return [base | cell for cell in self.cells]
+        return [base | levels_of(cell) for cell in self.cells]
 
     def expand(self) -> list[Cell]:
         """Every run that the study needs, each once: seeds outermost, so that an unfinished study is balanced."""
         cells: dict[str, Cell] = {}
-        for seed, scene, point, method in itertools.product(self.seeds, self.scenes, self.points(), self.methods):
+        points = list(zip(self.points(), self.cells, strict=True)) if self.cells else [(point, {}) for point in self.points()]
+        for seed, scene, (point, listed), method in itertools.product(self.seeds, self.scenes, points, self.methods):
+            if not covers(listed, scene, method, seed):
+                continue
             levels = {name: level if in_scope(name, method) else self.base[name] for name, level in point.items()}
             cells.setdefault(json.dumps([scene, method, seed, levels]), Cell(scene, method, seed, levels))
         return list(cells.values())
@@ -112,16 +142,17 @@ class Study:
         """The run of one cell; its folder is still to be named."""
         values = self.base | cell.levels
         settings = {path_of(name): value for name, value in values.items() if in_scope(name, cell.method)}
-        budget = str(settings.pop(BUDGET, self.budget))
+        given = {name: settings.pop(name, getattr(self, name)) for name in SETTINGS}
+        size = given[SIZE]
         return FitRequest(
             method=cell.method,
             scene=cell.scene,
             seed=cell.seed,
             out=request.out,
-            budget=budget,
-            preset=self.preset,
-            overrides=tuple(f"{path}={_written(value)}" for path, value in settings.items()),
-            size=self.size,
+            budget=str(given[BUDGET]),
+            preset=given[PRESET],
+            overrides=tuple(override(path, value) for path, value in settings.items()),
+            size=(size[0], size[1]) if isinstance(size, list) else size,
             test_views=None if self.test_views == "all" else self.test_views,
             device=request.device,
             kernels=request.kernels,
@@ -136,13 +167,14 @@ class Study:
         """The study with what the command line says instead.
 
         Raises:
-            InputError: it names a budget, and the study varies budgets; or a seed twice.
+            InputError: it names a budget, a size or seeds, and the study itself varies them; or a seed twice.
         """
-        if request.budget is not None and any(path_of(name) == BUDGET for name in self.base):
-            raise InputError("--budget cannot be given: the study itself says budgets in its factors or its base.")
+        varied = {path_of(name) for name in self.base} | {name for cell in self.cells for name in cell}
         names = ("seeds", "budget", "size", "test_views")
         given = {name: getattr(request, name) for name in names if getattr(request, name) is not None}
-        return _checked(replace(self, **given), f"The study '{request.study}'")
+        if refused := [name for name in given if name in varied]:
+            raise InputError(f"--{refused[0]} cannot be given: the study itself says it in its factors, base or cells.")
+        return checked(replace(self, **given), f"The study '{request.study}'")
 
 
 @dataclass(frozen=True)
@@ -161,16 +193,10 @@ class Cell:
     seed: int
     levels: Levels
 
-
-def in_scope(factor: str, method: str) -> bool:
-    """Whether a method has a factor (or a key of the base)."""
-    scope, colon, _ = factor.rpartition(":")
-    return not colon or fnmatch(method, scope)
-
-
-def path_of(factor: str) -> str:
-    """What a factor sets, without its scope."""
-    return factor.rpartition(":")[2]
+    @property
+    def scene_name(self) -> str:
+        """The scene without its path."""
+        return Path(self.scene).name if self.scene.startswith("$") else Path(self.scene).resolve().name
 
 
 def locate(name: str) -> Path:
@@ -208,87 +234,4 @@ def read_study(path: Path) -> Study:
         study = fill(Study, table)
     except InputError as error:
         raise InputError(f"{path}: {error.sentence}", error.remedy) from error
-    return _checked(_completed(study, str(path)), str(path))
-
-
-def _completed(study: Study, where: str) -> Study:
-    """The study with flat names, the factors of a list, and a base level for every factor."""
-    base = _flat(study.base)
-    cells = tuple(_flat(cell) for cell in study.cells)
-    factors = _flat(study.factors)
-    for name, levels in factors.items():
-        if not isinstance(levels, list):
-            raise InputError(f"{where}: the factor '{name}' is not a list of levels.", f"Expected: [{levels!r}, ...].")
-    if (study.design == "list") != bool(cells) or (study.design == "list" and factors):
-        raise InputError(f"{where}: the design 'list' needs [[cells]] and no [factors], the others the contrary.")
-    for name in dict.fromkeys(name for cell in cells for name in cell):
-        absent = [index for index, cell in enumerate(cells) if name not in cell]
-        if absent and name not in base:
-            raise InputError(f"{where}: cell {absent[0] + 1} does not say '{name}', and neither does [base].")
-        found = ([base[name]] if absent else []) + [cell[name] for cell in cells if name in cell]
-        factors[name] = [level for index, level in enumerate(found) if level not in found[:index]]
-    first = {name: levels[0] for name, levels in factors.items() if levels}
-    return replace(study, base=first | base, factors=factors, cells=cells)
-
-
-def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one with dotted names."""
-    flat: dict[str, Any] = {}
-    for key, value in table.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
-    return flat
-
-
-def _checked(study: Study, where: str) -> Study:
-    """Refuse what cannot be expanded, or would run in vain."""
-    for what in ("scenes", "methods", "seeds"):
-        _check_list(getattr(study, what), f"{where}: '{what}'")
-    for name, levels in study.factors.items():
-        _check_list(levels, f"{where}: the factor '{name}'")
-        if study.base[name] not in levels:
-            raise InputError(f"{where}: [base] gives '{name}' the value {study.base[name]!r}, which is none of its levels.")
-    for name, value in study.base.items():
-        values = study.factors.get(name, [value])
-        if strange := [value for value in values if not _is_plain(value)]:
-            raise InputError(f"{where}: '{name}' cannot be {strange[0]!r}.", _PLAIN)
-        if not any(in_scope(name, method) for method in study.methods):
-            raise InputError(f"{where}: '{name}' belongs to none of the study's methods ({', '.join(study.methods)}).")
-        for budget in values if path_of(name) == BUDGET else ():
-            Budget.parse(str(budget))
-    for method in study.methods:
-        paths = [path_of(name) for name in study.base if in_scope(name, method)]
-        if twice := [path for path in paths if paths.count(path) > 1]:
-            raise InputError(
-                f"{where}: '{twice[0]}' is set by two entries for {method}.", "Let their scopes exclude each other."
-            )
-    check_analyses(study.analyses, where)
-    for name in (name for pair in study.approximations for name in (pair.exact, pair.approximate)):
-        if name not in study.render_with:
-            raise InputError(f"{where}: an approximation names '{name}', which is not in 'render_with'.")
-    Budget.parse(study.budget)
-    views = study.test_views
-    if any(seed < 0 for seed in study.seeds) or (views != "all" and views < 1):
-        raise InputError(f"{where}: seeds must be 0 or more, and 'test_views' 1 or more or 'all'.")
-    return study
-
-
-_PLAIN = "Expected: a number, a text, true, false, or a list of such."
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, list):
-        return all(map(_is_plain, value))
-    return isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))
-
-
-def _check_list(items: Sequence[Any], what: str) -> None:
-    if not items:
-        raise InputError(f"{what} has no entries.")
-    for index, item in enumerate(items):
-        if item in items[:index]:
-            raise InputError(f"{what} has {item!r} twice.")
-
-
-def _written(value: Any) -> str:
-    """A level as ``--set`` takes it, in TOML, which for plain values is JSON."""
-    return json.dumps(value, ensure_ascii=False)
+    return checked(completed(study, str(path)), str(path))

@@ -125,7 +125,9 @@ def read_history(path: Path) -> tuple[Progress, ...]:
             raise InputError(f"'{path}', line {position + 1}, must be a table.")
         seconds = number(need(entry, "seconds", object, path), "seconds", path)
         if seconds is not None:
-            entries.append(Progress(need(entry, "step", int, path), seconds, number(entry.get("psnr"), "psnr", path)))
+            psnr, share, dead = (number(entry.get(key), key, path) for key in ("psnr", "progress", "dead"))
+            broken = tuple(key for key, value in entry.items() if isinstance(value, float) and not math.isfinite(value))
+            entries.append(Progress(need(entry, "step", int, path), seconds, psnr, share, dead, broken))
     return tuple(entries)
 
 

@@ -32,11 +32,17 @@ class Progress:
         step: optimisation steps taken.
         seconds: time spent in optimisation, nothing else.
         psnr: on the monitored views, dB; ``None`` where it was not measured.
+        share: of the budget that is spent, in [0, 1]; ``None`` where unknown.
+        dead: share of the primitives that can no longer change; ``None`` where unknown.
+        broken: quantities of the line that are not finite.
     """
 
     step: int
     seconds: float
     psnr: float | None
+    share: float | None = None
+    dead: float | None = None
+    broken: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,12 @@ from invgraphics.report.longtable import write_study_table
 from invgraphics.report.parts import draw_contrasts, draw_part
 from invgraphics.report.public import check_apart, redactor_for
 from invgraphics.report.records import Comparison
+from invgraphics.report.rules import headline, judge
 from invgraphics.report.studypage import StudyPage, write_study_html, write_study_markdown
 from invgraphics.report.studyreading import Study, read_study, scene_comparisons
 from invgraphics.report.summary import quality_columns, table_columns, value_of
 from invgraphics.report.tables import effects_caption, write_latex, write_latex_effects
+from invgraphics.report.verdictpage import write_verdict_report
 from invgraphics.report.wording import Quantity
 
 MOST_PICTURES = 8
@@ -36,7 +38,7 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
 
     Returns:
         The page, ``index.html``; beside it lie ``index.md``, ``results.csv`` and ``.parquet``, ``effects.tex``, a
-        ``table-*.tex`` for each scene, and ``figures/``.
+        ``table-*.tex`` for each scene, and ``figures/``; of a study that judges its cells, ``verdicts.csv`` instead.
 
     Raises:
         InputError: a file is missing or broken, or the folder cannot be written.
@@ -50,6 +52,10 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
     place = Folder(target, redactor=redactor)
     try:
         target.mkdir(parents=True, exist_ok=True)
+        if study.report == "verdicts":
+            write_study_table(study, target / "results", folder)
+            write_verdict_report(study, place, folder)
+            return target / "index.html"
         page = _draw(study, place, folder)
         write_study_table(study, target / "results", folder)
         for part in page.parts:
@@ -64,12 +70,14 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
 
 
 def study_sentences(folder: Path) -> list[str]:
-    """What a study's factors do to its first metric, a sentence for each pair of levels.
+    """What a study's factors do to its first metric, a sentence for each pair of levels; or how its cells are judged.
 
     Raises:
         InputError: a file is missing or broken.
     """
     study = read_study(folder)
+    if study.report == "verdicts":
+        return headline(judge(study.cells, study.known))
     quantities = _quantities(scene_comparisons(study))
     return [effect.sentence for effect in effects_on(quantities[0], study.factors, study.observations())] if quantities else []
 

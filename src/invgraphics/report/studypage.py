@@ -107,7 +107,7 @@ def study_facts(study: Study) -> facts.Facts:
 
 
 def _counted(study: Study) -> str:
-    parts = [f"{study.count(status)} {status}" for status in ("done", "failed", "missing") if study.count(status)]
+    parts = [f"{study.count(status)} {status}" for status in ("done", "failed", "missing", "skipped") if study.count(status)]
     return ", ".join(parts)
 
 
@@ -119,6 +119,9 @@ def _progress(study: Study) -> list[str]:
         sentences.append(f"{missing} of {total} cells {verb} not run yet: what follows may change.")
     if failed:
         sentences.append(f"{failed} of {total} cells failed: see below the matrix. Comparisons leave their pairs out.")
+    if skipped := [cell for cell in study.cells if cell.status == "skipped"]:
+        reasons = listing(dict.fromkeys(cell.error for cell in skipped))
+        sentences.append(f"{len(skipped)} of {total} cells were skipped: {reasons}.")
     return sentences
 
 
@@ -149,6 +152,8 @@ def _field(cell: StudyCell, index: int, quantity: Quantity | None, folder: Folde
     took = f", {duration(cell.seconds)}" if cell.seconds is not None else ""
     if cell.status == "failed":
         return MatrixCell("failed", "failed", f"#failure-{index}", f"{where}: {cell.error.splitlines()[0]}")
+    if cell.status == "skipped":
+        return MatrixCell("missing", "skipped", "", f"{where}: {cell.error}")
     if cell.run is None:
         return MatrixCell("missing", "–", "", f"{where}: has not run")
     value = value_of(cell.run, quantity) if quantity is not None else None

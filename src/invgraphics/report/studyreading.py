@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,10 @@ from invgraphics.errors import InputError
 from invgraphics.report.effects import METHOD, Factor, Observation, level_text
 from invgraphics.report.reading import need, number, optional, read_run, read_table
 from invgraphics.report.records import Comparison, Failure, Run
+from invgraphics.report.variants import find_factors, variant_name
 
 STUDY = "study.json"
-STATUSES = ("done", "failed", "missing")
+STATUSES = ("done", "failed", "missing", "skipped")
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,15 @@ class StudyCell:
         seed: its seed.
         levels: factor -> level as written, the method included.
         variant: method and levels in words, the same for all scenes and seeds.
-        status: ``done``, ``failed`` or ``missing``.
-        error: why it failed; empty otherwise.
+        status: ``done``, ``failed``, ``missing``, or ``skipped`` where its data was not there.
+        error: why it failed or was skipped; empty otherwise.
         seconds: what it took; ``None`` where unknown.
         run: its run, where it is done.
+        label: method, scene@size, budget and seed in a line.
+        size: of its pictures: the longest side, or width × height, px; empty for the scene's own.
+        budget: of its fit, in words.
+        amount: of its budget: (unit, seconds or steps); ``None`` where unknown.
+        forecast: seconds that it was expected to take; ``None`` where unknown.
     """
 
     id: str
@@ -45,6 +50,21 @@ class StudyCell:
     error: str
     seconds: float | None
     run: Run | None
+    label: str = ""
+    size: str = ""
+    budget: str = ""
+    amount: tuple[str, float] | None = None
+    forecast: float | None = None
+
+
+@dataclass(frozen=True)
+class Known:
+    """A red verdict whose cause is known: pattern of the cells' labels, rule, cause, and issue or empty."""
+
+    cells: str
+    rule: str
+    cause: str
+    issue: str
 
 
 @dataclass(frozen=True)
@@ -69,6 +89,8 @@ class Study:
         cells: all of them, in order.
         approximations: ``name``, and the renderers ``exact`` and ``approximate`` that are compared on every fit.
         analyses: names of the computations beside the fits.
+        report: what its page is about: ``effects`` or ``verdicts``.
+        known: red verdicts whose causes are known.
     """
 
     name: str
@@ -88,6 +110,8 @@ class Study:
     cells: tuple[StudyCell, ...]
     approximations: tuple[dict[str, Any], ...] = ()
     analyses: tuple[str, ...] = ()
+    report: str = "effects"
+    known: tuple[Known, ...] = ()
 
     @property
     def variants(self) -> tuple[str, ...]:
@@ -128,7 +152,7 @@ def read_study(folder: Path) -> Study:
     base = {str(key): level_text(value) for key, value in optional(table, "base", dict, source, {}).items()}
     cells = [_cell(entry, base, folder, str(protocol.get("name", "default"))) for entry in entries]
     declared = optional(table, "factors", dict, source, {})
-    factors = _factors(declared, base, cells)
+    factors = find_factors(declared, base, cells)
     return Study(
         name=optional(table, "name", str, source, folder.resolve().name),
         question=optional(table, "question", str, source, ""),
@@ -144,9 +168,11 @@ def read_study(folder: Path) -> Study:
         protocol=protocol,
         command=optional(table, "command", str, source, ""),
         environment=optional(table, "environment", dict, source, {}),
-        cells=tuple(replace(cell, variant=_variant(cell, factors)) for cell in cells),
+        cells=tuple(replace(cell, variant=variant_name(cell, factors)) for cell in cells),
         approximations=tuple(_approximations(table, source)),
         analyses=tuple(str(name) for name in optional(table, "analyses", list, source, [])),
+        report=optional(table, "report", str, source, "effects"),
+        known=tuple(_known(entry, source) for entry in optional(table, "known", list, source, [])),
     )
 
 
@@ -194,9 +220,10 @@ def _cell(entry: Any, base: Mapping[str, str], folder: Path, protocol: str) -> S
         raise InputError(f"'{source}': 'status' cannot be {status!r}.", f"Expected one of: {', '.join(STATUSES)}.")
     own = {str(key): level_text(value) for key, value in optional(entry, "levels", dict, source, {}).items()}
     run = read_run(folder / need(entry, "run", str, source), protocol) if status == "done" else None
+    scene, size = need(entry, "scene", str, source), _written(entry.get("size"))
     return StudyCell(
         id=need(entry, "id", str, source),
-        scene=need(entry, "scene", str, source),
+        scene=scene,
         method=method,
         seed=need(entry, "seed", int, source),
         levels={METHOD: method} | dict(base) | own,
@@ -205,7 +232,26 @@ def _cell(entry: Any, base: Mapping[str, str], folder: Path, protocol: str) -> S
         error=optional(entry, "error", str, source, "") or ("no message" if status == "failed" else ""),
         seconds=number(entry.get("seconds"), "seconds", source),
         run=run,
+        label=optional(entry, "label", str, source, f"{method} {scene}"),
+        size=size,
+        budget=optional(entry, "budget", str, source, ""),
+        amount=_amount(entry, source),
+        forecast=number(entry.get("forecast_seconds"), "forecast_seconds", source),
     )
+
+
+def _amount(entry: Mapping[str, Any], source: Path) -> tuple[str, float] | None:
+    """A budget's unit and amount."""
+    for unit in ("seconds", "steps"):
+        amount = number(entry.get(f"budget_{unit}"), f"budget_{unit}", source)
+        if amount is not None:
+            return unit, amount
+    return None
+
+
+def _known(entry: Any, source: Path) -> Known:
+    cells, rule, cause = (need(entry, key, str, source) for key in ("cells", "rule", "cause"))
+    return Known(cells, rule, cause, str(entry.get("issue") or ""))
 
 
 def _approximations(table: Mapping[str, Any], source: Path) -> list[dict[str, Any]]:
@@ -219,50 +265,6 @@ def _protocol(value: Any, source: Path) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise InputError(f"'{source}': 'protocol' cannot be {value!r}.")
     return dict(value)
-
-
-def _factors(declared: Mapping[str, Any], base: Mapping[str, str], cells: Sequence[StudyCell]) -> tuple[Factor, ...]:
-    """The method first, then what the study declares, then what only its cells vary; a single level is no factor."""
-    levels: dict[str, dict[str, None]] = {METHOD: {}}
-    for path, values in declared.items():
-        listed = values if isinstance(values, list | tuple) else [values]
-        levels[str(path)] = dict.fromkeys(level_text(value) for value in listed)
-    present: dict[str, set[str]] = {}
-    for cell in cells:
-        for path, level in cell.levels.items():
-            levels.setdefault(path, {}).setdefault(level, None)
-            present.setdefault(path, set()).add(level)
-    factors = []
-    for path, found in levels.items():
-        kept = tuple(level for level in found if level in present.get(path, ()))
-        if len(kept) > 1:
-            factors.append(Factor(path, kept, base[path] if base.get(path) in kept else kept[0]))
-    return tuple(factors)
-
-
-def _variant(cell: StudyCell, factors: Sequence[Factor]) -> str:
-    """Method and levels in words, as short as they stay distinct; factors of other methods are left out."""
-    names = short_names([factor.path for factor in factors])
-    own = [f.path for f in factors if f.path != METHOD and f.path in cell.levels and _concerns(f.path, cell.method)]
-    parts = [cell.method] if any(factor.path == METHOD for factor in factors) else []
-    return ", ".join([*parts, *(f"{names[path]} {cell.levels[path]}" for path in own)]) or cell.method
-
-
-def _concerns(path: str, method: str) -> bool:
-    """Whether a factor is one of ``method``: ``volumetric/*:batches.rays`` names the methods before its colon."""
-    pattern, colon, _ = path.rpartition(":")
-    return not colon or fnmatch(method, pattern)
-
-
-def short_names(paths: Sequence[str]) -> dict[str, str]:
-    """Path -> the shortest end of it that no other path has."""
-    split = {path: path.split(".") for path in paths}
-    names = {}
-    for path, parts in split.items():
-        lengths = range(1, len(parts) + 1)
-        clear = (n for n in lengths if sum(other[-n:] == parts[-n:] for other in split.values()) == 1)
-        names[path] = ".".join(parts[-next(clear, len(parts)) :])
-    return names
 
 
 def _listed(value: Any, found: Iterable[str]) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -13,7 +14,7 @@ from invgraphics.core import Scene, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions, pose
 
-__all__ = ["Loader", "SceneOptions", "find_loader", "open_scene", "validate"]
+__all__ = ["Loader", "SceneOptions", "absent_data", "find_loader", "open_scene", "validate"]
 
 _SAME_POSE = 1e-6  # entries of two poses that are closer than this are one camera
 
@@ -37,7 +38,7 @@ def open_scene(
 
     Args:
         spec: a built-in scene's name, which is rendered first unless its truth is in the cache; the path of one's own
-            ``scene.toml``; or the path of a data set.
+            ``scene.toml``; or the path of a data set, which may begin with a variable: ``$INVGRAPHICS_DATA/fox``.
         options: size and number of views.
         progress: called while a scene is rendered with (views done, views in all, what is being done).
 
@@ -49,8 +50,10 @@ def open_scene(
     if description is not None:
         path = _render(description, options, progress)
         return validate(plugins.load("scenes", "truth")().load(path, options))
-    path = Path(spec).expanduser()
+    path = _path(spec)
     if not path.exists():
+        if reason := absent_data(spec):
+            raise InputError(f"'{spec}' cannot be opened: {reason}.", "Set the variable to the folder that holds it.")
         raise InputError(
             f"'{spec}' is neither a built-in scene nor an existing path.", f"Built-in scenes: {', '.join(_built_in())}."
         )
@@ -76,6 +79,21 @@ def find_loader(path: Path) -> Loader:
     )
 
 
+def absent_data(spec: str) -> str:
+    """Why the data that a path names through a variable is not on this machine; empty where it is, and for other paths."""
+    variable, slash, name = spec.removeprefix("$").partition("/")
+    if not spec.startswith("$") or not slash:
+        return ""
+    if not os.environ.get(variable):
+        return f"{variable} is not set"
+    return "" if _path(spec).exists() else f"{name} is not in ${variable}"
+
+
+def _path(spec: str) -> Path:
+    """The path that a person wrote, with its variables and its home filled in."""
+    return Path(os.path.expandvars(spec)).expanduser()
+
+
 def _built_in() -> tuple[str, ...]:
     from invgraphics.scenes.mitsuba import spec
 
@@ -86,7 +104,7 @@ def _description(spec: str) -> str | None:
     """What `make` calls the scene: a built-in scene's name or the path of a ``scene.toml``; ``None`` for a data set."""
     from invgraphics.scenes.mitsuba.spec import FILE
 
-    path = Path(spec).expanduser()
+    path = _path(spec)
     own = path if path.name == FILE else path / FILE
     return spec if spec in _built_in() else str(own) if own.is_file() else None
 

@@ -1,0 +1,45 @@
+"""Factors of a study: their names, which methods have them, and which of them are settings of the request itself."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from fnmatch import fnmatch
+from typing import Any
+
+Levels = dict[str, Any]
+"""Factor -> level."""
+
+BUDGET, SIZE, PRESET = "budget", "size", "preset"
+
+SETTINGS = (BUDGET, SIZE, PRESET)
+"""Factors that are settings of the request, not keys of the recipe or of the training data."""
+
+NARROWING = ("scenes", "methods", "seeds")
+"""Keys of a listed cell that say for which of the study's scenes, methods and seeds it holds; absent ones mean all."""
+
+
+def in_scope(factor: str, method: str) -> bool:
+    """Whether a method has a factor (or a key of the base)."""
+    scope, colon, _ = factor.rpartition(":")
+    return not colon or fnmatch(method, scope)
+
+
+def path_of(factor: str) -> str:
+    """What a factor sets, without its scope."""
+    return factor.rpartition(":")[2]
+
+
+def levels_of(cell: Mapping[str, Any]) -> Levels:
+    """The levels of a listed cell, without what narrows it."""
+    return {name: level for name, level in cell.items() if name not in NARROWING}
+
+
+def covers(cell: Mapping[str, Any], scene: str, method: str, seed: int) -> bool:
+    """Whether a listed cell holds for a scene, a method and a seed."""
+    return all(value in cell.get(key, (value,)) for key, value in zip(NARROWING, (scene, method, seed), strict=True))
+
+
+def override(path: str, level: Any) -> str:
+    """A level as ``--set`` takes it: ``path=value`` in TOML, which for plain values is JSON."""
+    return f"{path}={json.dumps(level, ensure_ascii=False)}"
