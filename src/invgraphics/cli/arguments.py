@@ -28,9 +28,9 @@ class Shared:
 
     budget: Annotated[str, arg(metavar="60s|5000steps")] = "60s"
     """How long each fit may optimise: seconds (60s, 2m, 1h), or steps (5000steps)."""
-    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: laptop)")] = None
-    """Size of the method: laptop shows its character in a minute, long is for minutes to an hour, paper holds the published
-    values."""
+    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: from the budget)")] = None
+    """Size of the method. The budget chooses: laptop under two minutes (and for steps), long up to 30, hour above, or the
+    nearest smaller one that the method has; paper holds the published values."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
     """Change one value of the recipe, for instance --set batches.rays=2048, or of the training data: data.train_views=10,
     data.size, data.pose_noise (degrees and per cent), data.photo_noise, data.exposure (stops), data.background."""

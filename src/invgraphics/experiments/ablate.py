@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -24,6 +25,7 @@ from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.forecast import Cost, Forecast, duration, total, try_method
 from invgraphics.experiments.identity import TruthDigest, identify
+from invgraphics.experiments.presets import announcements
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.renderings import check_eyes, rendered
 from invgraphics.experiments.request import AblateRequest
@@ -87,8 +89,10 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         fits = {planned.id: planned for planned in plan}
         missing = [planned for planned in fits.values() if not _is_finished(planned, truths[planned.cell.scene], threads)]
         costs = _try_methods(missing, first)
-        forecast = total([(costs[p.cell.method], Budget.parse(p.fit.budget)) for p in missing], len(fits), request.jobs)
+        forecast = total([(costs[p.kind], Budget.parse(p.fit.budget)) for p in missing], len(fits), request.jobs)
         _check_disk(forecast, folder.root)
+        for sentence in announcements(planned.method.choice for planned in plan):
+            print(sentence, file=sys.stderr)
         confirm(forecast)
         record.start({planned.id for planned in missing})
         write_analyses(study.analyses, folder.root)
@@ -198,12 +202,12 @@ def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
     return same and rendered(run, planned.fit, planned.method)
 
 
-def _try_methods(missing: list[Planned], scene: Scene) -> dict[str, Cost]:
-    """What a run of each method costs, measured on one scene."""
-    costs: dict[str, Cost] = {}
+def _try_methods(missing: list[Planned], scene: Scene) -> dict[tuple[str, str], Cost]:
+    """What a run of each method and preset costs, measured on one scene."""
+    costs: dict[tuple[str, str], Cost] = {}
     for planned in missing:
-        if planned.cell.method not in costs:
-            costs[planned.cell.method] = try_method(planned.fit, planned.method, scene)
+        if planned.kind not in costs:
+            costs[planned.kind] = try_method(planned.fit, planned.method, scene)
     return costs
 
 
@@ -213,10 +217,10 @@ def _check_disk(forecast: Forecast, folder: Path) -> None:
         raise InputError(f"The study will write {forecast.size / 1e9:.2g} GB, and {folder} has {free / 1e9:.2g} GB left.")
 
 
-def _run(executor: Executor, missing: list[Planned], costs: dict[str, Cost], files: tuple[Record, Path]) -> None:
+def _run(executor: Executor, missing: list[Planned], costs: dict[tuple[str, str], Cost], files: tuple[Record, Path]) -> None:
     """Run what is missing; ``files`` are the record, and the folder for jobs and their logs."""
     record, jobs = files
-    expected = {p.fit.out: costs[p.cell.method].seconds(Budget.parse(p.fit.budget)) for p in missing}
+    expected = {p.fit.out: costs[p.kind].seconds(Budget.parse(p.fit.budget)) for p in missing}
     progress = _Progress(expected, time.monotonic())
     fits = [planned.fit for planned in missing]
     with Reporter("study", quiet_seconds=0) as reporter, closing(executor.run(fits, jobs)) as outcomes:

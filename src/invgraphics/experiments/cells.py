@@ -9,7 +9,7 @@ from pathlib import Path
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import device_of, training_data
 from invgraphics.experiments.identity import define
-from invgraphics.experiments.recipe import Method, load_method
+from invgraphics.experiments.recipe import Method, requested_method
 from invgraphics.experiments.recorder import Cadence
 from invgraphics.experiments.request import AblateRequest, FitRequest, slug
 from invgraphics.experiments.study import Cell, Study, in_scope, path_of
@@ -38,6 +38,11 @@ class Planned:
         """Name of the run's folder."""
         return Path(self.fit.out).name
 
+    @property
+    def kind(self) -> tuple[str, str]:
+        """Method and preset, which decide what a run costs."""
+        return self.method.name, self.method.preset
+
 
 def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
     """Every cell with its run, all settings checked.
@@ -48,15 +53,15 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
     protocol_named(study.protocol)
     device_of(request.device)
     Cadence.parse(request.checkpoint_every)
-    methods: dict[tuple[str, tuple[str, ...]], Method] = {}
+    methods: dict[tuple[str, tuple[str, ...], str], Method] = {}
     folders: dict[str, Path] = {}  # a run that several cells share is named after the first
     plan = []
     for cell in study.expand():
         fit = study.fit_request(cell, request)
-        key = (cell.method, fit.recipe_overrides)
+        key = (cell.method, fit.recipe_overrides, fit.budget)
         try:
             if key not in methods:
-                methods[key] = load_method(cell.method, study.preset, fit.recipe_overrides)
+                methods[key] = requested_method(cell.method, fit)
             training_data(fit)
         except InputError as error:
             raise _in_cell(cell, error) from error

@@ -21,7 +21,7 @@ class Settings:
         scene: built-in scene or path of a data set.
         out: folder to write.
         budget: of each fit, ``60s`` or ``5000steps``.
-        preset: preset of the recipes; ``None`` for their default.
+        preset: preset of the recipes; ``None`` for the one that suits the budget (see `experiments.presets`).
         overrides: ``key=value`` items laid over the recipes, or over the training data where the key begins with ``data.``.
         size: longest side in pixels, or (width, height); ``None`` for the scene's own.
         test_views: how many test views to score; ``None`` for all.

@@ -67,7 +67,7 @@ class Study:
         protocol: how to score.
         test_views: how many test views to score, or ``all``.
         size: longest side in pixels, or [width, height]; ``None`` for the scenes' own.
-        preset: preset of the recipes; ``None`` for their default.
+        preset: preset of the recipes; ``None`` for the one that suits each cell's budget.
         render_with: renderers that show every fitted field besides its own (see `invgraphics.experiments.renderings`).
         approximations: pairs of these renderers whose pictures of the same fit are compared.
         analyses: computations beside the fits (see `invgraphics.experiments.analyses`).
