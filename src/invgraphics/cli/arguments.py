@@ -38,6 +38,8 @@ class Shared:
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
     """How many test views are scored, evenly spaced."""
+    spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
+    """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
     """Most Gaussians a method may make; short for --set max_primitives=N."""
     optimise: Annotated[str, arg(metavar="poses")] = ""
@@ -71,6 +73,7 @@ class Shared:
             "overrides": tuple(self.overrides) + short,
             "size": None if self.size is None else parse_size(self.size),
             "test_views": parse_views(self.test_views),
+            "spp": parse_samples(self.spp),
             "device": self.device,
             "kernels": self.kernels,
             "protocol": self.protocol,
@@ -141,6 +144,17 @@ def parse_views(text: str) -> int | None:
     if not text.strip().isdecimal() or int(text) < 1:
         raise InputError(f"--test-views cannot be '{text}'.", "Expected a number of views, 1 or more, or 'all'.")
     return int(text)
+
+
+def parse_samples(count: int | None) -> int | None:
+    """Check a number of samples per pixel.
+
+    Raises:
+        InputError: it is less than one.
+    """
+    if count is not None and count < 1:
+        raise InputError(f"--spp cannot be {count}.", "Expected a number of samples per pixel, 1 or more.")
+    return count
 
 
 def parse_list(text: str, option: str) -> tuple[str, ...]:

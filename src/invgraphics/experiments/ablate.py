@@ -186,7 +186,7 @@ def _open_scenes(study: Study, plan: list[Planned]) -> tuple[Scene, dict[str, Tr
     truths = {}
     for name in study.scenes:
         with Reporter(f"rendering {name}") as reporter:
-            options = SceneOptions(size=study.size, test_views=views)
+            options = SceneOptions(size=study.size, test_views=views, spp=study.spp)
             scene = open_scene(name, options, lambda done, n, what, r=reporter: r.show(done / max(n, 1), what))
         for data in dict.fromkeys(training_data(planned.fit) for planned in plan):
             data.check(scene)

@@ -13,7 +13,7 @@ import torch
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import device_of, training_data
+from invgraphics.experiments.build import device_of, open_requested, training_data
 from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.base import INTERRUPTED
 from invgraphics.experiments.executors.local import LocalExecutor
@@ -26,7 +26,6 @@ from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named
 from invgraphics.scenes.corrupt import corrupt
-from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 
 
@@ -82,7 +81,7 @@ def _validate(request: CompareRequest) -> Scene:
     methods = [requested_method(name, request) for name in request.methods]
     data = training_data(request)
     RunFolder(Path(request.out)).create()
-    scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+    scene = open_requested(request)
     check_eyes(request.render_with, methods, scene)
     return corrupt(scene, data, request.seeds[0])
 

@@ -67,6 +67,7 @@ class Study:
         protocol: how to score.
         test_views: how many test views to score, or ``all``.
         size: longest side in pixels, or [width, height]; ``None`` for the scenes' own.
+        spp: samples per pixel of scenes that are rendered; ``None`` for their own.
         preset: preset of the recipes; ``None`` for the one that suits each cell's budget.
         render_with: renderers that show every fitted field besides its own (see `invgraphics.experiments.renderings`).
         approximations: pairs of these renderers whose pictures of the same fit are compared.
@@ -85,6 +86,7 @@ class Study:
     protocol: str = "default"
     test_views: int | Literal["all"] = 16
     size: int | tuple[int, int] | None = None
+    spp: int | None = None
     preset: str | None = None
     render_with: tuple[str, ...] = ()
     approximations: tuple[Approximation, ...] = ()
@@ -122,6 +124,7 @@ class Study:
             preset=self.preset,
             overrides=tuple(f"{path}={_written(value)}" for path, value in settings.items()),
             size=self.size,
+            spp=self.spp,
             test_views=None if self.test_views == "all" else self.test_views,
             device=request.device,
             kernels=request.kernels,
@@ -140,7 +143,7 @@ class Study:
         """
         if request.budget is not None and any(path_of(name) == BUDGET for name in self.base):
             raise InputError("--budget cannot be given: the study itself says budgets in its factors or its base.")
-        names = ("seeds", "budget", "size", "test_views")
+        names = ("seeds", "budget", "size", "test_views", "spp")
         given = {name: getattr(request, name) for name in names if getattr(request, name) is not None}
         return _checked(replace(self, **given), f"The study '{request.study}'")
 
