@@ -94,6 +94,12 @@ def test_numbers_of_views() -> None:
             arguments.parse_views(text)
 
 
+def test_samples_per_pixel() -> None:
+    assert arguments.parse_samples(None) is None
+    with pytest.raises(InputError, match="--spp cannot be 0"):
+        arguments.parse_samples(0)
+
+
 def test_fit_becomes_a_request() -> None:
     words = ["splatting/gaussians", "data/fox/", "--budget", "2m", "--set", "batches.rays=-2", "--set", "a.b=c d"]
     words += ["--size", "480", "--test-views", "all", "--seed", "3"]
@@ -109,10 +115,11 @@ def test_the_recorded_command_gives_the_same_request(tmp_path) -> None:
     import shlex
 
     words = ["volumetric/hash", "bricks", "--preset", "paper", "--size", "64x48", "--set", "x=[1, 2]", "--device", "cpu"]
-    words += ["--kernels", "reference", "--protocol", "float", "--out", str(tmp_path)]
+    words += ["--kernels", "reference", "--protocol", "float", "--spp", "32", "--out", str(tmp_path)]
     request = arguments.parse(Fit, "invgraphics fit", words).request()
     again = arguments.parse(Fit, "invgraphics fit", shlex.split(request.shell())[2:]).request()
     assert again == request
+    assert again.spp == 32
     comparison = arguments.parse(
         Compare, "invgraphics compare", ["bricks", "--methods", "a/b, c/d", "--seeds", "0,2", "--out", str(tmp_path)]
     ).request()

@@ -47,11 +47,17 @@ def test_compare_then_evaluate_and_report(tmp_path, capsys) -> None:
     assert text.splitlines()[-1] == str(out / "index.html")
     assert (out / "index.html").is_file()
 
+    table = json.loads((out / "compare.json").read_text())
+    assert (table["preset"], table["preset_choice"]) == ("laptop", "as for every budget in steps")
+    assert "preset: laptop, as for every budget in steps" in (out / "index.md").read_text()
+
     cell = out / "runs" / "splatting-gaussians" / "seed-0"
     assert runs_in(out) == runs_in(cell) == [cell]
     assert main.run(["evaluate", str(cell), "--protocol", "float"]) == main.DONE
     assert "protocol float" in capsys.readouterr().out
     assert json.loads((cell / "scores.float.json").read_text())["protocol"] == "float"
+    for name in ("scores.json", "scores.float.json", "provenance.json"):  # of the fit, and of the later evaluation
+        assert json.loads((cell / name).read_text())["preset_choice"] == "as for every budget in steps"
 
     assert main.run(["report", str(cell)]) == main.BAD_INPUT
     assert "--out" in capsys.readouterr().err

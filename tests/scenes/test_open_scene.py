@@ -119,11 +119,17 @@ def test_built_in_scenes_are_rendered_then_loaded(tmp_path: Path, monkeypatch, s
 
     monkeypatch.setattr(mitsuba, "make", make)
     monkeypatch.setattr(plugins, "load", lambda registry, name: Truth)
-    options = SceneOptions(size=size, test_views=3, seed=5)
+    options = SceneOptions(size=size, test_views=3, seed=5, spp=7)
     opened = open_scene("bricks", options, progress=print)
     assert opened.name == "toy"
-    assert calls["bricks"] == {"size": expected, "train": None, "test": 3, "seed": 5, "progress": print}
+    assert calls["bricks"] == {"size": expected, "train": None, "test": 3, "spp": 7, "seed": 5, "progress": print}
     assert calls["loaded"] == (tmp_path, options)
+
+
+def test_samples_are_for_what_is_rendered(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").touch()
+    with pytest.raises(InputError, match=r"holds pictures, whose samples per pixel are what they are\.\nLeave --spp away"):
+        open_scene(str(tmp_path), SceneOptions(spp=64))
 
 
 def test_evenly_spaced_choice() -> None:
@@ -133,7 +139,7 @@ def test_evenly_spaced_choice() -> None:
     assert len(set(evenly(list(range(17)), 16))) == 16
 
 
-@pytest.mark.parametrize("bad", [{"size": 0}, {"size": (4, -1)}, {"test_views": 0}, {"train_views": -2}])
+@pytest.mark.parametrize("bad", [{"size": 0}, {"size": (4, -1)}, {"test_views": 0}, {"train_views": -2}, {"spp": 0}])
 def test_bad_options_are_refused(bad: dict) -> None:
     with pytest.raises(InputError):
         SceneOptions(**bad)

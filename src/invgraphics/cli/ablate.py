@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from invgraphics.cli.arguments import parse_seeds, parse_size, parse_views
+from invgraphics.cli.arguments import parse_samples, parse_seeds, parse_size, parse_views
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.experiments.study import locate, name_of, read_study
@@ -51,6 +51,8 @@ class Ablate:
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str | None, arg(metavar="N|all", help_behavior_hint="(default: the study's)")] = None
     """How many test views are scored, evenly spaced."""
+    spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the study's)")] = None
+    """Samples per pixel of the training views of scenes that are rendered."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
     """Where to compute."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
@@ -101,6 +103,7 @@ class Ablate:
             budget=self.budget,
             size=None if self.size is None else parse_size(self.size),
             test_views=views,
+            spp=parse_samples(self.spp),
             device=self.device,
             kernels=self.kernels,
             checkpoint_every=self.checkpoint_every,

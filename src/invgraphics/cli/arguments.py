@@ -28,9 +28,9 @@ class Shared:
 
     budget: Annotated[str, arg(metavar="60s|5000steps")] = "60s"
     """How long each fit may optimise: seconds (60s, 2m, 1h), or steps (5000steps)."""
-    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: laptop)")] = None
-    """Size of the method: laptop shows its character in a minute, long is for minutes to an hour, paper holds the published
-    values."""
+    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: from the budget)")] = None
+    """Size of the method. The budget chooses: laptop under two minutes (and for steps), long up to 30, hour above, or the
+    nearest smaller one that the method has; paper holds the published values."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
     """Change one value of the recipe, for instance --set batches.rays=2048, or of the training data: data.train_views=10,
     data.size, data.pose_noise (degrees and per cent), data.photo_noise, data.exposure (stops), data.background."""
@@ -38,6 +38,8 @@ class Shared:
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
     """How many test views are scored, evenly spaced."""
+    spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
+    """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
     """Most Gaussians a method may make; short for --set max_primitives=N."""
     optimise: Annotated[str, arg(metavar="poses")] = ""
@@ -71,6 +73,7 @@ class Shared:
             "overrides": tuple(self.overrides) + short,
             "size": None if self.size is None else parse_size(self.size),
             "test_views": parse_views(self.test_views),
+            "spp": parse_samples(self.spp),
             "device": self.device,
             "kernels": self.kernels,
             "protocol": self.protocol,
@@ -141,6 +144,17 @@ def parse_views(text: str) -> int | None:
     if not text.strip().isdecimal() or int(text) < 1:
         raise InputError(f"--test-views cannot be '{text}'.", "Expected a number of views, 1 or more, or 'all'.")
     return int(text)
+
+
+def parse_samples(count: int | None) -> int | None:
+    """Check a number of samples per pixel.
+
+    Raises:
+        InputError: it is less than one.
+    """
+    if count is not None and count < 1:
+        raise InputError(f"--spp cannot be {count}.", "Expected a number of samples per pixel, 1 or more.")
+    return count
 
 
 def parse_list(text: str, option: str) -> tuple[str, ...]:

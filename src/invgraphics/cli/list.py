@@ -70,14 +70,21 @@ def _print_matrix() -> None:
 
 
 def _list_methods() -> None:
-    from invgraphics.experiments.recipe import methods
+    from invgraphics.experiments.presets import described
+    from invgraphics.experiments.recipe import methods, source
 
     ours = find("renderers")
     rows = [
-        (name, summary, "built in" if (ours / f"{name}.toml").is_file() else plugins.origin("recipes", name))
+        (
+            name,
+            summary,
+            described(source(name).get("presets", {})),
+            "built in" if (ours / f"{name}.toml").is_file() else plugins.origin("recipes", name),
+        )
         for name, summary in methods().items()
     ]
-    show_table("Methods (field x renderer recipes)", ("name", "summary", "from"), rows)
+    columns = ("name", "summary", "presets (chosen on)", "from")
+    show_table("Methods (field x renderer recipes)", columns, rows)
 
 
 def _list_scenes() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -23,6 +24,7 @@ from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.forecast import Cost, Forecast, duration, total, try_method
 from invgraphics.experiments.identity import TruthDigest, identify
+from invgraphics.experiments.presets import announcements
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.renderings import check_eyes, rendered
 from invgraphics.experiments.request import AblateRequest
@@ -98,6 +100,8 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         later = sum(state.status in ("later", "skipped") for state in states.values())
         forecast = total([(costs[_kind(p)], Budget.parse(p.fit.budget)) for p in missing], len(fits), request.jobs, later)
         _check_disk(forecast, folder.root)
+        for sentence in announcements(planned.method.choice for planned in plan):
+            print(sentence, file=sys.stderr)
         confirm(forecast)
         record.start(states | {name: CellState("missing", forecast=round(t, 1)) for name, t in expected.items()})
         write_analyses(study.analyses, folder.root)
@@ -157,7 +161,7 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple
         name, size = place
         group = [planned for planned in plan if _place(planned) == place]
         with Reporter(f"rendering {name}") as reporter:
-            options = SceneOptions(size=size, test_views=group[0].fit.test_views)
+            options = SceneOptions(size=size, test_views=group[0].fit.test_views, spp=group[0].fit.spp)
             scene = open_scene(name, options, lambda done, n, what, r=reporter: r.show(done / max(n, 1), what))
         for data in dict.fromkeys(training_data(planned.fit) for planned in group):
             data.check(scene)

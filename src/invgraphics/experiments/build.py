@@ -10,10 +10,12 @@ from invgraphics import kernels
 from invgraphics.config import fill
 from invgraphics.core import Field, RayRenderer, Renderer, Scene, check
 from invgraphics.errors import InputError
+from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.recipe import Method, assign
 from invgraphics.experiments.request import DATA, Settings
 from invgraphics.experiments.schema import Recipe
 from invgraphics.scenes.corrupt import TrainingData
+from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Plan
 from invgraphics.training.poses import make_poses, windows
@@ -43,6 +45,17 @@ def training_data(settings: Settings) -> TrainingData:
     table: dict[str, Any] = {}
     assign(table, settings.data_overrides)
     return fill(TrainingData, table.get(DATA.rstrip("."), {}), DATA.rstrip("."))
+
+
+def open_requested(settings: Settings) -> Scene:
+    """Open the scene that a request names; how far its rendering is, where it has to be rendered, is shown.
+
+    Raises:
+        InputError: the scene cannot be opened.
+    """
+    options = SceneOptions(size=settings.size, test_views=settings.test_views, spp=settings.spp)
+    with Reporter(f"rendering {settings.scene}") as reporter:
+        return open_scene(settings.scene, options, lambda done, total, what: reporter.show(done / max(total, 1), what))
 
 
 def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -> tuple[Field, Renderer]:

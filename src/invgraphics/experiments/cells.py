@@ -12,7 +12,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import device_of, training_data
 from invgraphics.experiments.factors import BUDGET, SIZE, in_scope, path_of
 from invgraphics.experiments.identity import define
-from invgraphics.experiments.recipe import Method, load_method
+from invgraphics.experiments.recipe import Method, requested_method
 from invgraphics.experiments.recorder import Cadence
 from invgraphics.experiments.request import AblateRequest, FitRequest, slug
 from invgraphics.experiments.study import Cell, Study
@@ -67,7 +67,7 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
         key = (cell.method, fit.preset, fit.budget, fit.recipe_overrides)
         try:
             if key not in methods:
-                methods[key] = load_method(cell.method, fit.preset, fit.recipe_overrides)
+                methods[key] = requested_method(cell.method, fit)
             training_data(fit)
         except InputError as error:
             raise _in_cell(cell, error) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -12,20 +13,19 @@ import torch
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import device_of, training_data
+from invgraphics.experiments.build import device_of, open_requested, training_data
 from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.base import INTERRUPTED
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import protocol_note
-from invgraphics.experiments.recipe import load_method
+from invgraphics.experiments.recipe import Method, requested_method
 from invgraphics.experiments.recorder import Cadence
 from invgraphics.experiments.renderings import check_eyes
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named
 from invgraphics.scenes.corrupt import corrupt
-from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 
 
@@ -78,10 +78,10 @@ def _validate(request: CompareRequest) -> Scene:
     Cadence.parse(request.checkpoint_every)
     device_of(request.device)
     protocol_named(request.protocol)
-    methods = [load_method(name, request.preset, request.recipe_overrides) for name in request.methods]
+    methods = [requested_method(name, request) for name in request.methods]
     data = training_data(request)
     RunFolder(Path(request.out)).create()
-    scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+    scene = open_requested(request)
     check_eyes(request.render_with, methods, scene)
     return corrupt(scene, data, request.seeds[0])
 
@@ -91,19 +91,18 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
     protocol = protocol_named(request.protocol)
     camera = scene.test[0].camera
     names, budget = ", ".join(request.methods), Budget.parse(request.budget)
-    notes = {protocol_note(load_method(name, request.preset, request.recipe_overrides)) for name in request.methods} - {""}
+    methods = [requested_method(name, request) for name in request.methods]
+    notes = {protocol_note(method) for method in methods} - {""}
     return {
         "schema": 1,
         "scene": scene.name,
         "question": f"Given {budget} of optimisation each, how well do {names} show new views, at what cost?",
         "methods": list(request.methods),
-        "summaries": {
-            name: load_method(name, request.preset, request.recipe_overrides).recipe.summary for name in request.methods
-        },
+        "summaries": {method.name: method.recipe.summary for method in methods},
         "seeds": list(request.seeds),
         "budget": request.budget,
         "size": [camera.width, camera.height],
-        "preset": request.preset or "laptop",
+        **_preset_facts(methods),
         "render_with": list(request.render_with),
         "command": request.shell(),
         "baselines": baseline_scores(scene, protocol),
@@ -119,4 +118,16 @@ def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:
             "notes": scene.notes,
         },
         "environment": environment(torch.device(request.device or "cpu")),
+    }
+
+
+def _preset_facts(methods: Sequence[Method]) -> dict[str, Any]:
+    """Which presets the fits take: the common one, empty where they differ; each method's; what chose them."""
+    names = {method.name: method.preset for method in methods}
+    choices = {method.preset_choice for method in methods}
+    return {
+        "preset": next(iter(names.values())) if len(set(names.values())) == 1 else "",
+        "presets": names,
+        "preset_choice": next(iter(choices)) if len(choices) == 1 else "",
+        "preset_chosen_on": {method.name: list(method.chosen_on) for method in methods if method.chosen_on},
     }

@@ -90,6 +90,7 @@ def evaluate(
         "schema": 1,
         "method": method.name,
         "preset": method.preset,
+        "preset_choice": method.preset_choice,
         "scene": scene.name,
         "seed": folder.read_json("provenance.json")["seed"],
         "protocol": protocol,

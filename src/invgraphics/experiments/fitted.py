@@ -69,7 +69,10 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     """
     keep_freed_memory()
     provenance = folder.read_json("provenance.json")
-    method = resolve(provenance["method"], provenance["preset"], folder.read_recipe())
+    method = replace(
+        resolve(provenance["method"], provenance["preset"], folder.read_recipe()),
+        preset_choice=str(provenance.get("preset_choice", "")),
+    )
     device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
     field, renderer = build_model(method, scene, provenance["seed"], device)
     shown = provenance.get("fitted_run")

@@ -65,6 +65,7 @@ def identify(request: FitRequest, method: Method, truth: TruthDigest, threads: i
 def define(request: FitRequest, method: Method) -> str:
     """The identity of a cell of a study: what it is asked for, whatever machine and code answer."""
     scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}
+    scene |= {} if request.spp is None else {"spp": request.spp}  # so that studies without keep their folders' names
     parts = {"method": method.name, "recipe": method.digest, "data": training_data(request).changes()}
     return _sha256(_asked(request) | scene | parts)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from invgraphics.core import Gaussians, Scene, harmonics
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import build_model, device_of, repeatable, use_kernels
+from invgraphics.experiments.build import build_model, device_of, open_requested, repeatable, use_kernels
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate
 from invgraphics.experiments.folder import RunFolder
@@ -25,7 +25,6 @@ from invgraphics.fields.transformed import move_gaussians
 from invgraphics.formats.base import Splats, read_gaussians
 from invgraphics.formats.ply import OPACITY_EPS
 from invgraphics.metrics.protocols import protocol_named
-from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training import checkpoint
 
 IMPORTED = "imported"
@@ -74,7 +73,7 @@ def import_run(request: ImportRequest) -> Path:
     folder = RunFolder(Path(request.out))
     if (folder.root / "provenance.json").is_file():
         raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
-    scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+    scene = open_requested(request)
     gaussians = move_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()
     repeatable(device)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,9 @@ from invgraphics import plugins
 from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
 from invgraphics.errors import InputError
+from invgraphics.experiments.presets import select_preset
+from invgraphics.experiments.request import Settings
+from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
     from invgraphics.experiments.schema import Recipe
@@ -28,17 +31,26 @@ class Method:
         preset: which preset was laid over the recipe; empty for none.
         recipe: its typed settings.
         table: the same, everything resolved, as plain values; what a run's ``recipe.toml`` holds.
+        preset_choice: what chose the preset, in words; empty where it was asked for.
+        chosen_on: scenes on which the preset's values were chosen.
     """
 
     name: str
     preset: str
     recipe: Recipe
     table: dict[str, Any]
+    preset_choice: str = ""
+    chosen_on: tuple[str, ...] = ()
 
     @property
     def slug(self) -> str:
         """The name as one folder name."""
         return self.name.removesuffix(".toml").strip("/").replace("/", "-")
+
+    @property
+    def choice(self) -> tuple[str, str, str]:
+        """Name, preset and what chose the preset, for `experiments.presets.announcements`."""
+        return self.name, self.preset, self.preset_choice
 
     @property
     def digest(self) -> str:
@@ -62,26 +74,32 @@ def presets(name: str) -> list[str]:
     return sorted(source(name).get("presets", {}))
 
 
-def load_method(name: str, preset: str | None = None, overrides: Sequence[str] = ()) -> Method:
+def load_method(name: str, preset: str | None = None, overrides: Sequence[str] = (), budget: Budget | None = None) -> Method:
     """Read a method's recipe, lay a preset and then overrides over it, and check every key.
 
     Args:
         name: ``renderer/recipe`` of a built-in or plugged-in method, or the path of a TOML file.
-        preset: one of the recipe's presets; ``None`` takes ``laptop`` where there is one.
+        preset: one of the recipe's presets; ``None`` takes the one for the budget (see `experiments.presets`).
         overrides: ``dotted.path=value`` items, values as in TOML; bare words are taken as text.
+        budget: of the fit; ``None`` counts as a short one.
 
     Raises:
         InputError: unknown method, preset or key, or a value of the wrong type.
     """
     table = source(name)
-    known = table.pop("presets", {})
-    if preset is None:
-        preset = "laptop" if "laptop" in known else ""
-    if preset and preset not in known:
-        raise InputError(f"{name} has no preset '{preset}'.", f"Its presets: {', '.join(known) or 'none'}.")
-    table = merge(table, known.get(preset, {}))
+    chosen = select_preset(name, preset, budget, table.pop("presets", {}))
+    table = merge(table, chosen.table)
     assign(table, overrides)
-    return resolve(name, preset, table)
+    return replace(resolve(name, chosen.name, table), preset_choice=chosen.choice, chosen_on=chosen.chosen_on)
+
+
+def requested_method(name: str, request: Settings) -> Method:
+    """The method that a request names, under the request's preset (or its budget's) and overrides.
+
+    Raises:
+        InputError: as `load_method`, or the budget cannot be read.
+    """
+    return load_method(name, request.preset, request.recipe_overrides, Budget.parse(request.budget))
 
 
 def assign(table: dict[str, Any], items: Sequence[str]) -> None:

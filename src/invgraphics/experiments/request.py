@@ -21,10 +21,11 @@ class Settings:
         scene: built-in scene or path of a data set.
         out: folder to write.
         budget: of each fit, ``60s`` or ``5000steps``.
-        preset: preset of the recipes; ``None`` for their default.
+        preset: preset of the recipes; ``None`` for the one that suits the budget (see `experiments.presets`).
         overrides: ``key=value`` items laid over the recipes, or over the training data where the key begins with ``data.``.
         size: longest side in pixels, or (width, height); ``None`` for the scene's own.
         test_views: how many test views to score; ``None`` for all.
+        spp: samples per pixel of a scene that is rendered; ``None`` for its own.
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
         kernels: implementation to force; ``None`` for the best one here.
         protocol: how to score.
@@ -39,6 +40,7 @@ class Settings:
     overrides: tuple[str, ...] = ()
     size: int | tuple[int, int] | None = None
     test_views: int | None = 16
+    spp: int | None = None
     device: str | None = None
     kernels: str | None = None
     protocol: str = "default"
@@ -62,6 +64,7 @@ class Settings:
         if self.size is not None:
             words += ["--size", str(self.size) if isinstance(self.size, int) else f"{self.size[0]}x{self.size[1]}"]
         words += ["--test-views", "all" if self.test_views is None else str(self.test_views)]
+        words += ["--spp", str(self.spp)] if self.spp is not None else []
         words += [word for item in self.overrides for word in ("--set", item)]
         words += ["--device", self.device] if self.device else []
         words += ["--kernels", self.kernels] if self.kernels else []
@@ -148,10 +151,11 @@ class AblateRequest:
         jobs: cells that share one machine; each gets an equal part of its cores.
         gpus: GPUs of each cell, for executors that hand them out.
         address: of the cluster, for executors that have one.
-        seeds: instead of the study's; also ``budget``, ``size`` and ``test_views``, where they are not ``None``.
+        seeds: instead of the study's; also ``budget``, ``size``, ``test_views`` and ``spp``, where they are not ``None``.
         budget: of each fit.
         size: longest side in pixels, or (width, height).
         test_views: number of test views, or ``all``.
+        spp: samples per pixel of scenes that are rendered.
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
         kernels: implementation to force; ``None`` for the best one here.
         checkpoint_every: for instance ``30s`` or ``100steps``.
@@ -170,6 +174,7 @@ class AblateRequest:
     budget: str | None = None
     size: int | tuple[int, int] | None = None
     test_views: int | Literal["all"] | None = None
+    spp: int | None = None
     device: str | None = None
     kernels: str | None = None
     checkpoint_every: str = "30s"
@@ -189,6 +194,7 @@ class AblateRequest:
             "--budget": self.budget,
             "--size": size,
             "--test-views": self.test_views,
+            "--spp": self.spp,
             "--device": self.device,
             "--kernels": self.kernels,
             "--cells": self.cells,

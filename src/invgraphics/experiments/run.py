@@ -24,6 +24,7 @@ from invgraphics.experiments.executors.local import WITH_PARENT
 from invgraphics.experiments.folder import RunFolder, write_json
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.posed import protocol_note
+from invgraphics.experiments.presets import announcements
 from invgraphics.experiments.recorder import Cadence, Monitor, Recorder
 from invgraphics.experiments.renderings import check_eyes, render_missing
 from invgraphics.experiments.request import FitRequest
@@ -45,7 +46,7 @@ def fit_run(request: FitRequest) -> Path:
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
     budget, cadence = Budget.parse(request.budget), Cadence.parse(request.checkpoint_every)
-    method = recipe.load_method(request.method, request.preset, request.recipe_overrides)
+    method = recipe.requested_method(request.method, request)
     data = training_data(request)
     device = device_of(request.device)
     folder = RunFolder(Path(request.out))
@@ -74,7 +75,8 @@ def fit_run(request: FitRequest) -> Path:
                 folder.clear()
             describe(folder, request, method, (scene, shown), identity, device)
             forecast = _rehearse(folder, fit, method, memory)
-            print(_prediction(request, fit, forecast), file=sys.stderr)
+            for sentence in (*announcements([method.choice]), _prediction(request, fit, forecast)):
+                print(sentence, file=sys.stderr)
             Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}", request.snapshots).run()
         spent = {"steps": fit.steps, "seconds": fit.seconds, "peak_memory_bytes": memory.peak_bytes}
         _evaluate(folder, scene, fit, request, method, spent)
@@ -154,6 +156,8 @@ def describe(
         "cell_sha256": identity,
         "method": method.name,
         "preset": method.preset,
+        "preset_choice": method.preset_choice,
+        "preset_chosen_on": list(method.chosen_on),
         "recipe_sha256": method.digest,
         "scene": request.scene,
         "seed": request.seed,

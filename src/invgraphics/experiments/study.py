@@ -91,7 +91,8 @@ class Study:
         protocol: how to score.
         test_views: how many test views to score, or ``all``.
         size: longest side in pixels, or [width, height]; ``None`` for the scenes' own.
-        preset: preset of the recipes; ``None`` for their default.
+        spp: samples per pixel of scenes that are rendered; ``None`` for their own.
+        preset: preset of the recipes; ``None`` for the one that suits each cell's budget.
         render_with: renderers that show every fitted field besides its own (see `invgraphics.experiments.renderings`).
         approximations: pairs of these renderers whose pictures of the same fit are compared.
         analyses: computations beside the fits (see `invgraphics.experiments.analyses`).
@@ -111,6 +112,7 @@ class Study:
     protocol: str = "default"
     test_views: int | Literal["all"] = 16
     size: int | tuple[int, int] | None = None
+    spp: int | None = None
     preset: str | None = None
     render_with: tuple[str, ...] = ()
     approximations: tuple[Approximation, ...] = ()
@@ -153,6 +155,7 @@ class Study:
             preset=given[PRESET],
             overrides=tuple(override(path, value) for path, value in settings.items()),
             size=(size[0], size[1]) if isinstance(size, list) else size,
+            spp=self.spp,
             test_views=None if self.test_views == "all" else self.test_views,
             device=request.device,
             kernels=request.kernels,
@@ -170,7 +173,7 @@ class Study:
             InputError: it names a budget, a size or seeds, and the study itself varies them; or a seed twice.
         """
         varied = {path_of(name) for name in self.base} | {name for cell in self.cells for name in cell}
-        names = ("seeds", "budget", "size", "test_views")
+        names = ("seeds", "budget", "size", "test_views", "spp")
         given = {name: getattr(request, name) for name in names if getattr(request, name) is not None}
         if refused := [name for name in given if name in varied]:
             raise InputError(f"--{refused[0]} cannot be given: the study itself says it in its factors, base or cells.")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from invgraphics.report.assets import Folder
 from invgraphics.report.records import Comparison, Run
-from invgraphics.report.wording import budget_words, duration
+from invgraphics.report.wording import budget_words, duration, listing
 
 RUN_FILES = ("recipe.toml", "scores.json", "history.jsonl", "provenance.json", "environment.json")
 
@@ -47,12 +47,36 @@ def protocol_facts(comparison: Comparison) -> Facts:
     if comparison.runs:
         facts["test views"] = str(len(comparison.runs[0].views))
         facts["seeds"] = ", ".join(str(seed) for seed in sorted({run.seed for run in comparison.runs}))
-    if comparison.preset:
-        facts["preset"] = comparison.preset
+    facts |= preset_facts(comparison.runs, comparison.preset)
     for key, value in comparison.protocol.items():
         if key not in ("name", "summary"):
             facts[_words(key)] = _words(_text(value))
     return tuple(facts.items())
+
+
+def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
+    """Presets of the fits, what chose them, and the scenes on which their values were chosen.
+
+    Args:
+        runs: the fits.
+        stated: preset of the whole comparison, for where no run says more.
+    """
+    presets = _grouped([(run.preset or stated, run.method) for run in runs]) or stated
+    choices = {str(run.provenance.get("preset_choice") or "") for run in runs}
+    if choices - {""}:
+        presets += f", {choices.pop()}" if len(choices) == 1 else ", chosen from each fit's budget"
+    scenes = _grouped([(_text(run.provenance.get("preset_chosen_on") or []), run.method) for run in runs])
+    return {name: text for name, text in (("preset", presets), ("preset chosen on", scenes)) if text}
+
+
+def _grouped(pairs: Sequence[tuple[str, str]]) -> str:
+    """The value that all owners have; else each value with its owners in brackets, empty values left out."""
+    owners: dict[str, list[str]] = {}
+    for value, owner in dict.fromkeys(pairs):
+        owners.setdefault(value, []).append(owner)
+    if len(owners) <= 1:
+        return "".join(owners)
+    return "; ".join(f"{value} ({listing(names)})" for value, names in owners.items() if value)
 
 
 def scene_facts(comparison: Comparison) -> Facts:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from invgraphics.report import facts
@@ -100,7 +100,7 @@ def study_facts(study: Study) -> facts.Facts:
         "seeds": ", ".join(map(str, study.seeds)),
         "cells": _counted(study),
         "budget per fit": budget_words(study.budget),
-        "preset": study.preset,
+        **facts.preset_facts([replace(cell.run, method=cell.method) for cell in study.cells if cell.run], study.preset),
         "picture size": study.size,
     }
     return tuple((name, value) for name, value in entries.items() if value)

@@ -37,20 +37,22 @@ class SceneOptions:
         test_views: number of views to score, evenly spaced among those held out; ``None`` means all.
         train_views: number of views to fit, evenly spaced; ``None`` means all.
         seed: seed of whatever has to be rendered first.
+        spp: samples per pixel of the training views of a scene that is rendered; ``None`` for what its description says.
     """
 
     size: int | tuple[int, int] | None = None
     test_views: int | None = 16
     train_views: int | None = None
     seed: int = 0
+    spp: int | None = None
 
     def __post_init__(self) -> None:
         sides = self.size if isinstance(self.size, tuple) else (self.size,)
         if any(side is not None and side < 1 for side in sides):
             raise InputError(f"The size {self.size} is not positive.")
-        for name in ("test_views", "train_views"):
+        for name, what in (("test_views", "test views"), ("train_views", "train views"), ("spp", "samples per pixel")):
             if (count := getattr(self, name)) is not None and count < 1:
-                raise InputError(f"The number of {name.replace('_', ' ')} must be at least 1, not {count}.")
+                raise InputError(f"The number of {what} must be at least 1, not {count}.")
 
 
 @dataclass(frozen=True, eq=False)

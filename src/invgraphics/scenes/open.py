@@ -37,9 +37,10 @@ def open_scene(
     """Open a scene and check it.
 
     Args:
-        spec: a built-in scene's name, which is rendered first unless its truth is in the cache; the path of one's own
-            ``scene.toml``; or the path of a data set, which may begin with a variable: ``$INVGRAPHICS_DATA/fox``.
-        options: size and number of views.
+        spec: a built-in scene's name, which is rendered first unless its truth is in the cache, at this size or at a larger
+            one to average; the path of one's own ``scene.toml``; or the path of a data set, which may begin with a variable:
+            ``$INVGRAPHICS_DATA/fox``.
+        options: size, number of views, samples per pixel.
         progress: called while a scene is rendered with (views done, views in all, what is being done).
 
     Raises:
@@ -57,6 +58,8 @@ def open_scene(
         raise InputError(
             f"'{spec}' is neither a built-in scene nor an existing path.", f"Built-in scenes: {', '.join(_built_in())}."
         )
+    if options.spp is not None:
+        raise InputError(f"{path} holds pictures, whose samples per pixel are what they are.", "Leave --spp away.")
     return validate(find_loader(path).load(path, options))
 
 
@@ -118,7 +121,13 @@ def _render(description: str, options: SceneOptions, progress: Callable[[int, in
         width, height = read(locate(description)).size
         size = (round(size * width / max(width, height)), round(size * height / max(width, height)))
     return make(
-        description, size=size, train=options.train_views, test=options.test_views, seed=options.seed, progress=progress
+        description,
+        size=size,
+        train=options.train_views,
+        test=options.test_views,
+        spp=options.spp,
+        seed=options.seed,
+        progress=progress,
     )
 
 

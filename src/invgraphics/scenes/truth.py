@@ -16,6 +16,9 @@ from invgraphics.scenes.images import RESIZE, Photo, load_view
 from invgraphics.scenes.layout import SceneOptions, evenly, pose
 from invgraphics.scenes.mitsuba import cache, ply
 
+LINEAR_RESIZE = "area average of linear light"
+"""The filter from a larger rendering to the folder's pictures, see `invgraphics.scenes.mitsuba.average`."""
+
 _DAMAGED = "Make the scene again: `invgraphics make-scene`."
 
 
@@ -95,9 +98,11 @@ def _mesh(path: Path) -> Mesh | None:
 
 
 def _notes(truth: Mapping[str, Any], view: View) -> dict[str, str]:
-    width, height = truth["size"]
     final = (view.camera.width, view.camera.height)
     samples = ", ".join(f"{split} {count}" for split, count in truth["samples_per_pixel"].items())
+    if cache.AVERAGED_FROM in truth:
+        own = ", ".join(f"{split} {count}" for split, count in truth[cache.AVERAGED_FROM]["samples_per_pixel"].items())
+        samples += f" (averaged; of each rendered pixel: {own})"
     return {
         "loader": "truth",
         "summary": truth["summary"],
@@ -105,5 +110,13 @@ def _notes(truth: Mapping[str, Any], view: View) -> dict[str, str]:
         "renderer": f"Mitsuba {truth['versions']['mitsuba']} ({truth['variant']}), seed {truth['seed']}",
         "samples_per_pixel": samples,
         "rig": truth["rig"]["kind"],
-        "resize": "none" if final == (width, height) else f"{RESIZE}, {width}x{height} to {final[0]}x{final[1]}",
+        "resize": "; then ".join(_resizes(truth, final)) or "none",
     }
+
+
+def _resizes(truth: Mapping[str, Any], final: tuple[int, int]) -> list[str]:
+    """How pictures came to their size: from a larger rendering to the folder's, and from the folder's to the view's."""
+    width, height = truth["size"]
+    source = truth.get(cache.AVERAGED_FROM)
+    steps = [] if source is None else [f"{LINEAR_RESIZE}, {source['size'][0]}x{source['size'][1]} to {width}x{height}"]
+    return steps if final == (width, height) else [*steps, f"{RESIZE}, {width}x{height} to {final[0]}x{final[1]}"]

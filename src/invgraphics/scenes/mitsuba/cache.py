@@ -17,6 +17,8 @@ VARIABLE = "INVGRAPHICS_CACHE"
 TRUTH = "truth.json"
 REQUEST = "job.json"
 SCHEMA = 1
+AVERAGED_FROM = "averaged_from"
+"""Key of ``truth.json``: size and samples of the larger rendering whose pictures were averaged."""
 
 
 def root() -> Path:

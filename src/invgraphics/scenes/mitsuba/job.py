@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,21 @@ _SOURCES = (
 
 
 @dataclass(frozen=True)
+class Source:
+    """A larger rendering of the same scene, whose pictures are averaged.
+
+    Attributes:
+        size: its width and height in pixels.
+        views: how many of each split it has, at least as many as are wanted.
+        samples: per pixel, of each split.
+    """
+
+    size: tuple[int, int]
+    views: Counts
+    samples: Samples
+
+
+@dataclass(frozen=True)
 class Job:
     """One rendering of a scene.
 
@@ -30,6 +45,7 @@ class Job:
         samples: per pixel, of each split.
         seed: of the camera positions and of the renderer's noise.
         variant: Mitsuba's.
+        source: what the pictures are averaged from; ``None`` where they are rendered. ``samples`` are then the effective ones.
     """
 
     spec: SceneSpec
@@ -38,6 +54,7 @@ class Job:
     samples: Samples
     seed: int
     variant: str
+    source: Source | None = None
 
     def table(self) -> dict[str, Any]:
         """As plain values."""
@@ -47,6 +64,17 @@ class Job:
     def from_json(text: str) -> Job:
         """Inverse of ``json.dumps(job.table())``."""
         return fill(Job, json.loads(text))
+
+    @property
+    def folder_name(self) -> str:
+        """Name of its folder in the cache."""
+        return f"{self.spec.name}-{self.key()}"
+
+    def rendered_source(self) -> Job:
+        """The larger rendering that this one is averaged from."""
+        assert self.source is not None, "only an averaged rendering has a source"
+        size, views, samples = self.source.size, self.source.views, self.source.samples
+        return replace(self, size=size, views=views, samples=samples, source=None)
 
     @property
     def total(self) -> int:

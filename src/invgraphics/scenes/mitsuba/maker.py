@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.mitsuba import cache, llvm
+from invgraphics.scenes.mitsuba.forecast import RenderingForecast
 from invgraphics.scenes.mitsuba.job import Job
+from invgraphics.scenes.mitsuba.larger import averaged
 from invgraphics.scenes.mitsuba.spec import Counts, locate, read
 from invgraphics.scenes.process import Progress, run_worker
 
@@ -24,7 +27,9 @@ def make(
     out: Path | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Ground truth of a scene, rendered unless it has been before.
+    """Ground truth of a scene, rendered unless it has been before, at this size or at a larger one with samples enough.
+
+    What takes time is announced on the terminal before it begins.
 
     Args:
         name: of a built-in scene, or the path of one's own ``scene.toml``.
@@ -43,7 +48,9 @@ def make(
         InputError: unknown scene, impossible option, unwritable folder, or the renderer failed.
     """
     job = _job(name, size, (train, test), spp, seed)
-    folder = cache.root() / f"{job.spec.name}-{job.key()}"
+    folder = cache.root() / job.folder_name
+    if cache.read_truth(folder) is None and (smaller := averaged(job)) is not None:
+        job, folder = smaller, cache.root() / smaller.folder_name
     report = progress or (lambda done, total, what: None)
     if cache.read_truth(folder) is None:
         with cache.locked(folder, waiting=lambda: report(0, job.total, "waiting for another process that renders it")):
@@ -87,11 +94,22 @@ def _make(job: Job, folder: Path, progress: Progress) -> None:
 
 
 def _run(job: Job, partial: Path, progress: Progress) -> None:
+    width, height = job.size
+    if job.source is None:
+        module, progress = "render", RenderingForecast(job, partial, progress, _say)
+    else:
+        module = "average"
+        larger = "x".join(map(str, job.source.size))
+        _say(f"{job.spec.name} at {width}x{height}: {job.total} views averaged from those at {larger} in the cache.")
     run_worker(
-        "invgraphics.scenes.mitsuba.render",
+        f"invgraphics.scenes.mitsuba.{module}",
         partial,
         progress,
         subject=f"The scene '{job.spec.name}' could not be rendered",
         remedy="If memory ran out, make it smaller (--size, --spp).",
         environment=llvm.status().environment(),
     )
+
+
+def _say(sentence: str) -> None:
+    print(sentence, file=sys.stderr, flush=True)

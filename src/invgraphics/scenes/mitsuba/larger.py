@@ -1,0 +1,70 @@
+"""Whether the cache holds a larger rendering of a scene, whose pictures can be averaged instead of rendering smaller ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+from invgraphics.scenes.mitsuba import cache
+from invgraphics.scenes.mitsuba.job import Job, Source
+from invgraphics.scenes.mitsuba.rig import SPLITS
+from invgraphics.scenes.mitsuba.spec import Counts, Samples
+
+
+def averaged(job: Job) -> Job | None:
+    """The same pictures as an average of a larger rendering in the cache; ``None`` where none has enough samples.
+
+    Of several, one that has been averaged before is taken, then one whose pixels are whole parts of the new ones, then the
+    smallest.
+    """
+    found = [replace(job, samples=effective, source=source) for source, effective in _sources(job)]
+    return min(found, key=_preference, default=None)
+
+
+def _preference(job: Job) -> tuple[bool, bool, int]:
+    assert job.source is not None
+    width, height = job.source.size
+    made = cache.read_truth(cache.root() / job.folder_name) is not None
+    return not made, width % job.size[0] != 0 or height % job.size[1] != 0, width * height
+
+
+def _sources(job: Job) -> Iterator[tuple[Source, Samples]]:
+    """Larger renderings of the same scene that serve, with the samples per pixel that their averages have."""
+    for folder in sorted(cache.root().glob(f"*/{cache.TRUTH}")):
+        truth = cache.read_truth(folder.parent)
+        if truth is None or truth.get("name") != job.spec.name or cache.AVERAGED_FROM in truth:
+            continue
+        source = _source_of(truth)
+        if source is None or not _is_larger(source, job):
+            continue
+        effective = _effective(source, job.size)
+        enough = all(getattr(effective, split) >= getattr(job.samples, split) for split in SPLITS)
+        views = all(getattr(source.views, split) >= getattr(job.views, split) for split in SPLITS)
+        # The key stands for description, seed, variant, our sources and the renderer's version: all must be today's.
+        if enough and views and replace(job, source=source).rendered_source().folder_name == folder.parent.name:
+            yield source, effective
+
+
+def _source_of(truth: Mapping[str, Any]) -> Source | None:
+    try:
+        width, height = truth["size"]
+        views = Counts(**{split: len(truth["cameras"][split]) for split in SPLITS})
+        return Source((width, height), views, Samples(**truth["samples_per_pixel"]))
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _is_larger(source: Source, job: Job) -> bool:
+    (width, height), (new_width, new_height) = source.size, job.size
+    return width > new_width and width * new_height == height * new_width
+
+
+def _effective(source: Source, size: tuple[int, int]) -> Samples:
+    """Samples per averaged pixel."""
+    pixels, new_pixels = math.prod(source.size), math.prod(size)
+    train, val, half = (
+        count * pixels // new_pixels for count in (source.samples.train, source.samples.val, source.samples.test // 2)
+    )
+    return Samples(train, val, 2 * half)
