@@ -53,12 +53,19 @@ def test_a_run_is_whole(run: Path) -> None:
     assert scores["cost"]["steps"] == 30
     assert scores["cost"]["primitives"] > 0
     assert all(
-        scores["cost"][key] > 0 for key in ("fit_seconds", "render_fps", "model_bytes", "parameters", "peak_memory_bytes")
+        scores["cost"][key] > 0
+        for key in ("fit_seconds", "fit_cpu_seconds", "render_fps", "model_bytes", "parameters", "peak_memory_bytes")
     )
+    share = scores["cost"]["fit_processor_share"]
+    assert share is None or 0 < share <= 1
+    assert ("disturbed" in scores) == (share is not None and share < 0.85)
     history = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
     assert history[0]["step"] == 0 and history[-1]["step"] == 30
     assert all(a["seconds"] <= b["seconds"] for a, b in itertools.pairwise(history))
     provenance = json.loads((run / "provenance.json").read_text())
+    assert provenance["threads"] == torch.get_num_threads()
+    assert set(provenance["load_average"]) == {"start", "end"}
+    assert provenance["options"]["spp"] is None
     truth = run / provenance["truth"]
     assert len(list(truth.glob("*.png"))) == 3
     assert provenance["command"].startswith("invgraphics fit splatting/gaussians")

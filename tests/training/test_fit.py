@@ -3,6 +3,7 @@
 import copy
 import itertools
 import math
+import time
 from dataclasses import replace
 
 import pytest
@@ -111,3 +112,25 @@ def test_state_holds_no_clock(scene, make_fit) -> None:
     before = copy.deepcopy(fit.state())
     fit.seconds += 100
     assert _equal(before, fit.state())
+
+
+def test_processor_time_is_counted_beside_the_clock(scene, make_fit) -> None:
+    fit = make_fit("volumetric/nerf", scene, 3)
+    began = time.process_time()
+    fit.run(lambda loss: False)
+    clocks = fit.clocks()
+    assert 0 < clocks["cpu_seconds"] <= time.process_time() - began
+    resumed = make_fit("volumetric/nerf", scene, 9)
+    resumed.load(fit.state(), clocks["seconds"])
+    resumed.resume_clocks(clocks)
+    resumed.rehearse()  # on no clock
+    assert (resumed.clocks()["seconds"], resumed.clocks()["cpu_seconds"]) == (clocks["seconds"], clocks["cpu_seconds"])
+    if clocks["ran_seconds"] is not None:
+        assert resumed.clocks()["ran_seconds"] >= clocks["ran_seconds"] > 0
+
+
+def test_every_fit_sees_to_waiting_threads(scene, make_fit, monkeypatch) -> None:
+    calls = []
+    monkeypatch.setattr("invgraphics.training.fit.limit_spinning", lambda: calls.append(1))
+    make_fit("volumetric/nerf", scene, 1)
+    assert calls == [1]

@@ -15,6 +15,7 @@ from PIL import Image
 
 from invgraphics.core import Camera, Context, Field, Renderer, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
@@ -107,6 +108,8 @@ def evaluate(
         "quality": quality if posed is None else quality | posed.quality(),
         "skipped": skipped,
     }
+    if disturbed := disturbance(costs.get("fit_processor_share")):
+        result["disturbed"] = disturbed
     if posed is not None:
         result["test_poses"] = protocol_note(method)
     folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)
@@ -147,9 +150,8 @@ def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> dict[str, 
 
 def _evaluate_fitted(fitted: Fitted, protocol: str) -> dict[str, Any]:
     fit = fitted.source.read_json("fit.json")
-    costs = {"fit_seconds": fit["seconds"], "steps": fit["steps"], "peak_memory_bytes": fit.get("peak_memory_bytes")}
     model = fitted.field, fitted.renderer
-    return evaluate(fitted.folder, fitted.scene, model, protocol, costs, fitted.method, fitted.poses)
+    return evaluate(fitted.folder, fitted.scene, model, protocol, fit_costs(fit), fitted.method, fitted.poses)
 
 
 def _save_view(stem: Path, picture: Rendering, scene: Scene) -> None:

@@ -14,6 +14,7 @@ from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import optimised, scene_of_fit
 from invgraphics.experiments.recipe import Method, resolve
 from invgraphics.kernels.allocator import keep_freed_memory
+from invgraphics.kernels.waiting import limit_spinning
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training import checkpoint
 from invgraphics.training.poses import Poses
@@ -56,8 +57,9 @@ def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
     """
     folder = RunFolder(run)
     provenance = folder.read_json("provenance.json")
-    size = provenance["options"]["size"]
-    options = SceneOptions(tuple(size) if isinstance(size, list) else size, provenance["options"]["test_views"])
+    chosen = provenance["options"]
+    size = tuple(chosen["size"]) if isinstance(chosen["size"], list) else chosen["size"]
+    options = SceneOptions(size, chosen["test_views"], spp=None if scene_spec else chosen.get("spp"))
     return load_fitted(folder, open_scene(scene_spec or provenance["scene"], options))
 
 
@@ -68,6 +70,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
         InputError: the checkpoint is missing or does not fit the recipe.
     """
     keep_freed_memory()
+    limit_spinning()
     provenance = folder.read_json("provenance.json")
     method = replace(
         resolve(provenance["method"], provenance["preset"], folder.read_recipe()),

@@ -46,3 +46,8 @@ class Reporter:
         elif now - self._last >= self._quiet or fraction >= 1:
             self._last = now
             print(f"{self._title}: {100 * fraction:3.0f} %  {note}", file=sys.stderr, flush=True)
+
+
+def warn(sentence: str) -> None:
+    """Say on stderr what must not be missed, in red on a terminal."""
+    Console(stderr=True, highlight=False, markup=False).print(sentence, style="bold red", soft_wrap=True)

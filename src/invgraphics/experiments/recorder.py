@@ -151,7 +151,7 @@ class Recorder:
 
     def _save(self) -> None:
         checkpoint.save(self._folder.checkpoint, self._fit.state())
-        self._folder.write_json("fit.json", {"steps": self._fit.steps, "seconds": self._fit.seconds})
+        self._folder.write_json("fit.json", {"steps": self._fit.steps, **self._fit.clocks()})
         self._saved_at = (self._fit.steps, time.monotonic())
 
     def _keep_snapshot(self, progress: float) -> None:

@@ -17,21 +17,22 @@ import torch
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import recipe
-from invgraphics.experiments.build import build_plan, device_of, repeatable, training_data, use_kernels
+from invgraphics.experiments.build import build_plan, device_of, open_requested, repeatable, training_data, use_kernels
+from invgraphics.experiments.clocks import disturbance, fit_costs, load_average, processor_share
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
-from invgraphics.experiments.executors.local import WITH_PARENT
+from invgraphics.experiments.executors.local import WITH_PARENT, cores
 from invgraphics.experiments.folder import RunFolder, write_json
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.presets import announcements
+from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Cadence, Monitor, Recorder
 from invgraphics.experiments.renderings import check_eyes, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.scenes.corrupt import corrupt
-from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training import checkpoint
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -53,7 +54,7 @@ def fit_run(request: FitRequest) -> Path:
     _check_existing(folder, request)
     repeatable(device)
     with folder.held():
-        scene = open_scene(request.scene, SceneOptions(size=request.size, test_views=request.test_views))
+        scene = open_requested(request)
         check_eyes(request.render_with, [method], scene)
         shown = corrupt(scene, data, request.seed)
         identity = identify(request, method, TruthDigest.of(scene), torch.get_num_threads())
@@ -66,10 +67,13 @@ def fit_run(request: FitRequest) -> Path:
             render_missing(folder, request, method, scene)
             return folder.root
         use_kernels(request.kernels)
+        began_at = load_average()
         with PeakMemory(device) as memory:
             fit = Fit(started(build_plan(method, shown, budget, request.seed, device), method, request.scene))
             if same and folder.resumable:
-                fit.load(checkpoint.load(folder.checkpoint, device), float(folder.read_json("fit.json")["seconds"]))
+                clocks = folder.read_json("fit.json")
+                fit.load(checkpoint.load(folder.checkpoint, device), float(clocks["seconds"]))
+                fit.resume_clocks(clocks)
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
@@ -78,7 +82,9 @@ def fit_run(request: FitRequest) -> Path:
             for sentence in (*announcements([method.choice]), _prediction(request, fit, forecast)):
                 print(sentence, file=sys.stderr)
             Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}", request.snapshots).run()
-        spent = {"steps": fit.steps, "seconds": fit.seconds, "peak_memory_bytes": memory.peak_bytes}
+        spent = {"steps": fit.steps, **fit.clocks(), "peak_memory_bytes": memory.peak_bytes, "cores": cores()}
+        spent |= {"load_average": {"start": began_at, "end": load_average()}}
+        _declare_clocks(folder, spent)
         _evaluate(folder, scene, fit, request, method, spent)
         render_missing(folder, request, method, scene)
     return folder.root
@@ -114,12 +120,20 @@ def _prediction(request: FitRequest, fit: Fit, memory: MemoryForecast) -> str:
     return f"{request.method} on {fit.plan.scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}."
 
 
+def _declare_clocks(folder: RunFolder, spent: Mapping[str, Any]) -> None:
+    """Write how busy the machine was beside the run's provenance, and warn where others had the fit's cores."""
+    machine = {"threads": torch.get_num_threads(), "load_average": spent["load_average"]}
+    folder.write_json("provenance.json", folder.read_json("provenance.json") | machine)
+    if disturbed := disturbance(processor_share(spent)):
+        warn(f"The fit {disturbed}. Its times are not to be compared.")
+
+
 def _evaluate(
     folder: RunFolder, scene: Scene, fit: Fit, request: FitRequest, method: recipe.Method, spent: dict[str, Any]
 ) -> None:
     """Score the fit on the undisturbed scene. ``scores.json`` comes last, because a run that has it is finished."""
     folder.write_json("fit.json", spent)
-    costs = {"fit_seconds": spent["seconds"], "steps": spent["steps"], "peak_memory_bytes": spent["peak_memory_bytes"]}
+    costs = fit_costs(spent)
     model = (fit.plan.field, fit.plan.renderer)
     if request.protocol != "default":
         evaluate(folder, scene, model, request.protocol, costs, method, fit.plan.poses)
@@ -172,7 +186,7 @@ def describe(
         "notes": shown.notes,
         "code_version": code_version(),
         "command": request.shell(),
-        "options": {"size": request.size, "test_views": request.test_views},
+        "options": {"size": request.size, "test_views": request.test_views, "spp": request.spp},
         "device": str(device),
     }
     note = protocol_note(method)

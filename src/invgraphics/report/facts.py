@@ -144,6 +144,7 @@ def _run_facts(run: Run) -> dict[str, str]:
         "resize": "resampling filter",
         "budget": "budget",
         "test_poses": "test poses",
+        "load_average": "load average",
     }
     facts = {label: _text(run.provenance[key]) for key, label in names.items() if run.provenance.get(key)}
     for key, value in run.environment.items():

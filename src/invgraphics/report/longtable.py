@@ -54,6 +54,7 @@ STUDY_TAIL: Columns = {
 
 _COST_UNITS = {
     "fit_seconds": "s",
+    "fit_cpu_seconds": "s",
     "render_seconds_per_view": "s",
     "render_fps": "1/s",
     "peak_memory_bytes": "bytes",

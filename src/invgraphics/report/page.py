@@ -74,7 +74,7 @@ def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
 
 def markdown_part(part: Part) -> list[str]:
     """A scene's table, and what could not be computed."""
-    lines = [markdown_table(part.summary)]
+    lines = [markdown_table(part.summary), *(f"**{escape_markdown(text)}**\n" for text in part.summary.disturbances)]
     for why, labels in part.summary.skipped.items():
         lines.append(f"Not computed: {escape_markdown(listing(labels))} ({escape_markdown(why)}).")
     return lines + markdown_crossed(part.crossed)

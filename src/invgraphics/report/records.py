@@ -64,6 +64,7 @@ class Run:
         provenance: hashes, code version and the command that reproduces the run.
         environment: the machine and the versions.
         truth: folder of the truth's pictures.
+        disturbed: why its times say nothing, the subject left out: other programs had its cores; empty where they did not.
     """
 
     folder: Path
@@ -80,6 +81,7 @@ class Run:
     provenance: dict[str, Any]
     environment: dict[str, Any]
     truth: Path
+    disturbed: str = ""
 
     @property
     def truth_hash(self) -> str:

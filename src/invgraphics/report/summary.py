@@ -10,7 +10,7 @@ from typing import Literal
 
 from invgraphics.report.records import Comparison, Failure, Run, Score
 from invgraphics.report.statistics import mean_half_width
-from invgraphics.report.wording import ABSENT, COSTS, Quantity, budget_words, metric_label, quality_quantity
+from invgraphics.report.wording import ABSENT, COSTS, TIMES, Quantity, budget_words, metric_label, quality_quantity
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ class Row:
         cells: one per column.
         complete: it has as many runs as the method with the most. Others are shown but never ranked: a hard seed that is
             missing makes a mean look better than it is.
+        disturbed: why its times are not ranked: what is wrong with the clock of its fits; empty where nothing is.
     """
 
     label: str
@@ -58,6 +59,11 @@ class Row:
     failures: tuple[Failure, ...]
     cells: tuple[Cell, ...]
     complete: bool = True
+    disturbed: str = ""
+
+    def ranked_in(self, column: Quantity) -> bool:
+        """Whether its number in a column may be called best: a disturbed clock says nothing."""
+        return self.complete and not (self.disturbed and column.key in TIMES)
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,11 @@ class Summary:
         return tuple(row for row in self.rows if row.kind == "method")
 
     @property
+    def disturbances(self) -> tuple[str, ...]:
+        """A sentence for each method whose times are not ranked."""
+        return tuple(f"The times of {row.label} are not ranked: {row.disturbed}." for row in self.methods if row.disturbed)
+
+    @property
     def baselines(self) -> tuple[Row, ...]:
         """Rows of trivial predictors."""
         return tuple(row for row in self.rows if row.kind == "baseline")
@@ -106,7 +117,7 @@ def summarise(comparison: Comparison) -> Summary:
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
         cells = tuple(_method_cell(column, runs, notes) for column in columns)
         kind: Literal["method", "failed"] = "method" if runs else "failed"
-        rows.append(Row(method, kind, series, len(runs), failures, cells, complete=len(runs) == most))
+        rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs)))
     for name, quality in comparison.baselines.items():
         cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
         rows.append(Row(name, "baseline", -1, 1, (), cells))
@@ -245,7 +256,7 @@ def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, .
     """Mark, among methods, every cell that reads the same as the best one; a contest needs two methods."""
     marked = [list(row.cells) for row in rows]
     for index, column in enumerate(columns):
-        values = {i: row.cells[index].mean for i, row in enumerate(rows) if row.kind == "method" and row.complete}
+        values = {i: row.cells[index].mean for i, row in enumerate(rows) if row.kind == "method" and row.ranked_in(column)}
         known = {i: value for i, value in values.items() if value is not None}
         if column.better == "none" or len(known) < 2:
             continue
@@ -254,6 +265,12 @@ def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, .
             if column.text(value) == column.text(best):
                 marked[i][index] = replace(marked[i][index], best=True)
     return tuple(replace(row, cells=tuple(cells)) for row, cells in zip(rows, marked, strict=True))
+
+
+def _disturbed(runs: Sequence[Run]) -> str:
+    """Whose clocks were disturbed among a method's fits, and how."""
+    seeds = {run.seed: run.disturbed for run in runs if run.disturbed}
+    return "; ".join(f"seed {seed} {how}" for seed, how in seeds.items())
 
 
 def _skipped(comparison: Comparison) -> dict[str, list[str]]:

@@ -90,8 +90,8 @@ def _draw(points: Sequence[Point], quality: Quantity, cost: Quantity, stem: Path
 
 
 def _front(points: Sequence[Point], quality: Quantity, cost: Quantity) -> list[Point]:
-    """The Pareto front of the methods that have all their seeds, by cost."""
-    ranked = [point for point in points if point.row.complete] or list(points)
+    """The Pareto front of the methods that have all their seeds, and clocks that were not disturbed, by cost."""
+    ranked = [point for point in points if point.row.ranked_in(cost)] or list(points)
     # Costs are compared as they are written: a fit that ran a hundredth of a second longer is not dearer.
     keys = [(cost.sort_key(float(f"{point.cost:.3g}")), quality.sort_key(point.quality)) for point in ranked]
     return [ranked[i] for i in pareto_front(keys)]

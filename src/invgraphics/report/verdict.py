@@ -21,7 +21,7 @@ def verdict(comparison: Comparison, summary: Summary) -> list[str]:
 
 def _ranking(summary: Summary, column: Quantity) -> list[tuple[float, Row]]:
     """(value, row) of the methods that have all their seeds, best first."""
-    rows = [row for row in summary.methods if row.complete]
+    rows = [row for row in summary.methods if row.ranked_in(column)]
     values = [(cell.mean, row) for row in rows if (cell := summary.cell(row, column.key)) and cell.mean is not None]
     return sorted(values, key=lambda entry: column.sort_key(entry[0]))
 

@@ -91,6 +91,7 @@ _UNITS = {"deg": "°", "degrees": "°", "degree": "°", "world units": "units"}
 
 COSTS = (
     Quantity("fit_seconds", "Fit", "s", "lower", "cost"),
+    Quantity("fit_cpu_seconds", "Fit, all threads", "CPU s", "none", "cost"),
     Quantity("steps", "Steps", "", "none", "cost", decimals=0),
     Quantity("render_seconds_per_view", "Render", "s/view", "lower", "cost"),
     Quantity("render_fps", "Render", "FPS", "higher", "cost"),
@@ -101,6 +102,10 @@ COSTS = (
     Quantity("dead", "Dead", "%", "none", "cost", scale=100, decimals=2),
 )
 """Costs in the order of the table; 1 MB = 10⁶ bytes."""
+
+
+TIMES = ("fit_seconds", "render_seconds_per_view", "render_fps")
+"""Costs that a clock measures, which other programs on the same cores disturb."""
 
 
 def metric_label(key: str) -> str:

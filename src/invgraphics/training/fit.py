@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as default
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,8 +14,10 @@ from torch import Tensor, nn
 from invgraphics.core import Batch, Context, Field, RayRenderer, Renderer, Rendering, Scene, Trace, check
 from invgraphics.errors import NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
+from invgraphics.kernels.waiting import limit_spinning
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
+from invgraphics.training.clock import SchedulerTimes
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
 from invgraphics.training.losses import Loss
 from invgraphics.training.optimiser import Optimiser, OptimiserConfig
@@ -68,9 +71,11 @@ class Fit:
         for hook in plan.hooks:
             hook.check(plan.field, plan.renderer)
         keep_freed_memory()
+        limit_spinning()
         self.plan = plan
         self.steps = 0
         self.seconds = 0.0
+        self.resume_clocks({})
         self._bounds = plan.scene.bounds.to(plan.device)
         self._generator = torch.Generator().manual_seed(plan.seed)
         self._batches = Batches(plan.batches, plan.scene, self._generator, plan.device, plan.poses)
@@ -101,7 +106,7 @@ class Fit:
         Raises:
             NumericalError: the loss is not finite; names the step and the first tensor that is not.
         """
-        began = time.perf_counter()
+        began, cpu_began = time.perf_counter(), time.process_time()
         plan, ctx = self.plan, self.context()
         state = FitState(plan.field, plan.renderer, self._optimiser, plan.scene, ctx, self.steps)
         self._optimiser.set_progress(ctx.progress)
@@ -127,6 +132,7 @@ class Fit:
         if plan.device.type == "cuda":
             torch.cuda.synchronize(plan.device)
         self.seconds += time.perf_counter() - began
+        self.cpu_seconds += time.process_time() - cpu_began
         return value
 
     def _open_windows(self, progress: float) -> None:
@@ -160,9 +166,23 @@ class Fit:
     def rehearse(self) -> None:
         """Take one step and undo it, so that compiling and allocating at first use is on no clock."""
         before = {part: {name: value.clone() for name, value in tensors.items()} for part, tensors in self.state().items()}
-        seconds = self.seconds
+        clocks = self.clocks()
         self.step()
-        self.load(before, seconds)
+        self.load(before, clocks["seconds"])
+        self.resume_clocks(clocks)
+
+    def clocks(self) -> dict[str, float | None]:
+        """Seconds of the steps (of all threads together: ``cpu_seconds``), and seconds in which busy threads ran, and waited
+        for a core, since the fit began; ``None`` where the system does not say."""
+        here = self._scheduler.seconds()
+        ran, waited = (None, None) if here is None else (self._earlier[0] + here[0], self._earlier[1] + here[1])
+        return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "ran_seconds": ran, "waited_seconds": waited}
+
+    def resume_clocks(self, record: Mapping[str, Any]) -> None:
+        """Go on from what `clocks` said, but for ``seconds``, which `load` takes."""
+        self.cpu_seconds = float(record.get("cpu_seconds") or 0.0)
+        self._earlier = float(record.get("ran_seconds") or 0.0), float(record.get("waited_seconds") or 0.0)
+        self._scheduler = SchedulerTimes()
 
     def run(self, after_step: Callable[[float], bool]) -> None:
         """Step until the budget is spent or ``after_step(loss)`` says stop (by returning True)."""

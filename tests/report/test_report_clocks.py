@@ -1,0 +1,52 @@
+"""Fits whose cores others had: their times are shown in red, and never ranked."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from report_folders import write_comparison
+
+from invgraphics.report.build import build_report
+from invgraphics.report.records import Comparison, Run, Score
+from invgraphics.report.summary import summarise
+from invgraphics.report.verdict import verdict
+
+TOLD = "had 50 % of the processor time that it was ready to use; other programs had the rest"
+
+
+def _run(method: str, seed: int, fps: float, disturbed: str = "") -> Run:
+    quality = {"psnr": Score(30.0 + fps / 100, "dB", True, ())}
+    cost = {"fit_seconds": 60.0, "fit_cpu_seconds": 100.0, "render_fps": fps, "model_bytes": 1e6 * fps}
+    folder = Path("x")
+    return Run(folder, method, seed, "laptop", "s", "default", (), quality, cost, {}, (), {}, {}, folder, disturbed)
+
+
+def test_disturbed_times_are_shown_but_not_ranked() -> None:
+    runs = (_run("fast", 0, 90.0), _run("fast", 1, 90.0), _run("slow", 0, 20.0), _run("slow", 1, 20.0), _run("mid", 0, 50.0))
+    runs += (_run("mid", 1, 50.0),)
+    comparison = Comparison("s", "?", ("fast", "mid", "slow"), runs, budget="500steps")
+    quiet = summarise(comparison)
+    assert quiet.disturbances == ()
+    assert _best(quiet, "render_fps") == ["fast"]
+    disturbed = replace(comparison, runs=(runs[0], replace(runs[1], disturbed=TOLD), *runs[2:]))
+    summary = summarise(disturbed)
+    assert _best(summary, "render_fps") == ["mid"]
+    assert _best(summary, "fit_seconds") == ["mid", "slow"]
+    assert _best(summary, "psnr") == ["fast"]  # what is no time is ranked as before
+    assert _best(summary, "model_bytes") == ["slow"]
+    assert summary.disturbances == (f"The times of fast are not ranked: seed 1 {TOLD}.",)
+    assert any("mid renders fastest" in sentence for sentence in verdict(disturbed, summary))
+    assert summary.cell(summary.rows[0], "render_fps").text == "90.0"
+
+
+def _best(summary, key: str) -> list[str]:
+    return [row.label for row in summary.rows if summary.cell(row, key).best]
+
+
+def test_a_page_says_it_in_red(tmp_path: Path) -> None:
+    root = write_comparison(tmp_path)
+    scores = sorted(root.glob("runs/*/*/scores.json"))[0]
+    scores.write_text(json.dumps(json.loads(scores.read_text()) | {"disturbed": TOLD}))
+    page = build_report(root)
+    assert '<p class="disturbed" role="note">The times of ' in page.read_text()
+    assert "are not ranked: seed 0 had 50 % of the processor time" in (root / "index.md").read_text()

@@ -1,0 +1,106 @@
+"""Clocks: processor time, time spent waiting for a core, and threads that do not spin."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from invgraphics.training import clock
+from invgraphics.training.clock import SchedulerTimes
+
+WORK = """
+import os, time
+os.sched_setaffinity(0, {{ {core} }})
+end = time.monotonic() + 60
+while time.monotonic() < end:
+    pass
+"""
+
+
+def _thread(folder: Path, name: str, ran: int, waited: int) -> None:
+    (folder / name).mkdir(exist_ok=True)
+    (folder / name / "schedstat").write_text(f"{ran} {waited} 7\n")
+
+
+def test_only_busy_threads_count(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(clock, "TASKS", tmp_path)
+    _thread(tmp_path, "1", 5_000_000_000, 1_000_000_000)
+    _thread(tmp_path, "2", 0, 0)
+    _thread(tmp_path, "9", 0, 0)
+    times = SchedulerTimes()
+    assert times.seconds() == (0, 0)  # nothing has run
+    _thread(tmp_path, "1", 7_000_000_000, 1_500_000_000)
+    _thread(tmp_path, "2", 10_000_000, 900_000_000)  # wakes now and then
+    _thread(tmp_path, "3", 1_000_000_000, 250_000_000)  # began since
+    (tmp_path / "9" / "schedstat").unlink()  # has ended
+    assert times.seconds() == pytest.approx((3.0, 0.75))
+
+
+def test_kernels_without_such_times(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(clock, "TASKS", tmp_path / "absent")
+    assert SchedulerTimes().seconds() is None
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the kernel keeps no times of threads")
+def test_waiting_for_a_core_is_told_from_having_nothing_to_do() -> None:
+    """A thread that shares its core with another program waits about as long as it runs; one that sleeps does not wait."""
+    core = min(os.sched_getaffinity(0))
+    rival = subprocess.Popen([sys.executable, "-c", WORK.format(core=core)])
+    found: dict[str, tuple[float, float]] = {}
+
+    def work(name: str, pause: float) -> None:
+        os.sched_setaffinity(0, {core})  # of this thread alone
+        tid = str(threading.get_native_id())
+        before = clock._thread_times()[tid]
+        end = time.monotonic() + 1.5
+        while time.monotonic() < end:
+            if pause:
+                time.sleep(pause)
+        after = clock._thread_times()[tid]
+        found[name] = (after[0] - before[0]) * 1e-9, (after[1] - before[1]) * 1e-9
+
+    try:
+        for name, pause in (("busy", 0.0), ("idle", 0.3)):
+            thread = threading.Thread(target=work, args=(name, pause))
+            thread.start()
+            thread.join()
+    finally:
+        rival.kill()
+        rival.wait()
+    ran, waited = found["busy"]
+    assert waited > 0.3 * ran
+    assert sum(found["idle"]) < 0.5 * (ran + waited)
+
+
+SPINNING = """
+import {first}
+import torch, time
+import invgraphics
+from invgraphics.kernels.waiting import limit_spinning
+print(limit_spinning())
+torch.set_num_threads(2)
+values = torch.zeros(200_000)
+for _ in range(5):
+    values = values + 1
+began = time.process_time()
+for _ in range(60):
+    values = values + 1
+    time.sleep(0.01)
+print((time.process_time() - began) / 60)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="libgomp is torch's on Linux")
+@pytest.mark.parametrize("first", ["invgraphics", "torch"])
+def test_idle_threads_sleep_whatever_is_imported_first(first: str) -> None:
+    """A sum over two threads takes microseconds; a thread that spins until the next one comes would burn milliseconds."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("GOMP_", "OMP_"))}
+    script = SPINNING.format(first=first)
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    told, seconds = done.stdout.split()
+    assert (int(told) > 0) == (first == "torch")
+    assert float(seconds) < 1.5e-3
