@@ -74,6 +74,8 @@ def fit_run(request: FitRequest) -> Path:
                 folder.clear()
             describe(folder, request, method, (scene, shown), identity, device)
             fit.rehearse()
+            if "suspicion" in scene.notes:
+                print(f"SUSPICIOUS poses: {scene.notes['suspicion']}", file=sys.stderr)
             print(_prediction(request, fit, method), file=sys.stderr)
             Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}", request.snapshots).run()
         spent = {"steps": fit.steps, "seconds": fit.seconds, "peak_memory_bytes": memory.peak_bytes}
