@@ -139,6 +139,15 @@ def test_strays_are_named_and_left_out(truth) -> None:
     assert not truth.images[far].has_pose
 
 
+def test_a_reconstruction_that_hangs_by_threads_is_left_as_it_is(truth) -> None:
+    for number in sorted(truth.images)[:6]:
+        for index, point in enumerate(truth.images[number].points2D):
+            if index >= 5 and point.has_point3D():
+                truth.delete_observation(number, index)
+    assert remove_strays(truth, photos_of(truth)) == {}
+    assert truth.num_reg_images() == COUNT
+
+
 def test_a_walk_has_no_strays() -> None:
     """Steps of one to three metres, then a look from ten metres away."""
     places = np.cumsum([1.0, 2, 3, 1, 2, 3, 1, 2, 3, 10])

@@ -18,7 +18,12 @@ from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
 from invgraphics.metrics.poses import pose_errors
 from invgraphics.scenes.open import SceneOptions, open_scene
-from invgraphics.scenes.photos import PhotoJob, reconstruct
+from invgraphics.scenes.photos import PhotoJob, mapping, reconstruct
+from invgraphics.scenes.photos.job import DATABASE, MODELS
+from invgraphics.scenes.photos.pairs import read_evidence
+from invgraphics.scenes.photos.prepare import prepare
+from invgraphics.scenes.photos.quality import describe
+from invgraphics.scenes.photos.strategies import WIDE_ANGLE, Strategy
 
 SIZE = 240
 EYES = orbit(10, SIZE, arc=90)
@@ -60,7 +65,8 @@ def test_poses_points_and_figures_are_right(imported) -> None:
     assert [row["kept"] for row in quality["attempts"]] == [True]
     assert quality["choice"] == "incremental mapper, pinhole lens"
     assert Image.open(out / "top-view.png").size == (1200, 600)
-    assert not {path.name for path in (out / ".import").iterdir()} - {"job.json", "lock", "database.db"}
+    kept = {path.name for path in (out / ".import").iterdir()}
+    assert {"database.db"} < kept <= {"job.json", "lock", "database.db", "database.db-wal", "database.db-shm"}
 
 
 def test_the_folder_opens_as_a_scene_with_its_points_on_the_box(imported) -> None:
@@ -117,6 +123,29 @@ def test_another_mapper_finds_features_and_matches(imported, box_photos: Path, t
         assert (content.num_matched_image_pairs(), content.num_verified_image_pairs()) == (matches, verified)
     other = PhotoJob(str(box_photos), lens="pinhole", max_size=200)
     assert other.matches_key() != job.matches_key() == PhotoJob(str(box_photos)).matches_key()
+
+
+@pytest.mark.parametrize(
+    "strategy",
+    [
+        Strategy("global", "opencv"),
+        Strategy("incremental", "radial", calibrated=True, initial_angle=WIDE_ANGLE),
+        Strategy("global", "pinhole", guided=True),
+    ],
+    ids=lambda strategy: strategy.name,
+)
+def test_each_way_from_matches_to_poses(strategy: Strategy, imported, box_photos: Path, tmp_path: Path) -> None:
+    job = PhotoJob(str(box_photos))
+    photos = prepare(job, tmp_path, lambda *_: None).photos
+    shutil.copy(imported[0] / ".import" / DATABASE, tmp_path)
+    before = read_evidence(tmp_path / DATABASE, photos)
+    models = mapping.reconstruct(strategy, mapping.Matched(job, photos, before, tmp_path), lambda *_: None)
+    assert models[0].num_reg_images() >= 9
+    assert {camera.model_name for camera in models[0].cameras.values()} == {MODELS[strategy.lens]}
+    quality = describe(models[0], photos)
+    assert float(truth_errors(quality).rotation_degrees.max()) < 3
+    after = read_evidence(tmp_path / DATABASE, photos)
+    assert [len(pair) for pair in after.pairs] == [len(pair) for pair in before.pairs]
 
 
 def test_another_folders_scene_is_not_overwritten(imported, tmp_path: Path) -> None:

@@ -22,7 +22,8 @@ class ImportPhotos:
 
     The folder of the scene gets straight pictures, poses and points in COLMAP's format, quality.json, and a plot of cameras and
     points. Where a check finds the poses suspicious, other strategies are tried and the best result is kept. An interrupted
-    import goes on when the same command is given again; another mapper or lens finds the features and matches of the last one.
+    import goes on when the same command is given again; another mapper or lens finds the features and matches of the last one
+    in FOLDER/.import, which may be deleted.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]

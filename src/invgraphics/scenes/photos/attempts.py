@@ -98,6 +98,7 @@ def try_strategies(
 def _attempt(strategy: Strategy, matched: Matched, progress: Progress, place: Reconstruct) -> Attempt:
     since = time.perf_counter()
     pieces = place(strategy, matched, progress)
+    progress(1, 1, "checking poses against the matches")
     strays, suspicion = {}, None
     if pieces:
         strays = remove_strays(pieces[0], matched.photos)
@@ -106,11 +107,13 @@ def _attempt(strategy: Strategy, matched: Matched, progress: Progress, place: Re
 
 
 def _share(progress: Progress, before: int) -> Progress:
-    """Progress of one of an unknown number of attempts: each gets half of what is left."""
-    start = 1 - 0.5**before
+    """Progress of one of an unknown number of attempts: each gets half of what is left, and never falls back."""
+    start, furthest = 1 - 0.5**before, 0.0
 
     def report(done: int, total: int, what: str) -> None:
-        progress(round(1000 * (start + (1 - start) / 2 * done / max(total, 1))), 1000, what)
+        nonlocal furthest
+        furthest = max(furthest, done / max(total, 1))
+        progress(round(1000 * (start + (1 - start) / 2 * furthest)), 1000, what)
 
     return report
 

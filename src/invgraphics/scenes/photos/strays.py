@@ -16,6 +16,9 @@ FEW_POINTS = 15
 FAR = 10.0
 """A camera is far off if its nearest neighbour is as many times farther than those of nine in ten cameras."""
 
+MOST = 1 / 3
+"""Share of a reconstruction's photographs of which more are no strays: then the whole is weak, and stays as it is."""
+
 _QUANTILE = 0.9
 
 
@@ -30,6 +33,7 @@ def remove_strays(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
     centres = np.array([image.projection_center() for image in images]).reshape(-1, 3)
     far = isolation(centres)
     reasons: dict[str, str] = {}
+    frames = []
     for image, times in zip(images, far, strict=True):
         if image.num_points3D < FEW_POINTS:
             reasons[source[image.name]] = f"a stray: it shows only {image.num_points3D} of the points"
@@ -37,7 +41,11 @@ def remove_strays(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
             reasons[source[image.name]] = f"a stray: {times:.0f} times as far from the other cameras as they are apart"
         else:
             continue
-        model.deregister_frame(image.frame_id)
+        frames.append(image.frame_id)
+    if len(frames) > MOST * len(images):
+        return {}
+    for frame in frames:
+        model.deregister_frame(frame)
     return reasons
 
 

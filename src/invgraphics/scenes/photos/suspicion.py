@@ -32,7 +32,7 @@ PARTNERS = 2
 """Strongest partners that a photograph is asked about: one on either side of it on a walk.
 
 Measured: no pair contradicts in four right reconstructions (bonsai by the global mapper, 84 pairs; fox by the incremental one,
-33, 0.6° from the known poses; the box with unique pictures by both, 38). Of the pairs that are each other's strongest, 1 to 6 of
+33, 0.6° from the known poses; the box with unique pictures by both, 38). Of pairs that are each other's strongest, 1 to 6 of
 17 to 42 contradict in eight wrong ones (bonsai by the incremental mapper; fox by the global one, 129° off; halves of the beer
 can, whose two mappers and given poses differ by 50° and more; the box with the same picture on all its sides). With four
 partners, bonsai's right poses have 4 of 158 against them; with the best matched quarter of all pairs, 15 of 169."""
