@@ -32,8 +32,6 @@ MODELS: dict[str, str] = {
 }
 """COLMAP's camera models by our names; ``auto`` begins with ``radial``."""
 
-_OF_POSES = ("mapper", "lens")  # settings that come into play after matching
-
 EXHAUSTIVE = 200
 """Most photographs of which every pair is matched when nothing else is asked for: 20 thousand pairs."""
 
@@ -88,9 +86,12 @@ class PhotoJob:
         return self._hash(self.text())
 
     def matches_key(self) -> str:
-        """Hash of all that features and matches depend on: of `key`, neither mapper nor lens."""
-        settings = asdict(self)
-        return self._hash(json.dumps({name: settings[name] for name in settings if name not in _OF_POSES}, sort_keys=True))
+        """Hash of all that features and matches depend on: of `key`, neither the mapper nor, but for fisheyes, the lens.
+
+        Pairs of known focal length are verified on the plane z = 1, which a fisheye's pixels reach in another way.
+        """
+        settings = {name: value for name, value in asdict(self).items() if name not in ("mapper", "lens")}
+        return self._hash(json.dumps(settings | {"fisheye": self.lens == "fisheye"}, sort_keys=True))
 
     def _hash(self, settings: str) -> str:
         files = sorted(path for path in self.path.rglob("*") if path.is_file())

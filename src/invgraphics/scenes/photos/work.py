@@ -16,7 +16,7 @@ from typing import Any
 from invgraphics.errors import InputError
 from invgraphics.scenes.photos import sfm
 from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
-from invgraphics.scenes.photos.job import QUALITY, SCHEMA, TOP_VIEW, PhotoJob
+from invgraphics.scenes.photos.job import DATABASE, QUALITY, SCHEMA, TOP_VIEW, PhotoJob
 from invgraphics.scenes.photos.maker import JOB, RESULT
 from invgraphics.scenes.photos.mapping import Matched
 from invgraphics.scenes.photos.pairs import read_evidence
@@ -68,9 +68,9 @@ def main(work: Path) -> None:
     sfm.extract(preparation.photos, work, clock.show)
     clock.start("matches")
     wanted = sfm.pairs(len(preparation.photos), job.matching)
-    sfm.match(wanted, preparation.photos, work / sfm.DATABASE, clock.show, sfm.Verification(job.seed))
+    sfm.match(wanted, preparation.photos, work / DATABASE, clock.show, sfm.Verification(job.seed))
     clock.start("poses")
-    evidence = read_evidence(work / sfm.DATABASE, preparation.photos)
+    evidence = read_evidence(work / DATABASE, preparation.photos)
     matched = Matched(job, preparation.photos, evidence, work)
     best, attempts = try_strategies(matched, clock.show)
     quality = _finish(matched, preparation.skipped, best, result, clock) | {"choice": choice(attempts), "attempts": attempts}
