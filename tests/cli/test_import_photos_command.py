@@ -9,11 +9,16 @@ from invgraphics.cli.arguments import parse
 from invgraphics.cli.import_photos import ImportPhotos
 
 LENS = {"model": "SIMPLE_RADIAL", "params": [1.0, 2.0, 3.0, 0.1], "size": [4, 5]}
-HONEST = {"pairs": 100, "contradicting": 1, "share": 0.01, "suspicious": False, "sentence": "1 of the 100"}
+HONEST = {
+    "pairs": 100, "contradicting": 1, "share": 0.01, "suspicious": False, "sentence": "fine", "support": 0.93,
+    "asked": 9, "doubtful": ["c.jpg"],
+}  # fmt: skip
+FIRST = {"strategy": "incremental mapper, radial lens", "outcome": "9 placed", "seconds": 4.0, "kept": True}
 QUALITY = {
     "registered": 9, "used": 10, "points": 1234, "track_length": 4.25, "reprojection_error_px": 0.512, "bend_px": 1.25,
     "lenses": [LENS, LENS], "other_pieces": [], "suspicion": HONEST, "usable": True, "refusal": None,
     "skipped": {"a.heic": "nothing here decodes HEIC"}, "unplaced": {"b.jpg": "blurred"}, "seconds": {"matches": 3.2},
+    "attempts": [FIRST],
 }  # fmt: skip
 
 
@@ -44,6 +49,8 @@ def test_figures_are_printed_and_the_folder_last(given, capsys, tmp_path) -> Non
         "0.51 px",
         "2 SIMPLE_RADIAL",
         "1 of the 100",
+        "1 of 9",
+        "93 %",
         "0.250°",
         "2.500 %",
         "matches 3 s",
@@ -52,6 +59,7 @@ def test_figures_are_printed_and_the_folder_last(given, capsys, tmp_path) -> Non
     assert "left out: a.heic: nothing here decodes HEIC" in text
     assert "not placed: b.jpg: blurred" in text
     assert "SUSPICIOUS" not in text
+    assert "incremental mapper" not in text
     assert text.splitlines()[-1] == str(tmp_path / "scene")
 
 
@@ -59,6 +67,15 @@ def test_a_suspicious_scene_says_so(given, capsys) -> None:
     _, run = given
     assert run(QUALITY | {"suspicion": HONEST | {"suspicious": True, "sentence": "folded"}}) == main.DONE
     assert "SUSPICIOUS: folded" in capsys.readouterr().out
+
+
+def test_what_was_tried_and_what_is_kept_is_printed(given, capsys) -> None:
+    _, run = given
+    second = FIRST | {"strategy": "global mapper, radial lens", "outcome": "10 placed"}
+    assert run(QUALITY | {"attempts": [FIRST | {"kept": False}, second]}) == main.DONE
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert any("tried" in line and "incremental mapper, radial lens: 9 placed, 4 s" in line for line in lines)
+    assert any("kept" in line and "global mapper, radial lens: 10 placed, 4 s" in line for line in lines)
 
 
 def test_too_few_photographs_are_refused_with_what_is_kept(given, capsys, tmp_path) -> None:
@@ -87,6 +104,7 @@ def test_options_reach_the_work(given) -> None:
         "sequential", "global", "opencv", "per-photo", 800, 0,
     )  # fmt: skip
     assert (second.matching, second.cameras, second.seed, asked[1][2]) == ("auto", "single", 3, Path("tests"))
+    assert (second.mapper, second.lens) == ("auto", "auto")
 
 
 @pytest.mark.parametrize(

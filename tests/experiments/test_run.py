@@ -18,10 +18,12 @@ from training_fixtures import SMALL
 
 from invgraphics.errors import InputError
 from invgraphics.experiments import evaluate
+from invgraphics.experiments import run as module
 from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
+from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.checkpoint import NAME, load
 
 METHOD = "splatting/gaussians"
@@ -70,6 +72,17 @@ def test_a_run_is_whole(run: Path) -> None:
     assert len(list(truth.glob("*.png"))) == 3
     assert provenance["command"].startswith("invgraphics fit splatting/gaussians")
     assert json.loads((run / "environment.json").read_text())["deterministic"] is True
+
+
+def test_what_an_import_suspects_is_repeated_before_the_fit(
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suspect = {"suspicion": "3 of 9 contradict"}
+    scene = open_scene(str(toy_folder), SceneOptions())
+    monkeypatch.setattr(module, "open_scene", lambda *_: replace(scene, notes=scene.notes | suspect))
+    out = fit_run(_request(toy_folder, tmp_path / "run", budget="2steps"))
+    assert "SUSPICIOUS poses: 3 of 9 contradict" in capsys.readouterr().err
+    assert json.loads((out / "provenance.json").read_text())["notes"]["suspicion"] == "3 of 9 contradict"
 
 
 def test_scores_can_be_recomputed_from_the_saved_pictures(run: Path) -> None:

@@ -18,7 +18,12 @@ from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
 from invgraphics.metrics.poses import pose_errors
 from invgraphics.scenes.open import SceneOptions, open_scene
-from invgraphics.scenes.photos import PhotoJob, reconstruct
+from invgraphics.scenes.photos import PhotoJob, mapping, reconstruct
+from invgraphics.scenes.photos.job import DATABASE, MODELS
+from invgraphics.scenes.photos.pairs import read_evidence
+from invgraphics.scenes.photos.prepare import prepare
+from invgraphics.scenes.photos.quality import describe
+from invgraphics.scenes.photos.strategies import WIDE_ANGLE, Strategy
 
 SIZE = 240
 EYES = orbit(10, SIZE, arc=90)
@@ -57,8 +62,11 @@ def test_poses_points_and_figures_are_right(imported) -> None:
     assert 0 < quality["reprojection_error_px"] < 1
     assert quality["track_length"] > 2.5
     assert not quality["suspicion"]["suspicious"]
+    assert [row["kept"] for row in quality["attempts"]] == [True]
+    assert quality["choice"] == "incremental mapper, pinhole lens"
     assert Image.open(out / "top-view.png").size == (1200, 600)
-    assert not (out / ".import").exists()
+    kept = {path.name for path in (out / ".import").iterdir()}
+    assert {"database.db"} < kept <= {"job.json", "lock", "database.db", "database.db-wal", "database.db-shm"}
 
 
 def test_the_folder_opens_as_a_scene_with_its_points_on_the_box(imported) -> None:
@@ -90,6 +98,54 @@ def test_the_same_request_is_answered_at_once(imported, box_photos: Path, monkey
     monkeypatch.setattr(subprocess, "Popen", refuse)
     out, quality = imported
     assert reconstruct(PhotoJob(str(box_photos), lens="pinhole"), out) == quality
+
+
+def test_another_mapper_finds_features_and_matches(imported, box_photos: Path, tmp_path: Path) -> None:
+    """Its matches are those of the data base that lies there, counterfeits included, and its result passes the same checks."""
+    import pycolmap
+
+    out = tmp_path / "scene"
+    shutil.copytree(imported[0], out)
+    database = out / ".import" / "database.db"
+    with pycolmap.Database.open(database) as content:
+        matches = content.num_matched_image_pairs()
+        assert matches == 45
+        first, second = (content.read_image_with_name(name).image_id for name in ("000.png", "001.png"))
+        content.delete_two_view_geometry(first, second)
+        verified = content.num_verified_image_pairs()
+    job = PhotoJob(str(box_photos), lens="pinhole", mapper="global")
+    steps: list[str] = []
+    quality = reconstruct(job, out, progress=lambda done, total, what: steps.append(what))
+    assert quality["registered"] == 10
+    assert quality["choice"].startswith("global mapper")
+    assert float(truth_errors(quality).rotation_degrees.max()) < 2
+    with pycolmap.Database.open(database) as content:
+        assert (content.num_matched_image_pairs(), content.num_verified_image_pairs()) == (matches, verified)
+    other = PhotoJob(str(box_photos), lens="pinhole", max_size=200)
+    assert other.matches_key() != job.matches_key() == PhotoJob(str(box_photos)).matches_key()
+
+
+@pytest.mark.parametrize(
+    "strategy",
+    [
+        Strategy("global", "opencv"),
+        Strategy("incremental", "radial", calibrated=True, initial_angle=WIDE_ANGLE),
+        Strategy("global", "pinhole", guided=True),
+    ],
+    ids=lambda strategy: strategy.name,
+)
+def test_each_way_from_matches_to_poses(strategy: Strategy, imported, box_photos: Path, tmp_path: Path) -> None:
+    job = PhotoJob(str(box_photos))
+    photos = prepare(job, tmp_path, lambda *_: None).photos
+    shutil.copy(imported[0] / ".import" / DATABASE, tmp_path)
+    before = read_evidence(tmp_path / DATABASE, photos)
+    models = mapping.reconstruct(strategy, mapping.Matched(job, photos, before, tmp_path), lambda *_: None)
+    assert models[0].num_reg_images() >= 9
+    assert {camera.model_name for camera in models[0].cameras.values()} == {MODELS[strategy.lens]}
+    quality = describe(models[0], photos)
+    assert float(truth_errors(quality).rotation_degrees.max()) < 3
+    after = read_evidence(tmp_path / DATABASE, photos)
+    assert [len(pair) for pair in after.pairs] == [len(pair) for pair in before.pairs]
 
 
 def test_another_folders_scene_is_not_overwritten(imported, tmp_path: Path) -> None:

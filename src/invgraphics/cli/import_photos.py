@@ -21,7 +21,9 @@ class ImportPhotos:
     """Find out where photographs were taken and what they show (structure from motion), and write a scene that fits can use.
 
     The folder of the scene gets straight pictures, poses and points in COLMAP's format, quality.json, and a plot of cameras and
-    points. An interrupted import goes on when the same command is given again.
+    points. Where a check finds the poses suspicious, other strategies are tried and the best result is kept. An interrupted
+    import goes on when the same command is given again; another mapper or lens finds the features and matches of the last one
+    in FOLDER/.import, which may be deleted.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -31,10 +33,11 @@ class ImportPhotos:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Which pairs are compared: all of them, or each photograph with those near it in name order; auto: all, up to 200
     photographs."""
-    mapper: Literal["incremental", "global"] = "incremental"
-    """How poses are found: one photograph after the other, or all at once (GLOMAP)."""
-    lens: Literal["pinhole", "radial", "opencv", "fisheye"] = "radial"
-    """What distortion is estimated and removed."""
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    """How poses are found: one photograph after the other, or all at once (GLOMAP); auto: the first, and the other where the
+    result is suspicious."""
+    lens: Literal["auto", "pinhole", "radial", "opencv", "fisheye"] = "auto"
+    """What distortion is estimated and removed; auto: radial, and pinhole or opencv where the result is suspicious."""
     single_camera: bool = False
     """All photographs share one set of intrinsics (default: those of one size and one EXIF lens do)."""
     camera_per_photo: bool = False
@@ -105,6 +108,10 @@ def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if quality["suspicion"] is not None:
         found = quality["suspicion"]
         yield "pairs against poses", f"{found['contradicting']} of the {found['pairs']} best matched contradict them"
+        yield "photographs in doubt", f"{len(found['doubtful'])} of {found['asked']}"
+        yield "matches explained", f"{100 * found['support']:.0f} %"
+    for row in quality["attempts"] if len(quality["attempts"]) > 1 else ():
+        yield "kept" if row["kept"] else "tried", f"{row['strategy']}: {row['outcome']}, {row['seconds']:.0f} s"
     if "truth" in quality:
         truth = quality["truth"]
         turn, shift = truth["rotation_degrees"], truth["translation_per_cent"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 from math import ceil
 from pathlib import Path
@@ -19,7 +18,7 @@ from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
-from invgraphics.experiments.progress import Reporter
+from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.experiments.recipe import Method
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
@@ -82,10 +81,6 @@ def evaluate(
             _save_view(folder.root / "test" / f"{index:04d}", picture, scene)
             scores.append(score(picture, view, scene, rules))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
-    per_view = statistics.median(seconds)
-    dead = dead_gaussians(field, [view.camera for view in scene.train])
-    if dead is not None and dead.share > DEAD_SHARE:
-        print(f"Warning: {dead.sentence()}", file=sys.stderr)
     quality, skipped = summarise(scores, rules)
     result = {
         "schema": 1,
@@ -96,15 +91,7 @@ def evaluate(
         "seed": folder.read_json("provenance.json")["seed"],
         "protocol": protocol,
         "views": [view.name for view in scene.test],
-        "cost": costs
-        | {
-            "render_seconds_per_view": per_view,
-            "render_fps": 1 / max(per_view, 1e-9),
-            "model_bytes": model_bytes(model),
-            "parameters": parameter_count(model),
-            "primitives": field.primitive_count(),
-            "dead": None if dead is None else dead.share,
-        },
+        "cost": costs | _model_costs(model, scene, statistics.median(seconds)),
         "quality": quality if posed is None else quality | posed.quality(),
         "skipped": skipped,
     }
@@ -114,6 +101,22 @@ def evaluate(
         result["test_poses"] = protocol_note(method)
     folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)
     return result
+
+
+def _model_costs(model: tuple[Field, Renderer], scene: Scene, seconds: float) -> dict[str, Any]:
+    """What a fitted model costs, and warns of primitives that no gradient could change; ``seconds`` are those of one view."""
+    field = model[0]
+    dead = dead_gaussians(field, [view.camera for view in scene.train])
+    if dead is not None and dead.share > DEAD_SHARE:
+        warn(f"Warning: {dead.sentence()}")
+    return {
+        "render_seconds_per_view": seconds,
+        "render_fps": 1 / max(seconds, 1e-9),
+        "model_bytes": model_bytes(model),
+        "parameters": parameter_count(model),
+        "primitives": field.primitive_count(),
+        "dead": None if dead is None else dead.share,
+    }
 
 
 def _picture(

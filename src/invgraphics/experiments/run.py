@@ -79,6 +79,8 @@ def fit_run(request: FitRequest) -> Path:
                 folder.clear()
             describe(folder, request, method, (scene, shown), identity, device)
             forecast = _rehearse(folder, fit, method, memory)
+            if "suspicion" in scene.notes:
+                warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
             for sentence in (*announcements([method.choice]), _prediction(request, fit, forecast)):
                 print(sentence, file=sys.stderr)
             Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}", request.snapshots).run()

@@ -43,6 +43,7 @@ def write_html(part: Part, contrasts: Contrasts, folder: Folder) -> None:
         "scene_facts": facts.scene_facts(comparison),
         "scene_summary": facts.scene_sentence(comparison, "summary"),
         "scene_stresses": facts.scene_sentence(comparison, "stresses"),
+        "scene_suspicion": facts.scene_sentence(comparison, "suspicion"),
         "shared_facts": facts.shared_facts(comparison),
         "cells": facts.reproduction(comparison, folder),
     }
@@ -55,6 +56,8 @@ def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
     parts = [f"# {text(comparison.question)}", *(f"- {text(sentence)}" for sentence in part.told)]
     settings = "; ".join(f"{name}: {value}" for name, value in facts.protocol_facts(comparison))
     stated = comparison.protocol.get("summary")
+    suspicion = facts.scene_sentence(comparison, "suspicion")
+    parts += ["", f"**The camera poses are suspicious.** {text(suspicion)}"] if suspicion else []
     parts += [
         "",
         f"Scene **{text(comparison.scene)}**. {text(settings)}." + (f" Protocol: {text(str(stated))}." if stated else ""),

@@ -14,6 +14,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo
 from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, present
 from invgraphics.scenes.lens import Lens
+from invgraphics.scenes.photos.notes import pose_notes
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 
@@ -22,7 +23,7 @@ class Colmap:
     """Loader of a COLMAP model, binary or text, with any perspective camera model and one camera per image if need be.
 
     The scene is unbounded, its SfM points are kept, and every eighth photograph by name is scored. Registered images whose
-    files do not exist are skipped and named in the scene's notes.
+    files do not exist are skipped and named in the scene's notes, as is what an import of photographs found suspicious.
     """
 
     def matches(self, path: Path) -> bool:
@@ -43,7 +44,7 @@ class Colmap:
         if not listed:
             raise InputError(f"{model} registers no image.")
         photos, notes = present(sorted(listed, key=lambda photo: photo.name), model)
-        notes |= {"loader": "colmap", "points": f"{reconstruction.num_points3D()} from SfM"}
+        notes |= {"loader": "colmap", "points": f"{reconstruction.num_points3D()} from SfM"} | pose_notes(path)
         poses = torch.stack([photo.camera.cam_to_world for photo in photos])
         frame = contracted_frame(poses, _points(reconstruction))
         return compose(path.resolve().name, every_eighth(photos), frame, options, notes)

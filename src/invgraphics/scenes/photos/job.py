@@ -12,22 +12,25 @@ from typing import Literal, get_args
 from invgraphics.config import fill
 from invgraphics.errors import InputError
 
-SCHEMA = 1
+SCHEMA = 2
+DATABASE = "database.db"
+"""COLMAP's data base of features and matches."""
+
 QUALITY, TOP_VIEW = "quality.json", "top-view.png"
 """What is written beside ``images`` and ``sparse``; the first is written last, and means that the folder is whole."""
 
 Matching = Literal["auto", "exhaustive", "sequential"]
-Mapper = Literal["incremental", "global"]
-Lens = Literal["pinhole", "radial", "opencv", "fisheye"]
+Mapper = Literal["auto", "incremental", "global"]
+Lens = Literal["auto", "pinhole", "radial", "opencv", "fisheye"]
 Cameras = Literal["auto", "single", "per-photo"]
 
-MODELS: dict[Lens, str] = {
+MODELS: dict[str, str] = {
     "pinhole": "SIMPLE_PINHOLE",
     "radial": "SIMPLE_RADIAL",
     "opencv": "OPENCV",
     "fisheye": "OPENCV_FISHEYE",
 }
-"""COLMAP's camera models by our names."""
+"""COLMAP's camera models by our names; ``auto`` begins with ``radial``."""
 
 EXHAUSTIVE = 200
 """Most photographs of which every pair is matched when nothing else is asked for: 20 thousand pairs."""
@@ -40,8 +43,8 @@ class PhotoJob:
     Attributes:
         folder: of the photographs; or a data set that `invgraphics.scenes.open` knows, whose pictures (not poses) are taken.
         matching: which pairs are compared: all, each with those near it in name order, or ``auto`` by their number.
-        mapper: COLMAP's incremental mapper, or its global one (GLOMAP).
-        lens: what distortion is estimated; data sets are straight already.
+        mapper: COLMAP's incremental mapper, or its global one (GLOMAP); ``auto``: the first, and others where it is suspicious.
+        lens: what distortion is estimated; data sets are straight already. ``auto``: radial, and others where it is suspicious.
         cameras: photographs of one size and one EXIF lens share their intrinsics, or all do, or none.
         max_size: longest side that pictures are reduced to, pixels.
         seed: of all random choices.
@@ -49,8 +52,8 @@ class PhotoJob:
 
     folder: str
     matching: Matching = "auto"
-    mapper: Mapper = "incremental"
-    lens: Lens = "radial"
+    mapper: Mapper = "auto"
+    lens: Lens = "auto"
     cameras: Cameras = "auto"
     max_size: int = 1600
     seed: int = 0
@@ -80,7 +83,18 @@ class PhotoJob:
 
     def key(self) -> str:
         """Hash of the settings, the photographs' names, sizes and dates, and the library's version."""
+        return self._hash(self.text())
+
+    def matches_key(self) -> str:
+        """Hash of all that features and matches depend on: of `key`, neither the mapper nor, but for fisheyes, the lens.
+
+        Pairs of known focal length are verified on the plane z = 1, which a fisheye's pixels reach in another way.
+        """
+        settings = {name: value for name, value in asdict(self).items() if name not in ("mapper", "lens")}
+        return self._hash(json.dumps(settings | {"fisheye": self.lens == "fisheye"}, sort_keys=True))
+
+    def _hash(self, settings: str) -> str:
         files = sorted(path for path in self.path.rglob("*") if path.is_file())
         listing = [(path.relative_to(self.path).as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-        content = [SCHEMA, self.text(), listing, version("pycolmap")]
+        content = [SCHEMA, settings, listing, version("pycolmap")]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

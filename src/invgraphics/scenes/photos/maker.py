@@ -5,19 +5,20 @@ from __future__ import annotations
 import fcntl
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.scenes.photos.job import QUALITY, TOP_VIEW, PhotoJob
+from invgraphics.scenes.photos.job import DATABASE, QUALITY, TOP_VIEW, PhotoJob
 from invgraphics.scenes.process import Progress, run_worker
 
 WORK = ".import"
-"""Where unfinished work lies inside the folder of the result; removed in the end."""
+"""Where unfinished work lies inside the folder of the result; features and matches stay there for another try."""
 
 JOB, LOCK, RESULT = "job.json", "lock", "result"
+MATCHES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm")
 RESULTS = ("images", "sparse", TOP_VIEW, QUALITY)
 """What the work process leaves for the folder, the proof of completeness last."""
 
@@ -25,7 +26,8 @@ RESULTS = ("images", "sparse", TOP_VIEW, QUALITY)
 def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Poses, points and straight pictures of a folder of photographs, which `invgraphics.scenes.open` then opens by itself.
 
-    The same request finds its finished result, or goes on with what an interrupted one has left.
+    The same request finds its finished result, or goes on with what an interrupted one has left. One that differs in mapper or
+    lens alone finds the features and matches.
 
     Args:
         job: which photographs, and how.
@@ -49,7 +51,7 @@ def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> d
             quality = read_quality(out)
             if quality is None or quality["key"] != key:
                 quality = _make(job, key, out, report)
-        shutil.rmtree(out / WORK, ignore_errors=True)
+            _clear(out / WORK, (JOB, LOCK, *MATCHES))
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror or error}.", "Choose another --out.") from error
     return quality
@@ -57,11 +59,16 @@ def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> d
 
 def read_quality(out: Path) -> dict[str, Any] | None:
     """The report of a finished import; ``None`` where there is none."""
+    quality = _read_json(out / QUALITY)
+    return quality if quality is not None and "key" in quality else None
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
     try:
-        quality = json.loads((out / QUALITY).read_text(encoding="utf-8"))
-        return quality if isinstance(quality, dict) and "key" in quality else None
+        table = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
+    return table if isinstance(table, dict) else None
 
 
 def _check_source(job: PhotoJob) -> None:
@@ -89,12 +96,13 @@ def _check_target(job: PhotoJob, out: Path) -> None:
 def _make(job: PhotoJob, key: str, out: Path, progress: Progress) -> dict[str, Any]:
     work = out / WORK
     request = work / JOB
-    asked = json.dumps({"key": key, "job": json.loads(job.text())})
-    if not request.is_file() or request.read_text(encoding="utf-8") != asked:  # left by another request: of no use
-        for path in work.iterdir():
-            if path.name != LOCK:
-                _remove(path)
-        request.write_text(asked, encoding="utf-8")
+    asked = {"key": key, "matches": job.matches_key(), "job": json.loads(job.text())}
+    left = _read_json(request)
+    if left is None or left.get("matches") != asked["matches"]:  # of no use
+        _clear(work, (LOCK,))
+    elif left != asked:
+        _clear(work, (LOCK, JOB, *MATCHES))
+    request.write_text(json.dumps(asked), encoding="utf-8")
     run_worker(
         "invgraphics.scenes.photos.work",
         work,
@@ -111,6 +119,12 @@ def _make(job: PhotoJob, key: str, out: Path, progress: Progress) -> dict[str, A
     if quality is None:
         raise InputError(f"{out} was not written.", "Choose another --out.")
     return quality
+
+
+def _clear(work: Path, but: Sequence[str]) -> None:
+    for path in work.iterdir():
+        if path.name not in but:
+            _remove(path)
 
 
 def _remove(path: Path) -> None:

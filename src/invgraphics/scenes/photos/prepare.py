@@ -29,7 +29,7 @@ RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
 ADVICE = "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."
 
-_FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length is a mistake
+FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length is a mistake
 _OPAQUE = 128
 
 
@@ -169,7 +169,7 @@ def _focal_share(path: Path) -> float | None:
     except (ValueError, RuntimeError):
         return None
     share = camera.mean_focal_length() / max(camera.width, camera.height)
-    return share if camera.has_prior_focal_length and _FOCAL_RANGE[0] < share < _FOCAL_RANGE[1] else None
+    return share if camera.has_prior_focal_length and FOCAL_RANGE[0] < share < FOCAL_RANGE[1] else None
 
 
 def _register_decoders() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,14 +52,16 @@ NOTHING: dict[str, Any] = {
 """`describe` where no two photographs could be placed."""
 
 
-def unplaced(photos: Sequence[Prepared], evidence: Evidence, placed: set[str]) -> dict[str, str]:
+def unplaced(photos: Sequence[Prepared], evidence: Evidence, placed: set[str], strays: Mapping[str, str]) -> dict[str, str]:
     """Why each photograph that has no pose has none, by its own name."""
     reasons = {}
     for index, photo in enumerate(photos):
         if photo.name in placed:
             continue
         features, partners = evidence.features[index], evidence.partners(index)
-        if features < FEW_FEATURES:
+        if photo.source in strays:
+            reasons[photo.source] = strays[photo.source]
+        elif features < FEW_FEATURES:
             reasons[photo.source] = f"only {features} features: blurred, or it shows something bare"
         elif not partners:
             reasons[photo.source] = "shares nothing with any other photograph"
@@ -68,21 +70,32 @@ def unplaced(photos: Sequence[Prepared], evidence: Evidence, placed: set[str]) -
     return reasons
 
 
-def refusal(photos: Sequence[Prepared], evidence: Evidence, registered: int) -> tuple[str, str] | None:
-    """What to tell a person when too few photographs could be placed, and what to do; ``None`` where enough could."""
-    if registered >= max(LEAST, SHARE * len(photos)):
-        return None
-    what = f"Only {registered} of {len(photos)} photographs could be placed" if registered else "No photograph could be placed"
+def enough(registered: int, count: int) -> bool:
+    """Whether a scene with ``registered`` of ``count`` photographs is usable."""
+    return registered >= max(LEAST, SHARE * count)
+
+
+def hopeless(photos: Sequence[Prepared], evidence: Evidence) -> tuple[str, str] | None:
+    """Why no strategy can place these photographs, and what to do; ``None`` where one may."""
     longest = max(max(photo.width, photo.height) for photo in photos)
     features = float(np.median(evidence.features))
     motions = [pair.motion for pair in evidence.pairs]
     if features < FEW_FEATURES:
         remedy = "Take sharp photographs of something with texture, in better light; or give a larger --max-size."
-        return f"{what}: they show too little to recognise ({features:.0f} features each, blurred or bare).", remedy
+        return f"they show too little to recognise ({features:.0f} features each, blurred or bare).", remedy
     if motions and float(np.median(motions)) < NO_MOTION * longest:
         remedy = "Step sideways between photographs: depth cannot be seen from one place."
-        return f"{what}: they are taken from one and the same place.", remedy
+        return "they are taken from one and the same place.", remedy
     if len(evidence.pairs) < len(photos) - 1:
-        return f"{what}: they hardly overlap ({len(evidence.pairs)} pairs of them show a common part).", ADVICE
-    remedy = "Try --mapper global, --lens opencv or --matching exhaustive; or take more photographs between those there are."
-    return f"{what}: their matches do not fit together.", remedy
+        return f"they hardly overlap ({len(evidence.pairs)} pairs of them show a common part).", ADVICE
+    return None
+
+
+def refusal(photos: Sequence[Prepared], evidence: Evidence, registered: int) -> tuple[str, str] | None:
+    """What to tell a person when too few photographs could be placed, and what to do; ``None`` where enough could."""
+    if enough(registered, len(photos)):
+        return None
+    what = f"Only {registered} of {len(photos)} photographs could be placed" if registered else "No photograph could be placed"
+    remedy = "Try --lens fisheye or --matching exhaustive; or take more photographs between those there are."
+    why, remedy = hopeless(photos, evidence) or ("their matches do not fit together.", remedy)
+    return f"{what}: {why}", remedy

@@ -15,17 +15,18 @@ from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.photos import sfm
-from invgraphics.scenes.photos.job import QUALITY, SCHEMA, TOP_VIEW, PhotoJob
+from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
+from invgraphics.scenes.photos.job import DATABASE, QUALITY, SCHEMA, TOP_VIEW, PhotoJob
 from invgraphics.scenes.photos.maker import JOB, RESULT
-from invgraphics.scenes.photos.pairs import Evidence, read_evidence
+from invgraphics.scenes.photos.mapping import Matched
+from invgraphics.scenes.photos.pairs import read_evidence
 from invgraphics.scenes.photos.plot import top_view
 from invgraphics.scenes.photos.prepare import PREPARED, Preparation, prepare
 from invgraphics.scenes.photos.quality import NOTHING, describe, refusal, unplaced
 from invgraphics.scenes.photos.result import write_scene
-from invgraphics.scenes.photos.suspicion import examine
 from invgraphics.scenes.process import say_error, say_progress
 
-STEPS = {"read": 10, "features": 20, "matches": 35, "poses": 25, "check": 3, "pictures": 7}
+STEPS = {"read": 10, "features": 20, "matches": 35, "poses": 27, "pictures": 8}
 """Stages in their order, and about how many per cent of the time each takes."""
 
 
@@ -66,11 +67,13 @@ def main(work: Path) -> None:
     sfm.enter(job, preparation.photos, work)
     sfm.extract(preparation.photos, work, clock.show)
     clock.start("matches")
-    sfm.match(job, preparation.photos, work, clock.show)
+    wanted = sfm.pairs(len(preparation.photos), job.matching)
+    sfm.match(wanted, preparation.photos, work / DATABASE, clock.show, sfm.Verification(job.seed))
     clock.start("poses")
-    models = sfm.reconstruct(job, preparation.photos, work, clock.show)
-    evidence = read_evidence(work / sfm.DATABASE, preparation.photos)
-    quality = _finish(job, preparation, evidence, models, (work, result), clock)
+    evidence = read_evidence(work / DATABASE, preparation.photos)
+    matched = Matched(job, preparation.photos, evidence, work)
+    best, attempts = try_strategies(matched, clock.show)
+    quality = _finish(matched, preparation.skipped, best, result, clock) | {"choice": choice(attempts), "attempts": attempts}
     partial = result / f"{QUALITY}.partial"
     partial.write_text(json.dumps({"schema": SCHEMA, "key": asked["key"], **quality}, indent=1), encoding="utf-8")
     partial.replace(result / QUALITY)
@@ -86,40 +89,30 @@ def _prepared(job: PhotoJob, work: Path, clock: Clock) -> Preparation:
     return preparation
 
 
-def _finish(
-    job: PhotoJob,
-    preparation: Preparation,
-    evidence: Evidence,
-    models: list[Any],
-    places: tuple[Path, Path],
-    clock: Clock,
-) -> dict[str, Any]:
-    """Examine the largest piece, write it down, and return the report."""
-    photos = preparation.photos
-    figures, suspicion, bend = NOTHING, None, 0.0
-    if models:
-        clock.start("check")
-        figures = describe(models[0], photos)
-        clock.show(0, 1, "checking pairs against the whole")
-        suspicion = examine(models[0], photos, evidence)
+def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Path, clock: Clock) -> dict[str, Any]:
+    """Write down the largest piece of the best attempt, and return the report."""
+    job, photos = matched.job, matched.photos
+    figures, bend = NOTHING, 0.0
+    if best.pieces:
+        figures = describe(best.pieces[0], photos)
         clock.start("pictures")
         title = f"{job.path.name}: {figures['registered']} of {len(photos)} photographs, {figures['points']} points"
-        top_view(models[0], title, places[1] / TOP_VIEW)
-        bend = write_scene(models[0], photos, *places, clock.show)
+        top_view(best.pieces[0], title, result / TOP_VIEW)
+        bend = write_scene(best.pieces[0], photos, matched.work, result, clock.show)
     clock.start("")
-    refused = refusal(photos, evidence, figures["registered"])
+    refused = refusal(photos, matched.evidence, figures["registered"])
     return {
         "job": json.loads(job.text()),
-        "given": len(photos) + len(preparation.skipped),
+        "given": len(photos) + len(skipped),
         "used": len(photos),
         **figures,
         "bend_px": bend,
-        "other_pieces": [model.num_reg_images() for model in models[1:]],
-        "suspicion": suspicion,
+        "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],
+        "suspicion": best.suspicion,
         "usable": refused is None,
         "refusal": refused,
-        "skipped": preparation.skipped,
-        "unplaced": unplaced(photos, evidence, {camera["name"] for camera in figures["cameras"]}),
+        "skipped": skipped,
+        "unplaced": unplaced(photos, matched.evidence, {camera["name"] for camera in figures["cameras"]}, best.strays),
         "seconds": clock.seconds,
     }
 

@@ -1,0 +1,201 @@
+"""Strategies in turn, the judge between them, strays, and what later readers are told; on COLMAP's own synthetic scene."""
+
+import json
+import os
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from dots import ring, save
+from scipy.spatial.transform import Rotation
+
+from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.scenes.photos import PhotoJob, reconstruct
+from invgraphics.scenes.photos.attempts import choice, try_strategies
+from invgraphics.scenes.photos.mapping import Matched
+from invgraphics.scenes.photos.pairs import Evidence, Pair
+from invgraphics.scenes.photos.prepare import Prepared
+from invgraphics.scenes.photos.strategies import WIDE_ANGLE, Strategy, strategies
+from invgraphics.scenes.photos.strays import isolation, remove_strays
+
+COUNT = 10
+
+
+@pytest.fixture
+def truth() -> pycolmap.Reconstruction:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, COUNT, 80
+    model = pycolmap.synthesize_dataset(options)
+    for number, image in model.images.items():
+        image.name = f"{number}.png"
+    return model
+
+
+def photos_of(model: pycolmap.Reconstruction) -> tuple[Prepared, ...]:
+    camera = next(iter(model.cameras.values()))
+    return tuple(
+        Prepared(model.images[number].name, f"{number}.jpg", camera.width, camera.height, "") for number in sorted(model.images)
+    )
+
+
+def evidence_of(model: pycolmap.Reconstruction) -> Evidence:
+    """Matches are the observations of one point."""
+    numbers, seen = sorted(model.images), {}
+    for number in numbers:
+        points = model.images[number].points2D
+        seen[number] = {point.point3D_id: point.xy for point in points if point.has_point3D()}
+    pairs = []
+    for (i, first), (j, second) in combinations(enumerate(numbers), 2):
+        shared = sorted(set(seen[first]) & set(seen[second]))
+        if shared:
+            places = [np.array([seen[number][point] for point in shared]) for number in (first, second)]
+            pairs.append(Pair(i, j, (places[0], places[1])))
+    return Evidence((1000,) * len(numbers), tuple(pairs))
+
+
+def turned(model: pycolmap.Reconstruction, every: int) -> pycolmap.Reconstruction:
+    """A copy in which some cameras stand elsewhere."""
+    copy = pycolmap.Reconstruction(model)
+    about = Rotation.from_euler("xyz", [40, 70, 20], degrees=True).as_matrix()
+    for number in sorted(copy.images)[::every]:
+        frame = copy.frames[copy.images[number].frame_id]
+        frame.rig_from_world = frame.rig_from_world * pycolmap.Rigid3d(np.column_stack([about, [0.5, 0, 0]]))
+    return copy
+
+
+def tried(truth: pycolmap.Reconstruction, outcomes: list, tmp_path: Path, **options):
+    """Try strategies whose reconstructions are given; returns what `try_strategies` does, and the strategies used."""
+    photos, used = photos_of(truth), []
+
+    def place(strategy, matched, progress):
+        used.append(strategy)
+        progress(1, 2, "placing")
+        model = outcomes[min(len(used), len(outcomes)) - 1]
+        return [] if model is None else [pycolmap.Reconstruction(model)]
+
+    done = []
+    matched = Matched(PhotoJob(str(tmp_path), **options), photos, evidence_of(truth), tmp_path)
+    best, rows = try_strategies(matched, lambda step, total, _: done.append(step / total), place)
+    assert done == sorted(done)
+    assert done[-1] < 1
+    return best, rows, used
+
+
+def test_a_sound_reconstruction_is_the_last(truth, tmp_path: Path) -> None:
+    best, rows, used = tried(truth, [truth], tmp_path)
+    assert used == [Strategy("incremental", "radial")]
+    assert (best.registered, best.suspicion["support"], best.strays) == (COUNT, 1.0, {})
+    assert choice(rows) == "incremental mapper, radial lens"
+
+
+@pytest.mark.parametrize("first", ["folded", "nothing"])
+def test_the_next_strategy_is_tried_and_the_choice_written_down(first: str, truth, tmp_path: Path) -> None:
+    best, rows, used = tried(truth, [None if first == "nothing" else turned(truth, 2), truth], tmp_path)
+    assert [strategy.mapper for strategy in used] == ["incremental", "global"]
+    assert best.strategy == used[1]
+    assert [row["kept"] for row in rows] == [False, True]
+    assert rows[1]["reprojection_error_px"] < 1e-3
+    assert choice(rows).startswith(f"global mapper, radial lens: {COUNT} placed")
+    assert ("nothing placed" if first == "nothing" else ", suspicious") in choice(rows)
+    json.dumps(rows)
+
+
+def test_the_best_of_the_suspicious_is_kept(truth, tmp_path: Path) -> None:
+    """The one whose poses explain most of the matches, not the last one."""
+    best, rows, used = tried(truth, [turned(truth, 2), turned(truth, 5), turned(truth, 2)], tmp_path)
+    assert len(used) == len(set(used)) == len(rows) == 6
+    assert [row["kept"] for row in rows].index(True) == 1
+    assert best.suspicion["suspicious"]
+
+
+def test_settings_restrict_what_is_tried() -> None:
+    photos = [Prepared("a.png", "a", 10, 10, "")]
+    anything = strategies(PhotoJob("p"), photos)
+    assert {row.mapper for row in anything} == {"incremental", "global"}
+    assert {row.lens for row in anything} == {"radial", "pinhole", "opencv"}
+    assert {row.initial_angle for row in anything} == {16.0, WIDE_ANGLE}
+    assert any(row.guided for row in anything) and any(row.calibrated for row in anything)
+    assert {row.mapper for row in strategies(PhotoJob("p", mapper="global"), photos)} == {"global"}
+    assert {row.lens for row in strategies(PhotoJob("p", lens="fisheye"), photos)} == {"fisheye"}
+    assert {row.lens for row in strategies(PhotoJob("p"), [replace(photos[0], centre=(5.0, 5.0))])} == {"pinhole"}
+    assert strategies(PhotoJob("p", mapper="incremental"), photos)[0] == Strategy("incremental", "radial")
+
+
+def test_strays_are_named_and_left_out(truth) -> None:
+    far, bare = sorted(truth.images)[2:4]
+    frame = truth.frames[truth.images[far].frame_id]
+    frame.rig_from_world = pycolmap.Rigid3d(np.column_stack([np.eye(3), [1e4, 0, 0]]))
+    for index, point in enumerate(truth.images[bare].points2D):
+        if index >= 5 and point.has_point3D():
+            truth.delete_observation(bare, index)
+    found = remove_strays(truth, photos_of(truth))
+    assert set(found) == {f"{far}.jpg", f"{bare}.jpg"}
+    assert "times as far" in found[f"{far}.jpg"]
+    assert "only 5 of the points" in found[f"{bare}.jpg"]
+    assert truth.num_reg_images() == COUNT - 2
+    assert not truth.images[far].has_pose
+
+
+def test_a_reconstruction_that_hangs_by_threads_is_left_as_it_is(truth) -> None:
+    for number in sorted(truth.images)[:6]:
+        for index, point in enumerate(truth.images[number].points2D):
+            if index >= 5 and point.has_point3D():
+                truth.delete_observation(number, index)
+    assert remove_strays(truth, photos_of(truth)) == {}
+    assert truth.num_reg_images() == COUNT
+
+
+def test_a_walk_has_no_strays() -> None:
+    """Steps of one to three metres, then a look from ten metres away."""
+    places = np.cumsum([1.0, 2, 3, 1, 2, 3, 1, 2, 3, 10])
+    assert isolation(np.column_stack([places, 0 * places, 0 * places])).max() == pytest.approx(10 / 3)
+
+
+@pytest.mark.parametrize("suspicious", [True, False])
+def test_a_scene_repeats_what_its_import_suspects(suspicious: bool, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction()
+    for index, eye in enumerate(ring(9, distortion=None), start=1):
+        save(eye.picture(), tmp_path / "images" / f"{index}.png")
+        params = [*eye.focal, *eye.centre]
+        camera = pycolmap.Camera(model="PINHOLE", width=eye.size[0], height=eye.size[1], params=params, camera_id=index)
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=f"{index}.png", camera_id=index, image_id=index)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([eye.R, eye.t])))
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    model.write(str(tmp_path / "sparse/0"))
+    assert "poses" not in open_scene(str(tmp_path), SceneOptions()).notes
+    quality = {"key": "k", "choice": "global mapper", "suspicion": {"suspicious": suspicious, "sentence": "3 of 9 contradict"}}
+    (tmp_path / "quality.json").write_text(json.dumps(quality))
+    notes = open_scene(str(tmp_path), SceneOptions()).notes
+    assert notes["poses"] == "global mapper"
+    assert notes.get("suspicion") == ("3 of 9 contradict" if suspicious else None)
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif("INVGRAPHICS_DATA" not in os.environ, reason="INVGRAPHICS_DATA is not set")
+def test_photographs_around_a_table_look_at_it(tmp_path: Path) -> None:
+    """No flags: rings of cameras around what their optical axes have in common, which lies before all of them."""
+    folder = Path(os.environ["INVGRAPHICS_DATA"]) / "bonsai_photos"
+    quality = reconstruct(PhotoJob(str(folder)), tmp_path / "scene")
+    assert quality["registered"] >= 60
+    assert not quality["suspicion"]["suspicious"]
+    assert quality["reprojection_error_px"] < 0.7
+    poses = np.array([camera["cam_to_world"] for camera in quality["cameras"]])
+    centre, forward = poses[:, :3, 3], poses[:, :3, 2]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None]
+    middle = np.linalg.solve(across.sum(axis=0), (across @ centre[:, :, None]).sum(axis=0))[:, 0]
+    depth = ((middle - centre) * forward).sum(axis=1)
+    beside = np.linalg.norm(middle - centre - depth[:, None] * forward, axis=1)
+    assert (depth > 0).all()
+    assert np.median(beside / depth) < 0.15
+    # All around: seen from the middle, no gap between neighbouring cameras is wider than a sixth of the circle.
+    up = np.linalg.svd(centre - centre.mean(axis=0))[2][2]
+    flat = (centre - middle) - np.outer((centre - middle) @ up, up)
+    axes = np.linalg.svd(flat)[2][:2]
+    azimuth = np.sort(np.arctan2(flat @ axes[1], flat @ axes[0]))
+    assert np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi)).max() < 2 * np.pi / 6
