@@ -11,6 +11,7 @@ from invgraphics.errors import InputError
 from invgraphics.training import checkpoint
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
+from invgraphics.training.hooks import FitState, ShDegreeConfig
 from invgraphics.training.losses import CoarseConfig, DistortionConfig, PhotometricConfig, SsimConfig, picture_of
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 
@@ -200,3 +201,16 @@ def test_batch_config_refuses_nonsense() -> None:
         BatchConfig(resolution=(0.5, 1.0))
     with pytest.raises(ValueError, match="at least 1"):
         BatchConfig(rays=0)
+
+
+@pytest.mark.parametrize(
+    ("step", "progress", "degree"), [(999, 0.01, 0), (1000, 0.01, 1), (2500, 0.01, 2), (10, 0.45, 2), (9999, 0.9, 3)]
+)
+def test_bands_come_by_steps_where_the_budget_is_long(step: int, progress: float, degree: int) -> None:
+    """One band each 1000 steps or each fifth of the fit, whichever comes first; never more than there are."""
+    field = torch.nn.Module()
+    field.sh_degree, field.active_degree = 3, 0
+    ctx = Context(Bounds(-torch.ones(3), torch.ones(3)), training=True, progress=progress)
+    state = FitState(field, None, None, None, ctx, step)
+    ShDegreeConfig(start=0.2, interval=0.2, steps=1000).build().before_step(state)
+    assert field.active_degree == degree
