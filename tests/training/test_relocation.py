@@ -1,6 +1,7 @@
 """Relocation (MCMC): what is seen stays, the dead live again, the cap holds, Adam forgets; and resuming repeats the bits."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -83,6 +84,16 @@ def test_nothing_dead_or_nothing_alive_is_left_alone() -> None:
         before = state.field.means.detach().clone()
         RelocationConfig(every=10, growth=0.0, noise=0.0).build().after_step(state)
         assert torch.equal(state.field.means, before)
+
+
+def test_the_cap_rises_by_equal_factors() -> None:
+    """From 10 to 1000 Gaussians within half of the fit: a quarter of it multiplies them by ten, and growth allows no more."""
+    state = _state(10)
+    hook = RelocationConfig(every=10, start=0.0, growth=100.0, pace=0.5, max_primitives=1000, noise=0.0).build()
+    for progress, count in ((0.0, 10), (0.25, 100), (0.4, 398), (0.5, 1000), (0.8, 1000)):
+        state.ctx = replace(state.ctx, progress=progress)
+        hook.after_step(state)
+        assert state.field.primitive_count() == count
 
 
 def test_resuming_gives_the_same_bits(make_fit, scene) -> None:

@@ -88,6 +88,20 @@ class Splats(Protocol):
         ...
 
 
+def paced_limit(first: int, most: int, passed: float, pace: float) -> int:
+    """Number of primitives that growth may have reached: from ``first`` to ``most`` by equal factors over ``pace`` of a fit.
+
+    Args:
+        first: number when growth began.
+        most: number in the end.
+        passed: progress since growth began.
+        pace: progress until the end; 0 for no limit but ``most``.
+    """
+    if not pace or first >= most:
+        return most
+    return int(first * (most / first) ** min(1.0, max(0.0, passed) / pace))
+
+
 def check_splats(hook: str, field: Field) -> None:
     """Refuse a field without Gaussians that can be edited.
 
@@ -176,13 +190,10 @@ class DensityControl(Hook):
         self._apply(state, keep.nonzero()[:, 0], cloned, split)
 
     def _limit(self, progress: float, count: int) -> int:
-        """Most Gaussians there may be now: ``max_primitives``, approached from the first number by equal factors."""
+        """Most Gaussians there may be now."""
         config = self._config
         self._first = self._first or count
-        if not config.pace or self._first >= config.max_primitives:
-            return config.max_primitives
-        risen = min(1.0, (progress - self._started) / config.pace)
-        return int(self._first * (config.max_primitives / self._first) ** risen)
+        return paced_limit(self._first, config.max_primitives, progress - self._started, config.pace)
 
     def _to_grow(self, pull: Float[Tensor, " n"], room: int) -> Bool[Tensor, " n"]:
         """Above the threshold; where room is short, the strongest only."""

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from invgraphics.core import Field, Renderer
 from invgraphics.core.transforms import quaternion_to_matrix
-from invgraphics.training.density_control import Splats, check_splats
+from invgraphics.training.density_control import Splats, check_splats, paced_limit
 from invgraphics.training.hooks import FitState, Hook
 
 MOST_COPIES = 51
@@ -33,8 +33,9 @@ class RelocationConfig:
         stop: progress at which it ends (paper: 25,000 of 30,000).
         every: steps between two rounds.
         dead: opacity up to which a Gaussian counts as dead.
-        growth: share of new Gaussians per round, until there are ``max_primitives``.
+        growth: most new Gaussians of a round, as a share of those there are, until there are ``max_primitives``.
         max_primitives: cap.
+        pace: progress, from ``start`` on, over which the cap itself rises from the first number, by equal factors; 0 for none.
         noise: standard deviation of the noise on means, per learning rate and covariance; 0 for none.
     """
 
@@ -44,13 +45,14 @@ class RelocationConfig:
     dead: float = 0.005
     growth: float = 0.05
     max_primitives: int = 1_000_000
+    pace: float = 0.0
     noise: float = 5e5
 
     def __post_init__(self) -> None:
         if self.every < 1 or self.max_primitives < 1:
             raise ValueError("'every' and 'max_primitives' must be at least 1.")
-        if not 0 < self.dead < 1 or self.growth < 0 or self.noise < 0:
-            raise ValueError("'dead' must lie between 0 and 1, 'growth' and 'noise' must not be negative.")
+        if not 0 < self.dead < 1 or min(self.growth, self.noise, self.pace) < 0:
+            raise ValueError("'dead' must lie between 0 and 1, 'growth', 'noise' and 'pace' must not be negative.")
 
     def capped(self, most: int) -> RelocationConfig:
         """The same, growing to at most ``most`` Gaussians."""
@@ -62,10 +64,11 @@ class RelocationConfig:
 
 
 class _Relocation(Hook):
-    """Keeps nothing between steps, so it needs no state."""
+    """Keeps the number of Gaussians that growth began with."""
 
     def __init__(self, config: RelocationConfig) -> None:
         self._config = config
+        self._first = 0
 
     @override
     def check(self, field: Field, renderer: Renderer) -> None:
@@ -91,10 +94,20 @@ class _Relocation(Hook):
 
     def _grow(self, state: FitState) -> None:
         opacities = torch.sigmoid(cast(Splats, state.field).opacity_logits)
-        n = len(opacities)
-        added = min(self._config.max_primitives, int(n * (1 + self._config.growth))) - n
+        config, n = self._config, len(opacities)
+        self._first = self._first or n
+        limit = paced_limit(self._first, config.max_primitives, state.ctx.progress - config.start, config.pace)
+        added = min(limit, int(n * (1 + config.growth))) - n
         if added > 0:
             self._copy(state, _draw(opacities, added, state), torch.arange(n, n + added, device=opacities.device))
+
+    @override
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"first": torch.tensor(self._first)}
+
+    @override
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self._first = int(state["first"])
 
     def _copy(self, state: FitState, source: Int[Tensor, " k"], target: Int[Tensor, " k"]) -> None:
         """Put copies of ``source`` into the rows ``target``, which may lie behind the last, and share out what is seen."""
