@@ -166,9 +166,9 @@ class Fit:
     def rehearse(self) -> None:
         """Take one step and undo it, so that compiling and allocating at first use is on no clock."""
         before = {part: {name: value.clone() for name, value in tensors.items()} for part, tensors in self.state().items()}
-        clocks = self.clocks()
+        clocks, seconds = self.clocks(), self.seconds
         self.step()
-        self.load(before, clocks["seconds"])
+        self.load(before, seconds)
         self.resume_clocks(clocks)
 
     def clocks(self) -> dict[str, float | None]:
