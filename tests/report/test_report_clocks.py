@@ -18,7 +18,9 @@ def _run(method: str, seed: int, fps: float, disturbed: str = "") -> Run:
     quality = {"psnr": Score(30.0 + fps / 100, "dB", True, ())}
     cost = {"fit_seconds": 60.0, "fit_cpu_seconds": 100.0, "render_fps": fps, "model_bytes": 1e6 * fps}
     folder = Path("x")
-    return Run(folder, method, seed, "laptop", "s", "default", (), quality, cost, {}, (), {}, {}, folder, disturbed)
+    return Run(
+        folder, method, seed, "laptop", "s", "default", (), quality, cost, {}, (), {"truth_sha256": "t"}, {}, folder, disturbed
+    )
 
 
 def test_disturbed_times_are_shown_but_not_ranked() -> None:

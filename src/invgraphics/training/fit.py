@@ -166,7 +166,7 @@ class Fit:
     def rehearse(self) -> None:
         """Take one step and undo it, so that compiling and allocating at first use is on no clock."""
         before = {part: {name: value.clone() for name, value in tensors.items()} for part, tensors in self.state().items()}
-        seconds, clocks = self.seconds, self.clocks()
+        clocks, seconds = self.clocks(), self.seconds
         self.step()
         self.load(before, seconds)
         self.resume_clocks(clocks)
