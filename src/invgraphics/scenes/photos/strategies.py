@@ -1,9 +1,9 @@
 """Ways from the same features and matches to poses, in the order in which they are tried.
 
 Each answers a known weakness of the one before. The incremental mapper stands or falls with its first pair and with the focal
-length that it guesses for photographs without EXIF; the global mapper averages rotations over all pairs, and calibrates focal
-lengths from their fundamental matrices first. Such a calibration and an initial pair of larger parallax help the incremental
-mapper, too. A wrong lens model bends the whole; guided matching adds matches where few were found.
+length that it guesses for photographs without EXIF; the global mapper averages rotations over all pairs instead. Focal lengths
+calibrated from the fundamental matrices of all pairs, and an initial pair of larger parallax, mend the incremental mapper's
+beginning. A wrong lens model bends the whole; guided matching adds matches where few were found.
 """
 
 from __future__ import annotations
