@@ -92,6 +92,7 @@ def read_run(folder: Path, protocol: str = "default") -> Run:
         provenance=dict(provenance),
         environment=dict(read_table(folder / "environment.json")),
         truth=(folder / str(provenance["truth"])).resolve(),
+        shortfall=optional(scores, "shortfall", str, source, ""),
     )
 
 

@@ -58,6 +58,7 @@ class Run:
         provenance: hashes, code version and the command that reproduces the run.
         environment: the machine and the versions.
         truth: folder of the truth's pictures.
+        shortfall: why it may have lost to the mean training image, and what to try; empty where it has not.
     """
 
     folder: Path
@@ -74,6 +75,7 @@ class Run:
     provenance: dict[str, Any]
     environment: dict[str, Any]
     truth: Path
+    shortfall: str = ""
 
     @property
     def truth_hash(self) -> str:

@@ -129,6 +129,11 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
         ]
         if below:
             sentences.append(f"{listing(below)} did not beat the trivial baseline '{reference[1].label}' in {column.label}.")
+    told: dict[str, str] = {}
+    for run in comparison.runs:
+        if run.shortfall:
+            told.setdefault(run.method, run.shortfall)
+    sentences += told.values()
     short = [row.label for row in summary.methods if not row.complete]
     if short:
         words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"
