@@ -165,7 +165,7 @@ def contracted_frame(
         poses: camera-to-world, float64.
         points: known surface points, world frame; kept, and used for what is not given.
         distance: how far ahead the subject is, world units.
-        near: closest thing in front of a camera, world units; by default half the distance of the nearest points.
+        near: closest thing in front of a camera, world units; by default somewhat less than the distance of the nearest points.
     """
     position, forward = poses[:, :3, 3], poses[:, :3, 2]
     middle = position.mean(dim=0)

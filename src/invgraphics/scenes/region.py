@@ -17,7 +17,7 @@ SMALLEST = 0.05
 
 NEAREST_SHARE = 0.02
 """Share of a camera's points that may be wrong and nearer than its nearest surface."""
-CLEARANCE = 0.5
+CLEARANCE = 0.7
 """Distance of the first sample over that of the nearest surface."""
 VIEW_ANGLE = 45.0
 """Degrees from the optical axis within which points count as seen."""
@@ -34,7 +34,7 @@ def subject_half(points: Float[Tensor, "n 3"]) -> float:
 
 
 def near_plane(poses: Float[Tensor, "k 4 4"], points: Float[Tensor, "n 3"]) -> float | None:
-    """Distance from cameras at which samples may begin: half that of the nearest point; ``None`` where points say nothing.
+    """Distance from cameras at which samples may begin: a share of that of the nearest point; ``None`` where points say nothing.
 
     Args:
         poses: camera-to-world; ``points`` are in the same frame.
