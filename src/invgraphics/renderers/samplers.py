@@ -96,7 +96,8 @@ class Hierarchical(Sampler):
             weights = trace.weights.reshape(len(hit), self.config.coarse)
             drawn = invert(spacing, weights + PADDING, quantiles(len(hit), self.config.fine, ctx, like=spacing))
         both = torch.cat([spacing, drawn], dim=1).sort(dim=1).values
-        return pack(rays, hit, from_spacing(both, ctx.bounds, far_side(rays[hit], ctx.bounds))), () if self.proposal is None else (trace,)
+        edges = from_spacing(both, ctx.bounds, far_side(rays[hit], ctx.bounds))
+        return pack(rays, hit, edges), () if self.proposal is None else (trace,)
 
     def first_pass(self, rays: Rays, density: Density, ctx: Context) -> tuple[Float[Tensor, "k edges"], Trace]:
         """Edges of the coarse strata in spacing coordinates, for the rays that meet the bounds, and what they weigh."""

@@ -34,7 +34,7 @@ def subject_half(points: Float[Tensor, "n 3"]) -> float:
 
 
 def near_plane(poses: Float[Tensor, "k 4 4"], points: Float[Tensor, "n 3"]) -> float | None:
-    """Distance from cameras at which samples may begin: a share of that of the nearest point; ``None`` where points say nothing.
+    """Distance from cameras at which samples may begin: a share of the nearest point's; ``None`` if points say nothing.
 
     Args:
         poses: camera-to-world; ``points`` are in the same frame.
