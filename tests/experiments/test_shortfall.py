@@ -41,7 +41,7 @@ def test_says_why_and_what_to_try(method: str, colour: float, alpha: float, dept
     if words:
         sentence = found["shortfall"]
         assert words in sentence
-        assert sentence.startswith(f"{method} reaches 8.0 dB, below the mean training image (20.0 dB): ")
+        assert sentence.startswith(f"{method} reaches 8.0 dB, below the mean training image (20.2 dB): ")
         assert " Try a longer --budget" in sentence
         assert "splatting" not in sentence.removeprefix(method) or method.startswith("volumetric")
     else:
