@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from invgraphics.config import fill, to_table
-from invgraphics.core import Bounds, Quantity, Samples
+from invgraphics.core import Bounds, Quantity, Samples, no_grad_density
 from invgraphics.errors import InputError
 from invgraphics.fields import neural
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies
@@ -282,3 +282,19 @@ def test_nonsense_is_refused(bad):
 def test_config_survives_a_round_trip():
     for config in KINDS.values():
         assert fill(NeuralFieldConfig, to_table(config)) == config
+
+
+def test_a_new_field_is_as_thin_in_endless_space_as_in_a_box(make_scene) -> None:
+    """Its optical depth from the middle outward is the contracted distance, 2 - 1/r, times the density it starts with."""
+    for half in (1.5, 0.2):
+        scene = make_scene("contracted", half=half)
+        config = NeuralFieldConfig(layers=1, width=8, skip=-1, geometry_features=2, density_bias=0.5, density_per="contracted")
+        field = config.build(scene)
+        torch.nn.init.zeros_(field.geometry_net.output.weight)
+        torch.nn.init.zeros_(field.geometry_net.output.bias)
+        r = torch.cat([torch.linspace(0, 1, 2001), torch.logspace(0, 2, 4001)[1:]]).double()
+        position = scene.bounds.centre + (half * (r[1:] + r[:-1]) / 2).float()[:, None] * torch.tensor([[0.6, 0.0, 0.8]])
+        density = no_grad_density(field)(Samples.at(position)).double()
+        depth = (density * half * r.diff()).sum()
+        start = math.log1p(math.exp(0.5))  # softplus
+        assert float(depth) == pytest.approx(start * (2 - 1 / 100), rel=1e-3)

@@ -202,19 +202,32 @@ def test_a_wire_is_kept_by_the_patience_of_a_late_fit(make_scene: Callable[..., 
     assert SMALL.decay_at(0.0) == SMALL.decay
 
 
-def test_steps_grow_in_a_contracted_space(make_scene: Callable[..., Scene]) -> None:
+def test_steps_grow_with_a_cone(make_scene: Callable[..., Scene]) -> None:
     scene = make_scene("contracted")
-    sampler, rays = SMALL.build(scene), scene.bounds.clip(scene.train[0].camera.rays())
+    steps = SMALL.steps_per_diagonal / 4
+    sampler = replace(SMALL, cone=1 / steps).build(scene)
+    rays = scene.bounds.clip(scene.train[0].camera.rays())
     samples, _ = sampler.sample(rays, lambda s: torch.zeros(len(s)), context(scene, training=False))
     first = samples[samples.ray == 0]
     assert float(first.t1[-1]) == pytest.approx(float(rays.far[0]))
-    steps = SMALL.steps_per_diagonal / 4
     grown = first.t0 > steps * sampler.length
     torch.testing.assert_close(first.delta[grown][:-1], first.t0[grown][:-1] / steps, rtol=1e-3, atol=0)
     # An even fog is worth as much per step as it is long: far cells must not be forgotten.
-    sampler = learnt(SMALL, scene, Sphere(0.05, 1e6))
+    sampler = learnt(replace(SMALL, cone=1 / steps), scene, Sphere(0.05, 1e6))
     far = sampler.ema[0, 8, 8] / sampler.ema[8, 8, 8]
     assert float(far) > 2
+
+
+def test_endless_space_takes_as_many_steps_as_its_contraction_is_long(make_scene: Callable[..., Scene]) -> None:
+    """Each but the last, which is cut, is the same part of the way through the contracted ball, to first order."""
+    scene = make_scene("contracted")
+    sampler, rays = replace(SMALL, steps_per_diagonal=2048).build(scene), scene.bounds.clip(scene.train[0].camera.rays())
+    samples, _ = sampler.sample(rays, lambda s: torch.zeros(len(s)), context(scene, training=False))
+    first = samples[(samples.ray == 0) & (samples.t1 < 20)]
+    ends = [scene.bounds.to_unit(rays[:1].at(t[None])[0]) for t in (first.t0, first.t1)]
+    moved = (ends[1] - ends[0]).norm(dim=1) * 4 * scene.bounds.half[0]
+    torch.testing.assert_close(moved, torch.full_like(moved, sampler.length), rtol=0.05, atol=0)
+    assert 100 < len(samples) / len(rays) < 4 * 2048 / 3**0.5 / 2
 
 
 def test_nothing_is_culled_before_the_field_was_fitted_at_all(make_scene: Callable[..., Scene]) -> None:

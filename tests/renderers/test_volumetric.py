@@ -175,3 +175,20 @@ def test_updates_reach_the_sampler(make_scene: Callable[..., Scene]) -> None:
     make.update(Sphere(50.0, 0.3), Context(scene.bounds, training=True))
     assert not make.sampler.occupied.all()  # type: ignore[union-attr]
     assert {"sampler.ema", "sampler.occupied", "sampler.step"} == set(make.state_dict())
+
+
+def test_near_samples_pull_less_but_look_the_same(make_scene: Callable[..., Scene], make_camera: Callable[..., Camera]) -> None:
+    """A slab at a known distance: its colour's gradient is scaled by that distance squared, in endless space only."""
+    rays = Rays.make(torch.zeros(5, 3, dtype=F64), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(5, 3))
+    for space, scale in (("contracted", 0.5**2), ("box", 1.0)):
+        pictures, gradients = [], []
+        for reach in (0.0, 1.0):
+            field = Slab(20.0, 0.495, 0.505, colour=(0.2, 0.5, 0.8)).double()
+            field.colour = torch.nn.Parameter(field.colour.detach().clone())
+            model = VolumetricConfig(StratifiedConfig(4000), gradient_reach=reach).build(make_scene(space))
+            rendering, _ = model.render_rays(field, rays, Context(box(space), training=True))
+            pictures.append(rendering.rgb.detach())
+            (gradient,) = torch.autograd.grad(rendering.rgb.sum(), field.colour)
+            gradients.append(gradient)
+        torch.testing.assert_close(pictures[1], pictures[0], atol=0.02, rtol=0.1)
+        torch.testing.assert_close(gradients[1] / gradients[0], torch.full((3,), scale, dtype=F64), rtol=0.1, atol=0)

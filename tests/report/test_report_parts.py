@@ -151,6 +151,9 @@ def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
     assert "One seed per method" in " ".join(verdict(single, summarise(single)))
     bad = replace(comparison, baselines={"nearest view": {"psnr": replace(comparison.runs[0].quality["psnr"], mean=28.0)}})
     assert "did not beat the trivial baseline 'nearest view'" in " ".join(verdict(bad, summarise(bad)))
+    foggy = replace(comparison, runs=tuple(replace(run, shortfall=f"{run.method}: fog.") for run in comparison.runs))
+    told = verdict(foggy, summarise(foggy))
+    assert [told.count(f"{method}: fog.") for method in comparison.methods] == [1] * len(comparison.methods)
 
 
 def test_words() -> None:

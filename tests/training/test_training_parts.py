@@ -136,6 +136,11 @@ def test_background_is_random_only_where_there_is_alpha(scene) -> None:
 
     opaque = scene.with_views(train=tuple(replace(view, alpha=None) for view in scene.train))
     assert torch.equal(Batches(BatchConfig(), opaque, generator, torch.device("cpu")).background(), scene.background)
+    # Unless a method asks for it, in endless space: there every ray ends somewhere.
+    for space, random in (("box", False), ("contracted", True)):
+        placed = replace(opaque, bounds=replace(opaque.bounds, space=space))
+        batches = Batches(BatchConfig(opaque=True), placed, generator, torch.device("cpu"))
+        assert torch.equal(batches.background(), batches.background()) != random
 
 
 def test_ray_count_follows_samples(scene) -> None:

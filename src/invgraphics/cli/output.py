@@ -38,3 +38,5 @@ def show_scores(scores: Mapping[str, Any]) -> None:
         print(f"Test poses: {scores['test_poses']}. Pose errors are medians over the training views.")
     for name, why in scores["skipped"].items():
         print(f"{name}: {why}")
+    if "shortfall" in scores:
+        print(scores["shortfall"])

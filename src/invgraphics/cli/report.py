@@ -90,6 +90,8 @@ def write_report(folder: Path, out: Path | None = None, public: bool = False) ->
         cells = [row.cells[index] for row in summary.rows]
         rows.append([column.heading, *(f"{cell.text} {cell.spread}{' *' if cell.best else ''}".strip() for cell in cells)])
     show_table(f"{comparison.question} (* best)", ["", *(row.label for row in summary.rows)], rows)
+    for sentence in dict.fromkeys(run.shortfall for run in comparison.runs if run.shortfall):
+        print(sentence)
     for failure in comparison.failures:
         print(
             f"{failure.method}, seed {failure.seed}, failed: {failure.error.splitlines()[0] if failure.error else 'no message'}"

@@ -59,6 +59,13 @@ class Bounds:
         x = uncontract((unit * 2 - 1) * 2) if self.space == "contracted" else unit * 2 - 1
         return self.centre + x * self.half
 
+    def radial_scale(self, position: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m"]:
+        """Contracted length per length along the radius, 1 / |x|² outside the unit ball; 1 inside it and in a box."""
+        if self.space == "box":
+            return torch.ones_like(position[..., 0])
+        x, y, z = ((position - self.centre) / self.half).unbind(dim=-1)
+        return 1 / (x * x + y * y + z * z).clamp_min(1.0)
+
     def contains(self, position: Float[Tensor, "*m 3"]) -> Tensor:
         """Whether a position is described by the field (everything, in a contracted space)."""
         if self.space == "contracted":

@@ -20,6 +20,7 @@ from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.experiments.recipe import Method
+from invgraphics.experiments.shortfall import observe, shortfall
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
@@ -68,7 +69,7 @@ def evaluate(
     field, renderer = model
     device = next(field.parameters()).device
     (folder.root / "test").mkdir(exist_ok=True)
-    scores, seconds = [], []
+    scores, seconds, observed = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
     with Reporter(f"{method.name} evaluation") as reporter:
         render_view(field, renderer, scene.test[0].camera.resized(16, 16), scene, device)  # first use pays for allocation
@@ -80,6 +81,7 @@ def evaluate(
             picture = picture if posed is None else posed.as_seen(picture, camera, view)
             _save_view(folder.root / "test" / f"{index:04d}", picture, scene)
             scores.append(score(picture, view, scene, rules))
+            observed.append(observe(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
     result = {
@@ -97,6 +99,7 @@ def evaluate(
     }
     if disturbed := disturbance(costs.get("fit_processor_share")):
         result["disturbed"] = disturbed
+    result |= shortfall(method.name, quality, observed, scene, rules)
     if posed is not None:
         result["test_poses"] = protocol_note(method)
     folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)

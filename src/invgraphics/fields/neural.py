@@ -59,6 +59,8 @@ class NeuralFieldConfig:
         direction_degree: octaves for ``frequency``; bands for ``sh``, 1 to 4.
         density_activation: ``exp`` stops growing at exp(15); not used for ``sdf``.
         density_bias: added before that activation (mip-NeRF: softplus and -1).
+        density_per: unit of length of the network's density. ``contracted``: in a contracted space, the box's half-extent after
+            contraction along the radius, so that a new field is as thin a fog all the way to infinity as in a box.
     """
 
     encoding: Annotated[Any, Slot("encodings")] = field(default_factory=FrequencyConfig)
@@ -73,6 +75,7 @@ class NeuralFieldConfig:
     direction_degree: int = 4
     density_activation: Literal["softplus", "exp", "relu"] = "softplus"
     density_bias: float = -1.0
+    density_per: Literal["local", "contracted"] = "local"
 
     def __post_init__(self) -> None:
         if self.layers < 0 or self.colour_layers < 0:
@@ -207,8 +210,14 @@ class NeuralField(Field):
             return None
         geometry, colour = (net.layers() for net in (self.geometry_net, self.colour_net))
         bands = config.direction_degree if config.direction == "sh" else 0
-        activation, bias = config.density_activation, config.density_bias
-        return HashField(encoding.table.detach(), encoding.grid, geometry, colour, activation, bias, bands, self.colour)
+        density = config.density_activation, config.density_bias, bands, self.colour, self._contracted_density
+        return HashField(encoding.table.detach(), encoding.grid, geometry, colour, *density)
+
+    @property
+    def _contracted_density(self) -> float:
+        """Half-extents per local length unit where densities are per half-extent after contraction, else 0."""
+        contracted = self._space == "contracted" and self.config.density_per == "contracted"
+        return 1 / float(self.bounds.half.mean()) if contracted else 0.0
 
     def _encode(self, samples: Samples, position: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
         unit = self.bounds.to_unit(position)
@@ -255,6 +264,8 @@ class NeuralField(Field):
     def _density(self, raw: Float[Tensor, " m"], position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
         activation = {"softplus": softplus, "exp": truncated_exp, "relu": relu}[self.config.density_activation]
         density = activation(raw + self.config.density_bias)
+        if self._contracted_density > 0:
+            density = density * (self._contracted_density * self.bounds.radial_scale(position))
         return torch.where(self.bounds.contains(position), density, torch.zeros_like(density))
 
 

@@ -71,6 +71,7 @@ class HashField:
         bias: see ``density``.
         bands: bands of spherical harmonics of the direction that the colour network sees, 0 to 4.
         colour_space: radiance is the raw one's sigmoid for ``srgb``, its softplus for ``linear``.
+        contracted_density: what densities are multiplied with besides `Bounds.radial_scale`; 0 leaves them as they are.
     """
 
     table: Float[Tensor, "entries f"]
@@ -81,6 +82,7 @@ class HashField:
     bias: float
     bands: int
     colour_space: Literal["srgb", "linear"]
+    contracted_density: float = 0.0
 
 
 @runtime_checkable
@@ -95,17 +97,19 @@ def hash_field(field: object, bounds: Bounds) -> HashField | None:
 
 @dataclass(frozen=True)
 class MarchSteps:
-    """How a ray is walked: t grows by ``max(step, cone * t)``.
+    """How a ray is walked: t grows by ``max(step, cone * t)``, or by what is ``step`` long after contraction.
 
     Attributes:
         step: shortest step, local units.
         cone: growth of the step with distance (0 for bounded scenes, 1/256 in Instant-NGP's unbounded ones).
         limit: most samples kept per ray in one march.
+        contracted: steps of equal contracted length (see `kernels.reference.march.step_lengths`); ``cone`` must be 0.
     """
 
     step: float
     cone: float = 0.0
     limit: int = 1024
+    contracted: bool = False
 
 
 @dataclass(frozen=True, eq=False)

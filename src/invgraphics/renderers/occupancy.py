@@ -12,9 +12,11 @@ from torch import Tensor
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, FieldValues, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.core.field import Density, NoGradDensity
+from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import March, MarchSteps, hash_field
 from invgraphics.renderers.samplers import uniform
 from invgraphics.renderers.termination import Look, in_front
+from invgraphics.renderers.visibility import visible_cells
 
 LATE = 0.5
 """Progress of a fit at which its late steps begin to replace the usual ones."""
@@ -34,8 +36,8 @@ class OccupancyConfig:
             no change.
         late_steps: the same at the end of training; the number moves there over the second half of the fit. Shorter steps
             show thin things, once they are all that is left to be learned. ``None``: no change.
-        cone: growth of the step with distance; ``None`` means 0 in a box and 4 / ``steps_per_diagonal`` (Instant-NGP's
-            1/256) in a contracted space.
+        cone: growth of the step with distance; ``None`` means 0 in a box and steps of equal contracted length in a contracted
+            space, where Instant-NGP's is 1/256.
         grace: training steps before the first refresh. What is thinner than the threshold before it was ever seen would be
             culled, never be sampled, and never grow.
         decay: what a cell's memory is multiplied with when the cell is looked at again.
@@ -102,8 +104,10 @@ class OccupancyConfig:
         return early * (usual / early) ** min(1.0, 4 * progress) * (late / usual) ** max(0.0, (progress - LATE) / (1 - LATE))
 
     def build(self, scene: Scene) -> Occupancy:
-        """The sampler, every cell occupied."""
-        return Occupancy(self, scene.bounds)
+        """The sampler; every cell is occupied, in endless space only those that a training view shows."""
+        endless = scene.bounds.space == "contracted" and len(scene.train) > 0
+        cameras = [view.camera for view in scene.train]
+        return Occupancy(self, scene.bounds, visible_cells(scene.bounds, self.resolution, cameras) if endless else None)
 
 
 class Occupancy(Sampler):
@@ -112,22 +116,25 @@ class Occupancy(Sampler):
     Attributes:
         ema: fading maximum of the optical depth that one step has in each cell.
         occupied: cells worth a sample.
+        visible: cells that may be; ``None`` for all. Not part of the state: it follows from the scene.
         step: number of updates asked for so far.
     """
 
     ema: Float[Tensor, "r r r"]
     occupied: Bool[Tensor, "r r r"]
+    visible: Bool[Tensor, "r r r"] | None
     step: Int[Tensor, ""]
 
-    def __init__(self, config: OccupancyConfig, bounds: Bounds) -> None:
+    def __init__(self, config: OccupancyConfig, bounds: Bounds, visible: Bool[Tensor, "r r r"] | None = None) -> None:
         super().__init__()
         self.config = config
         shape = (config.resolution,) * 3
         self.register_buffer("ema", torch.zeros(shape))
-        self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool))
+        self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool) if visible is None else visible.clone())
+        self.register_buffer("visible", visible, persistent=False)
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
-        growing = 4 / config.steps_per_diagonal if bounds.space == "contracted" else 0.0
-        self.cone = growing if config.cone is None else config.cone
+        self.contracted = bounds.space == "contracted" and config.cone is None
+        self.cone = config.cone or 0.0
         self.length = 2 * bounds.radius / config.steps_per_diagonal
 
     def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
@@ -148,8 +155,9 @@ class Occupancy(Sampler):
     @torch.no_grad()
     def _march_in_one_pass(self, rays: Rays, density: NoGradDensity, ctx: Context) -> March | None:
         """A march that stops by itself, if there is a kernel for what the field is made of and for these steps."""
-        parts, steps, boxed = hash_field(density.field, ctx.bounds), self.steps(ctx), ctx.bounds.space == "box"
-        if parts is None or not boxed or steps.cone > 0 or not kernels.compiled("hash_march", parts.table):
+        parts, steps = hash_field(density.field, ctx.bounds), self.steps(ctx)
+        even = ctx.bounds.space == "box" or steps.contracted
+        if parts is None or not even or steps.cone > 0 or not kernels.compiled("hash_march", parts.table):
             return None
         start = self._start(rays, steps, ctx)
         return kernels.hash_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
@@ -158,13 +166,13 @@ class Occupancy(Sampler):
         """How long steps are now."""
         usual = self.config.steps_per_diagonal
         now = self.config.steps_at(ctx.progress) if ctx.training else self.config.evaluation_steps or usual
-        return MarchSteps(self.length * usual / now, self.cone * usual / now)
+        return MarchSteps(self.length * usual / now, self.cone * usual / now, contracted=self.contracted)
 
     def _start(self, rays: Rays, steps: MarchSteps, ctx: Context) -> Float[Tensor, " n"]:
         """Where rays begin: in training their whole lattice of steps is shifted, so that every distance gets its turn."""
         if not ctx.training:
             return rays.near
-        return rays.near + uniform((len(rays),), ctx, like=rays.near) * (steps.cone * rays.near).clamp_min(steps.step)
+        return rays.near + uniform((len(rays),), ctx, like=rays.near) * step_lengths(rays, rays.near, ctx.bounds, steps)
 
     @torch.no_grad()
     def _march(self, rays: Rays, ctx: Context) -> March:
@@ -214,17 +222,22 @@ class Occupancy(Sampler):
         # The mean of equal float32 numbers must not exceed them, or an even fog would vanish: sum in float64.
         mean = float(self.ema.mean(dtype=torch.float64))
         self.occupied.copy_(self.ema >= min(self.config.threshold, mean))
+        if self.visible is not None:
+            self.occupied &= self.visible
 
     def _thickness(self, cells: Int[Tensor, " k"], density: Density, ctx: Context) -> Float[Tensor, " k"]:
         """Optical depth of one step at a random point of each cell.
 
-        Steps grow with the distance from the camera, which a cell does not know; the distance from the middle of the
-        bounds stands in for it. Steps that become shorter late in a fit make no cell emptier.
+        Steps of equal contracted length are taken along the radius. With a cone they grow with the distance from the camera,
+        which a cell does not know; the distance from the middle of the bounds stands in for it. Steps that become shorter
+        late in a fit make no cell emptier.
         """
         corner = torch.stack(torch.unravel_index(cells, self.ema.shape), dim=1)
         unit = (corner + uniform((len(cells), 3), ctx, like=self.ema)) / self.config.resolution
         position = ctx.bounds.from_unit(unit.to(ctx.bounds.lo.dtype))
         steps = self.steps(replace(ctx, progress=min(ctx.progress, LATE)))
+        if steps.contracted:
+            return density(Samples.at(position)) * steps.step / ctx.bounds.radial_scale(position)
         distance = (position - ctx.bounds.centre).norm(dim=1)
         return density(Samples.at(position)) * (steps.cone * distance).clamp_min(steps.step)
 

@@ -48,7 +48,8 @@ class Stratified(Sampler):
     def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Samples on every ray that meets the bounds; the density is not asked."""
         hit = hitting(rays)
-        edges = from_spacing(strata(rays[hit], self.config.count, ctx), ctx.bounds)
+        knee = far_side(rays[hit], ctx.bounds)
+        edges = from_spacing(strata(rays[hit], self.config.count, ctx, knee), ctx.bounds, knee)
         return pack(rays, hit, edges), ()
 
 
@@ -95,13 +96,15 @@ class Hierarchical(Sampler):
             weights = trace.weights.reshape(len(hit), self.config.coarse)
             drawn = invert(spacing, weights + PADDING, quantiles(len(hit), self.config.fine, ctx, like=spacing))
         both = torch.cat([spacing, drawn], dim=1).sort(dim=1).values
-        return pack(rays, hit, from_spacing(both, ctx.bounds)), () if self.proposal is None else (trace,)
+        edges = from_spacing(both, ctx.bounds, far_side(rays[hit], ctx.bounds))
+        return pack(rays, hit, edges), () if self.proposal is None else (trace,)
 
     def first_pass(self, rays: Rays, density: Density, ctx: Context) -> tuple[Float[Tensor, "k edges"], Trace]:
         """Edges of the coarse strata in spacing coordinates, for the rays that meet the bounds, and what they weigh."""
         hit = hitting(rays)
-        spacing = strata(rays[hit], self.config.coarse, ctx)
-        coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds))
+        knee = far_side(rays[hit], ctx.bounds)
+        spacing = strata(rays[hit], self.config.coarse, ctx, knee)
+        coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds, knee))
         if self.proposal is None:
             values, sigma = None, density(coarse)
         else:
@@ -117,28 +120,34 @@ def hitting(rays: Rays) -> Int[Tensor, " k"]:
     return torch.nonzero(rays.far > rays.near)[:, 0]
 
 
-def to_spacing(t: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:
+def far_side(rays: Rays, bounds: Bounds) -> Float[Tensor, "k 1"]:
+    """Distance at which rays have the bounds' unit ball behind them, wherever they began."""
+    return (rays.origins - bounds.centre).norm(dim=1, keepdim=True) + bounds.half.max()
+
+
+def to_spacing(t: Float[Tensor, "*n"], bounds: Bounds, knee: float | Tensor | None = None) -> Float[Tensor, "*n"]:
     """The coordinate in which strata are equal: distance itself in a box.
 
-    In a contracted space, distance up to the box's radius and disparity beyond it (nerfacto), both scaled to run over
-    halves of [0, 1].
+    In a contracted space, distance up to ``knee`` (by default the box's radius) and disparity beyond it (nerfacto), both
+    scaled to run over halves of [0, 1].
     """
     if bounds.space == "box":
         return t
-    x = t / bounds.radius
+    x = t / (bounds.radius if knee is None else knee)
     return torch.where(x < 1, x / 2, 1 - 1 / (2 * x.clamp_min(1)))
 
 
-def from_spacing(s: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:
+def from_spacing(s: Float[Tensor, "*n"], bounds: Bounds, knee: float | Tensor | None = None) -> Float[Tensor, "*n"]:
     """Inverse of `to_spacing`."""
     if bounds.space == "box":
         return s
-    return torch.where(s < 0.5, 2 * s, 1 / (2 * (1 - s.clamp_min(0.5)))) * bounds.radius
+    return torch.where(s < 0.5, 2 * s, 1 / (2 * (1 - s.clamp_min(0.5)))) * (bounds.radius if knee is None else knee)
 
 
-def strata(rays: Rays, count: int, ctx: Context) -> Float[Tensor, "k edges"]:
+def strata(rays: Rays, count: int, ctx: Context, knee: Float[Tensor, "k 1"] | None = None) -> Float[Tensor, "k edges"]:
     """``count + 1`` edges from near to far in spacing coordinates; in training the inner ones move by up to half a stratum."""
-    near, far = to_spacing(rays.near, ctx.bounds), to_spacing(rays.far, ctx.bounds)
+    bend = None if knee is None else knee[:, 0]
+    near, far = to_spacing(rays.near, ctx.bounds, bend), to_spacing(rays.far, ctx.bounds, bend)
     fraction = torch.arange(count + 1, dtype=near.dtype, device=near.device).expand(len(near), -1)
     if ctx.training and count > 1:
         shift = uniform((len(near), count - 1), ctx, like=near) - 0.5

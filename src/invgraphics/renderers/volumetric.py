@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from invgraphics import kernels
 from invgraphics.config import Slot
@@ -42,13 +44,21 @@ class VolumetricConfig:
 
     Attributes:
         sampler: where along the rays to look.
+        gradient_reach: in endless space, gradients of samples nearer to a camera than this are scaled by the square of their
+            distance over it, local units; 0 leaves them alone. Few pixels see what is near a camera, and each sees it large
+            (Philip and Deschaintre 2023, Floaters no more).
     """
 
     sampler: Annotated[Any, Slot("samplers")] = field(default_factory=StratifiedConfig)
+    gradient_reach: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.gradient_reach < 0:
+            raise ValueError(f"gradient_reach must not be negative, not {self.gradient_reach}")
 
     def build(self, scene: Scene) -> Volumetric:
         """The renderer with its sampler."""
-        return Volumetric(self.sampler.build(scene))
+        return Volumetric(self.sampler.build(scene), self.gradient_reach)
 
 
 class Volumetric(RayRenderer):
@@ -56,9 +66,10 @@ class Volumetric(RayRenderer):
 
     requires: ClassVar[Quantity] = Quantity.DENSITY | Quantity.RADIANCE
 
-    def __init__(self, sampler: Sampler) -> None:
+    def __init__(self, sampler: Sampler, gradient_reach: float = 0.0) -> None:
         super().__init__()
         self.sampler = sampler
+        self.gradient_reach = gradient_reach
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; normals are added when ``ctx.geometry`` asks for them and the field has some."""
@@ -72,6 +83,9 @@ class Volumetric(RayRenderer):
         else:
             values = query(field, samples, want, ctx.chunk)
         assert values.density is not None
+        if self.gradient_reach > 0 and ctx.bounds.space == "contracted" and torch.is_grad_enabled():
+            values = _scale_gradients(values, (samples.mid.detach() / self.gradient_reach).square().clamp_max(1.0))
+            assert values.density is not None
         return integrate(rays, samples, values, values.density * samples.delta, levels)
 
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
@@ -96,6 +110,14 @@ class Volumetric(RayRenderer):
     def update(self, field: Field, ctx: Context) -> None:
         """Let the sampler refresh what it remembers of the field."""
         self.sampler.update(no_grad_density(field), ctx)
+
+
+def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldValues:
+    """Density and radiance as they are, with gradients multiplied by ``scale``."""
+    assert values.density is not None
+    assert values.radiance is not None
+    density = torch.lerp(values.density.detach(), values.density, scale)
+    return replace(values, density=density, radiance=torch.lerp(values.radiance.detach(), values.radiance, scale[:, None]))
 
 
 def _seen(field: Field, samples: Samples, rays: int, want: Quantity, chunk: int) -> FieldValues:

@@ -93,6 +93,7 @@ def read_run(folder: Path, protocol: str = "default") -> Run:
         environment=dict(read_table(folder / "environment.json")),
         truth=(folder / str(provenance["truth"])).resolve(),
         disturbed=optional(scores, "disturbed", str, source, ""),
+        shortfall=optional(scores, "shortfall", str, source, ""),
     )
 
 

@@ -65,6 +65,7 @@ class Run:
         environment: the machine and the versions.
         truth: folder of the truth's pictures.
         disturbed: why its times say nothing, the subject left out: other programs had its cores; empty where they did not.
+        shortfall: why it may have lost to the mean training image, and what to try; empty where it has not.
     """
 
     folder: Path
@@ -82,6 +83,7 @@ class Run:
     environment: dict[str, Any]
     truth: Path
     disturbed: str = ""
+    shortfall: str = ""
 
     @property
     def truth_hash(self) -> str:

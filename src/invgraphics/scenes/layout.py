@@ -15,6 +15,7 @@ from invgraphics.core import Bounds, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity, transform_points
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, Photo, load_view, match_sizes, wanted_size
+from invgraphics.scenes.region import near_plane, subject_half
 
 T = TypeVar("T")
 
@@ -159,13 +160,14 @@ def contracted_frame(
     """A frame for an unbounded scene: +z is the cameras' mean up, the subject is at the origin, cameras within distance 1.
 
     The subject is where the optical axes come closest to each other. Where they are too parallel for that it lies ``distance``
-    ahead of the cameras, and where it would be behind them (an inside-out rig) it is the middle of the cameras.
+    ahead of the cameras, and where it would be behind them (an inside-out rig) it is the middle of the cameras. The box is
+    fitted to most of the points (`subject_half`), if there are any.
 
     Args:
         poses: camera-to-world, float64.
-        points: known surface points, world frame; kept, and used where ``distance`` is not given.
+        points: known surface points, world frame; kept, and used for what is not given.
         distance: how far ahead the subject is, world units.
-        near: closest thing in front of a camera, world units.
+        near: closest thing in front of a camera, world units; by default somewhat less than the distance of the nearest points.
     """
     position, forward = poses[:, :3, 3], poses[:, :3, 2]
     middle = position.mean(dim=0)
@@ -186,7 +188,10 @@ def contracted_frame(
     world_from_local = torch.eye(4, dtype=poses.dtype)
     world_from_local[:3, :3] = radius * _turn_z_to(-poses[:, :3, 1].mean(dim=0))
     world_from_local[:3, 3] = centre
-    bounds = Bounds(-torch.ones(3), torch.ones(3), "contracted", near=NEAR if near is None else near / radius)
+    known = torch.zeros(0, 3, dtype=poses.dtype) if points is None else points.position.to(poses.dtype)
+    near = near_plane(poses, known) if near is None else near
+    half = torch.full((3,), subject_half((known - centre) / radius))
+    bounds = Bounds(-half, half, "contracted", near=NEAR if near is None else near / radius)
     return Frame(bounds, world_from_local, points)
 
 

@@ -23,6 +23,8 @@ class BatchConfig:
         samples: target number of samples per step: the ray count follows what is kept (Instant-NGP); 0 keeps ``rays``.
         resolution: image scale of each phase of the fit; the last should be 1.
         until: progress at which each phase but the last ends; one fewer than ``resolution``.
+        opaque: in endless space, opaque photographs are seen in front of a random background too: every ray must end somewhere,
+            and darkness cannot be learnt as emptiness.
     """
 
     rays: int = 1024
@@ -30,6 +32,7 @@ class BatchConfig:
     samples: int = 0
     resolution: tuple[float, ...] = (1.0,)
     until: tuple[float, ...] = ()
+    opaque: bool = False
 
     def __post_init__(self) -> None:
         if self.rays < 1 or self.views < 1 or self.samples < 0:
@@ -76,8 +79,11 @@ class Batches:
         self._small: dict[tuple[int, float], View] = {}
 
     def background(self) -> Float[Tensor, 3]:
-        """Random where photographs are transparent, so that emptiness must be learnt; declared otherwise. All methods alike."""
-        if self._scene.has_alpha:
+        """Random where photographs are transparent, so that emptiness must be learnt, all methods alike; declared otherwise.
+
+        See `BatchConfig.opaque` for the one exception.
+        """
+        if self._scene.has_alpha or (self._config.opaque and self._scene.bounds.space == "contracted"):
             return torch.rand(3, generator=self._generator)
         return self._scene.background
 

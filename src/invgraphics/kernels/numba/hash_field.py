@@ -15,7 +15,7 @@ ACTIVATIONS = ("exp", "softplus", "relu")
 """Of densities, by the numbers that kernels know them by."""
 _EXP, _SOFTPLUS = 0, 1
 
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0.0, 1.0, 2.0, 4.0))
 _LOG2E, _LN2 = np.float32(1 / np.log(2.0)), np.float32(np.log(2.0))
 _MOST = np.float32(EXP_LIMIT)
 _LARGEST = np.float32(80.0)
@@ -40,6 +40,14 @@ def density_of(raw, activation):
     if activation == _EXP:
         return exp2(min(raw, _MOST) * _LOG2E)
     return softplus(raw) if activation == _SOFTPLUS else max(raw, _ZERO)
+
+
+@inlined
+def radial_scale(points, p):
+    """`Bounds.radial_scale` at position ``p`` in the unit cube of a contracted space: (2 - |y|)², y after contraction."""
+    x, y, z = _FOUR * points[0, p] - _TWO, _FOUR * points[1, p] - _TWO, _FOUR * points[2, p] - _TWO
+    left = min(_TWO - np.sqrt(x * x + y * y + z * z), _ONE)
+    return left * left
 
 
 @inlined

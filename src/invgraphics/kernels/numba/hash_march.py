@@ -14,23 +14,28 @@ from invgraphics.kernels.numba.composite import absorb
 from invgraphics.kernels.numba.dense import POINTS
 from invgraphics.kernels.numba.hash import levels_of
 from invgraphics.kernels.numba.hash_cells import BLOCK
-from invgraphics.kernels.numba.hash_field import ACTIVATIONS, density_of, encode, outputs_of, packed_network
+from invgraphics.kernels.numba.hash_field import ACTIVATIONS, density_of, encode, outputs_of, packed_network, radial_scale
 from invgraphics.kernels.numba.hash_places import EDGE, fill, no_rays, step_of, stop
-from invgraphics.kernels.numba.march import ROOM, longest, packed, surroundings
+from invgraphics.kernels.numba.march import ROOM, most_steps, packed, surroundings
 from invgraphics.kernels.numba.runtime import array, inlined, parallel, prange, scratch, threads
 from invgraphics.kernels.types import HashField, March, MarchSteps
 
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+
 
 @inlined
-def _keep(s, said, way, far, settings, rows, counts):
-    """Write down the step of slot ``s``, of which ``said`` was said, and let its ray go on if light is left behind it."""
-    activation, bias, opaque = settings
+def _keep(s, said, scale, way, far, settings, rows, counts):
+    """Write down the step of slot ``s``, of which ``said`` was said, and let its ray go on if light is left behind it.
+
+    ``scale`` is what the density is multiplied with.
+    """
+    activation, bias, opaque, _ = settings
     r = way.which[s]
     begin, end = step_of(way, s)
     way.done[s] += 1
     rows[0, r, counts[r]], rows[1, r, counts[r]] = begin, end
     counts[r] += 1
-    passed, _ = absorb(density_of(said + bias, activation) * (end - begin))
+    passed, _ = absorb(density_of(said + bias, activation) * scale * (end - begin))
     way.light[s] *= passed
     if way.light[s] < opaque:
         stop(way, s, far)
@@ -40,7 +45,8 @@ def _keep(s, said, way, far, settings, rows, counts):
 def reach(rays, space, table, levels, geometry, settings, jobs, rows, counts):
     """Steps of every ray that light reaches, in ``rows``: begin and end; ``counts`` of them, which are 0 before.
 
-    Arguments as in `hash_render.render`; ``settings`` are activation, bias and least transmittance.
+    Arguments as in `hash_render.render`; ``settings`` are activation, bias, least transmittance, and
+    `HashField.contracted_density`.
     """
     sizes = geometry[1]
     for job in prange(jobs):
@@ -53,7 +59,8 @@ def reach(rays, space, table, levels, geometry, settings, jobs, rows, counts):
             said = outputs_of(geometry, x, odd, even)
             for p in range(POINTS):
                 if way.slots[p] >= 0:
-                    _keep(way.slots[p], said[p], way, rays[3], settings, rows, counts)
+                    scale = settings[3] * radial_scale(points, p) if settings[3] > _ZERO else _ONE
+                    _keep(way.slots[p], said[p], scale, way, rays[3], settings, rows, counts)
 
 
 @torch.no_grad()
@@ -66,15 +73,21 @@ def hash_march(
     start: Float[Tensor, " n"],
     transmittance: float,
 ) -> March:
-    """See `invgraphics.kernels.hash_march`; endless space, steps that grow and other widths are left to the reference."""
-    if field.table.shape[1] != 2 or steps.cone > 0 or bounds.space != "box":
+    """See `invgraphics.kernels.hash_march`; steps that grow with a cone and other widths are left to the reference."""
+    endless = bounds.space == "contracted" and not steps.contracted
+    if field.table.shape[1] != 2 or steps.cone > 0 or endless:
         return reference.hash_march(rays, occupied, bounds, steps, field, start, transmittance)
     space = surroundings(occupied, bounds, steps)
     # The first output alone: nobody asks for a colour.
     *hidden, (weight, bias) = field.geometry
     model = array(field.table).reshape(-1), levels_of(field.grid), packed_network((*hidden, (weight[:1], bias[:1])))
-    settings = ACTIVATIONS.index(field.density), np.float32(field.bias), float(transmittance)
-    most = int(longest(rays, start) / steps.step) + 2
+    settings = (
+        ACTIVATIONS.index(field.density),
+        np.float32(field.bias),
+        float(transmittance),
+        np.float32(field.contracted_density),
+    )
+    most = most_steps(rays, bounds, start, steps)
     batch, found = max(1, ROOM // most), []
     for first in range(0, max(len(rays), 1), batch):
         lines = tuple(array(x[first : first + batch]) for x in (rays.origins, rays.directions, start, rays.far))

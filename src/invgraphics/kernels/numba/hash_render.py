@@ -18,23 +18,35 @@ from invgraphics.kernels.numba.composite import absorb
 from invgraphics.kernels.numba.dense import POINTS
 from invgraphics.kernels.numba.hash import levels_of
 from invgraphics.kernels.numba.hash_cells import BLOCK
-from invgraphics.kernels.numba.hash_field import ACTIVATIONS, density_of, encode, outputs_of, packed_network, sigmoid, softplus
+from invgraphics.kernels.numba.hash_field import (
+    ACTIVATIONS,
+    density_of,
+    encode,
+    outputs_of,
+    packed_network,
+    radial_scale,
+    sigmoid,
+    softplus,
+)
 from invgraphics.kernels.numba.hash_places import EDGE, fill, no_rays, step_of, stop, view_of
 from invgraphics.kernels.numba.march import surroundings
 from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, parallel, prange, threads
 from invgraphics.kernels.types import HashField, MarchSteps
 
-_ZERO, _HALF = np.float32(0.0), np.float32(0.5)
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
 @inlined
-def _meet(s, said, way, far, settings, sums, alpha):
-    """Composite the step of slot ``s``, of which ``said`` was said; returns its colour's weight, 0 if nobody will miss it."""
-    activation, bias, _, _, opaque, unseen = settings
+def _meet(s, said, scale, way, far, settings, sums, alpha):
+    """Composite the step of slot ``s``, of which ``said`` was said; returns its colour's weight, 0 if nobody will miss it.
+
+    ``scale`` is what the density is multiplied with.
+    """
+    activation, bias, _, _, opaque, unseen, _ = settings
     r = way.which[s]
     begin, end = step_of(way, s)
     way.done[s] += 1
-    passed, opacity = absorb(density_of(said + bias, activation) * (end - begin))
+    passed, opacity = absorb(density_of(said + bias, activation) * scale * (end - begin))
     weight = np.float32(way.light[s]) * opacity
     way.light[s] *= passed
     alpha[r] += weight
@@ -79,7 +91,8 @@ def render(rays, space, table, levels, geometry, colour, widest, settings, width
         geometry: layers of the density's network as `packed_network`, and their inputs and padded outputs.
         colour: the same of the radiance's.
         widest: most inputs or outputs of any layer.
-        settings: activation, bias, whether radiance is linear, bands, least transmittance, most weight of a ray to leave out.
+        settings: activation, bias, whether radiance is linear, bands, least transmittance, most weight of a ray to leave out,
+            `HashField.contracted_density`.
         width: pixels of a row of the picture.
         jobs: number of jobs.
         sums: output (n, 4).
@@ -100,7 +113,8 @@ def render(rays, space, table, levels, geometry, colour, widest, settings, width
             said = outputs_of(geometry, x, odd, even)
             for p in range(POINTS):
                 s = way.slots[p]
-                weight = _meet(s, said[p], way, rays[3], settings, sums, alpha) if s >= 0 else _ZERO
+                scale = settings[6] * radial_scale(points, p) if settings[6] > _ZERO else _ONE
+                weight = _meet(s, said[p], scale, way, rays[3], settings, sums, alpha) if s >= 0 else _ZERO
                 if weight > _ZERO:
                     _ask(p, s, said, way.views, waiting, handed, harmonic, asked)
                     whose[waiting], weights[waiting] = way.which[s], weight
@@ -134,6 +148,7 @@ def hash_render(
         field.bands,
         float(transmittance),
         np.float32(unseen),
+        np.float32(field.contracted_density),
     )
     widest = int(max(geometry[1].max(), colour[1].max()))
     sums, alpha = torch.zeros(len(rays), 4), torch.zeros(len(rays))

@@ -17,6 +17,9 @@ ROOM = 1 << 22
 """Most intervals that one batch of rays may keep, which bounds memory."""
 _ZERO = np.float32(0.0)
 
+CONTRACTED_LENGTH = 12.0
+"""No line is longer than this after contraction, in half-extents: 4 along the radius, 2 pi across it, and some room."""
+
 BLOCKS = 32
 """Most blocks along the grid's edge; their edges are powers of two, ``1 << shift`` cells long."""
 
@@ -104,11 +107,12 @@ def gather(t0, t1, counts, ends, first_ray, jobs, ray, packed0, packed1):
 
 def surroundings(
     occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps
-) -> tuple[np.ndarray, np.ndarray, int, bool, np.float32, np.float32]:
+) -> tuple[np.ndarray, np.ndarray, int, bool, np.float32, np.float32, bool]:
     """What a walk needs besides the rays.
 
     The box (centre, half edges); of every cell whether it is occupied, or how many blocks away the nearest block with an
-    occupied cell is; the blocks' shift; whether space is contracted; the steps' length and the cone's slope.
+    occupied cell is; the blocks' shift; whether space is contracted; the steps' length and the cone's slope; and whether
+    steps are equal after contraction.
     """
     box, contracted = array(torch.cat([bounds.centre, bounds.half]).float()), bounds.space == "contracted"
     cells = array(occupied)
@@ -118,7 +122,7 @@ def surroundings(
     if not contracted:
         measure(gaps)
     draw_map(cells, shift, gaps, ways)
-    return box, ways, shift, contracted, np.float32(steps.step), np.float32(steps.cone)
+    return box, ways, shift, contracted, np.float32(steps.step), np.float32(steps.cone), steps.contracted
 
 
 @torch.no_grad()
@@ -130,7 +134,7 @@ def ray_march(
     resume = torch.empty(len(rays))
     parts = []
     # A row has room for one interval more than it keeps.
-    width = 1 + _most(rays, start, steps)
+    width = 1 + min(most_steps(rays, bounds, start, steps), steps.limit + 2)
     batch = max(1, ROOM // width)
     for first in range(0, len(rays), batch):
         some = slice(first, min(first + batch, len(rays)))
@@ -160,6 +164,12 @@ def longest(rays: Rays, start: Float[Tensor, " n"]) -> float:
     return max(float((rays.far - start).nan_to_num(0.0).max()), 0.0) if len(rays) else 0.0
 
 
-def _most(rays: Rays, start: Float[Tensor, " n"], steps: MarchSteps) -> int:
-    """Most intervals that any ray can keep: steps are never shorter than ``steps.step``."""
-    return min(steps.limit, int(min(longest(rays, start) / steps.step, steps.limit)) + 2)
+def most_steps(rays: Rays, bounds: Bounds, start: Float[Tensor, " n"], steps: MarchSteps) -> int:
+    """Most steps that any ray can take: none is shorter than ``steps.step``.
+
+    A line is at most 2 pi half-extents long after contraction: its turn as seen from the centre, at a radius below 2.
+    """
+    length = longest(rays, start)
+    if steps.contracted:
+        length = min(length, CONTRACTED_LENGTH * float(bounds.half.max()))
+    return int(length / steps.step) + 2

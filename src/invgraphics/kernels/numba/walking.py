@@ -49,6 +49,19 @@ def to_unit(box, contracted, x, y, z):
 
 
 @exact
+def _step_length(box, direction, step, x, y, z):
+    """`reference.march.step_lengths` of contracted steps that begin at `LANES` positions."""
+    x, y, z = (x - box[0]) / box[3], (y - box[1]) / box[4], (z - box[2]) / box[5]
+    u, v, w = direction[0] / box[3], direction[1] / box[4], direction[2] / box[5]
+    squared = x * x + y * y + z * z
+    outside, squared = squared > _ONE, max(squared, _ONE)
+    speed, along = u * u + v * v + w * w, x * u + y * v + z * w
+    radial, across = along * along / squared, _TWO * np.sqrt(squared) - _ONE
+    scaled = radial + max(speed - radial, _ZERO) * (across * across)
+    return where(outside, step * (squared * np.sqrt(speed / scaled)), step)
+
+
+@exact
 def _inside(unit):
     """Whether positions lie in the unit cube."""
     x, y, z = unit
@@ -156,7 +169,7 @@ def walk_rays(lines, marks, room, space, t0, t1):
         t0: begins of intervals, flat.
         t1: their ends.
     """
-    box, ways, shift, contracted, step, cone = space
+    box, ways, shift, contracted, step, cone, even = space
     grid = np.float32(ways.shape[0]), np.float32(1 << shift)
     paces, per_step = _paces(lines, box), _ONE / step
     first, far = load(lines, _6), load(lines, _7)
@@ -166,6 +179,10 @@ def walk_rays(lines, marks, room, space, t0, t1):
     while any_of(going):
         # Without a cone the lattice is counted from the first step, so that leaping over steps changes no bit of the rest.
         after = first + (taken + _ONE) * step if cone == _ZERO else t + max(cone * t, step)
+        if even:
+            x, y, z = _position(lines, t)
+            direction = load(lines, _3), load(lines, _4), load(lines, _5)
+            after = t + _step_length(box, direction, step, x, y, z)
         # Otherwise the step is lost to rounding, or not a number, and the walk ends.
         moving = going & (after > t)
         end = min(after, far)

@@ -67,6 +67,8 @@ def _look(field: HashField, rays: Rays, bounds: Bounds, march: March) -> tuple[F
     outputs = _network(field.geometry, features)
     raw = outputs[:, 0] + field.bias
     density = {"exp": raw.clamp_max(EXP_LIMIT).exp(), "softplus": softplus(raw), "relu": relu(raw)}[field.density]
+    if field.contracted_density > 0:
+        density = density * (field.contracted_density * bounds.radial_scale(position))
     inputs = outputs[:, 1:]
     if field.bands:
         inputs = torch.cat([inputs, harmonics.basis(direction, field.bands - 1)], dim=1)

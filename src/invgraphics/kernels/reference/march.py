@@ -20,15 +20,16 @@ def ray_march(
 ) -> March:
     """See `invgraphics.kernels.ray_march`.
 
-    The walk visits the lattice ``start + k * step``, or with a cone t, t + dt, ... where ``dt = max(step, cone * t)``; the last
-    interval is cut at ``far``, which must be finite. ``resume`` is the end of the last interval looked at.
+    The walk visits the lattice ``start + k * step``, or with a cone or contracted steps t, t + dt, ... where dt are the
+    `step_lengths`; the last interval is cut at ``far``, which must be finite. ``resume`` is the end of the last interval looked
+    at.
     """
     done = 0
     resume, room = start.clone(), torch.full_like(start, steps.limit, dtype=torch.int64)
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
     walking = torch.nonzero((start < rays.far) & (room > 0))[:, 0]
     while len(walking):
-        edges = _edges(start[walking], resume[walking], rays.far[walking], steps, done)
+        edges = _edges(rays[walking], start[walking], resume[walking], (bounds, steps), done)
         done += BLOCK
         t0, t1 = edges[:, :-1], edges[:, 1:]
         unit = bounds.to_unit(rays[walking].at((t0 + t1) / 2))
@@ -45,17 +46,35 @@ def ray_march(
     return _packed(kept, resume)
 
 
+def step_lengths(rays: Rays, t: Float[Tensor, " n"], bounds: Bounds, steps: MarchSteps) -> Float[Tensor, " n"]:
+    """Lengths of the steps that begin at ``t`` on each ray: ``max(step, cone * t)``, or ``step`` after contraction.
+
+    With x the position and v the direction in half-extents, contraction outside the unit ball scales v's part along x by
+    1 / |x|² and the part across it by (2 |x| - 1) / |x|² (the Jacobian of mip-NeRF 360's equation 10).
+    """
+    if not steps.contracted:
+        return (steps.cone * t).clamp_min(steps.step)
+    x, y, z = ((rays.at(t) - bounds.centre) / bounds.half).unbind(dim=1)
+    u, v, w = (rays.directions / bounds.half).unbind(dim=1)
+    squared = (x * x + y * y + z * z).clamp_min(1.0)
+    speed, along = u * u + v * v + w * w, x * u + y * v + z * w
+    radial, across = along * along / squared, 2 * squared.sqrt() - 1
+    scaled = radial + (speed - radial).clamp_min(0.0) * (across * across)
+    return torch.where(squared > 1, steps.step * (squared * (speed / scaled).sqrt()), steps.step)
+
+
 def _edges(
-    start: Float[Tensor, " k"], t: Float[Tensor, " k"], far: Float[Tensor, " k"], steps: MarchSteps, done: int
+    rays: Rays, start: Float[Tensor, " k"], t: Float[Tensor, " k"], walk: tuple[Bounds, MarchSteps], done: int
 ) -> Float[Tensor, "k edges"]:
     """The next BLOCK + 1 interval ends of rays that are at ``t`` after ``done`` steps; those beyond ``far`` fall onto it."""
-    if steps.cone == 0:
+    (bounds, steps), far = walk, rays.far
+    if steps.cone == 0 and not steps.contracted:
         # Counted from the start, not added up, so that a walk may leap over steps and still meet the same lattice.
         count = torch.arange(done, done + BLOCK + 1, dtype=t.dtype, device=t.device)
         return torch.minimum(start[:, None] + count * steps.step, far[:, None])
     edges = [t]
     for _ in range(BLOCK):
-        t = t + (steps.cone * t).clamp_min(steps.step)
+        t = t + step_lengths(rays, t, bounds, steps)
         edges.append(torch.minimum(t, far))
     return torch.stack(edges, dim=1)
 

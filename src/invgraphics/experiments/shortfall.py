@@ -1,0 +1,64 @@
+"""Why a method may have lost to the mean of the training images, and what to try: one sentence for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from invgraphics.core import Camera, Rendering, Scene
+from invgraphics.metrics.baselines import mean_image
+from invgraphics.metrics.protocols import Protocol, score
+
+FOG_DEPTH = 0.6
+"""Median depth, over the camera's distance to the scene's middle, below which fog hangs in front of the cameras."""
+THIN = 0.6
+"""Mean alpha below which pictures of opaque photographs are mostly background."""
+
+
+def observe(picture: Rendering, camera: Camera, scene: Scene) -> dict[str, float]:
+    """What tells fog from emptiness: mean ``alpha``, and ``nearness``, see `FOG_DEPTH`."""
+    seen = picture.depth[picture.depth.isfinite() & (picture.alpha >= 0.5)]
+    reach = float((camera.position.cpu() - scene.bounds.centre).norm())
+    nearness = float(seen.median()) / max(reach, 1e-9) if len(seen) else 1.0
+    return {"alpha": float(picture.alpha.mean()), "nearness": nearness}
+
+
+def shortfall(
+    method: str, quality: Mapping[str, Any], observed: Sequence[Mapping[str, float]], scene: Scene, protocol: Protocol
+) -> dict[str, str]:
+    """A sentence under ``shortfall`` where the mean PSNR is below that of the mean training image; else nothing.
+
+    Args:
+        method: ``renderer/recipe``.
+        quality: the ``quality`` part of its scores.
+        observed: `observe` of each test view.
+        scene: with its training views.
+        protocol: of the scores.
+    """
+    if "psnr" not in quality or not scene.train:
+        return {}
+    with torch.no_grad():
+        pairs = zip(mean_image(scene), scene.test, strict=True)
+        values = [score(picture, view, scene, protocol, only=("psnr",)).values.get("psnr") for picture, view in pairs]
+    known = [value for value in values if value is not None]
+    if not known or quality["psnr"]["mean"] >= (baseline := sum(known) / len(known)):
+        return {}
+    means = {key: sum(view[key] for view in observed) / len(observed) for key in ("alpha", "nearness")}
+    cause, remedy = _likely(method, means, opaque=not scene.has_alpha)
+    lost = f"{method} reaches {quality['psnr']['mean']:.1f} dB, below the mean training image ({baseline:.1f} dB)"
+    return {"shortfall": f"{lost}: {cause}. Try {remedy}."}
+
+
+def _likely(method: str, means: Mapping[str, float], opaque: bool) -> tuple[str, str]:
+    """Cause and remedy, by the family of the method and what was seen of its pictures."""
+    if method.startswith("splatting/"):
+        return "its Gaussians do not cover the views yet, or overfit few photographs", "a longer --budget or more photographs"
+    remedy = "a longer --budget, a smaller --size, more photographs, or splatting/gaussians, which starts from known points"
+    if means["nearness"] < FOG_DEPTH:
+        where = f"median depth {means['nearness']:.0%} of the way to the scene's middle"
+        return f"fog hangs in front of the cameras ({where})", remedy
+    if opaque and means["alpha"] < THIN:
+        return f"its pictures are mostly empty (mean alpha {means['alpha']:.2f})", remedy
+    return "the budget ended before its fog had cleared, or it overfits few photographs", remedy

@@ -1,0 +1,38 @@
+"""Which cells of the unit cube a photograph shows: only there can anything be learnt (Instant-NGP's untrained cells)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from invgraphics.core import Bounds, Camera
+
+ROOM = 0.1
+"""Share of the picture's size by which cells may lie outside it: poses are never exact."""
+
+
+@torch.no_grad()
+def visible_cells(bounds: Bounds, resolution: int, cameras: Sequence[Camera]) -> Bool[Tensor, "r r r"]:
+    """Cells with a corner or their centre, beyond the near plane, in the picture of at least one camera."""
+    seen = _corners(bounds, resolution, 0.0, cameras)
+    padded = seen[:-1] | seen[1:]
+    padded = padded[:, :-1] | padded[:, 1:]
+    return (padded[:, :, :-1] | padded[:, :, 1:]) | _corners(bounds, resolution, 0.5, cameras)
+
+
+def _corners(bounds: Bounds, resolution: int, offset: float, cameras: Sequence[Camera]) -> Bool[Tensor, "k k k"]:
+    """Whether the lattice's points are in a picture: the cells' corners for ``offset`` 0, their centres for 0.5."""
+    count = resolution if offset else resolution + 1
+    axis = (torch.arange(count, dtype=bounds.lo.dtype, device=bounds.lo.device) + offset) / resolution
+    position = bounds.from_unit(torch.cartesian_prod(axis, axis, axis))
+    seen = torch.zeros(len(position), dtype=torch.bool, device=position.device)
+    for camera in cameras:
+        at = camera.to(position.dtype).to(position.device)
+        pixel, depth = at.project(position)
+        size = pixel.new_tensor([camera.width, camera.height])
+        inside = ((pixel >= -ROOM * size) & (pixel <= (1 + ROOM) * size)).all(dim=1)
+        seen |= inside & (depth > 0) & ((position - at.position).norm(dim=1) >= bounds.near)
+    return seen.view(count, count, count)
