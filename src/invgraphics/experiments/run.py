@@ -30,7 +30,7 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.scenes.corrupt import corrupt
-from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.scenes.open import SceneOptions, choices, open_scene
 from invgraphics.training import checkpoint
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -101,7 +101,8 @@ def _prediction(request: FitRequest, fit: Fit, method: recipe.Method) -> str:
     seconds = expected_seconds(fit.plan.field, fit.plan.renderer, fit.plan.scene, fit.plan.device)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     memory = memory_forecast(fit.plan.field, method)
-    return f"{request.method} on {fit.plan.scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}."
+    scene = fit.plan.scene
+    return f"{request.method} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
 
 
 def _evaluate(

@@ -13,7 +13,7 @@ from invgraphics.core import Scene, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions, pose
 
-__all__ = ["Loader", "SceneOptions", "find_loader", "open_scene", "validate"]
+__all__ = ["Loader", "SceneOptions", "choices", "find_loader", "open_scene", "validate"]
 
 _SAME_POSE = 1e-6  # entries of two poses that are closer than this are one camera
 
@@ -74,6 +74,11 @@ def find_loader(path: Path) -> Loader:
         "Looked for truth.json, transforms_train.json, transforms.json, poses_bounds.npy, sparse/0/cameras.bin, cameras*.npz "
         f"and .npz (formats: {', '.join(formats)}).",
     )
+
+
+def choices(scene: Scene) -> str:
+    """The scene's notes on which model and photographs were taken, a line each to print before work starts; mostly empty."""
+    return "".join(f"\n  {key}: {scene.notes[key]}" for key in ("model", "missing") if key in scene.notes)
 
 
 def _built_in() -> tuple[str, ...]:
