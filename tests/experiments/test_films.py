@@ -118,7 +118,8 @@ def test_spiral_stays_in_the_window_and_looks_at_the_subject() -> None:
 
 
 def test_film_says_why_it_takes_its_path(run: Path, tmp_path: Path, capsys) -> None:
-    film(FilmRequest(run, tmp_path / "a.mp4", frames=2))
+    film(FilmRequest(run, tmp_path / "new" / "folder" / "a.mp4", frames=2))
+    assert (tmp_path / "new" / "folder" / "a.mp4").is_file()
     assert "Path: orbit, as the photographs surround the subject." in capsys.readouterr().err
     film(FilmRequest(run, tmp_path / "a.mp4", "spiral", frames=2))
     assert "Path: spiral." in capsys.readouterr().err
@@ -156,10 +157,11 @@ def test_paths_become_films(run: Path, tmp_path: Path, path) -> None:
 
 
 def test_bad_requests_are_refused(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
     bare = fit_run(_request(toy_folder, tmp_path / "bare", budget="1steps", snapshots=0))
     for request, words in (
         (FilmRequest(bare, tmp_path / "a.mp4", "timelapse"), "no snapshots"),
-        (FilmRequest(run, tmp_path / "no" / "a.mp4"), "does not exist"),
+        (FilmRequest(run, tmp_path / "file" / "a.mp4"), "cannot be made"),
         (FilmRequest(run, tmp_path / "a.mp4", "timelapse", view=99), "--view"),
     ):
         with pytest.raises(InputError, match=words):

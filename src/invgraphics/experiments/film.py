@@ -15,7 +15,7 @@ from invgraphics.core import Camera, Context, Quantity
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display, render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.experiments.folder import RunFolder
+from invgraphics.experiments.folder import RunFolder, make_parent
 from invgraphics.experiments.paths import PATHS, Capture, PathName, classify_capture
 from invgraphics.experiments.progress import Reporter
 from invgraphics.renderers.ellipsoids import draw_ellipsoids
@@ -64,9 +64,8 @@ def film(request: FilmRequest) -> Path:
     Raises:
         InputError: the run cannot be opened, or has no snapshots for a time-lapse, or the file cannot be written.
     """
-    if not request.out.absolute().parent.is_dir():
-        raise InputError(f"The folder of '{request.out}' does not exist.", "Choose another --out.")
     fitted = open_fitted(request.run, request.scene).in_its_frame()
+    make_parent(request.out)
     if request.path == "timelapse":
         total, pictures = _timelapse(fitted, request)
     else:

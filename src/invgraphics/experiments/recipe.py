@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from invgraphics import plugins
 from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from invgraphics.experiments.schema import Recipe
@@ -78,7 +78,9 @@ def load_method(name: str, preset: str | None = None, overrides: Sequence[str] =
     if preset is None:
         preset = "laptop" if "laptop" in known else ""
     if preset and preset not in known:
-        raise InputError(f"{name} has no preset '{preset}'.", f"Its presets: {', '.join(known) or 'none'}.")
+        raise InputError(
+            f"{name} has no preset '{preset}'.{did_you_mean(preset, known)}", f"Its presets: {', '.join(known) or 'none'}."
+        )
     table = merge(table, known.get(preset, {}))
     assign(table, overrides)
     return resolve(name, preset, table)
@@ -114,7 +116,8 @@ def source(name: str) -> dict[str, Any]:
         if name in plugins.names("recipes") and not path.is_file():
             return _parse(_foreign_text(name), name)
         if not path.is_file():
-            raise InputError(f"There is no method '{name}'.", f"Known methods: {', '.join(methods())}; or the path of a .toml.")
+            sentence = f"There is no method '{name}'.{did_you_mean(name, methods())}"
+            raise InputError(sentence, f"Known methods: {', '.join(methods())}; or the path of a .toml.")
     try:
         return _parse(path.read_text(), str(path))
     except OSError as error:

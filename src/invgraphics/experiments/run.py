@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import recipe
@@ -29,6 +30,7 @@ from invgraphics.experiments.renderings import check_eyes, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
+from invgraphics.metrics.protocols import protocol_named
 from invgraphics.scenes.corrupt import corrupt
 from invgraphics.scenes.open import SceneOptions, choices, open_scene
 from invgraphics.training import checkpoint
@@ -44,6 +46,7 @@ def fit_run(request: FitRequest) -> Path:
         KeyboardInterrupt: the run was interrupted and holds a checkpoint.
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
+    protocol_named(request.protocol)  # now, not when the fit is done
     budget, cadence = Budget.parse(request.budget), Cadence.parse(request.checkpoint_every)
     method = recipe.load_method(request.method, request.preset, request.recipe_overrides)
     data = training_data(request)
@@ -160,6 +163,7 @@ def describe(
         "data": training_data(request).changes(),
         "notes": shown.notes,
         "code_version": code_version(),
+        "plugins": plugins.brought(method.table, method.name),
         "command": request.shell(),
         "options": {"size": request.size, "test_views": request.test_views},
         "device": str(device),

@@ -10,7 +10,7 @@ import torch
 
 from invgraphics import plugins
 from invgraphics.core import Scene, View
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions, pose
 
 __all__ = ["Loader", "SceneOptions", "choices", "find_loader", "open_scene", "validate"]
@@ -52,7 +52,8 @@ def open_scene(
     path = Path(spec).expanduser()
     if not path.exists():
         raise InputError(
-            f"'{spec}' is neither a built-in scene nor an existing path.", f"Built-in scenes: {', '.join(_built_in())}."
+            f"'{spec}' is neither a built-in scene nor an existing path.{did_you_mean(spec, _built_in())}",
+            f"Built-in scenes: {', '.join(_built_in())}.",
         )
     return validate(find_loader(path).load(path, options))
 
