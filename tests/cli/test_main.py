@@ -106,7 +106,7 @@ def test_usage_tells_what_is_optional(name: str, expected: str, capsys) -> None:
         (["make-scene", "material"], "materials"),
         (["ablate", "training-view"], "training-views"),
         (["list", "method"], "methods"),
-        (["rescore", "nowhere", "--protocol", "nerfstudo"], "nerfstudio"),
+        (["rescore", "nowhere", "--protocol", "defualt"], "default"),
     ],
 )
 def test_misspelt_names_get_a_guess(words: list[str], guess: str, tmp_path, monkeypatch, capsys) -> None:

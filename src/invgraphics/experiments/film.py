@@ -70,9 +70,10 @@ def film(request: FilmRequest) -> Path:
         total, pictures = _timelapse(fitted, request)
     else:
         capture = classify_capture(fitted.scene)
-        request = replace(request, path=request.path or capture.path)
-        print(explanation(request.path, capture), file=sys.stderr)
-        cameras = PATHS[request.path](fitted.scene, request.frames)
+        path = request.path or capture.path
+        print(explanation(path, capture), file=sys.stderr)
+        cameras = PATHS[path](fitted.scene, request.frames)
+        request = replace(request, path=path)
         total, pictures = len(cameras), (_picture(fitted, _sized(camera, request.size)) for camera in cameras)
     with Reporter(f"{request.path} of {request.run}") as reporter:
         _write(request, _reported(pictures, total, reporter))
