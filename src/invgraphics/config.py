@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from invgraphics import plugins
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 
 T = TypeVar("T")
 
@@ -42,7 +42,7 @@ def fill(schema: type[T], table: Mapping[str, Any], path: str = "") -> T:
     for key in table:
         if key not in fields:
             known = ", ".join(fields) or "none: this part has no settings"
-            raise InputError(f"Unknown key '{_join(path, key)}'.", f"Known keys here: {known}.")
+            raise InputError(f"Unknown key '{_join(path, key)}'.{did_you_mean(key, fields)}", f"Known keys here: {known}.")
     values = {key: _convert(hints[key], value, _join(path, key)) for key, value in table.items()}
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
@@ -123,7 +123,7 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
     slot = _slot_of(hint)
     if slot is not None:
         return fill_slot(slot.registry, value, path)
-    origin, args = get_origin(hint), get_args(hint)
+    origin, args, guess = get_origin(hint), get_args(hint), ""
     if origin is Annotated:
         return _convert(args[0], value, path)
     if origin in (Union, types.UnionType):
@@ -131,6 +131,7 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
     if origin is Literal:
         if value in args:
             return value
+        guess = did_you_mean(value, [arg for arg in args if isinstance(arg, str)]) if isinstance(value, str) else ""
     elif origin is tuple and isinstance(value, list | tuple):
         if len(args) == 2 and args[1] is ...:
             return tuple(_convert(args[0], item, f"{path}.{i}") for i, item in enumerate(value))
@@ -145,7 +146,7 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
         return float(value)
     elif (hint is Any) or (hint in (int, str, bool) and type(value) is hint):
         return value
-    raise InputError(f"'{path}' cannot be {value!r}.", f"Expected: {_describe(hint)}.")
+    raise InputError(f"'{path}' cannot be {value!r}.{guess}", f"Expected: {_describe(hint)}.")
 
 
 def _convert_union(args: tuple[Any, ...], value: Any, path: str) -> Any:

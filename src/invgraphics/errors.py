@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class InputError(Exception):
     """Bad input, said in one clear sentence and, where there is one, the remedy.
@@ -25,3 +28,14 @@ class NotComposableError(InputError):
 
 class NumericalError(Exception):
     """A fit produced a number that is not finite; the sentence names the step and the tensor."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The closest known name to a misspelt one, as a question with a leading space; empty where none is close.
+
+    Names with folders (``renderer/recipe``) are also known by their last part.
+    """
+    known = list(known)
+    full = {name.rpartition("/")[2].lower(): name for name in reversed(known)} | {name.lower(): name for name in known}
+    close = difflib.get_close_matches(word.lower(), full, n=1, cutoff=0.7)
+    return f" Did you mean '{full[close[0]]}'?" if close else ""

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from typing import Any
 
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 
 REGISTRIES = {
     "fields": ("invgraphics.fields", "FIELDS"),
@@ -64,6 +65,39 @@ def origin(registry: str, name: str) -> str:
     return point.dist.name if point is not None and point.dist is not None else "unknown package"
 
 
+def brought(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
+    """Name -> distribution and version of the plug-ins among a recipe's ``type`` entries, and of the recipe itself.
+
+    Args:
+        table: a resolved recipe.
+        method: its name.
+    """
+    used = {method}
+    waiting: list[Any] = [table]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, Mapping):
+            used |= {part["type"]} if isinstance(part.get("type"), str) else set()
+            waiting += part.values()
+        elif isinstance(part, list | tuple):
+            waiting += part
+    found = {}
+    for registry in REGISTRIES:
+        for name, point in _foreign(registry).items():
+            if name in used and name not in _own(registry) and point.dist is not None:
+                found[name] = f"{point.dist.name} {point.dist.version}"
+    return found
+
+
+def installed(package: str) -> bool:
+    """Whether the distribution that `brought` calls ``name version`` is here, in whatever version."""
+    try:
+        distribution(package.partition(" ")[0])
+    except PackageNotFoundError:
+        return False
+    return True
+
+
 def load(registry: str, name: str) -> Any:
     """Import and return the object registered as ``name``.
 
@@ -73,7 +107,9 @@ def load(registry: str, name: str) -> Any:
     target = names(registry).get(name)
     if target is None:
         known = ", ".join(sorted(names(registry))) or "none"
-        raise InputError(f"There is no '{name}' among the {registry}.", f"Known {registry}: {known}.")
+        raise InputError(
+            f"There is no '{name}' among the {registry}.{did_you_mean(name, names(registry))}", f"Known {registry}: {known}."
+        )
     module, _, attribute = target.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)

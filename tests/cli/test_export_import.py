@@ -55,6 +55,21 @@ def test_there_and_back(run: Path, toy_folder: Path, tmp_path: Path, capsys, to:
     assert abs(ours["psnr"] - theirs["psnr"]) < {"ply": 1e-4, "splat": 0.1, "spz": 0.1}[to]
 
 
+@pytest.mark.parametrize(("option", "degree"), [([], 3), (["--sh-degree", "1"], 1), (["--sh-degree", "0"], 0)])
+def test_ply_has_the_bands_that_other_loaders_insist_on(run: Path, tmp_path: Path, capsys, option, degree: int) -> None:
+    """3DGS's own loader asserts 45 properties f_rest_*, channel by channel; the run has degree 1."""
+    file = tmp_path / "new folder" / "model.ply"
+    assert main.run(["export", str(run), "--to", "ply", "--out", str(file), *option]) == main.DONE
+    vertex = PlyData.read(str(file))["vertex"].data
+    rest = [name for name in vertex.dtype.names if name.startswith("f_rest_")]
+    per_channel = (degree + 1) ** 2 - 1
+    assert len(rest) == 3 * per_channel
+    filled = {index for index, name in enumerate(rest) if vertex[name].any()}
+    assert filled == {channel * per_channel + i for channel in range(3) for i in range(min(3, per_channel))}
+    assert f"SH degree                        {degree}" in capsys.readouterr().out
+    assert main.run(["export", str(run), "--to", "ply", "--out", str(file), "--sh-degree", "4"]) == main.BAD_INPUT
+
+
 def test_an_imported_run_is_a_run(run: Path, toy_folder: Path, tmp_path: Path, capsys) -> None:
     file, back = tmp_path / "model.ply", tmp_path / "back"
     export_run(ExportRequest(run, "ply", file))

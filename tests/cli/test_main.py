@@ -10,6 +10,7 @@ from invgraphics.cli import arguments, main
 from invgraphics.cli.compare import Compare
 from invgraphics.cli.evaluate import Evaluate
 from invgraphics.cli.fit import Fit
+from invgraphics.cli.output import not_scored
 from invgraphics.errors import InputError, NumericalError
 
 
@@ -71,6 +72,62 @@ def test_every_command_has_help(name: str, capsys) -> None:
     text = capsys.readouterr().out
     assert f"usage: invgraphics {name}" in text
     assert name in main.overview()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("render", "--out FILM.mp4 [-h] [OPTIONS] RUN"),
+        ("explain", "--view N --pixel COLUMN,ROW [-h] [OPTIONS] RUN"),
+        ("import", "--scene SCENE [-h] [OPTIONS] FILE"),
+        ("evaluate", "[-h] RUN [SCENE] [--protocol NAME]"),
+        ("view", "[-h] [OPTIONS] RUN [RUN2]"),
+        ("list", "[-h] [KIND ...]"),
+        ("report", "[-h] RUN ... [--out FOLDER] [--public]"),
+    ],
+)
+def test_usage_tells_what_is_optional(name: str, expected: str, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main.main([name, "--help"])
+    assert capsys.readouterr().out.splitlines()[0] == f"usage: invgraphics {name} {expected}"
+
+
+@pytest.mark.parametrize(
+    ("words", "guess"),
+    [
+        (["fit", "volumetric/hahs", "bricks"], "volumetric/hash"),
+        (["fit", "gaussians", "bricks"], "splatting/gaussians"),
+        (["compare", "brics", "--methods", "volumetric/hash"], "bricks"),
+        (["fit", "volumetric/hash", "bricks", "--preset", "laptpo"], "laptop"),
+        (["fit", "volumetric/hash", "bricks", "--set", "batches.ray=3"], "rays"),
+        (["fit", "volumetric/hash", "bricks", "--set", "fields.width=3"], "field"),
+        (["fit", "volumetric/hash", "bricks", "--set", "field.encoding.type=hesh"], "hash"),
+        (["fit", "volumetric/hash", "bricks", "--protocol", "defualt"], "default"),
+        (["make-scene", "material"], "materials"),
+        (["ablate", "training-view"], "training-views"),
+        (["list", "method"], "methods"),
+        (["rescore", "nowhere", "--protocol", "defualt"], "default"),
+    ],
+)
+def test_misspelt_names_get_a_guess(words: list[str], guess: str, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main.run(words) == main.BAD_INPUT
+    assert f"Did you mean '{guess}'?" in capsys.readouterr().err
+
+
+def test_what_could_not_be_scored_takes_one_line() -> None:
+    reasons = {
+        "ms_ssim": "needs 161 pixels",
+        "lpips": "the package lpips is not installed",
+        "depth_rmse": "the scene has no true depth",
+        "depth_abs_rel": "the scene has no true depth",
+        "normal_deg": "the scene has no true normals",
+        "alpha_iou": "the scene has no true alpha",
+    }
+    assert not_scored(reasons) == (
+        "Not scored (6 metrics): the scene has no true depth, normals, alpha; ms_ssim: needs 161 pixels; "
+        "lpips: the package lpips is not installed."
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Films and snapshots: paths through a scene, time-lapses of a fit, caps and starts that a command line asks for."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -8,11 +9,12 @@ import pytest
 import torch
 from training_fixtures import SMALL
 
+from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError
-from invgraphics.experiments.film import FilmRequest, film
+from invgraphics.experiments.film import FilmRequest, explanation, film
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.folder import RunFolder
-from invgraphics.experiments.paths import interpolate, orbit
+from invgraphics.experiments.paths import classify_capture, interpolate, orbit, spiral
 from invgraphics.experiments.recipe import load_method
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
@@ -69,6 +71,65 @@ def test_interpolation_comes_by_photographs() -> None:
     assert float(steps.max()) < 1.0
 
 
+def _captured(eyes: torch.Tensor, outwards: bool = False):
+    """The toy scene with training cameras at ``eyes``, which look at the origin or away from it."""
+    scene = toy_scene(views=4, size=8)
+    poses = [look_at(eye, 2 * eye if outwards else torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])) for eye in eyes]
+    views = tuple(replace(scene.train[0], camera=scene.train[0].camera.moved(pose)) for pose in poses)
+    return scene.with_views(train=views)
+
+
+def _ring(first: float, last: float, count: int = 12) -> torch.Tensor:
+    azimuth = torch.deg2rad(torch.linspace(first, last, count))
+    return torch.stack([3 * azimuth.cos(), 3 * azimuth.sin(), torch.ones(count)], dim=1)
+
+
+@pytest.mark.parametrize(
+    ("eyes", "outwards", "path"),
+    [
+        (_ring(0, 330), False, "orbit"),
+        (_ring(-10, 250), False, "orbit"),
+        (_ring(-75, 75), False, "interpolate"),
+        (_ring(0, 330), True, "interpolate"),
+        (_ring(-20, 20), False, "spiral"),
+        (torch.tensor([[3.0, 0.3 * x, 0.2 * y] for x in (-1, 0, 1) for y in (-1, 0, 1)]), False, "spiral"),
+        (torch.tensor([[0.2 * x, 0.01 + 0.2 * y, 3.0] for x in (-1, 0, 1) for y in (-1, 0, 1)]), False, "spiral"),
+    ],
+    ids=["ring", "most of a ring", "half a ring", "outwards", "arc", "window", "from above"],
+)
+def test_path_suits_the_capture(eyes: torch.Tensor, outwards: bool, path: str) -> None:
+    assert classify_capture(_captured(eyes, outwards)).path == path
+
+
+def test_spiral_stays_in_the_window_and_looks_at_the_subject() -> None:
+    """LLFF's closed path: its cameras lie within the photographs' window, and each sees the origin in its middle."""
+    eyes = torch.tensor([[3.0, 0.3 * x, 0.2 * y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    path = spiral(_captured(eyes), 48)
+    position = torch.stack([camera.position for camera in path])
+    assert float(position[:, 1].abs().max()) == pytest.approx(0.3, abs=0.02)
+    assert float(position[:, 2].abs().max()) == pytest.approx(0.2, abs=0.02)
+    assert float(position[:, 0].min()) > 2.5 and float(position[:, 0].max()) < 3.5
+    for camera in path:
+        pixel, _ = camera.project(torch.zeros(1, 3))
+        torch.testing.assert_close(pixel[0], camera.centre, atol=0.2, rtol=0)
+        assert float(camera.cam_to_world[2, 1]) < -0.9
+    steps = torch.cat([position, position[:1]]).diff(dim=0).norm(dim=1)
+    assert float(steps.max()) < 2 * float(steps.mean())
+
+
+def test_film_says_why_it_takes_its_path(run: Path, tmp_path: Path, capsys) -> None:
+    film(FilmRequest(run, tmp_path / "new" / "folder" / "a.mp4", frames=2))
+    assert (tmp_path / "new" / "folder" / "a.mp4").is_file()
+    assert "Path: orbit, as the photographs surround the subject." in capsys.readouterr().err
+    film(FilmRequest(run, tmp_path / "a.mp4", "spiral", frames=2))
+    assert "Path: spiral." in capsys.readouterr().err
+
+
+def test_orbit_of_a_forward_facing_capture_is_warned_of() -> None:
+    words = explanation("orbit", classify_capture(_captured(_ring(-20, 20))))
+    assert "elsewhere nothing was fitted" in words and "--path spiral" in words
+
+
 def test_snapshots_cover_the_fit_and_end_with_its_model(run: Path) -> None:
     snapshots = RunFolder(run).snapshots
     assert [path.stem for path in snapshots] == ["0000", "0001", "0002", "0003", "0004"]
@@ -88,7 +149,7 @@ def test_time_lapse_shows_pictures_beside_ellipsoids(run: Path, tmp_path: Path) 
     assert float(np.abs(left - right).mean()) > 0.5
 
 
-@pytest.mark.parametrize("path", ["orbit", "interpolate"])
+@pytest.mark.parametrize("path", ["orbit", "spiral", "interpolate"])
 def test_paths_become_films(run: Path, tmp_path: Path, path) -> None:
     frames = frames_of(film(FilmRequest(run, tmp_path / "a.mp4", path, frames=6)))
     assert frames.shape == (6, 24, 24, 3)
@@ -96,10 +157,11 @@ def test_paths_become_films(run: Path, tmp_path: Path, path) -> None:
 
 
 def test_bad_requests_are_refused(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
     bare = fit_run(_request(toy_folder, tmp_path / "bare", budget="1steps", snapshots=0))
     for request, words in (
         (FilmRequest(bare, tmp_path / "a.mp4", "timelapse"), "no snapshots"),
-        (FilmRequest(run, tmp_path / "no" / "a.mp4"), "does not exist"),
+        (FilmRequest(run, tmp_path / "file" / "a.mp4"), "cannot be made"),
         (FilmRequest(run, tmp_path / "a.mp4", "timelapse", view=99), "--view"),
     ):
         with pytest.raises(InputError, match=words):

@@ -105,7 +105,7 @@ def test_a_photograph_with_another_shape_and_lens(run: Path, toy_folder: Path, t
         (["--near", "99"], "training view '99'"),
         (["--fov", "200"], "--fov"),
         (["--starts", "0"], "--starts"),
-        (["--out", "missing/x.json"], "folder"),
+        (["--out", "/dev/null/x.json"], "folder"),
         (["--out", "x.png"], ".json"),
     ],
 )

@@ -16,6 +16,7 @@ from PIL import Image
 
 from invgraphics.report import pictures
 from invgraphics.report.reading import read_comparison
+from invgraphics.report.records import Run
 from invgraphics.report.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
 from invgraphics.report.summary import pareto_front, seconds_to_reach, time_to_quality
 from invgraphics.report.verdict import verdict
@@ -149,6 +150,18 @@ def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
     assert "that lead" in told
     single = replace(comparison, runs=tuple(run for run in comparison.runs if run.seed == 0))
     assert "One seed per method" in " ".join(verdict(single, summarise(single)))
+    pair = replace(comparison, runs=tuple(run for run in comparison.runs if run.seed < 2))
+
+    def scattered(run: Run) -> Run:
+        """One method gains 2 dB from one seed to the next, the others nothing."""
+        gain = 2.0 * run.seed if run.method == "volumetric/hash" else 0.0
+        views = tuple(20.0 + gain for _ in run.views)
+        return replace(run, quality={"psnr": replace(run.quality["psnr"], mean=20.0 + gain, per_view=views)})
+
+    pair = replace(pair, runs=tuple(map(scattered, pair.runs)))
+    told = " ".join(verdict(pair, summarise(pair)))
+    # Student's t with one degree of freedom: 12.71 times the standard error of the mean difference, which is 1 dB.
+    assert "2 seeds cannot tell that lead from chance: only one above about 12.71 dB" in told
     bad = replace(comparison, baselines={"nearest view": {"psnr": replace(comparison.runs[0].quality["psnr"], mean=28.0)}})
     assert "did not beat the trivial baseline 'nearest view'" in " ".join(verdict(bad, summarise(bad)))
     foggy = replace(comparison, runs=tuple(replace(run, shortfall=f"{run.method}: fog.") for run in comparison.runs))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap import Colmap
 from invgraphics.scenes.layout import SceneOptions
-from invgraphics.scenes.open import validate
+from invgraphics.scenes.open import choices, find_loader, validate
 
 
 def radial(k: float):
@@ -103,6 +103,76 @@ def test_no_photographs_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "images").rename(tmp_path / "pictures")
     with pytest.raises(InputError, match="None of the 9 pictures"):
         Colmap().load(tmp_path, SceneOptions())
+
+
+def workspace(path: Path) -> Path:
+    """COLMAP's usual folders: a distorted model whose photographs are gone, and the undistorted one in ``dense/0``."""
+    root = mixed(path / "statue")
+    pinholes = ["PINHOLE 160 120 150 155 83 58"] * 9
+    write(root / "dense" / "0", ring(9), pinholes, "sparse")
+    for photo in (root / "images").iterdir():
+        photo.unlink()
+    return root
+
+
+@pytest.mark.parametrize("given", [".", "dense", "dense/0", "dense/0/sparse", "dense/0/images"])
+def test_workspace_is_found_from_any_of_its_folders(tmp_path: Path, given: str) -> None:
+    path = workspace(tmp_path) / given
+    scene = validate(find_loader(path).load(path, SceneOptions()))
+    assert scene.name == "statue"
+    assert len(scene.train) + len(scene.test) == 9 and "undistortion" not in scene.notes
+    assert_dots_are_found(scene)
+    said = scene.notes.get("model", "")
+    assert choices(scene) == (f"\n  model: {said}" if said else "")
+    assert (given == ".") == ("dense/0/sparse (9 photographs)" in said and "sparse/0 (0 of 9" in said)
+
+
+@pytest.mark.parametrize("given", [".", "sparse", "sparse/0", "images"])
+def test_largest_of_several_models_is_taken(tmp_path: Path, given: str) -> None:
+    """COLMAP numbers models in the order in which it began them; the parts do not share a frame."""
+    root = mixed(tmp_path / "garden")
+    (root / "sparse" / "0").rename(root / "sparse" / "1")
+    keep = [path.read_bytes() for path in sorted((root / "images").iterdir())]
+    write(root, ring(3), ["PINHOLE 160 120 150 155 83 58"] * 3)
+    for index, photo in enumerate(sorted((root / "images").iterdir())):
+        photo.write_bytes(keep[index])
+    scene = find_loader(root / given).load(root / given, SceneOptions())
+    assert scene.name == "garden"
+    assert len(scene.train) + len(scene.test) == (3 if given == "sparse/0" else 9)
+    if given == ".":
+        assert scene.notes["model"] == (
+            "sparse/1 (9 photographs) has the most photographs; not taken: sparse/0 (3 photographs)"
+        )
+
+
+@pytest.mark.parametrize("place", ["images", "sparse/0/images", "input", "sparse/images", "."])
+def test_photographs_lie_beside_the_model_or_below(tmp_path: Path, place: str) -> None:
+    root = mixed(tmp_path / "garden")
+    (root / "images").rename(root / "photos")
+    (root / place).mkdir(exist_ok=True)
+    for photo in (root / "photos").iterdir():
+        photo.rename(root / place / photo.name)
+    scene = Colmap().load(root, SceneOptions())
+    assert scene.name == "garden" and len(scene.train) + len(scene.test) == 9
+    assert_dots_are_found(scene)
+
+
+def test_undistorted_model_never_takes_the_distorted_photographs(tmp_path: Path) -> None:
+    root = workspace(tmp_path)
+    (root / "dense" / "0" / "images").rename(root / "elsewhere")
+    for photo in (root / "elsewhere").iterdir():
+        photo.rename(root / "images" / photo.name)
+    with pytest.raises(InputError, match=r"None of the 9 pictures.*\n.*dense/0/images"):
+        Colmap().load(root / "dense" / "0", SceneOptions())
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("given", [".", "dense/0", "dense/0/sparse"])
+def test_statue_opens_from_its_root(data, given: str) -> None:
+    path = data("colmap_statue") / given
+    scene = validate(find_loader(path).load(path, SceneOptions(size=100, train_views=3, test_views=1)))
+    assert scene.name == "colmap_statue"
+    assert scene.notes["train_views"] == "3 of 20, evenly spaced"
 
 
 @pytest.mark.data

@@ -195,7 +195,22 @@ def test_turning_leaves_the_photograph_and_truth_comes_back_to_one(watch: Any, r
     assert _apart(watcher.canvas("turned-depth"), free) > 3
     watcher.choose("Show", "truth")
     assert watcher.value("View").startswith(("test", "train")), "truth goes to the nearest photograph"
+    assert watcher.page.get_by_text("Moved to the nearest photograph, ").count() == 1
     assert _apart(watcher.canvas(), free) > 1
+    assert watcher.complaints == []
+
+
+def test_the_picture_can_be_saved_on_another_background(watch: Any, runs: dict[str, Path], tmp_path: Path) -> None:
+    watcher = watch(runs["splatting/gaussians"])
+    own = watcher.canvas()
+    watcher.choose("Background", "black")
+    black = watcher.canvas("black")
+    assert _apart(black, own) > 5
+    with watcher.page.expect_download(timeout=PATIENCE) as download:
+        watcher.page.get_by_role("button", name="Save picture").click()
+    download.value.save_as(tmp_path / "saved.png")
+    saved = np.asarray(Image.open(tmp_path / "saved.png")).astype(float)
+    assert float(saved.min()) < 5 and saved.shape[2] == 3
     assert watcher.complaints == []
 
 

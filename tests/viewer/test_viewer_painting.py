@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from PIL import Image
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.training import checkpoint
 from invgraphics.viewer.cameras import Gaze, Mount
-from invgraphics.viewer.colouring import EMPTY, ERROR_LIMIT
+from invgraphics.viewer.colouring import EMPTY, ERROR_LIMIT, resized
 from invgraphics.viewer.pace import LEAST
 from invgraphics.viewer.painting import Order, Painter
 from invgraphics.viewer.subject import Subject, open_subject
@@ -29,7 +30,8 @@ def subjects(runs: dict[str, Path]) -> dict[str, Subject]:
 
 def _painted(order: Order, *subjects: Subject, pixels: float = LEAST):
     painter = Painter(subjects)
-    painter.pace.pixels = pixels
+    for pace in painter.paces.values():
+        pace.pixels = pixels
     pictures = []
     pieces = sum(1 for _ in painter.paint(order, pictures.append))
     return pictures, pieces
@@ -153,6 +155,38 @@ def test_side_by_side_shows_both_whole(subjects: dict[str, Subject]) -> None:
         assert np.abs(both.picture[:, columns].astype(int) - _composited(one, half)[:, whole]).max() <= 1
     at_view = _painted(replace(order, view=pair[0].scene.test[0]), *pair)[0][-1]
     assert len(at_view.psnr) == 2
+
+
+class Slow(Subject):
+    """A run whose every piece takes long."""
+
+    def render(self, camera, geometry):
+        time.sleep(0.05)
+        return super().render(camera, geometry)
+
+
+@pytest.mark.parametrize("layout", ["split", "side by side"])
+def test_each_side_refines_by_itself(subjects: dict[str, Subject], layout) -> None:
+    """The fast run is as fine as it gets before the slow one is; until then its half of the window does not change."""
+    slow, fast = Slow(subjects["volumetric/nerf"].fitted), subjects["splatting/gaussians"]
+    order = Order(_gaze(slow), (160, 100), longest=160, layout=layout)
+    pictures, _ = _painted(order, slow, fast)
+    right = [resized(painted.picture, (160, 100))[:, 84:].astype(int) for painted in pictures]
+    early = [index for index, seen in enumerate(right) if np.abs(seen - right[-1]).mean() < 1]
+    assert not pictures[early[0]].finest and early[0] < len(pictures) - 1
+    assert early == list(range(early[0], len(pictures)))
+    left = [resized(painted.picture, (160, 100))[:, :76].astype(int) for painted in pictures]
+    assert np.abs(left[early[0]] - left[-1]).mean() > 1, "the slow side is still coarse then"
+
+
+def test_background_can_be_chosen(subjects: dict[str, Subject]) -> None:
+    subject = subjects["splatting/gaussians"]
+    order = Order(_gaze(subject), (64, 40), longest=64, resting=True)
+    (own,), (black,) = (_painted(each, subject)[0] for each in (order, replace(order, background=(0.0, 0.0, 0.0))))
+    rendering = subject.render(order.gaze.camera(64, 40), geometry=False)
+    empty, premultiplied = (rendering.alpha < 1e-3).numpy(), rendering.rgb.clamp(0, 1).numpy()
+    assert empty.any() and (own.picture[empty] > 250).all() and (black.picture[empty] < 5).all()
+    assert np.abs(black.picture - premultiplied * 255).max() <= 1
 
 
 def test_a_second_run_in_another_frame_shows_the_same_place(subjects: dict[str, Subject]) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from invgraphics.errors import InputError
 from invgraphics.training.budget import Budget
@@ -20,6 +21,7 @@ SMALLEST = 8
 """Pixels along the shorter side of the smallest pictures that are worth fitting."""
 
 _BOX = "│╭╮╰╯"
+_POSITIONAL = get_args(Positional[int])[1]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +97,8 @@ def parse(command: type[T], program: str, arguments: Sequence[str]) -> T:
     import tyro
 
     complaints = io.StringIO()
+    if {"-h", "--help"} & set(arguments):  # tyro's short usage line leaves out the options that are required
+        program = " ".join([program, *required_options(command)])
     try:
         with contextlib.redirect_stderr(complaints):
             return tyro.cli(command, prog=program, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
@@ -102,6 +106,19 @@ def parse(command: type[T], program: str, arguments: Sequence[str]) -> T:
         if not stop.code:
             raise
         raise InputError(*condense(complaints.getvalue())) from None
+
+
+def required_options(command: type) -> list[str]:
+    """The options of a command that have no default, as ``--name METAVAR``; its positional arguments are not among them."""
+    words = []
+    hints = get_type_hints(command, include_extras=True)
+    for field in dataclasses.fields(command):
+        marks = get_args(hints[field.name])[1:]
+        metavar = next((mark.metavar for mark in marks if getattr(mark, "metavar", None)), None)
+        optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+        if metavar and not optional and _POSITIONAL not in marks:
+            words.append(f"--{field.name.replace('_', '-')} {metavar}")
+    return words
 
 
 def condense(box: str) -> tuple[str, str]:

@@ -18,7 +18,7 @@ class Evaluate:
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a run."""
-    scene: Annotated[Positional[str | None], arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    scene: Annotated[Positional[str | None], arg(metavar="[SCENE]", help_behavior_hint="(default: the run's own)")] = None
     """Another copy of the scene, for instance where the data set has moved."""
     protocol: Annotated[str, arg(metavar="NAME")] = "default"
     """How pictures are scored: default (rounded to 8 bits), or float."""

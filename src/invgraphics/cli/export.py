@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from invgraphics import plugins
 from invgraphics.cli.output import show_table
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,18 @@ class Export:
     resolution: Annotated[int, arg(metavar="N")] = 192
     """For mesh: voxels along the longest edge of the scene's box."""
 
+    sh_degree: Annotated[
+        int | None, arg(metavar="0..3", help_behavior_hint="(default: ply 3, as most loaders insist; else the run's own)")
+    ] = None
+    """For ply and spz: degree of the spherical harmonics in the file; bands that the run does not have are zeros."""
+
     def run(self) -> int:
         """Write; print facts about the file."""
         known = plugins.names("exporters")
         if self.to not in known:
-            raise InputError(f"--to cannot be '{self.to}'.", f"Expected one of: {', '.join(known)}.")
+            raise InputError(
+                f"--to cannot be '{self.to}'.{did_you_mean(self.to, known)}", f"Expected one of: {', '.join(known)}."
+            )
         if not (self.folder / "recipe.toml").is_file():
             raise InputError(
                 f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
@@ -50,7 +57,16 @@ class Export:
         from invgraphics.experiments.export import ExportRequest, export_run
 
         exported = export_run(
-            ExportRequest(self.folder, self.to, self.out, self.scene, self.world, self.level, self.resolution)
+            ExportRequest(
+                self.folder,
+                self.to,
+                self.out,
+                scene=self.scene,
+                world=self.world,
+                level=self.level,
+                resolution=self.resolution,
+                sh_degree=self.sh_degree,
+            )
         )
         show_table(f"Exported {self.folder} as {self.to}", ("fact", "value"), exported.facts.items())
         print(exported.path)

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from invgraphics import plugins
 from invgraphics.cli.output import show_table
 from invgraphics.data import find
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 
 COMPONENTS = {
     "fields": "fields",
@@ -38,7 +38,7 @@ EVERYTHING = KINDS[1:]
 class List:
     """List methods, scenes and the components that recipes are made of, and where each comes from."""
 
-    kinds: Annotated[Positional[tuple[str, ...]], arg(metavar="KIND", help_behavior_hint="(default: everything)")] = ()
+    kinds: Annotated[Positional[tuple[str, ...]], arg(metavar="[KIND ...]", help_behavior_hint="(default: everything)")] = ()
     """What to list: methods, scenes, studies, fields, encodings, renderers, samplers, losses, hooks, metrics, formats,
     model-formats, exporters, executors, protocols; or matrix, the table of fields and renderers as Markdown."""
 
@@ -46,7 +46,7 @@ class List:
         """Print the tables."""
         for kind in self.kinds:
             if kind not in KINDS:
-                raise InputError(f"There is no list of '{kind}'.", f"Lists: {', '.join(KINDS)}.")
+                raise InputError(f"There is no list of '{kind}'.{did_you_mean(kind, KINDS)}", f"Lists: {', '.join(KINDS)}.")
         for kind in self.kinds or EVERYTHING:
             if kind == "matrix":
                 _print_matrix()

@@ -5,7 +5,6 @@ Exit status: 0 done, 1 some cells failed, 2 bad input, 130 interrupted.
 
 from __future__ import annotations
 
-import difflib
 import errno
 import importlib
 import os
@@ -17,7 +16,7 @@ from importlib.metadata import version
 from typing import Any
 
 from invgraphics.cli.arguments import parse
-from invgraphics.errors import InputError, NumericalError
+from invgraphics.errors import InputError, NumericalError, did_you_mean
 
 COMMANDS = {
     "list": (
@@ -144,8 +143,6 @@ def explain(error: Exception) -> tuple[int, list[str]]:
 def _command(name: str) -> Any:
     """The class of a command's arguments."""
     if name not in COMMANDS:
-        close = difflib.get_close_matches(name, COMMANDS, n=1)
-        guess = f" Did you mean '{close[0]}'?" if close else ""
-        raise InputError(f"There is no command '{name}'.{guess}", f"Commands: {', '.join(COMMANDS)}.")
+        raise InputError(f"There is no command '{name}'.{did_you_mean(name, COMMANDS)}", f"Commands: {', '.join(COMMANDS)}.")
     module, _, attribute = COMMANDS[name][0].partition(":")
     return getattr(importlib.import_module(module), attribute)

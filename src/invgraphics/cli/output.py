@@ -6,6 +6,8 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+NO_TRUTH = "the scene has no true "
+"""How the reason begins for which a metric of geometry has no value."""
 PIPED_WIDTH = 160
 """Columns where there is no terminal that could say how many it has."""
 
@@ -36,7 +38,19 @@ def show_scores(scores: Mapping[str, Any]) -> None:
     show_table(title, ("metric", "mean", "unit", "better"), rows)
     if "test_poses" in scores:
         print(f"Test poses: {scores['test_poses']}. Pose errors are medians over the training views.")
-    for name, why in scores["skipped"].items():
-        print(f"{name}: {why}")
+    if scores["skipped"]:
+        print(not_scored(scores["skipped"]))
     if "shortfall" in scores:
         print(scores["shortfall"])
+
+
+def not_scored(skipped: Mapping[str, str]) -> str:
+    """One line on the metrics that have no value and why, those with one reason together."""
+    reasons: dict[str, list[str]] = {}
+    for name, why in skipped.items():
+        absent = why.removeprefix(NO_TRUTH)
+        reasons.setdefault(NO_TRUTH if absent != why else why, []).append(absent if absent != why else name)
+    parts = [f"{', '.join(names)}: {why}" for why, names in reasons.items() if why != NO_TRUTH]
+    if NO_TRUTH in reasons:
+        parts.insert(0, NO_TRUTH + ", ".join(dict.fromkeys(reasons[NO_TRUTH])))
+    return f"Not scored ({len(skipped)} metrics): {'; '.join(parts)}."

@@ -14,17 +14,21 @@ from invgraphics.errors import InputError
 
 @dataclass(frozen=True)
 class Render:
-    """Film a finished run: once around the scene, from photograph to photograph, or the fit itself."""
+    """Film a finished run: around the scene, within the photographs' window, from one to the next, or the fit itself."""
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a run."""
     out: Annotated[Path, arg(metavar="FILM.mp4")]
     """File to write."""
-    path: Literal["orbit", "interpolate", "timelapse"] = "orbit"
-    """The camera's way. A timelapse stands still and shows the states that `fit --snapshots N` kept; of Gaussians also the
+    path: Annotated[
+        Literal["orbit", "spiral", "interpolate", "timelapse"] | None,
+        arg(help_behavior_hint="(default: what suits the capture)"),
+    ] = None
+    """The camera's path: orbit where photographs surround the subject, spiral where they face one way, else interpolate from
+    photograph to photograph. A timelapse stands still and shows the states that `fit --snapshots N` kept; of Gaussians also the
     ellipsoids."""
     frames: Annotated[int, arg(metavar="N")] = 90
-    """Pictures of an orbit or interpolation."""
+    """Pictures of a path."""
     fps: Annotated[int, arg(metavar="N")] = 15
     """Pictures per second."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the run's own)")] = None

@@ -18,7 +18,7 @@ COMPARISON = "compare.json"
 class Report:
     """Write a report from a comparison's folder, from a study's folder, or from single runs on the same ground truth."""
 
-    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN ...")]
     """The folder of one comparison or of one study, or folders of runs."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the folder itself)")] = None
     """Where to write."""

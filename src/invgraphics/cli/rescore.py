@@ -19,7 +19,7 @@ COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 class Rescore:
     """Score saved pictures again under named protocols: those of a run, or of any tool. `list protocols` explains them."""
 
-    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|FOLDER", help_behavior_hint="(one or more)")]
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|FOLDER ...", help_behavior_hint="(one or more)")]
     """Runs, comparisons, or folders of predicted pictures (3DGS's renders/ + gt/ and nerfbaselines' color/ + gt-color/ bring
     their truth). Several must share their truth."""
     protocol: Annotated[str, arg(metavar="NAME,NAME|all")] = "all"

@@ -25,7 +25,7 @@ class View:
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a run."""
-    other: Annotated[Positional[Path | None], arg(metavar="RUN2", help_behavior_hint="(default: none)")] = None
+    other: Annotated[Positional[Path | None], arg(metavar="[RUN2]", help_behavior_hint="(default: none)")] = None
     """Another run of the same scene, to compare."""
     live: bool = False
     """Follow a fit that runs in another process: wait for its first checkpoint, and show each newer one when it is written

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 
 Kind = Literal["scenes", "renderers", "studies"]
 
@@ -23,8 +23,10 @@ def find(kind: Kind, name: str = "") -> Path:
     if folder is None:
         raise InputError(f"The packaged folder '{kind}' is missing.", "Reinstall invgraphics, or run from its repository.")
     if name and not (folder / name).exists():
-        known = ", ".join(sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))) or "none"
-        raise InputError(f"There is no '{name}' among the {kind}.", f"Known {kind}: {known}.")
+        known = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
+        raise InputError(
+            f"There is no '{name}' among the {kind}.{did_you_mean(name, known)}", f"Known {kind}: {', '.join(known) or 'none'}."
+        )
     return folder / name
 
 

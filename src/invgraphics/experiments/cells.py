@@ -17,6 +17,7 @@ from invgraphics.experiments.recorder import Cadence
 from invgraphics.experiments.request import AblateRequest, FitRequest, slug
 from invgraphics.experiments.study import Cell, Study
 from invgraphics.metrics.protocols import protocol_named
+from invgraphics.scenes.open import is_rendered
 from invgraphics.training.budget import Budget
 
 LONGEST_NAME = 100
@@ -64,6 +65,7 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
     plan = []
     for cell in study.expand():
         fit = study.fit_request(cell, request)
+        fit = fit if is_rendered(fit.scene) else replace(fit, spp=None)
         key = (cell.method, fit.preset, fit.budget, fit.recipe_overrides)
         try:
             if key not in methods:

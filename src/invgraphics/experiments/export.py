@@ -15,6 +15,7 @@ from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.experiments.evaluate import render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
+from invgraphics.experiments.folder import make_parent
 from invgraphics.experiments.placing import WORLD, file_from_local, local_from_file
 from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.transformed import move_gaussians
@@ -36,6 +37,8 @@ class ExportRequest:
         world: how the axes of the data set's world point, for formats that want certain axes.
         level: density or signed distance of a mesh's surface; ``None`` for the default.
         resolution: voxels along the longest edge that a mesh is made from.
+        sh_degree: degree of the spherical harmonics that are written, zeros where the run has fewer bands; ``None`` for what
+            readers of the format expect: 3 for PLY, elsewhere the run's own.
     """
 
     run: Path
@@ -45,8 +48,11 @@ class ExportRequest:
     world: str = WORLD
     level: float | None = None
     resolution: int = RESOLUTION
+    sh_degree: int | None = None
 
     def __post_init__(self) -> None:
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= harmonics.MAX_DEGREE:
+            raise InputError(f"--sh-degree cannot be {self.sh_degree}.", f"Expected 0 to {harmonics.MAX_DEGREE}.")
         low, high = RESOLUTIONS
         if not low <= self.resolution <= high:
             raise InputError(f"--resolution cannot be {self.resolution}.", f"Expected a number of voxels, {low} to {high}.")
@@ -88,10 +94,9 @@ def export_run(request: ExportRequest) -> Exported:
     Raises:
         InputError: the run cannot be opened, its model cannot be written in this way, or the file cannot be written.
     """
-    out = request.out
-    if not out.absolute().parent.is_dir() or out.is_dir():
-        raise InputError(f"--out cannot be '{out}': expected a file in a folder that exists.")
-    return plugins.load("exporters", request.to)(open_fitted(request.run, request.scene).in_its_frame(), request)
+    fitted = open_fitted(request.run, request.scene).in_its_frame()
+    make_parent(request.out)
+    return plugins.load("exporters", request.to)(fitted, request)
 
 
 def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
@@ -110,6 +115,8 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     with torch.no_grad():
         local = fitted.field.primitives(Quantity.GAUSSIANS, Context(scene.bounds.to(fitted.device)))
     placed = on_cpu(move_gaussians(on_cpu(local), file_from_local(scene, axes, request.world).float()))
+    expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
+    placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
     shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
     note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
     antialiased = getattr(fitted.method.recipe.renderer, "compensate", False)
@@ -130,6 +137,15 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
             "PSNR to the run's own pictures": decibels(loss),
         },
     )
+
+
+def with_degree(gaussians: Gaussians, degree: int | None) -> Gaussians:
+    """The Gaussians with spherical harmonics of ``degree``: further bands are zero, or cut off; ``None`` changes nothing."""
+    if degree is None:
+        return gaussians
+    wanted, (count, have, _) = harmonics.count(degree), gaussians.sh.shape
+    sh = torch.cat([gaussians.sh[:, :wanted], gaussians.sh.new_zeros(count, max(0, wanted - have), 3)], dim=1)
+    return replace(gaussians, sh=sh)
 
 
 def agreement(gaussians: Gaussians, others: Gaussians, fitted: Fitted) -> list[float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,13 +15,13 @@ from invgraphics.core import Camera, Context, Quantity
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display, render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.experiments.folder import RunFolder
-from invgraphics.experiments.paths import interpolate, orbit
+from invgraphics.experiments.folder import RunFolder, make_parent
+from invgraphics.experiments.paths import PATHS, Capture, PathName, classify_capture
 from invgraphics.experiments.progress import Reporter
 from invgraphics.renderers.ellipsoids import draw_ellipsoids
 from invgraphics.training import checkpoint
 
-PathName = Literal["orbit", "interpolate", "timelapse"]
+FilmPath = PathName | Literal["timelapse"]
 HOLD_SECONDS = 1.5
 """How long a time-lapse shows its last picture."""
 
@@ -32,7 +33,8 @@ class FilmRequest:
     Attributes:
         run: folder of the run.
         out: file to write, ``.mp4``.
-        path: ``orbit``, ``interpolate`` between photographs, or ``timelapse`` of the fit.
+        path: ``orbit``, ``spiral``, ``interpolate`` between photographs, or ``timelapse`` of the fit; ``None`` for the one that
+            suits the capture.
         frames: pictures of a path; a time-lapse has one for each snapshot.
         rate: pictures per second.
         size: of the pictures, the longest side or (width, height); ``None`` for the run's own.
@@ -42,7 +44,7 @@ class FilmRequest:
 
     run: Path
     out: Path
-    path: PathName = "orbit"
+    path: FilmPath | None = None
     frames: int = 90
     rate: int = 15
     size: int | tuple[int, int] | None = None
@@ -62,17 +64,29 @@ def film(request: FilmRequest) -> Path:
     Raises:
         InputError: the run cannot be opened, or has no snapshots for a time-lapse, or the file cannot be written.
     """
-    if not request.out.absolute().parent.is_dir():
-        raise InputError(f"The folder of '{request.out}' does not exist.", "Choose another --out.")
     fitted = open_fitted(request.run, request.scene).in_its_frame()
+    make_parent(request.out)
     if request.path == "timelapse":
         total, pictures = _timelapse(fitted, request)
     else:
-        cameras = (orbit if request.path == "orbit" else interpolate)(fitted.scene, request.frames)
+        capture = classify_capture(fitted.scene)
+        path = request.path or capture.path
+        print(explanation(path, capture), file=sys.stderr)
+        cameras = PATHS[path](fitted.scene, request.frames)
+        request = replace(request, path=path)
         total, pictures = len(cameras), (_picture(fitted, _sized(camera, request.size)) for camera in cameras)
     with Reporter(f"{request.path} of {request.run}") as reporter:
         _write(request, _reported(pictures, total, reporter))
     return request.out
+
+
+def explanation(path: str, capture: Capture) -> str:
+    """Why this path, or what is wrong with it, in one line."""
+    if path == capture.path:
+        return f"Path: {path}, as the photographs {capture.words}."
+    if path == "orbit":
+        return f"Path: orbit, but the photographs {capture.words}: elsewhere nothing was fitted (--path {capture.path} suits)."
+    return f"Path: {path}."
 
 
 def _reported(pictures: Iterator[np.ndarray], total: int, reporter: Reporter) -> Iterator[np.ndarray]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from invgraphics import plugins
 from invgraphics.core import Field, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
@@ -72,10 +75,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     keep_freed_memory()
     limit_spinning()
     provenance = folder.read_json("provenance.json")
-    method = replace(
-        resolve(provenance["method"], provenance["preset"], folder.read_recipe()),
-        preset_choice=str(provenance.get("preset_choice", "")),
-    )
+    method = replace(_method(folder, provenance), preset_choice=str(provenance.get("preset_choice", "")))
     device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
     field, renderer = build_model(method, scene, provenance["seed"], device)
     shown = provenance.get("fitted_run")
@@ -89,3 +89,21 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     except RuntimeError as error:
         raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
     return Fitted(folder, method, scene, field, renderer, device, source, poses)
+
+
+def _method(folder: RunFolder, provenance: Mapping[str, Any]) -> Method:
+    """The run's recipe.
+
+    Raises:
+        InputError: it cannot be resolved here; where packages are missing that the run was made with, the sentence names them.
+    """
+    try:
+        return resolve(provenance["method"], provenance["preset"], folder.read_recipe())
+    except InputError as error:
+        used: Mapping[str, str] = provenance.get("plugins", {})
+        missing = sorted({package for package in used.values() if not plugins.installed(package)})
+        if not missing:
+            raise
+        names = ", ".join(f"'{name}'" for name, package in used.items() if package in missing)
+        sentence = f"{folder.root} was made with {', '.join(missing)}, which brings {names} and is not installed here."
+        raise InputError(sentence, "Install the package into this environment.") from error

@@ -17,6 +17,20 @@ from invgraphics.errors import InputError
 from invgraphics.training import checkpoint
 
 
+def make_parent(out: Path) -> None:
+    """Create the folder that the file ``out`` goes into, before anything is computed for it.
+
+    Raises:
+        InputError: it cannot be made, or ``out`` is a folder.
+    """
+    if out.is_dir():
+        raise InputError(f"--out cannot be '{out}', which is a folder.", "Give the name of a file.")
+    try:
+        out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"The folder of '{out}' cannot be made: {error.strerror}.", "Choose another --out.") from error
+
+
 class RunFolder:
     """A run on disk. Every file but the history is replaced whole, so that an interruption leaves valid files."""
 

@@ -68,6 +68,7 @@ def import_run(request: ImportRequest) -> Path:
     protocol_named(request.protocol)
     device = device_of(request.device)
     name, splats = read_gaussians(Path(request.file))
+    splats = replace(splats, gaussians=without_zero_bands(splats.gaussians))
     method = method_for(request, splats.gaussians)
     axes = request.frame or splats.axes
     folder = RunFolder(Path(request.out))
@@ -97,6 +98,14 @@ def import_run(request: ImportRequest) -> Path:
         for rules in dict.fromkeys([request.protocol, "default"]):
             evaluate(folder, scene, (field, renderer), rules, costs, method)
     return folder.root
+
+
+def without_zero_bands(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians without upper bands of spherical harmonics that are zero throughout, with which files are padded."""
+    sh = gaussians.sh
+    while (degree := harmonics.degree_of(sh.shape[1])) and not bool(sh[:, harmonics.count(degree - 1) :].any()):
+        sh = sh[:, : harmonics.count(degree - 1)]
+    return replace(gaussians, sh=sh.contiguous())
 
 
 def method_for(request: ImportRequest, gaussians: Gaussians) -> Method:

@@ -16,7 +16,7 @@ from invgraphics.core.transforms import apply_similarity, focal_from_fov, se3_ex
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display, render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.experiments.folder import write_json
+from invgraphics.experiments.folder import make_parent, write_json
 from invgraphics.experiments.posed import carried, into_fit, inverse
 from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.poses import Similarity, rotation_angle
@@ -74,10 +74,9 @@ def locate(request: LocateRequest) -> dict[str, Any]:
     Raises:
         InputError: the run or the photograph cannot be used, there is no such view, or the files cannot be written.
     """
-    if not request.out.absolute().parent.is_dir():
-        raise InputError(f"The folder of '{request.out}' does not exist.", "Choose another --out.")
     pixels = read_pixels(request.photo)
     fitted = open_fitted(request.run, request.scene)
+    make_parent(request.out)
     drift = Similarity(1.0, torch.eye(3).double(), torch.zeros(3).double())
     if fitted.poses is not None:
         drift = into_fit(fitted.poses, fitted.scene)

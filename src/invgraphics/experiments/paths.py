@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,6 +19,80 @@ PARALLEL = 1e-2
 """Mean squared sine of the angles between optical axes and a common direction below which they have no common point."""
 STOPS = 8
 """Photographs that an interpolated path comes by."""
+WIDEST_GAP = 120.0
+"""Degrees of azimuth without a camera up to which cameras surround what they look at."""
+ONE_WAY = 30.0
+"""Degrees from the mean viewing direction within which nine cameras in ten of a forward-facing capture look."""
+SPIRAL_TURNS = 2
+"""Turns of a spiral, in which it goes once forward and back."""
+
+PathName = Literal["orbit", "spiral", "interpolate"]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """How the photographs of a scene were taken, and the camera path that stays among them.
+
+    Attributes:
+        path: orbit where cameras surround the subject, spiral where all face one way, otherwise interpolation.
+        words: the reason, as a clause whose subject is the photographs.
+    """
+
+    path: PathName
+    words: str
+
+
+def classify_capture(scene: Scene) -> Capture:
+    """The kind of capture, by the azimuths of the training cameras around their subject and by their viewing directions."""
+    cameras = [view.camera for view in scene.train]
+    forward, position, up = _axis(cameras, 2), torch.stack([camera.position for camera in cameras]), _mean_up(cameras)
+    mean = torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
+    angles = torch.rad2deg((forward @ mean).clamp(-1, 1).acos())
+    if float(angles.quantile(0.9)) <= ONE_WAY:
+        return Capture("spiral", f"face one way, within {float(angles.quantile(0.9)):.0f} degrees")
+    offset = position - _focus(cameras, scene.bounds.centre)
+    if float((offset * forward).sum(dim=1).median()) >= 0:
+        return Capture("interpolate", "look outwards")
+    covered = 360 - _widest_gap(offset, up)
+    if covered >= 360 - WIDEST_GAP:
+        return Capture("orbit", "surround the subject")
+    return Capture("interpolate", f"cover {covered:.0f} degrees around the subject")
+
+
+def _axis(cameras: Sequence[Camera], column: int) -> Float[Tensor, "n 3"]:
+    return torch.stack([camera.cam_to_world[:3, column] for camera in cameras])
+
+
+def _mean_up(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
+    return torch.nn.functional.normalize(-_axis(cameras, 1).mean(dim=0), dim=0)
+
+
+def _widest_gap(offset: Float[Tensor, "n 3"], up: Float[Tensor, " 3"]) -> float:
+    """The widest interval of azimuths around ``up`` without an offset, degrees."""
+    flat = offset - (offset @ up)[:, None] * up
+    x = torch.nn.functional.normalize(flat[flat.norm(dim=1).argmax()], dim=0)
+    azimuth = torch.rad2deg(torch.atan2(flat @ torch.linalg.cross(up, x), flat @ x)).sort().values
+    return float(torch.cat([azimuth.diff(), azimuth[:1] + 360 - azimuth[-1:]]).max())
+
+
+def spiral(scene: Scene, frames: int) -> list[Camera]:
+    """The closed path of LLFF's films: ellipses within the photographs' window, forward and back, towards their subject.
+
+    The half-axes are the 90th percentiles of the cameras' distances from their mean along its right, down and forward axes.
+    """
+    cameras = [view.camera for view in scene.train]
+    position, up = torch.stack([camera.position for camera in cameras]), _mean_up(cameras)
+    middle, forward = position.mean(dim=0), torch.nn.functional.normalize(_axis(cameras, 2).mean(dim=0), dim=0)
+    ahead = float((_focus(cameras, scene.bounds.centre) - middle) @ forward)
+    target = middle + (ahead if ahead > 0 else scene.extent) * forward
+    axes = look_at(middle, target, up)[:3, :3]
+    half = ((position - middle) @ axes).abs().quantile(0.9, dim=0)
+    path = []
+    for frame in range(frames):
+        turn = 2 * math.pi * frame / frames
+        ellipse = half.new_tensor([math.cos(SPIRAL_TURNS * turn), math.sin(SPIRAL_TURNS * turn), math.sin(turn)])
+        path.append(scene.test[0].camera.moved(look_at(middle + axes @ (half * ellipse), target, up)))
+    return path
 
 
 def orbit(scene: Scene, frames: int) -> list[Camera]:
@@ -26,7 +102,7 @@ def orbit(scene: Scene, frames: int) -> list[Camera]:
     """
     cameras = [view.camera for view in scene.train]
     target = _focus(cameras, scene.bounds.centre)
-    up = torch.nn.functional.normalize(-torch.stack([camera.cam_to_world[:3, 1] for camera in cameras]).mean(dim=0), dim=0)
+    up = _mean_up(cameras)
     offset = torch.stack([camera.position for camera in cameras]) - target
     height = (offset @ up).median()
     flat = offset - (offset @ up)[:, None] * up
@@ -69,6 +145,10 @@ def interpolate(scene: Scene, frames: int) -> list[Camera]:
     rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))(moments).as_matrix()
     lens = scene.test[0].camera
     return [lens.moved(_pose(r, p)) for r, p in zip(rotations, positions, strict=True)]
+
+
+PATHS: dict[PathName, Callable[[Scene, int], list[Camera]]] = {"orbit": orbit, "spiral": spiral, "interpolate": interpolate}
+"""Makers of paths by name: scene and number of frames -> cameras."""
 
 
 def _tour(cameras: Sequence[Camera]) -> list[Camera]:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.training.budget import Budget
 
 LADDER = (("laptop", 0.0), ("long", 120.0), ("hour", math.nextafter(1800.0, math.inf)))
@@ -62,7 +62,9 @@ def select_preset(method: str, asked: str | None, budget: Budget | None, known: 
     """
     name = preset_for(budget, known) if asked is None else asked
     if name and name not in known:
-        raise InputError(f"{method} has no preset '{name}'.", f"Its presets: {', '.join(known) or 'none'}.")
+        raise InputError(
+            f"{method} has no preset '{name}'.{did_you_mean(name, known)}", f"Its presets: {', '.join(known) or 'none'}."
+        )
     table = dict(known.get(name, {}))
     scenes = table.pop(CHOSEN_ON, [])
     if not isinstance(scenes, list) or not all(isinstance(scene, str) for scene in scenes):

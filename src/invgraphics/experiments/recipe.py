@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from invgraphics import plugins
 from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.experiments.presets import select_preset
 from invgraphics.experiments.request import Settings
 from invgraphics.training.budget import Budget
@@ -132,7 +132,8 @@ def source(name: str) -> dict[str, Any]:
         if name in plugins.names("recipes") and not path.is_file():
             return _parse(_foreign_text(name), name)
         if not path.is_file():
-            raise InputError(f"There is no method '{name}'.", f"Known methods: {', '.join(methods())}; or the path of a .toml.")
+            sentence = f"There is no method '{name}'.{did_you_mean(name, methods())}"
+            raise InputError(sentence, f"Known methods: {', '.join(methods())}; or the path of a .toml.")
     try:
         return _parse(path.read_text(), str(path))
     except OSError as error:

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 from invgraphics.core import Rendering, View
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.experiments.pictures import PictureSet
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.rescored import KNOWN, Rescored, Rules, background_name, evaluated, labels, scores_of
@@ -32,7 +32,7 @@ def rules_named(names: str) -> list[Rules]:
         raise InputError("No protocol is named.", known)
     for name in wanted:
         if name not in KNOWN:
-            raise InputError(f"There is no protocol '{name}'.", known)
+            raise InputError(f"There is no protocol '{name}'.{did_you_mean(name, KNOWN)}", known)
     return [KNOWN[name] for name in dict.fromkeys(wanted)]
 
 

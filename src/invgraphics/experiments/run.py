@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import recipe
@@ -32,7 +33,9 @@ from invgraphics.experiments.renderings import check_eyes, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
+from invgraphics.metrics.protocols import protocol_named
 from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.open import choices
 from invgraphics.training import checkpoint
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -46,6 +49,7 @@ def fit_run(request: FitRequest) -> Path:
         KeyboardInterrupt: the run was interrupted and holds a checkpoint.
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
+    protocol_named(request.protocol)  # now, not when the fit is done
     budget, cadence = Budget.parse(request.budget), Cadence.parse(request.checkpoint_every)
     method = recipe.requested_method(request.method, request)
     data = training_data(request)
@@ -119,7 +123,8 @@ def _prediction(request: FitRequest, fit: Fit, memory: MemoryForecast) -> str:
     views = len(fit.plan.scene.test)
     seconds = expected_seconds(fit.plan.field, fit.plan.renderer, fit.plan.scene, fit.plan.device)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
-    return f"{request.method} on {fit.plan.scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}."
+    scene = fit.plan.scene
+    return f"{request.method} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
 
 
 def _declare_clocks(folder: RunFolder, spent: Mapping[str, Any]) -> None:
@@ -187,6 +192,7 @@ def describe(
         "data": training_data(request).changes(),
         "notes": shown.notes,
         "code_version": code_version(),
+        "plugins": plugins.brought(method.table, method.name),
         "command": request.shell(),
         "options": {"size": request.size, "test_views": request.test_views, "spp": request.spp},
         "device": str(device),

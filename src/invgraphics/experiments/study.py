@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from invgraphics.config import fill
 from invgraphics.data import find
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.experiments.factors import (
     BUDGET,
     PRESET,
@@ -214,7 +214,8 @@ def locate(name: str) -> Path:
     known = [path.parent.name for path in sorted(find("studies").glob(f"*/{FILE}"))]
     if name in known:
         return find("studies", name) / FILE
-    raise InputError(f"There is no study '{name}'.", f"Built-in studies: {', '.join(known)}; or the path of a {FILE}.")
+    guess = did_you_mean(name, known)
+    raise InputError(f"There is no study '{name}'.{guess}", f"Built-in studies: {', '.join(known)}; or the path of a {FILE}.")
 
 
 def name_of(path: Path) -> str:

@@ -31,6 +31,8 @@ class Ply:
 
     suffixes: ClassVar[tuple[str, ...]] = (".ply",)
     axes: ClassVar[str | None] = None
+    sh_degree: ClassVar[int] = harmonics.MAX_DEGREE
+    """What 3DGS's own loader and many after it insist on."""
 
     def matches(self, path: Path, head: bytes) -> bool:
         """Any PLY file: those that hold no Gaussians are refused with a sentence."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,7 +31,10 @@ def use(name: str | None) -> None:
         InputError: unknown name, or the implementation does not work on this machine.
     """
     if name is not None and name not in IMPLEMENTATIONS:
-        raise InputError(f"There are no '{name}' kernels.", f"Known kernels: {', '.join(IMPLEMENTATIONS)}.")
+        raise InputError(
+            f"There are no '{name}' kernels.{did_you_mean(name, IMPLEMENTATIONS)}",
+            f"Known kernels: {', '.join(IMPLEMENTATIONS)}.",
+        )
     if name is not None and why_not(name):
         raise InputError(f"The {name} kernels cannot be used here: {why_not(name)}.")
     global _forced  # noqa: PLW0603

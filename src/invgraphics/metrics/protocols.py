@@ -14,7 +14,7 @@ from torch import Tensor
 from invgraphics import plugins
 from invgraphics.core import Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.metrics.base import Metric, Pair, Skip
 from invgraphics.metrics.conventions import CONVENTIONS, PROTOCOLS, Protocol
 
@@ -46,7 +46,9 @@ def protocol_named(name: str) -> Protocol:
             f"Score the finished run again: invgraphics rescore RUN --protocol {name}.",
         )
     if name not in PROTOCOLS:
-        raise InputError(f"There is no protocol '{name}'.", f"Known protocols: {', '.join(PROTOCOLS)}.")
+        raise InputError(
+            f"There is no protocol '{name}'.{did_you_mean(name, PROTOCOLS)}", f"Known protocols: {', '.join(PROTOCOLS)}."
+        )
     return PROTOCOLS[name]
 
 

@@ -79,6 +79,11 @@ def _resolution(comparison: Comparison, summary: Summary, column: Quantity, rank
     if lead.found:
         return f"Over {lead.estimate.size} that lead lies in [{lead.text(low)}, {lead.text(high)}]{unit} (95% interval)."
     half = lead.text(lead.estimate.half_width)
+    if lead.estimate.seeds[1] == 2:
+        return (
+            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: only one above about "
+            f"{half}{unit} could be told from it; three seeds or more see smaller ones."
+        )
     return f"Over {lead.estimate.size} that lead may be chance: only one above about {half}{unit} could be told from it."
 
 

@@ -1,4 +1,4 @@
-"""COLMAP reconstructions: ``sparse/0`` beside ``images``."""
+"""COLMAP reconstructions, in any of the folders of a workspace."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import torch
 from invgraphics.core import Camera, Points, Scene
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
+from invgraphics.scenes.colmap_workspace import find_model, model_folders
 from invgraphics.scenes.images import Photo
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, present
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, present, scene_name
 from invgraphics.scenes.lens import Lens
 from invgraphics.scenes.photos.notes import pose_notes
-
-_PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 
 
 class Colmap:
     """Loader of a COLMAP model, binary or text, with any perspective camera model and one camera per image if need be.
 
     The scene is unbounded, its SfM points are kept, and every eighth photograph by name is scored. Registered images whose
-    files do not exist are skipped and named in the scene's notes, as is what an import of photographs found suspicious.
+    files do not exist are skipped and named in the scene's notes, as is what an import of photographs found suspicious. Of
+    several models the one with the most photographs is taken, and the notes say so.
     """
 
     def matches(self, path: Path) -> bool:
-        """Whether ``path`` holds a COLMAP model in one of the usual places."""
-        return _model(path) is not None
+        """Whether ``path`` is a COLMAP workspace or one of its usual folders."""
+        return bool(model_folders(path))
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Read the model and the photographs it registers.
@@ -36,34 +36,14 @@ class Colmap:
         Raises:
             InputError: the model is unusable or its photographs are missing.
         """
-        model = _model(path)
-        if model is None:
-            raise InputError(f"{path} has no COLMAP model.", f"Looked for cameras.bin or cameras.txt in {', '.join(_PLACES)}.")
-        reconstruction = _read(model)
-        listed = [_photo(image, path / "images") for image in reconstruction.images.values() if image.has_pose]
-        if not listed:
-            raise InputError(f"{model} registers no image.")
-        photos, notes = present(sorted(listed, key=lambda photo: photo.name), model)
-        notes |= {"loader": "colmap", "points": f"{reconstruction.num_points3D()} from SfM"} | pose_notes(path)
+        model = find_model(path)
+        folder = model.images or path
+        photos, notes = present([_photo(image, folder) for image in model.registered], model.folder)
+        notes |= {"loader": "colmap", "points": f"{model.reconstruction.num_points3D()} from SfM"} | pose_notes(path)
+        notes |= {"model": model.note} if model.note else {}
         poses = torch.stack([photo.camera.cam_to_world for photo in photos])
-        frame = contracted_frame(poses, _points(reconstruction))
-        return compose(path.resolve().name, every_eighth(photos), frame, options, notes)
-
-
-def _model(path: Path) -> Path | None:
-    for place in _PLACES:
-        if any((path / place / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
-            return path / place
-    return None
-
-
-def _read(model: Path) -> Any:
-    from invgraphics.scenes.colmap_library import pycolmap
-
-    try:
-        return pycolmap.Reconstruction(str(model))
-    except (ValueError, IndexError, RuntimeError, MemoryError) as error:
-        raise InputError(f"The COLMAP model {model} cannot be read: {str(error).splitlines()[0]}.") from error
+        frame = contracted_frame(poses, _points(model.reconstruction))
+        return compose(scene_name(path), every_eighth(photos), frame, options, notes)
 
 
 def _photo(image: Any, folder: Path) -> Photo:

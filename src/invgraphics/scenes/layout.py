@@ -25,6 +25,11 @@ HOLD_OUT = 8
 NEAR = 0.05
 """Closest sample to a camera in local units, where a data set does not say."""
 
+IMAGE_FOLDERS = ("images", "input", "images_2", "images_4", "images_8")
+"""What people call the folder of a scene's photographs, the most telling first; a number is how much smaller they are."""
+
+_HOLDERS = ("sparse", "dense", "colmap", "undistorted", "distorted")  # folders of a COLMAP workspace, which name no scene
+
 _RIGID = 1e-3  # a pose that is farther from a rotation than this is an error, not rounding
 _PARALLEL = 0.01  # mean squared sine of the angle between viewing directions (6°) below which they have no common focus
 
@@ -117,6 +122,21 @@ def pose(values: object, where: str) -> Float[Tensor, "4 4"]:
     result = torch.eye(4, dtype=torch.float64)
     result[:3, :3], result[:3, 3] = u @ vh, matrix[:3, 3]
     return result
+
+
+def is_image_folder(path: Path) -> bool:
+    """Whether the folder's name says that it holds a scene's photographs."""
+    return path.name in IMAGE_FOLDERS
+
+
+def scene_name(path: Path) -> str:
+    """The name of a data set: that of the first folder upwards whose name is not a convention (``sparse/0``, ``images``)."""
+    folder = path.resolve()
+    for each in (folder, *folder.parents):
+        numbered = each.name.isdecimal() and each.parent.name in _HOLDERS
+        if each.name and not numbered and each.name not in _HOLDERS and not is_image_folder(each):
+            return each.name
+    return folder.name or "scene"
 
 
 def every_eighth(photos: Sequence[Photo]) -> Split:

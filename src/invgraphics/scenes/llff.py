@@ -12,7 +12,7 @@ from invgraphics.core import Camera, Scene
 from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, scene_name
 from invgraphics.scenes.npz import DAMAGED
 
 
@@ -47,7 +47,7 @@ class Llff:
         poses = torch.stack([photo.camera.cam_to_world for photo in photos])
         # LLFF's own numbers: 10% in front of the nearest bound; focus between that and five times the farthest.
         frame = contracted_frame(poses, distance=1 / (0.25 / (0.9 * near) + 0.75 / (5 * far)), near=0.9 * near)
-        return compose(path.resolve().name, every_eighth(photos), frame, options, {"loader": "llff"})
+        return compose(scene_name(path), every_eighth(photos), frame, options, {"loader": "llff"})
 
 
 def _read(source: Path) -> Float[np.ndarray, "n 17"]:

@@ -8,7 +8,7 @@ import torch
 
 from invgraphics.core import Scene
 from invgraphics.scenes.frames import Frames
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, present
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, present, scene_name
 
 
 class Nerfstudio:
@@ -37,7 +37,7 @@ class Nerfstudio:
         if any("mask_path" in frame for frame in frames.frames):
             notes["masks"] = "the frames' mask_path is not read"
         poses = torch.stack([photo.camera.cam_to_world for photo in photos])
-        return compose(source.resolve().parent.name, every_eighth(photos), contracted_frame(poses), options, notes)
+        return compose(scene_name(source.parent), every_eighth(photos), contracted_frame(poses), options, notes)
 
 
 def _source(path: Path) -> Path:

@@ -11,10 +11,10 @@ import torch
 
 from invgraphics import plugins
 from invgraphics.core import Scene, View
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions, pose
 
-__all__ = ["Loader", "SceneOptions", "absent_data", "find_loader", "open_scene", "validate"]
+__all__ = ["Loader", "SceneOptions", "absent_data", "choices", "find_loader", "is_rendered", "open_scene", "validate"]
 
 _SAME_POSE = 1e-6  # entries of two poses that are closer than this are one camera
 
@@ -56,7 +56,8 @@ def open_scene(
         if reason := absent_data(spec):
             raise InputError(f"'{spec}' cannot be opened: {reason}.", "Set the variable to the folder that holds it.")
         raise InputError(
-            f"'{spec}' is neither a built-in scene nor an existing path.", f"Built-in scenes: {', '.join(_built_in())}."
+            f"'{spec}' is neither a built-in scene nor an existing path.{did_you_mean(spec, _built_in())}",
+            f"Built-in scenes: {', '.join(_built_in())}.",
         )
     if options.spp is not None:
         raise InputError(f"{path} holds pictures, whose samples per pixel are what they are.", "Leave --spp away.")
@@ -95,6 +96,16 @@ def absent_data(spec: str) -> str:
 def _path(spec: str) -> Path:
     """The path that a person wrote, with its variables and its home filled in."""
     return Path(os.path.expandvars(spec)).expanduser()
+
+
+def is_rendered(spec: str) -> bool:
+    """Whether a scene's truth is rendered here, so that its samples per pixel can be chosen."""
+    return _description(spec) is not None
+
+
+def choices(scene: Scene) -> str:
+    """The scene's notes on which model and photographs were taken, a line each to print before work starts; mostly empty."""
+    return "".join(f"\n  {key}: {scene.notes[key]}" for key in ("model", "missing") if key in scene.notes)
 
 
 def _built_in() -> tuple[str, ...]:

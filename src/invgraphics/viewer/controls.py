@@ -16,16 +16,21 @@ ANYWHERE = "anywhere"
 SMALLEST, LARGEST = 64, 2048
 """Pixels along a picture's longest side that can be chosen."""
 
+BACKGROUNDS = {"the scene's": None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+"""What can be put behind predictions; scores keep the scene's own."""
+
 Answer = Callable[[], Awaitable[None]]
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What to do when a person has changed something: the picture's content, the camera's place, or what the browser draws."""
+    """What to do when a person has changed something: the picture's content, the camera's place, what the browser draws; or
+    wants the picture as a file."""
 
     picture: Answer
     place: Answer
     drawn: Answer
+    saved: Answer
 
 
 class Controls:
@@ -48,6 +53,9 @@ class Controls:
         several = len(subjects) > 1
         self.layout = gui.add_dropdown("Runs", LAYOUTS if several else ("first",), visible=several)
         self.share = gui.add_slider("Split at", 0.0, 1.0, 0.01, 0.5, visible=several)
+        self.background = gui.add_dropdown(
+            "Background", tuple(BACKGROUNDS), hint="Behind predictions. Scores and errors keep the scene's own."
+        )
         self.cameras = gui.add_checkbox("Cameras", False, hint="The photographs, where they were taken; a click goes there.")
         self.splats = gui.add_checkbox(
             "Splats drawn by the browser",
@@ -59,11 +67,17 @@ class Controls:
         self.longest = gui.add_slider(
             "Most pixels", min(SMALLEST, longest), top, 1, longest, hint="Along the longer side, when the camera rests."
         )
+        save = gui.add_button("Save picture", hint="The picture as it is now, as a PNG file, without the browser's drawings.")
         self._status = gui.add_html("")
         self._facts = gui.add_html("")
         self.tell_facts()
-        for handle in (self.shown, self.layout, self.share, self.longest):
+        for handle in (self.shown, self.layout, self.share, self.longest, self.background):
             _answer(handle, answers.picture)
+
+        async def saved(_: Any) -> None:
+            await answers.saved()
+
+        save.on_click(saved)
         _answer(self.view, answers.place)
         for handle in (self.cameras, self.splats):
             _answer(handle, answers.drawn)

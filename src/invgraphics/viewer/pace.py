@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-TARGET = 0.12
-"""Seconds that a picture may take while the camera moves, and a piece of work that cannot be cut short."""
+TARGET = 0.08
+"""Seconds that rendering may take while the camera moves (with sending, ten pictures a second), and an uncut piece of work."""
 REST = 0.2
 """Seconds without news after which the camera counts as resting."""
-FIRST, LEAST, MOST = 40 * 40, 24 * 24, 1 << 22
+FIRST, LEAST, MOST = 40 * 40, 12 * 12, 1 << 22
 """Pixels of the first picture, and the least and the most that a picture may be given."""
 STEP = 2.0
 """Largest factor by which one measurement changes the number of pixels: single measurements are noisy."""
@@ -32,15 +32,16 @@ class Pace:
         wanted = pixels * TARGET / max(seconds, 1e-6)
         self.pixels = min(max(wanted, self.pixels / STEP, LEAST), self.pixels * STEP, float(MOST))
 
-    def scales(self, width: int, height: int, resting: bool = False) -> list[float]:
+    def scales(self, width: int, height: int, resting: bool = False, sharing: int = 1) -> list[float]:
         """Scales of the pictures that lead to one of ``width`` x ``height``, from coarse to 1.
 
         Args:
             width: of the finest picture.
             height: likewise.
             resting: whether the coarse ones can be left out, because there is a picture already.
+            sharing: pictures that `TARGET` has to do for.
         """
-        coarse = math.sqrt(self.pixels / (width * height))
+        coarse = math.sqrt(max(self.pixels / sharing, LEAST) / (width * height))
         if resting or coarse >= 1:
             return [1.0]
         steps = max(1, round(-math.log(coarse, GROWTH)))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import UInt8
 from numpy import ndarray
 
@@ -36,6 +37,7 @@ class Order:
         share: of the window's width that the first run has in a split one.
         longest: most pixels along a picture's longest side.
         resting: whether there is a picture from here already, so that no coarse one is needed.
+        background: behind predictions, in the scene's colour space; ``None`` for the scene's own.
     """
 
     gaze: Gaze
@@ -46,6 +48,7 @@ class Order:
     share: float = 0.5
     longest: int = 800
     resting: bool = False
+    background: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +84,41 @@ class _Panel:
     def whole(self) -> bool:
         return self.columns == (0, self.camera.width)
 
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height of what has to be rendered; of splats that is the whole picture."""
+        return (self.columns[1] - self.columns[0] if self.subject.by_rays else self.camera.width), self.camera.height
+
+    def at(self, scale: float) -> _Panel:
+        """The same part of a smaller picture, at least a column of it."""
+        camera = scaled(self.camera, scale)
+        first, last = (round(column * camera.width / self.camera.width) for column in self.columns)
+        first = min(first, camera.width - 1)
+        return _Panel(self.subject, camera, (first, max(last, first + 1)))
+
+
+@dataclass(eq=False)
+class _Side:
+    """How far the pictures of one panel are.
+
+    Attributes:
+        panel: at full size.
+        scales: of the pictures that are still to come, from coarse to fine.
+        spent: seconds that have gone into this side.
+        latest: the finest picture so far, its panel and the seconds it took.
+        job: the picture that is being made.
+    """
+
+    panel: _Panel
+    scales: list[float]
+    spent: float = 0.0
+    latest: tuple[_Panel, Rendering, float] | None = None
+    job: Generator[float, None, Rendering] | None = None
+    began: float = 0.0
+
 
 class Painter:
-    """Paints orders with one or two runs.
+    """Paints orders with one or two runs; each refines its part of the window at its own speed.
 
     Args:
         subjects: the runs; cameras are in the first one's local frame.
@@ -91,36 +126,54 @@ class Painter:
 
     def __init__(self, subjects: Sequence[Subject]) -> None:
         self.subjects = tuple(subjects)
-        self.pace = Pace()
+        self.paces = {subject: Pace() for subject in self.subjects}
 
     def paint(self, order: Order, deliver: Callable[[Painted], None]) -> Job:
         """Work for the rendering thread that delivers pictures from coarse to fine."""
-        side = order.layout == "side by side" and order.shown != "truth"
-        window = (max(1, order.window[0] // (1 + side)), max(1, order.window[1]))
+        side_by_side = order.layout == "side by side" and order.shown != "truth"
+        window = (max(1, order.window[0] // (1 + side_by_side)), max(1, order.window[1]))
         mount = None
         if order.view is None:
-            gaze = replace(order.gaze, aspect=order.gaze.aspect / (1 + side))
+            gaze = replace(order.gaze, aspect=order.gaze.aspect / (1 + side_by_side))
             camera = limited(gaze.camera(*window), order.longest)
         else:
-            mount = Mount.of(limited(order.view.camera, order.longest), order.gaze.aspect / (1 + side))
+            mount = Mount.of(limited(order.view.camera, order.longest), order.gaze.aspect / (1 + side_by_side))
             camera = mount.camera
         if order.shown == "truth" and order.view is not None:
             deliver(self._truth(order.view, mount))
             return
-        scales = self.pace.scales(camera.width * (1 + side), camera.height, order.resting)
-        for index, scale in enumerate(scales):
-            began = time.perf_counter()
-            panels = self._panels(order, scaled(camera, scale), mount)
-            first = index == 0 and not order.resting
-            renderings = []
-            for panel in panels:
-                renderings.append((yield from self._render(panel, order.shown == "normal", in_one_piece=first)))
-            seconds = time.perf_counter() - began
-            if first:
-                self.pace.learn(sum(rendering.alpha.numel() for rendering in renderings), seconds)
-            painted = self._compose(order, panels, renderings, mount)
-            deliver(replace(painted, seconds=seconds, finest=index == len(scales) - 1))
-            yield REST if first else 0.0
+        panels = self._panels(order, camera, mount)
+        sides = [_Side(each, self.paces[each.subject].scales(*each.pixels, order.resting, len(panels))) for each in panels]
+        moving = not order.resting
+        for side in sides:
+            while not self._advance(side, order, in_one_piece=moving):
+                yield 0.0
+        deliver(self._compose(order, sides, mount))
+        yield REST if moving else 0.0
+        while waiting := [side for side in sides if side.scales]:
+            # The side that has had least time: a fast run is fine long before a slow one, whose pieces come between.
+            if self._advance(min(waiting, key=lambda side: side.spent), order, in_one_piece=False):
+                deliver(self._compose(order, sides, mount))
+            yield 0.0
+
+    def _advance(self, side: _Side, order: Order, in_one_piece: bool) -> bool:
+        """Do the next piece of a side's picture; whether that has finished it."""
+        panel, began, finished = side.panel.at(side.scales[0]), time.perf_counter(), None
+        if side.job is None:
+            side.job, side.began = self._render(panel, order.shown == "normal", in_one_piece), side.spent
+        try:
+            next(side.job)
+        except StopIteration as stop:
+            finished = stop.value
+        side.spent += time.perf_counter() - began
+        if finished is None:
+            return False
+        took = side.spent - side.began
+        if in_one_piece:
+            self.paces[panel.subject].learn(finished.alpha.numel(), took)
+        side.latest, side.job = (panel, finished, took), None
+        side.scales.pop(0)
+        return True
 
     def _panels(self, order: Order, camera: Camera, mount: Mount | None) -> list[_Panel]:
         whole = (0, camera.width)
@@ -143,7 +196,8 @@ class Painter:
             # A splat's footprint depends on how far beyond the picture it lies, so parts would not fit together.
             picture = subject.render(camera, geometry)
             return picture if panel.whole else _columns(picture, columns)
-        rows = camera.height if in_one_piece else self.pace.rows(columns[1] - columns[0])
+        pace = self.paces[subject]
+        rows = camera.height if in_one_piece else pace.rows(columns[1] - columns[0])
         parts = []
         for top in range(0, camera.height, rows):
             if parts:
@@ -152,23 +206,39 @@ class Painter:
             began = time.perf_counter()
             parts.append(subject.render(strip, geometry))
             if not in_one_piece and strip.height == rows:
-                self.pace.learn(strip.width * rows, time.perf_counter() - began)
+                pace.learn(strip.width * rows, time.perf_counter() - began)
         return Rendering.cat(parts)
 
-    def _compose(self, order: Order, panels: Sequence[_Panel], renderings: Sequence[Rendering], mount: Mount | None) -> Painted:
-        """Colour the panels alike and put them into the window."""
-        camera = panels[0].camera
-        size = (camera.width, camera.height)
+    def _compose(self, order: Order, sides: Sequence[_Side], mount: Mount | None) -> Painted:
+        """Colour the latest pictures of all sides alike, at the size of the finest, and put them into the window."""
+        latest = [side.latest for side in sides if side.latest is not None]
+        panels, renderings = [panel for panel, _, _ in latest], [rendering for _, rendering, _ in latest]
+        finest = max((panel.camera for panel in panels), key=lambda camera: camera.width)
         truths: list[Picture | None] = [None] * len(panels)
         if order.shown == "error" and order.view is not None:
-            truth = photograph(order.view, self.subjects[0].scene, size)
-            truths = [truth[:, slice(*panel.columns)] for panel in panels]
-        seen = coloured(order.shown, renderings, [panel.subject.scene for panel in panels], truths)
+            scene, sizes = self.subjects[0].scene, [(panel.camera.width, panel.camera.height) for panel in panels]
+            truths = [photograph(order.view, scene, size)[:, slice(*p.columns)] for p, size in zip(panels, sizes, strict=True)]
+        scenes = [panel.subject.scene for panel in panels]
+        if order.background is not None and order.shown == "prediction":
+            scenes = [replace(scene, background=torch.tensor(order.background)) for scene in scenes]
+        seen = coloured(order.shown, renderings, scenes, truths)
+        columns = [side.panel.at(finest.width / side.panel.camera.width).columns for side in sides]
+        pictures = [
+            resized(picture, (last - first, finest.height))
+            for picture, (first, last) in zip(seen.pictures, columns, strict=True)
+        ]
         if order.layout == "side by side":
-            picture = _beside([_mounted(picture, mount) for picture in seen.pictures])
+            picture = _beside([_mounted(picture, mount) for picture in pictures])
         else:
-            picture = _mounted(_beside(seen.pictures), mount)
-        return Painted(picture, size, 0.0, False, seen.legend, self._psnr(order, panels, renderings))
+            picture = _mounted(_beside(pictures), mount)
+        return Painted(
+            picture,
+            (finest.width, finest.height),
+            sum(took for _, _, took in latest),
+            not any(side.scales for side in sides),
+            seen.legend,
+            self._psnr(order, panels, renderings),
+        )
 
     def _psnr(self, order: Order, panels: Sequence[_Panel], renderings: Sequence[Rendering]) -> tuple[float, ...]:
         view = order.view

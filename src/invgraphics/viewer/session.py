@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from invgraphics.core import Scene, View
 from invgraphics.experiments.evaluate import display
 from invgraphics.viewer.cameras import Gaze, Mount, limited, quaternion
 from invgraphics.viewer.colouring import OF_VIEWS
-from invgraphics.viewer.controls import ANYWHERE, Answers, Controls
+from invgraphics.viewer.controls import ANYWHERE, BACKGROUNDS, Answers, Controls
 from invgraphics.viewer.drawn import Photographs, draw_splats
 from invgraphics.viewer.painting import Order, Painted, Painter
 from invgraphics.viewer.worker import Job, Worker
@@ -58,7 +60,7 @@ class Session:
     def __init__(self, client: ClientHandle, stage: Stage) -> None:
         self._client, self._stage = client, stage
         names = [name for name, _ in stage.views]
-        answers = Answers(self._ask_again, self._go, self._draw)
+        answers = Answers(self._ask_again, self._go, self._draw, self._save)
         self._controls = Controls(client.gui, stage.painter.subjects, names, stage.longest, answers)
         self._standing: int | None = None
         self._arrived, self._deadline = False, 0.0
@@ -66,6 +68,8 @@ class Session:
         self._frusta: dict[int, Any] = {}
         self._splats: Any = None
         self._gone = False
+        self._why = ""
+        self._painted: Painted | None = None
         client.camera.on_update(self._moved)
         self.stand(stage.start)
 
@@ -137,7 +141,7 @@ class Session:
             there = self._gaze.sees_from(pose, NEAR_ENOUGH * self._scene.extent, NEAR_ENOUGH)
             self._arrived = self._arrived or there
             if not there and (self._arrived or time.monotonic() > self._deadline):
-                self._standing = None
+                self._standing, self._why = None, ""
                 self._controls.view.value = ANYWHERE
                 self._submit("drawn", self._drawing())
             elif self._asked == self._mounted:
@@ -147,7 +151,7 @@ class Session:
         self._ask()
 
     async def _go(self) -> None:
-        name = self._controls.view.value
+        name, self._why = self._controls.view.value, ""
         if name != ANYWHERE:
             self.stand([each for each, _ in self._stage.views].index(name))
             return
@@ -157,7 +161,9 @@ class Session:
 
     async def _ask_again(self) -> None:
         if self._controls.shown.value in OF_VIEWS and self._standing is None:
-            self.stand(nearest([view for _, view in self._stage.views], self._gaze, self._scene.extent))
+            index = nearest([view for _, view in self._stage.views], self._gaze, self._scene.extent)
+            self._why = jump_words(self._controls.shown.value, self._stage.views[index][0])
+            self.stand(index)
         else:
             self._submit("drawn", self._drawing())
             self._controls.say(RENDERING)
@@ -167,6 +173,16 @@ class Session:
         self._submit("drawn", self._drawing())
         self._controls.say(RENDERING)
         self._ask()
+
+    async def _save(self) -> None:
+        """Send the picture as a file."""
+        if self._painted is None:
+            return
+        content = io.BytesIO()
+        Image.fromarray(self._painted.picture).save(content, format="PNG")
+        self._client.send_file_download(
+            f"{self._scene.name}-{self._controls.shown.value}.png", content.getvalue(), save_immediately=True
+        )
 
     def _submit(self, what: str, job: Job) -> None:
         self._stage.worker.submit((what, self._client.client_id), job)
@@ -188,12 +204,14 @@ class Session:
             share=float(controls.share.value),
             longest=int(controls.longest.value),
             resting=resting,
+            background=BACKGROUNDS[controls.background.value],
         )
-        note = "" if order.shown == shown else f"This is the prediction: the {shown} is known at photographs only."
+        note = self._why if order.shown == shown else f"This is the prediction: the {shown} is known at photographs only."
 
         def deliver(painted: Painted) -> None:
             if self._gone:
                 return
+            self._painted = painted
             self._client.scene.set_background_image(painted.picture, format="png" if painted.finest else "jpeg")
             controls.tell(painted, note)
 
@@ -225,6 +243,11 @@ class Session:
             self.stand(index)
 
         return choose
+
+
+def jump_words(shown: str, view: str) -> str:
+    """Why choosing to see something has moved the camera."""
+    return f"Moved to the nearest photograph, {view}: the {shown} is known at photographs only."
 
 
 def nearest(views: Sequence[View], gaze: Gaze, extent: float) -> int:

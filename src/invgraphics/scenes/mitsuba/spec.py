@@ -11,7 +11,7 @@ from typing import Any
 
 from invgraphics import data
 from invgraphics.config import fill
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 
 FILE = "scene.toml"
 
@@ -109,7 +109,10 @@ def locate(name: str) -> Path:
     for path in (Path(name), Path(name) / FILE):
         if path.name == FILE and path.is_file():
             return path
-    raise InputError(f"There is no scene '{name}'.", f"Built-in scenes: {', '.join(names())}; or give a path to a {FILE}.")
+    guess = did_you_mean(name, names())
+    raise InputError(
+        f"There is no scene '{name}'.{guess}", f"Built-in scenes: {', '.join(names())}; or give a path to a {FILE}."
+    )
 
 
 def read(path: Path) -> SceneSpec:

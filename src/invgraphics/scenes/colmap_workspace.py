@@ -1,0 +1,136 @@
+"""COLMAP workspaces as people have them: which model to take, and where its photographs are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from invgraphics.errors import InputError
+from invgraphics.scenes.layout import IMAGE_FOLDERS, is_image_folder
+
+PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse", "colmap/sparse/*", ".", "[0-9]")
+UNDISTORTED = ("dense/sparse", "dense/*/sparse", "undistorted/sparse", "[0-9]/sparse", "dense/*", "dense")
+"""Where models are looked for, the usual places first; those of the second tuple come with undistorted photographs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A COLMAP model and the folder of its photographs.
+
+    Attributes:
+        folder: holds ``cameras.bin`` or ``cameras.txt``.
+        reconstruction: a ``pycolmap.Reconstruction``.
+        images: the photographs' folder; ``None`` where no photograph of the model was found.
+        present: registered photographs whose files exist.
+        note: which model was chosen among several, in words; empty where there is only one.
+    """
+
+    folder: Path
+    reconstruction: Any
+    images: Path | None
+    present: int
+    note: str = ""
+
+    @property
+    def registered(self) -> list[Any]:
+        """Its ``pycolmap.Image`` objects that have a pose, by name."""
+        return sorted((image for image in self.reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
+
+
+def model_folders(path: Path) -> list[Path]:
+    """Folders of COLMAP models of the workspace ``path``, which may be any of its folders, the photographs' included."""
+    root = path.resolve().parent if is_image_folder(path.resolve()) and not _holds_model(path) else path
+    found: dict[Path, Path] = {}
+    for place in (*PLACES, *UNDISTORTED):
+        for folder in sorted(root.glob(place)) if place != "." else [root]:
+            if _holds_model(folder):
+                found.setdefault(folder.resolve(), folder)
+    return list(found.values())
+
+
+def find_model(path: Path) -> Model:
+    """The model with the most photographs on disk; of equal ones the first in the order of the places.
+
+    Raises:
+        InputError: there is no model, none can be read, none registers an image, or no photograph of any exists.
+    """
+    folders = model_folders(path)
+    if not folders:
+        raise InputError(
+            f"{path} has no COLMAP model.", f"Looked for cameras.bin or cameras.txt in {', '.join((*PLACES, *UNDISTORTED))}."
+        )
+    models, failures = [], []
+    for folder in folders:
+        try:
+            models.append(_read(folder))
+        except InputError as error:
+            failures.append((folder, error))
+    if not models:
+        raise failures[0][1]
+    chosen = max(models, key=lambda model: (model.present, len(model.registered)))  # of equal ones, the first
+    if not chosen.registered:
+        raise InputError(f"{chosen.folder} registers no image.")
+    if chosen.images is None:
+        names, looked = [image.name for image in chosen.registered], [*_image_folders(chosen.folder)]
+        raise InputError(
+            f"None of the {len(names)} pictures that {chosen.folder} lists exists.",
+            f"Looked for '{names[0]}' in {', '.join(map(str, looked))}.",
+        )
+    others = [f"{_place(model.folder, path)} ({_count(model)})" for model in models if model is not chosen]
+    others += [f"{_place(folder, path)} (cannot be read)" for folder, _ in failures]
+    note = f"{_place(chosen.folder, path)} ({_count(chosen)}) has the most photographs; not taken: {', '.join(others)}"
+    return replace(chosen, note=note if others else "")
+
+
+def _place(folder: Path, path: Path) -> str:
+    inner, outer = folder.resolve(), path.resolve()
+    return str(inner.relative_to(outer)) if inner.is_relative_to(outer) else str(inner)
+
+
+def _count(model: Model) -> str:
+    listed = len(model.registered)
+    return f"{listed} photographs" if model.present == listed else f"{model.present} of {listed} photographs are there"
+
+
+def _holds_model(folder: Path) -> bool:
+    return any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))
+
+
+def _read(folder: Path) -> Model:
+    from invgraphics.scenes.colmap_library import pycolmap
+
+    try:
+        reconstruction = pycolmap.Reconstruction(str(folder))
+    except (ValueError, IndexError, RuntimeError, MemoryError) as error:
+        raise InputError(f"The COLMAP model {folder} cannot be read: {str(error).splitlines()[0]}.") from error
+    bare = Model(folder, reconstruction, None, 0)
+    names = [image.name for image in bare.registered]
+    for images in _image_folders(folder):
+        present = _present(images, names)
+        if present:
+            return replace(bare, images=images, present=present)
+    return bare
+
+
+def _present(folder: Path, names: Sequence[str]) -> int:
+    return sum((folder / name).is_file() for name in names) if folder.is_dir() else 0
+
+
+def _image_folders(model: Path) -> Iterator[Path]:
+    """Where a model's photographs may be, nearest first: below it, or beside it and the folders that merely hold it.
+
+    The search ends at the folder that holds ``sparse``: photographs farther up are not those of an undistorted model.
+    """
+    base = model.resolve()
+    bases = [base]
+    for convention in (str.isdecimal, "sparse".__eq__, "colmap".__eq__):
+        if convention(base.name):
+            base = base.parent
+            bases.append(base)
+    for each in bases:
+        yield from (each / name for name in IMAGE_FOLDERS)
+        yield each
+    if len(bases) == 1:  # a model in a folder of any name: photographs beside it
+        yield base.parent / IMAGE_FOLDERS[0]
