@@ -177,7 +177,7 @@ def test_studies_are_found_by_name_file_and_folder(tmp_path: Path) -> None:
 def test_the_studies_that_come_along_are_whole_and_short(path: Path, tmp_path: Path) -> None:
     """Every level fits its methods; an hour on two cores, with a third of the fit's time for start and evaluation.
 
-    Twenty steps are taken for a second. The gauntlet has six hours and more pixels than steps; its own test says what it covers.
+    Twenty steps are taken for a second. The gauntlet has six hours; its own test says what it covers.
     """
     study = read_study(path)
     plan = make_plan(study, AblateRequest(study=str(path), out=str(tmp_path)))
