@@ -15,6 +15,7 @@ from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.forecast import CHECKPOINT_COPIES
 from invgraphics.experiments.recipe import Method
 from invgraphics.metrics.cost import model_bytes
+from invgraphics.training.batches import Batches
 from invgraphics.training.fit import Plan
 
 COPIES = 6
@@ -23,6 +24,8 @@ SCREEN_BYTES = 300
 """Of a primitive on the screen: footprint, its gradients, packed row and sums; rounded up from two threads."""
 PICTURE_BYTES = 300
 """Of a pixel of a training picture: rendering, truth, SSIM's moments, and their gradients."""
+RAY_BYTES = 512
+"""Of a ray of a batch that follows its samples: origin, direction, interval, colours and their gradients."""
 MARGIN = 1.25
 """Memory that is freed and asked for again in other sizes leaves gaps."""
 BASE_BYTES = 30 * 10**6
@@ -69,8 +72,8 @@ def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
     """What a fit will need: what it holds after a step and a look of the monitor, and what is still to come.
 
     To come are primitives with their gradients, moments and footprints, pictures at full size where the fit begins with smaller
-    ones, and a checkpoint's copy of the parameters and their moments. Empty space is not known yet, so that rays are as full of
-    samples as they will ever be.
+    ones, more rays where empty space leaves fewer samples on each, and a checkpoint's copy of the parameters and their moments.
+    Empty space is not known yet, so that rays are as full of samples as they will ever be.
 
     Args:
         plan: of the fit.
@@ -93,7 +96,8 @@ def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
     parameters = model_bytes(plan.modules.values()) + (most - now) * row
     pixels = max(view.camera.width * view.camera.height for view in plan.scene.train)
     pictures = 0 if isinstance(plan.renderer, RayRenderer) or plan.batches.resolution[0] == 1 else pixels * PICTURE_BYTES
-    total = MARGIN * held + growth + pictures + CHECKPOINT_COPIES * parameters + BASE_BYTES
+    rays = Batches.MAX_RAYS * RAY_BYTES if isinstance(plan.renderer, RayRenderer) and plan.batches.samples else 0
+    total = MARGIN * held + growth + pictures + rays + CHECKPOINT_COPIES * parameters + BASE_BYTES
     return MemoryForecast(round(total), most)
 
 
