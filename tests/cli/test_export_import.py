@@ -16,7 +16,7 @@ from training_fixtures import SMALL
 from invgraphics.cli import main
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments import EXPORTERS, fitted, imported
+from invgraphics.experiments import EXPORTERS, build, fitted
 from invgraphics.experiments.export import ExportRequest, export_run
 from invgraphics.experiments.imported import ImportRequest, import_run
 from invgraphics.experiments.request import FitRequest
@@ -112,7 +112,7 @@ def test_exports_are_in_the_world(run: Path, toy_folder: Path, tmp_path: Path, m
     def moved(open_scene: Callable[..., Scene]) -> Callable[..., Scene]:
         return lambda *words: replace(open_scene(*words), world_from_local=similarity)
 
-    for module in (fitted, imported):
+    for module in (fitted, build):
         monkeypatch.setattr(module, "open_scene", moved(module.open_scene))
     world = read_gaussians(_exported(run, tmp_path / "world.ply"))[1].gaussians
     expected = 2 * local.means @ turn.T + similarity[:3, 3]
@@ -151,6 +151,7 @@ def test_the_comment_says_where_a_ply_came_from(run: Path, tmp_path: Path) -> No
 
 def test_what_cannot_be_exported(run: Path, toy_folder: Path, tmp_path: Path, capsys) -> None:
     neural = tmp_path / "neural"
+    (tmp_path / "file").touch()
     overrides = tuple(SMALL["volumetric/hash"])
     fit_run(FitRequest(method="volumetric/hash", scene=str(toy_folder), out=str(neural), budget="1steps", overrides=overrides))
     capsys.readouterr()
@@ -158,7 +159,7 @@ def test_what_cannot_be_exported(run: Path, toy_folder: Path, tmp_path: Path, ca
         ([str(neural), "--to", "ply", "--out", str(tmp_path / "a.ply")], "has no Gaussians to write as ply"),
         ([str(run), "--to", "obj", "--out", str(tmp_path / "a.obj")], "--to cannot be 'obj'"),
         ([str(tmp_path), "--to", "ply", "--out", str(tmp_path / "a.ply")], "is not a run"),
-        ([str(run), "--to", "ply", "--out", str(tmp_path / "none" / "a.ply")], "in a folder that exists"),
+        ([str(run), "--to", "ply", "--out", str(tmp_path / "file" / "a.ply")], "cannot be made"),
         ([str(run), "--to", "spz", "--out", str(tmp_path / "a.spz"), "--world", "up"], "'up' names no axes"),
     ):
         assert main.run(["export", *words]) == main.BAD_INPUT

@@ -95,7 +95,11 @@ def test_a_small_gauntlet_from_its_file_to_its_verdicts(executor, gauntlet, toy_
     assert (gone["status"], gone["error"]) == ("skipped", "gone is not in $TOY_DATA")
     for method in METHODS:
         provenance = json.loads((folder / cells[f"{method} {name}@24 12steps seed=0"]["run"] / "provenance.json").read_text())
-        assert provenance["scene"] == f"$TOY_DATA/{name}" and provenance["options"] == {"size": 24, "test_views": 2}
+        assert provenance["scene"] == f"$TOY_DATA/{name}" and provenance["options"] == {
+            "size": 24,
+            "test_views": 2,
+            "spp": None,
+        }
         assert provenance["memory_forecast_bytes"] > 0
         assert cells[f"{method} {name}@24 12steps seed=0"]["forecast_seconds"] > 0
     build_study_report(folder)

@@ -18,7 +18,7 @@ SMALLEST = 0.05
 NEAREST_SHARE = 0.02
 """Share of a camera's points that may be wrong and nearer than its nearest surface."""
 CLEARANCE = 0.7
-"""Distance of the first sample over that of the nearest surface."""
+"""Distance of the first sample over that of the nearest points."""
 VIEW_ANGLE = 45.0
 """Degrees from the optical axis within which points count as seen."""
 FEWEST = 16

@@ -134,7 +134,7 @@ def ray_march(
     resume = torch.empty(len(rays))
     parts = []
     # A row has room for one interval more than it keeps.
-    width = 1 + min(most_steps(rays, bounds, start, steps), steps.limit + 2)
+    width = 1 + min(most_steps(rays, bounds, start, steps), steps.limit)
     batch = max(1, ROOM // width)
     for first in range(0, len(rays), batch):
         some = slice(first, min(first + batch, len(rays)))
