@@ -134,7 +134,7 @@ def test_strays_are_named_and_left_out(truth) -> None:
     found = remove_strays(truth, photos_of(truth))
     assert set(found) == {f"{far}.jpg", f"{bare}.jpg"}
     assert "times as far" in found[f"{far}.jpg"]
-    assert "only 5 of the points" in found[f"{bare}.jpg"]
+    assert re.search(r"only [1-5] of the points", found[f"{bare}.jpg"])  # some of the first five may show none
     assert truth.num_reg_images() == COUNT - 2
     assert not truth.images[far].has_pose
 
