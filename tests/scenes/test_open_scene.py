@@ -100,9 +100,7 @@ def test_unknown_formats_are_sentences(tmp_path: Path) -> None:
 
 
 def test_unknown_name_lists_the_built_in_scenes() -> None:
-    with pytest.raises(
-        InputError, match=r"'brick' is neither a built-in scene nor an existing path\. Did you mean 'bricks'\?\n.*bricks"
-    ):
+    with pytest.raises(InputError, match=r"'brick' is neither .* path\. Did you mean 'bricks'\?\n.*bricks"):
         open_scene("brick")
 
 
