@@ -6,11 +6,9 @@ import math
 
 from invgraphics.report.effects import METHOD, Factor, Observation, effects_on
 from invgraphics.report.records import Comparison
+from invgraphics.report.rules import DEAD_SHARE
 from invgraphics.report.summary import Row, Summary
 from invgraphics.report.wording import Quantity, budget_words, listing, times
-
-DEAD_SHARE = 0.01
-"""Share of primitives that no gradient can change above which the page warns."""
 
 
 def verdict(comparison: Comparison, summary: Summary) -> list[str]:

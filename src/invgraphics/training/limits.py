@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,8 +13,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Camera, Field, Quantity, Renderer
-from invgraphics.errors import InputError
 from invgraphics.kernels.types import ALPHA_MIN
+from invgraphics.training.density_control import Splats, check_splats
 from invgraphics.training.hooks import FitState, Hook
 
 VANISHING_SLOPE = 2.0**-23
@@ -26,12 +26,6 @@ SMALLEST = 1e-12
 """Scale limit, local units, of a Gaussian at a camera's very position."""
 CHUNK = 1 << 15
 """Points whose distances to all cameras are held at once."""
-
-
-class _Gaussians(Protocol):
-    means: Float[Tensor, "n 3"]
-    log_scales: Float[Tensor, "n 3"]
-    opacity_logits: Float[Tensor, " n"]
 
 
 @dataclass(frozen=True)
@@ -74,13 +68,12 @@ class _Limits(Hook):
 
     @override
     def check(self, field: Field, renderer: Renderer) -> None:
-        if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "opacity_logits"):
-            raise InputError(f"The hook 'limits' needs Gaussians, which {type(field).__name__} does not have.")
+        check_splats("limits", field)
 
     @override
     @torch.no_grad()
     def after_step(self, state: FitState) -> None:
-        config, field = self._config, cast(_Gaussians, state.field)
+        config, field = self._config, cast(Splats, state.field)
         field.opacity_logits.clamp_(_logit(config.min_opacity), _logit(config.max_opacity))
         if config.min_scale:
             if len(self._log_limit) != len(field.means) or state.step % config.every == 0:
@@ -163,7 +156,7 @@ def dead_gaussians(field: Field, cameras: Sequence[Camera]) -> DeadGaussians | N
     """
     if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "opacity_logits"):
         return None
-    gaussians = cast(_Gaussians, field)
+    gaussians = cast(Splats, field)
     opacity = gaussians.opacity_logits.float().sigmoid()
     largest = gaussians.log_scales.amax(dim=1).exp()
     return DeadGaussians(
