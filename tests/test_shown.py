@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from invgraphics.experiments.matrix import markdown
-from invgraphics.experiments.recipe import load_method, methods
+from invgraphics.recipes.recipe import load_method, methods
+from invgraphics.recipes.table import markdown
 from invgraphics.scenes.mitsuba.spec import names
 
 ROOT = Path(__file__).parents[1]

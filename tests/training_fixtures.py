@@ -12,7 +12,7 @@ from PIL import Image
 from invgraphics.core import Scene
 from invgraphics.core.transforms import opencv_to_opengl
 from invgraphics.experiments.build import build_plan
-from invgraphics.experiments.recipe import Method, load_method
+from invgraphics.recipes.recipe import Method, load_method
 from invgraphics.testing import toy_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit

@@ -26,8 +26,8 @@ REGISTRIES = {
     "scenes": ("invgraphics.scenes", "LOADERS"),
     "metrics": ("invgraphics.metrics", "METRICS"),
     "formats": ("invgraphics.formats", "FORMATS"),
-    "exporters": ("invgraphics.experiments", "EXPORTERS"),
-    "recipes": ("invgraphics.experiments", "RECIPES"),
+    "exporters": ("invgraphics.tools", "EXPORTERS"),
+    "recipes": ("invgraphics.recipes", "RECIPES"),
     "executors": ("invgraphics.experiments.executors", "EXECUTORS"),
 }
 """Registry name -> (module, dictionary). ``recipes`` starts empty: built-in recipes are TOML files."""

@@ -10,9 +10,9 @@ import pytest
 
 from invgraphics.cli import arguments, main
 from invgraphics.cli.ablate import Ablate
-from invgraphics.experiments import ablate as module
-from invgraphics.experiments.forecast import Forecast
 from invgraphics.experiments.request import AblateRequest
+from invgraphics.studies import ablate as module
+from invgraphics.studies.forecast import Forecast
 
 LONG, SHORT = Forecast(90, 80, 5 * 3600.0, 3 * 10**9), Forecast(9, 8, 600.0, 10**6)
 

@@ -16,13 +16,14 @@ from training_fixtures import SMALL
 from invgraphics.cli import main
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments import EXPORTERS, build, fitted
-from invgraphics.experiments.export import ExportRequest, export_run
-from invgraphics.experiments.imported import ImportRequest, import_run
+from invgraphics.experiments import build, fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.formats.base import read_gaussians, write_gaussians
-from invgraphics.report.reading import read_run
+from invgraphics.report.data.reading import read_run
+from invgraphics.tools import EXPORTERS
+from invgraphics.tools.export import ExportRequest, export_run
+from invgraphics.tools.import_gaussians import ImportRequest, import_run
 
 METHOD = "splatting/gaussians"
 

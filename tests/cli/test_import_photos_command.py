@@ -25,7 +25,7 @@ QUALITY = {
 @pytest.fixture
 def given(monkeypatch, tmp_path: Path):
     """Replace the work by a report; returns the requests and a way to run the command."""
-    from invgraphics.experiments import photos
+    from invgraphics.tools import photos
 
     asked = []
 

@@ -17,9 +17,9 @@ from invgraphics import plugins
 from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.executors.local import LocalExecutor, cores
-from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.request import FitRequest
-from invgraphics.training.checkpoint import NAME
+from invgraphics.runs.checkpoint import NAME
+from invgraphics.runs.folder import RunFolder
 
 METHOD = "splatting/gaussians"
 ENDLESS = {"budget": "1000000steps", "checkpoint_every": "10000s"}

@@ -12,17 +12,17 @@ import pytest
 import torch
 from training_fixtures import SMALL, write_blender
 
-from invgraphics.experiments.ablate import ablate
 from invgraphics.experiments.executors.local import THREAD_VARIABLES
 from invgraphics.experiments.request import AblateRequest
+from invgraphics.runs.checkpoint import NAME
+from invgraphics.studies.ablate import ablate
 from invgraphics.testing import toy_scene
-from invgraphics.training.checkpoint import NAME
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 PROGRAM = (
     "import json, sys\n"
-    "from invgraphics.experiments.ablate import ablate\n"
+    "from invgraphics.studies.ablate import ablate\n"
     "from invgraphics.experiments.request import AblateRequest\n"
     "ablate(AblateRequest(**json.loads(sys.argv[1])), lambda forecast: None)\n"
 )

@@ -15,19 +15,19 @@ from invgraphics.cli.compare import Compare
 from invgraphics.core import Context
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
-from invgraphics.experiments.cells import make_plan
 from invgraphics.experiments.compare import compare
 from invgraphics.experiments.evaluate import evaluate_run
-from invgraphics.experiments.folder import RunFolder
-from invgraphics.experiments.recipe import load_method
 from invgraphics.experiments.renderings import check_eyes, eye_named, rendered
 from invgraphics.experiments.request import AblateRequest, CompareRequest, FitRequest
 from invgraphics.experiments.run import fit_run
-from invgraphics.experiments.study import read_study
+from invgraphics.recipes.recipe import load_method
 from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.studies.cells import make_plan
+from invgraphics.studies.study import read_study
 from invgraphics.testing import toy_scene
-from invgraphics.training import checkpoint
 
 METHOD = "splatting/gaussians"
 RAY = "gaussian-volume/sorted:opacity=splat"

@@ -23,8 +23,8 @@ from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
+from invgraphics.runs.checkpoint import NAME, load
 from invgraphics.scenes.open import SceneOptions, open_scene
-from invgraphics.training.checkpoint import NAME, load
 
 METHOD = "splatting/gaussians"
 LONG = 300

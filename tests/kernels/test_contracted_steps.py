@@ -7,7 +7,7 @@ import torch
 from invgraphics.core.bounds import Bounds, contract
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
-from invgraphics.kernels.numba.march import most_steps
+from invgraphics.kernels.numba.rays.march import most_steps
 from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import HashField, HashGrid, March, MarchSteps
 

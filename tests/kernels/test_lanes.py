@@ -9,8 +9,8 @@ import pytest
 
 nb = pytest.importorskip("numba")
 
-from invgraphics.kernels.numba import lanes, layouts  # noqa: E402
 from invgraphics.kernels.numba.runtime import LANES, index  # noqa: E402
+from invgraphics.kernels.numba.simd import lanes, layouts  # noqa: E402
 
 GROUP = int(LANES)
 

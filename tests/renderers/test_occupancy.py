@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from invgraphics.core import Context, Field, Quantity, Samples, Scene, no_grad_density
-from invgraphics.experiments.recipe import load_method
 from invgraphics.fields.analytic import GaussianBlob, Sphere
+from invgraphics.recipes.recipe import load_method
 from invgraphics.renderers.occupancy import Occupancy, OccupancyConfig
 from invgraphics.renderers.volumetric import Volumetric
 

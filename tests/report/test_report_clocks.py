@@ -7,9 +7,9 @@ from pathlib import Path
 from report_folders import write_comparison
 
 from invgraphics.report.build import build_report
-from invgraphics.report.records import Comparison, Run, Score
-from invgraphics.report.summary import summarise
-from invgraphics.report.verdict import verdict
+from invgraphics.report.data.records import Comparison, Run, Score
+from invgraphics.report.statistics.summary import summarise
+from invgraphics.report.statistics.verdict import verdict
 
 TOLD = "had 50 % of the processor time that it was ready to use; other programs had the rest"
 

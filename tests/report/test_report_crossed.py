@@ -9,10 +9,10 @@ import pytest
 from report_folders import METHODS, SEEDS, VIEWS, truth_frame, write_run
 
 from invgraphics.errors import InputError
-from invgraphics.report.assets import Folder
 from invgraphics.report.build import build_report
-from invgraphics.report.crossed import cross
-from invgraphics.report.reading import read_comparison
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.reading import read_comparison
+from invgraphics.report.statistics.cross_render import cross
 from invgraphics.report.study import build_study_report
 
 OWN, OTHER = METHODS[2], "gaussian-volume/exact:opacity=physical"

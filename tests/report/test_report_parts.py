@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from invgraphics.report import pictures
-from invgraphics.report.reading import read_comparison
-from invgraphics.report.records import Run
-from invgraphics.report.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
-from invgraphics.report.summary import pareto_front, seconds_to_reach, time_to_quality
-from invgraphics.report.verdict import verdict
+from invgraphics.report.data.reading import read_comparison
+from invgraphics.report.data.records import Run
+from invgraphics.report.figures import views as pictures
+from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
+from invgraphics.report.statistics.summary import pareto_front, seconds_to_reach, time_to_quality
+from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import budget_words, duration, listing, significant_decimals, times
 
 
@@ -142,7 +142,7 @@ def test_labels_are_pushed_apart_no_further_than_needed() -> None:
 def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
     from dataclasses import replace
 
-    from invgraphics.report.summary import summarise
+    from invgraphics.report.statistics.summary import summarise
 
     comparison = read_comparison(built_report)
     told = " ".join(verdict(comparison, summarise(comparison)))
@@ -186,7 +186,7 @@ def test_report_never_imports_torch() -> None:
 def test_verdict_says_on_which_side_of_a_line_the_winner_is(built_report: Path) -> None:
     from dataclasses import replace
 
-    from invgraphics.report.summary import summarise
+    from invgraphics.report.statistics.summary import summarise
 
     comparison = read_comparison(built_report)
     score = comparison.runs[0].quality["psnr"]

@@ -15,7 +15,7 @@ from pyarrow import parquet
 
 from invgraphics.cli import main
 from invgraphics.errors import InputError
-from invgraphics.report.public import HIDDEN, Redactor, redactor_for
+from invgraphics.report.data.redact import HIDDEN, Redactor, redactor_for
 from invgraphics.report.study import build_study_report
 
 USER, HOST, LOGIN, NODE = "ada_lovelace", "analyticalengine", "countess", "babbage-07"

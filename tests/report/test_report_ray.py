@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from invgraphics.errors import InputError
-from invgraphics.report.ray import close_up, read_ray, whole_ray
-from invgraphics.report.rayplot import draw_ray
+from invgraphics.report.data.ray import close_up, read_ray, whole_ray
+from invgraphics.report.figures.ray import draw_ray
 
 KEYS = ("t", "begin", "end", "alpha", "transmittance", "weight", "red", "green", "blue", "counted")
 

@@ -11,7 +11,7 @@ import pytest
 
 from invgraphics.errors import InputError
 from invgraphics.report.build import build_from_runs, build_report
-from invgraphics.report.reading import read_comparison, read_run
+from invgraphics.report.data.reading import read_comparison, read_run
 
 RUN = "runs/volumetric-hash/seed-0"
 

@@ -12,10 +12,10 @@ import pytest
 from judged_folders import entry, rising, write_judged
 
 from invgraphics.cli import main
-from invgraphics.experiments.study import KnownDeviation
-from invgraphics.report.rules import RULES, JudgedCell, judge, unused
+from invgraphics.report.data.studies import read_study
+from invgraphics.report.statistics.rules import RULES, JudgedCell, judge, unused
 from invgraphics.report.study import build_study_report
-from invgraphics.report.studyreading import read_study
+from invgraphics.studies.study import KnownDeviation
 
 SPLATS, HASH = "splatting/gaussians", "volumetric/hash"
 

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from invgraphics.report.effects import METHOD, Effect, Factor, Observation, effects_on
-from invgraphics.report.records import Run, Score
-from invgraphics.report.statistics import ENOUGH, RESAMPLES, Estimate, band, estimate, holm
+from invgraphics.report.data.factors import METHOD, Factor, Observation
+from invgraphics.report.data.records import Run, Score
+from invgraphics.report.statistics.effects import Effect, effects_on
+from invgraphics.report.statistics.intervals import ENOUGH, RESAMPLES, Estimate, band, estimate, holm
 from invgraphics.report.wording import quality_quantity
 
 PSNR = quality_quantity("psnr", Score(0.0, "dB", True, ()))

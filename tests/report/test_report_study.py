@@ -22,11 +22,11 @@ from statsmodels.stats.multitest import multipletests
 
 from invgraphics.cli import main
 from invgraphics.errors import InputError
-from invgraphics.report.effectplots import heat_map
+from invgraphics.report.data.studies import read_study, scene_comparisons
+from invgraphics.report.data.variants import short_names
+from invgraphics.report.figures.effects import heat_map
+from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.study import build_study_report, shown_variants, study_sentences
-from invgraphics.report.studyreading import read_study, scene_comparisons
-from invgraphics.report.summary import summarise
-from invgraphics.report.variants import short_names
 from invgraphics.report.wording import quality_quantity
 
 VIEWS, LEVELS = STUDY_FACTORS

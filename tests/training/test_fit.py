@@ -11,7 +11,7 @@ import torch
 
 from invgraphics.core import Context
 from invgraphics.errors import NumericalError
-from invgraphics.training import checkpoint
+from invgraphics.runs import checkpoint
 
 METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
 STEPS = {"volumetric/nerf": 350, "volumetric/hash": 300, "splatting/gaussians": 120}

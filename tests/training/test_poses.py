@@ -19,9 +19,9 @@ from invgraphics.kernels.types import HashGrid
 from invgraphics.metrics.poses import pose_errors
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
+from invgraphics.runs import checkpoint
 from invgraphics.scenes.corrupt import TrainingData, corrupt
 from invgraphics.testing import toy_cameras
-from invgraphics.training import checkpoint
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan

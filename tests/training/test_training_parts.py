@@ -8,7 +8,7 @@ import torch
 from invgraphics.core import Batch, Bounds, Context, Rays, Rendering, Samples, Trace
 from invgraphics.core.samples import FieldValues
 from invgraphics.errors import InputError
-from invgraphics.training import checkpoint
+from invgraphics.runs import checkpoint
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.hooks import FitState, ShDegreeConfig

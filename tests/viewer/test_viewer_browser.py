@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from invgraphics.training import checkpoint
+from invgraphics.runs import checkpoint
 
 viser = pytest.importorskip("viser")
 

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from invgraphics.experiments.fitted import open_fitted
-from invgraphics.training import checkpoint
+from invgraphics.runs import checkpoint
 from invgraphics.viewer.cameras import Gaze, Mount
 from invgraphics.viewer.colouring import EMPTY, ERROR_LIMIT, resized
 from invgraphics.viewer.pace import LEAST

@@ -20,7 +20,7 @@ from invgraphics.cli import main, view
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
-from invgraphics.training import checkpoint
+from invgraphics.runs import checkpoint
 from invgraphics.viewer.subject import open_subject
 from invgraphics.viewer.view import ViewRequest, check_place, is_loopback, open_viewer
 

@@ -12,11 +12,11 @@ from tyro.conf import Positional, arg
 from invgraphics.cli.arguments import parse_samples, parse_seeds, parse_size, parse_views
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
-from invgraphics.experiments.study import locate, name_of, read_study
+from invgraphics.studies.study import locate, name_of, read_study
 from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
-    from invgraphics.experiments.forecast import Forecast
+    from invgraphics.studies.forecast import Forecast
 
 MOST_HOURS = 4.0
 """A longer study is not started without asking."""
@@ -71,7 +71,7 @@ class Ablate:
         request = self.request()
         read_study(locate(request.study)).overridden(request)  # refuses most mistakes before torch is imported
 
-        from invgraphics.experiments.ablate import ablate
+        from invgraphics.studies.ablate import ablate
 
         folder, failed = ablate(request, self._confirm)
         for cell in failed:

@@ -114,7 +114,7 @@ def _look() -> Look:
     from importlib.resources import files
 
     from invgraphics.bench.plots import Look
-    from invgraphics.report import style
+    from invgraphics.report.figures import style
 
     sheet = files("invgraphics.report").joinpath("templates", "style.css").read_text(encoding="utf-8")
     return Look(style.canvas, style.save, style.series_style, sheet)

@@ -10,8 +10,8 @@ from tyro.conf import Positional, arg
 
 from invgraphics.cli.arguments import Shared, parse_list, parse_seeds
 from invgraphics.cli.report import write_report
-from invgraphics.experiments.recipe import presets
 from invgraphics.experiments.request import CompareRequest
+from invgraphics.recipes.recipe import presets
 
 
 @dataclass(frozen=True, kw_only=True)

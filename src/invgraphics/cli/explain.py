@@ -13,7 +13,7 @@ from invgraphics.cli.output import show_table
 from invgraphics.errors import InputError
 
 if TYPE_CHECKING:
-    from invgraphics.experiments.explaining import Explanation
+    from invgraphics.tools.explain import Explanation
 
 ROWS = 24
 """Contributions that are printed, those that weigh most; the file has all."""
@@ -48,8 +48,8 @@ class Explain:
                 f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
             )
 
-        from invgraphics.experiments.explaining import ExplainRequest, explain
-        from invgraphics.report.rayplot import draw_ray
+        from invgraphics.report.figures.ray import draw_ray
+        from invgraphics.tools.explain import ExplainRequest, explain
 
         explanation = explain(ExplainRequest(self.folder, self.view, pixel, self.split, self.out, self.scene))
         figure = draw_ray(explanation.folder)

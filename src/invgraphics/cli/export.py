@@ -54,7 +54,7 @@ class Export:
                 f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
             )
 
-        from invgraphics.experiments.export import ExportRequest, export_run
+        from invgraphics.tools.export import ExportRequest, export_run
 
         exported = export_run(
             ExportRequest(

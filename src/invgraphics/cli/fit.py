@@ -13,8 +13,8 @@ from tyro.conf import Positional, arg
 from invgraphics.cli.arguments import Shared
 from invgraphics.cli.output import show_scores
 from invgraphics.errors import InputError
-from invgraphics.experiments.recipe import presets
 from invgraphics.experiments.request import FitRequest, slug
+from invgraphics.recipes.recipe import presets
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from invgraphics.cli.arguments import parse_size, parse_views
 from invgraphics.cli.output import show_scores
 from invgraphics.errors import InputError
-from invgraphics.experiments.recipe import presets
+from invgraphics.recipes.recipe import presets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class ImportFile:
         if not self.file.is_file():
             raise InputError(f"There is no file '{self.file}'.")
 
-        from invgraphics.experiments.imported import ImportRequest, import_run
+        from invgraphics.tools.import_gaussians import ImportRequest, import_run
 
         out = self.out or Path("runs") / f"{Path(self.scene).resolve().name}-{self.file.name}"
         folder = import_run(

@@ -57,9 +57,9 @@ class ImportPhotos:
             raise InputError(f"There is no data set '{self.truth}'.")
         out = self.out or Path("scenes") / (self.folder.resolve().name or "photos")
 
-        from invgraphics.experiments.photos import import_photos
         from invgraphics.experiments.progress import Reporter
         from invgraphics.scenes.photos import PhotoJob
+        from invgraphics.tools.photos import import_photos
 
         job = PhotoJob(
             folder=str(self.folder),

@@ -64,14 +64,14 @@ class List:
 
 
 def _print_matrix() -> None:
-    from invgraphics.experiments.matrix import markdown
+    from invgraphics.recipes.table import markdown
 
     print(markdown())
 
 
 def _list_methods() -> None:
-    from invgraphics.experiments.presets import described
-    from invgraphics.experiments.recipe import methods, source
+    from invgraphics.recipes.presets import described
+    from invgraphics.recipes.recipe import methods, source
 
     ours = find("renderers")
     rows = [
@@ -99,7 +99,7 @@ def _list_scenes() -> None:
 
 
 def _list_studies() -> None:
-    from invgraphics.experiments.study import FILE, read_study
+    from invgraphics.studies.study import FILE, read_study
 
     rows = []
     for path in sorted(find("studies").glob(f"*/{FILE}")):

@@ -50,7 +50,7 @@ class Locate:
         if out.suffix != ".json":
             raise InputError(f"--out cannot be '{out}'.", "Expected a file name that ends in .json.")
 
-        from invgraphics.experiments.locating import LocateRequest, locate
+        from invgraphics.tools.localise import LocateRequest, locate
 
         options = (self.near, self.start, self.starts, self.steps, self.fov, self.scene, self.seed)
         found = locate(LocateRequest(self.folder, self.photo, out, *options))

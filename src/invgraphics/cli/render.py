@@ -46,7 +46,7 @@ class Render:
                 f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
             )
 
-        from invgraphics.experiments.film import FilmRequest, film
+        from invgraphics.tools.film import FilmRequest, film
 
         print(film(FilmRequest(self.folder, self.out, self.path, self.frames, self.fps, size, self.view, self.scene)))
         return 0

@@ -27,7 +27,7 @@ class Report:
 
     def run(self) -> int:
         """Write the report; print the page's path."""
-        from invgraphics.report.studyreading import is_study
+        from invgraphics.report.data.studies import is_study
 
         if not self.folders:
             raise InputError("There is nothing to report.", "Give the folder of a comparison, of a study, or of runs.")
@@ -78,8 +78,8 @@ def runs_in(folder: Path) -> list[Path]:
 def write_report(folder: Path, out: Path | None = None, public: bool = False) -> None:
     """Write the report of a comparison's folder, into itself or into ``out``; print its table and the page's path."""
     from invgraphics.report.build import build_report
-    from invgraphics.report.reading import read_comparison
-    from invgraphics.report.summary import summarise
+    from invgraphics.report.data.reading import read_comparison
+    from invgraphics.report.statistics.summary import summarise
 
     page = build_report(folder, out, public)
     comparison = read_comparison(folder)

@@ -39,9 +39,9 @@ class Rescore:
         if not self.folders:
             raise InputError("There is nothing to score.", "Give a run, or a folder of predicted pictures.")
 
-        from invgraphics.experiments.pictures import open_pictures
-        from invgraphics.experiments.rescore import rescore, rules_named
-        from invgraphics.experiments.rescored import reasons, rows_of, winners, write_scores, write_tables
+        from invgraphics.tools.predictions import open_pictures
+        from invgraphics.tools.rescore import rescore, rules_named
+        from invgraphics.tools.rescoring import reasons, rows_of, winners, write_scores, write_tables
 
         rules = rules_named(self.protocol)
         folders = [one for folder in self.folders for one in (runs_in(folder) if (folder / COMPARISON).is_file() else [folder])]

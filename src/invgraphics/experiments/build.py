@@ -11,14 +11,23 @@ from invgraphics.config import fill
 from invgraphics.core import Field, RayRenderer, Renderer, Scene, check
 from invgraphics.errors import InputError
 from invgraphics.experiments.progress import Reporter
-from invgraphics.experiments.recipe import Method, assign
 from invgraphics.experiments.request import DATA, Settings
-from invgraphics.experiments.schema import Recipe
+from invgraphics.recipes.recipe import Method, assign, load_method
+from invgraphics.recipes.schema import Recipe
 from invgraphics.scenes.corrupt import TrainingData
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Plan
 from invgraphics.training.poses import make_poses, windows
+
+
+def requested_method(name: str, request: Settings) -> Method:
+    """The method that a request names, under the request's preset (or its budget's) and overrides.
+
+    Raises:
+        InputError: as `load_method`, or the budget cannot be read.
+    """
+    return load_method(name, request.preset, request.recipe_overrides, Budget.parse(request.budget))
 
 
 def device_of(name: str | None) -> torch.device:

@@ -13,18 +13,18 @@ import torch
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import device_of, open_requested, training_data
+from invgraphics.experiments.build import device_of, open_requested, requested_method, training_data
 from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.base import INTERRUPTED
 from invgraphics.experiments.executors.local import LocalExecutor
-from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import protocol_note
-from invgraphics.experiments.recipe import Method, requested_method
 from invgraphics.experiments.recorder import Cadence
 from invgraphics.experiments.renderings import check_eyes
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named
+from invgraphics.recipes.recipe import Method
+from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.corrupt import corrupt
 from invgraphics.training.budget import Budget
 

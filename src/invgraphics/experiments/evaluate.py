@@ -16,13 +16,13 @@ from invgraphics.core import Camera, Context, Field, Renderer, Rendering, Scene,
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
-from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
-from invgraphics.experiments.recipe import Method
 from invgraphics.experiments.shortfall import observe, shortfall
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
+from invgraphics.recipes.recipe import Method
+from invgraphics.runs.folder import RunFolder
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
 

@@ -13,13 +13,13 @@ from invgraphics import plugins
 from invgraphics.core import Field, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
-from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import optimised, scene_of_fit
-from invgraphics.experiments.recipe import Method, resolve
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.waiting import limit_spinning
+from invgraphics.recipes.recipe import Method, resolve
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.open import SceneOptions, open_scene
-from invgraphics.training import checkpoint
 from invgraphics.training.poses import Poses
 
 

@@ -11,9 +11,9 @@ from typing import Any
 from invgraphics.core import Scene
 from invgraphics.experiments.build import training_data
 from invgraphics.experiments.environment import code_version
-from invgraphics.experiments.folder import RunFolder
-from invgraphics.experiments.recipe import Method
 from invgraphics.experiments.request import FitRequest
+from invgraphics.recipes.recipe import Method
+from invgraphics.runs.folder import RunFolder
 from invgraphics.training.budget import Budget
 
 

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from invgraphics.core import Camera, Field, Renderer, Rendering, Scene, View
-from invgraphics.experiments.recipe import Method
 from invgraphics.metrics.poses import PoseErrors, Similarity, pose_errors
+from invgraphics.recipes.recipe import Method
 from invgraphics.training.localise import Descent, descend
 from invgraphics.training.poses import Poses, PosesConfig
 

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
 from invgraphics.errors import InputError
-from invgraphics.experiments.folder import RunFolder
 from invgraphics.experiments.posed import carried, into_fit
 from invgraphics.experiments.progress import Reporter
-from invgraphics.training import checkpoint
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import RunFolder
 from invgraphics.training.fit import Fit
 from invgraphics.training.limits import dead_gaussians
 

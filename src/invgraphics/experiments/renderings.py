@@ -24,9 +24,9 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.evaluate import evaluate_saved
-from invgraphics.experiments.folder import RunFolder
-from invgraphics.experiments.recipe import Method, load_method, resolve
 from invgraphics.experiments.request import FitRequest, slug
+from invgraphics.recipes.recipe import Method, load_method, resolve
+from invgraphics.runs.folder import RunFolder
 
 RECORD = "renderings.json"
 """What a fit's folder holds about its renderings."""

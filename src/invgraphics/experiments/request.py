@@ -21,7 +21,7 @@ class Settings:
         scene: built-in scene or path of a data set.
         out: folder to write.
         budget: of each fit, ``60s`` or ``5000steps``.
-        preset: preset of the recipes; ``None`` for the one that suits the budget (see `experiments.presets`).
+        preset: preset of the recipes; ``None`` for the one that suits the budget (see `recipes.presets`).
         overrides: ``key=value`` items laid over the recipes, or over the training data where the key begins with ``data.``.
         size: longest side in pixels, or (width, height); ``None`` for the scene's own.
         test_views: how many test views to score; ``None`` for all.
@@ -160,7 +160,7 @@ class AblateRequest:
         kernels: implementation to force; ``None`` for the best one here.
         checkpoint_every: for instance ``30s`` or ``100steps``.
         keep: whether finished cells count although the code has changed since, if recipe, scene and request are the same.
-        cells: pattern of the labels of the cells to run (`invgraphics.experiments.cells.Planned.label`); ``None`` for all.
+        cells: pattern of the labels of the cells to run (`invgraphics.studies.cells.Planned.label`); ``None`` for all.
         most_seconds: fits with a longer budget are left for later; ``None`` for none.
     """
 

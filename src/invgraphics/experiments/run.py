@@ -17,16 +17,21 @@ import torch
 from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments import recipe
-from invgraphics.experiments.build import build_plan, device_of, open_requested, repeatable, training_data, use_kernels
+from invgraphics.experiments.build import (
+    build_plan,
+    device_of,
+    open_requested,
+    repeatable,
+    requested_method,
+    training_data,
+    use_kernels,
+)
 from invgraphics.experiments.clocks import disturbance, fit_costs, load_average, processor_share
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import WITH_PARENT, cores
-from invgraphics.experiments.folder import RunFolder, write_json
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.posed import protocol_note
-from invgraphics.experiments.presets import announcements
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Cadence, Monitor, Recorder
 from invgraphics.experiments.renderings import check_eyes, render_missing
@@ -34,9 +39,12 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.metrics.protocols import protocol_named
+from invgraphics.recipes.presets import announcements
+from invgraphics.recipes.recipe import Method
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import RunFolder, write_json
 from invgraphics.scenes.corrupt import corrupt
 from invgraphics.scenes.open import choices
-from invgraphics.training import checkpoint
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 
@@ -51,7 +59,7 @@ def fit_run(request: FitRequest) -> Path:
     """
     protocol_named(request.protocol)  # now, not when the fit is done
     budget, cadence = Budget.parse(request.budget), Cadence.parse(request.checkpoint_every)
-    method = recipe.requested_method(request.method, request)
+    method = requested_method(request.method, request)
     data = training_data(request)
     device = device_of(request.device)
     folder = RunFolder(Path(request.out))
@@ -105,7 +113,7 @@ def _check_existing(folder: RunFolder, request: FitRequest) -> None:
     folder.create()
 
 
-def _rehearse(folder: RunFolder, fit: Fit, method: recipe.Method, memory: PeakMemory) -> MemoryForecast:
+def _rehearse(folder: RunFolder, fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
     """Take a step and a look of the monitor that count for nothing; the memory that they needed tells what the fit will need.
 
     Raises:
@@ -135,9 +143,7 @@ def _declare_clocks(folder: RunFolder, spent: Mapping[str, Any]) -> None:
         warn(f"The fit {disturbed}. Its times are not to be compared.")
 
 
-def _evaluate(
-    folder: RunFolder, scene: Scene, fit: Fit, request: FitRequest, method: recipe.Method, spent: dict[str, Any]
-) -> None:
+def _evaluate(folder: RunFolder, scene: Scene, fit: Fit, request: FitRequest, method: Method, spent: dict[str, Any]) -> None:
     """Score the fit on the undisturbed scene. ``scores.json`` comes last, because a run that has it is finished."""
     folder.write_json("fit.json", spent)
     costs = fit_costs(spent)
@@ -150,7 +156,7 @@ def _evaluate(
 def describe(
     folder: RunFolder,
     request: FitRequest,
-    method: recipe.Method,
+    method: Method,
     scenes: tuple[Scene, Scene],
     identity: str,
     device: torch.device,

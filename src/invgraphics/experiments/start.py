@@ -11,10 +11,9 @@ import torch
 from invgraphics.core import RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
-from invgraphics.experiments.folder import RunFolder
-from invgraphics.experiments.forecast import CHECKPOINT_COPIES
-from invgraphics.experiments.recipe import Method
 from invgraphics.metrics.cost import model_bytes
+from invgraphics.recipes.recipe import Method
+from invgraphics.runs.folder import RunFolder
 from invgraphics.training.batches import Batches
 from invgraphics.training.fit import Plan
 
@@ -26,6 +25,8 @@ PICTURE_BYTES = 300
 """Of a pixel of a training picture: rendering, truth, SSIM's moments, and their gradients."""
 RAY_BYTES = 512
 """Of a ray of a batch that follows its samples: origin, direction, interval, colours and their gradients."""
+CHECKPOINT_COPIES = 3
+"""A checkpoint holds each parameter and Adam's two moments."""
 MARGIN = 1.25
 """Memory that is freed and asked for again in other sizes leaves gaps."""
 BASE_BYTES = 30 * 10**6

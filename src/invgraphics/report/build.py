@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.errors import InputError
-from invgraphics.report.assets import Folder, read_picture
-from invgraphics.report.longtable import write_comparison_table
-from invgraphics.report.page import write_html, write_markdown
-from invgraphics.report.parts import draw_part, method_contrasts
-from invgraphics.report.public import check_apart, redactor_for
-from invgraphics.report.reading import check_comparable, read_comparison, read_run
-from invgraphics.report.records import Comparison, Run
-from invgraphics.report.tables import effects_caption, write_latex, write_latex_effects
+from invgraphics.report.data.assets import Folder, read_picture
+from invgraphics.report.data.reading import check_comparable, read_comparison, read_run
+from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.data.redact import check_apart, redactor_for
+from invgraphics.report.pages.comparison import write_html, write_markdown
+from invgraphics.report.pages.longtable import write_comparison_table
+from invgraphics.report.pages.parts import draw_part, method_contrasts
+from invgraphics.report.pages.tables import effects_caption, write_latex, write_latex_effects
 from invgraphics.report.wording import listing
 
 

@@ -8,20 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.errors import InputError
-from invgraphics.report.analysisplots import draw_analyses
-from invgraphics.report.assets import Folder
-from invgraphics.report.effectplots import draw_heat_maps, file_name
-from invgraphics.report.effects import effects_on
-from invgraphics.report.longtable import write_study_table
-from invgraphics.report.parts import draw_contrasts, draw_part
-from invgraphics.report.public import check_apart, redactor_for
-from invgraphics.report.records import Comparison
-from invgraphics.report.rules import headline, judge
-from invgraphics.report.studypage import StudyPage, write_study_html, write_study_markdown
-from invgraphics.report.studyreading import Study, read_study, scene_comparisons
-from invgraphics.report.summary import quality_columns, table_columns, value_of
-from invgraphics.report.tables import effects_caption, write_latex, write_latex_effects
-from invgraphics.report.verdictpage import write_verdict_report
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.records import Comparison
+from invgraphics.report.data.redact import check_apart, redactor_for
+from invgraphics.report.data.studies import Study, read_study, scene_comparisons
+from invgraphics.report.figures.analyses import draw_analyses
+from invgraphics.report.figures.effects import draw_heat_maps, file_name
+from invgraphics.report.pages.longtable import write_study_table
+from invgraphics.report.pages.parts import draw_contrasts, draw_part
+from invgraphics.report.pages.study import StudyPage, write_study_html, write_study_markdown
+from invgraphics.report.pages.tables import effects_caption, write_latex, write_latex_effects
+from invgraphics.report.pages.verdicts import write_verdict_report
+from invgraphics.report.statistics.effects import effects_on
+from invgraphics.report.statistics.rules import headline, judge
+from invgraphics.report.statistics.summary import quality_columns, table_columns, value_of
 from invgraphics.report.wording import Quantity
 
 MOST_PICTURES = 8

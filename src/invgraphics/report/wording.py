@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from invgraphics.report.records import Score
+from invgraphics.report.data.records import Score
 
 Direction = Literal["higher", "lower", "none"]
 Group = Literal["image", "geometry", "cost"]

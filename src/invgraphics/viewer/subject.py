@@ -14,8 +14,8 @@ from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.experiments.folder import RunFolder
-from invgraphics.training import checkpoint
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import RunFolder
 
 Stamp = tuple[int, int, int]
 Stamps = tuple[Stamp | None, Stamp | None]

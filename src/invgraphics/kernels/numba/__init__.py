@@ -5,15 +5,15 @@ the reference: discs, lenses that are being optimised, gradients through `Footpr
 pictures of hash grids with other than two features per entry.
 """
 
-from invgraphics.kernels.numba.binning import splat_bin as splat_bin
-from invgraphics.kernels.numba.composite import composite as composite
-from invgraphics.kernels.numba.grid import grid_sample as grid_sample
-from invgraphics.kernels.numba.hash import hash_encode as hash_encode
-from invgraphics.kernels.numba.hash_march import hash_march as hash_march
-from invgraphics.kernels.numba.hash_render import hash_render as hash_render
-from invgraphics.kernels.numba.march import ray_march as ray_march
-from invgraphics.kernels.numba.projecting import splat_project as splat_project
-from invgraphics.kernels.numba.rasterising import splat_median as splat_median
-from invgraphics.kernels.numba.rasterising import splat_rasterise as splat_rasterise
+from invgraphics.kernels.numba.hash.encode import hash_encode as hash_encode
+from invgraphics.kernels.numba.hash.grid import grid_sample as grid_sample
+from invgraphics.kernels.numba.ngp.march import hash_march as hash_march
+from invgraphics.kernels.numba.ngp.render import hash_render as hash_render
+from invgraphics.kernels.numba.rays.composite import composite as composite
+from invgraphics.kernels.numba.rays.march import ray_march as ray_march
+from invgraphics.kernels.numba.splat.binning import splat_bin as splat_bin
+from invgraphics.kernels.numba.splat.project import splat_project as splat_project
+from invgraphics.kernels.numba.splat.rasterise import splat_median as splat_median
+from invgraphics.kernels.numba.splat.rasterise import splat_rasterise as splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim as ssim
-from invgraphics.kernels.numba.warming import warm_up as warm_up
+from invgraphics.kernels.numba.warmup import warm_up as warm_up

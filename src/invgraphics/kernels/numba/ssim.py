@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.lanes import counting, load, spread, store, total, where
 from invgraphics.kernels.numba.runtime import (
     GROUP,
     array,
@@ -26,6 +25,7 @@ from invgraphics.kernels.numba.runtime import (
     share,
     threads,
 )
+from invgraphics.kernels.numba.simd.lanes import counting, load, spread, store, total, where
 from invgraphics.kernels.reference.ssim import C1, C2, SIGMA, WINDOW
 
 REACH = WINDOW // 2

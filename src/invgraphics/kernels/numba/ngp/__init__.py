@@ -1,0 +1,1 @@
+"""Fused ray marching of a hash grid with small networks."""

@@ -1,0 +1,89 @@
+"""A hash grid and its networks as kernels ask them: densities and colours of `POINTS` positions at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+from invgraphics.kernels.numba.hash.cells import ask_for, at_vertices, locate
+from invgraphics.kernels.numba.ngp.dense import POINTS, dense, packed_layer, padded
+from invgraphics.kernels.numba.runtime import exp2, index, inlined, log2
+from invgraphics.kernels.numba.simd.instructions import blend_pair
+from invgraphics.kernels.types import EXP_LIMIT
+
+ACTIVATIONS = ("exp", "softplus", "relu")
+"""Of densities, by the numbers that kernels know them by."""
+_EXP, _SOFTPLUS = 0, 1
+
+_ZERO, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0.0, 1.0, 2.0, 4.0))
+_LOG2E, _LN2 = np.float32(1 / np.log(2.0)), np.float32(np.log(2.0))
+_MOST = np.float32(EXP_LIMIT)
+_LARGEST = np.float32(80.0)
+"""Beyond this exp(-x) is nothing beside 1, and stays within float32."""
+
+
+@inlined
+def softplus(x):
+    """log(1 + exp(x))."""
+    return max(x, _ZERO) + log2(_ONE + exp2(-abs(x) * _LOG2E)) * _LN2
+
+
+@inlined
+def sigmoid(x):
+    """1 / (1 + exp(-x))."""
+    return _ONE / (_ONE + exp2(min(-x, _LARGEST) * _LOG2E))
+
+
+@inlined
+def density_of(raw, activation):
+    """The density that a network's output stands for; ``activation`` is one of `ACTIVATIONS`, by number."""
+    if activation == _EXP:
+        return exp2(min(raw, _MOST) * _LOG2E)
+    return softplus(raw) if activation == _SOFTPLUS else max(raw, _ZERO)
+
+
+@inlined
+def radial_scale(points, p):
+    """`Bounds.radial_scale` at position ``p`` in the unit cube of a contracted space: (2 - |y|)², y after contraction."""
+    x, y, z = _FOUR * points[0, p] - _TWO, _FOUR * points[1, p] - _TWO, _FOUR * points[2, p] - _TWO
+    left = min(_TWO - np.sqrt(x * x + y * y + z * z), _ONE)
+    return left * left
+
+
+@inlined
+def encode(table, levels, points, entries, weights, out):
+    """Features of `POINTS` positions, feature after feature; ``entries`` and ``weights`` have room for two levels.
+
+    A level's entries are asked for before those of the level before it are read.
+    """
+    cells, offsets, masks = levels
+    for number in range(len(cells) + 1):
+        if number < len(cells):
+            level, place = (cells[number], offsets[number], masks[number]), number % 2
+            locate(points[0], points[1], points[2], (index(0), np.int64(POINTS)), level, entries[place], weights[place])
+            ask_for(table, entries[place], POINTS)
+        if number > 0:
+            column, place = index(2 * (number - 1)) * POINTS, (number - 1) % 2
+            for point in range(POINTS):
+                n = index(point)
+                low, high = blend_pair(table, at_vertices(entries[place], n), at_vertices(weights[place], n))
+                out[column + n], out[column + POINTS + n] = low, high
+
+
+@inlined
+def outputs_of(network, x, odd, even):
+    """The outputs of `POINTS` inputs; layers write to ``odd`` and ``even`` in turn."""
+    layers, sizes = network
+    at, last, source, target = index(0), len(sizes) - 1, x, odd
+    for number in range(len(sizes)):
+        size = index(sizes[number, 0]), index(sizes[number, 1])
+        dense(layers, at, source, target, size, number < last)
+        at += (size[0] + index(1)) * size[1]
+        source, target = target, even if number % 2 == 0 else odd
+    return source
+
+
+def packed_network(layers: tuple[tuple[Tensor, Tensor], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """A network as kernels read it: its layers, and their inputs and padded outputs."""
+    sizes = np.array([(weight.shape[1], padded(len(weight))) for weight, _ in layers], np.int64)
+    return np.concatenate([packed_layer(weight, bias) for weight, bias in layers]), sizes

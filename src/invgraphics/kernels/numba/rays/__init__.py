@@ -1,0 +1,1 @@
+"""Occupancy-grid marching and compositing."""

@@ -1,0 +1,1 @@
+"""Registers of 16 numbers as a Numba type."""

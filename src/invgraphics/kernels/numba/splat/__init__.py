@@ -1,0 +1,1 @@
+"""Projection, binning and rasterisation of Gaussians."""

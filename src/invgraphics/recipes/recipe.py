@@ -1,0 +1,148 @@
+"""Recipes: a method is data, a TOML file that names a field, a renderer, losses, hooks and settings."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from invgraphics import plugins
+from invgraphics.config import fill, merge, set_path, to_table
+from invgraphics.data import find
+from invgraphics.errors import InputError, did_you_mean
+from invgraphics.recipes.presets import select_preset
+from invgraphics.training.budget import Budget
+
+if TYPE_CHECKING:
+    from invgraphics.recipes.schema import Recipe
+
+
+@dataclass(frozen=True)
+class Method:
+    """A recipe ready to be built.
+
+    Attributes:
+        name: ``renderer/recipe``, or the path of a user's own TOML file.
+        preset: which preset was laid over the recipe; empty for none.
+        recipe: its typed settings.
+        table: the same, everything resolved, as plain values; what a run's ``recipe.toml`` holds.
+        preset_choice: what chose the preset, in words; empty where it was asked for.
+        chosen_on: scenes on which the preset's values were chosen.
+    """
+
+    name: str
+    preset: str
+    recipe: Recipe
+    table: dict[str, Any]
+    preset_choice: str = ""
+    chosen_on: tuple[str, ...] = ()
+
+    @property
+    def slug(self) -> str:
+        """The name as one folder name."""
+        return self.name.removesuffix(".toml").strip("/").replace("/", "-")
+
+    @property
+    def choice(self) -> tuple[str, str, str]:
+        """Name, preset and what chose the preset, for `recipes.presets.announcements`."""
+        return self.name, self.preset, self.preset_choice
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the resolved table."""
+        return hashlib.sha256(json.dumps(self.table, sort_keys=True).encode()).hexdigest()
+
+
+def methods() -> dict[str, str]:
+    """Name -> summary of every known method, our own first; imports no implementation."""
+    root = find("renderers")
+    found = {}
+    for path in sorted(root.glob("*/*.toml")):
+        found[f"{path.parent.name}/{path.stem}"] = str(_parse(path.read_text(), str(path)).get("summary", ""))
+    for name in plugins.names("recipes"):
+        found.setdefault(name, str(_parse(_foreign_text(name), name).get("summary", "")))
+    return found
+
+
+def presets(name: str) -> list[str]:
+    """Names of the presets of a method."""
+    return sorted(source(name).get("presets", {}))
+
+
+def load_method(name: str, preset: str | None = None, overrides: Sequence[str] = (), budget: Budget | None = None) -> Method:
+    """Read a method's recipe, lay a preset and then overrides over it, and check every key.
+
+    Args:
+        name: ``renderer/recipe`` of a built-in or plugged-in method, or the path of a TOML file.
+        preset: one of the recipe's presets; ``None`` takes the one for the budget (see `recipes.presets`).
+        overrides: ``dotted.path=value`` items, values as in TOML; bare words are taken as text.
+        budget: of the fit; ``None`` counts as a short one.
+
+    Raises:
+        InputError: unknown method, preset or key, or a value of the wrong type.
+    """
+    table = source(name)
+    chosen = select_preset(name, preset, budget, table.pop("presets", {}))
+    table = merge(table, chosen.table)
+    assign(table, overrides)
+    return replace(resolve(name, chosen.name, table), preset_choice=chosen.choice, chosen_on=chosen.chosen_on)
+
+
+def assign(table: dict[str, Any], items: Sequence[str]) -> None:
+    """Set values of a table from ``dotted.path=value`` items, in their order.
+
+    Raises:
+        InputError: an item has another form, or its path leads nowhere.
+    """
+    for item in items:
+        path, equals, value = item.partition("=")
+        if not equals or not path.strip():
+            raise InputError(f"'--set {item}' is not of the form key=value.", "Example: --set batches.rays=2048.")
+        set_path(table, path.strip(), _value(value.strip()))
+
+
+def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
+    """A method from a complete table, for instance from a run's ``recipe.toml``."""
+    from invgraphics.recipes.schema import Recipe
+
+    recipe = fill(Recipe, table).capped()
+    return Method(name, preset, recipe, to_table(recipe))
+
+
+def source(name: str) -> dict[str, Any]:
+    """The recipe's table as written, presets included."""
+    if name.endswith(".toml"):
+        path = Path(name)
+    else:
+        path = find("renderers") / f"{name}.toml"
+        if name in plugins.names("recipes") and not path.is_file():
+            return _parse(_foreign_text(name), name)
+        if not path.is_file():
+            sentence = f"There is no method '{name}'.{did_you_mean(name, methods())}"
+            raise InputError(sentence, f"Known methods: {', '.join(methods())}; or the path of a .toml.")
+    try:
+        return _parse(path.read_text(), str(path))
+    except OSError as error:
+        raise InputError(f"The recipe {path} cannot be read: {error.strerror}.") from error
+
+
+def _foreign_text(name: str) -> str:
+    return str(plugins.load("recipes", name))
+
+
+def _parse(text: str, where: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"The recipe {where} is not valid TOML: {error}.") from error
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

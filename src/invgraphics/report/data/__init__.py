@@ -1,0 +1,1 @@
+"""Run, comparison and study folders as the report's records."""

@@ -1,0 +1,135 @@
+"""Files that a page shows: arrays and pictures read with care, maps written small, links kept inside the folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+from zipfile import BadZipFile
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+
+from invgraphics.errors import InputError
+from invgraphics.report.data.redact import Redactor
+
+Arrays = dict[str, Float[ndarray, "..."]]
+"""What an ``.npz`` holds: alpha, depth, normal and so on."""
+
+MASKED = 255
+"""Palette entry of transparent pixels."""
+
+
+@dataclass(frozen=True)
+class Folder:
+    """The folder a report is written to; everything its page shows lies inside.
+
+    Attributes:
+        root: where ``index.html`` lies.
+        part: name of the part of the page whose files these are; empty where the page has only one.
+        redactor: cleans what is copied, for a public report; ``None`` for a private one.
+    """
+
+    root: Path
+    part: str = ""
+    redactor: Redactor | None = None
+
+    @property
+    def figures(self) -> Path:
+        """Where this part's plots and maps go."""
+        return self.root / "figures" / self.part
+
+    def url(self, path: Path) -> str:
+        """The relative, quoted link to a file inside the folder."""
+        return quote(Path(os.path.relpath(path.resolve(), self.root.resolve())).as_posix())
+
+    def publish(self, path: Path, place: str) -> str:
+        """A relative link to ``path``, which is copied to ``place`` when it lies outside the folder or must be cleaned.
+
+        Raises:
+            InputError: there is no such file.
+        """
+        if not path.is_file():
+            raise InputError(f"'{path}' is missing.", "Fit the run again, or leave it out of the report.")
+        inside = path.resolve().is_relative_to(self.root.resolve())
+        if inside and self.redactor is None:
+            return self.url(path)
+        copy = self.root / self.part / place
+        if self.redactor is not None:
+            self.redactor.copy(path, copy)
+        else:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
+        return self.url(copy)
+
+
+def read_picture(path: Path) -> UInt8[ndarray, "h w 3"]:
+    """An 8-bit colour picture.
+
+    Raises:
+        InputError: it is missing or broken.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except FileNotFoundError:
+        raise InputError(f"'{path}' is missing.") from None
+    except (OSError, SyntaxError, ValueError, UnidentifiedImageError) as error:
+        raise InputError(f"'{path}' is not a readable picture: {error}.") from None
+
+
+def read_arrays(path: Path) -> Arrays:
+    """All arrays of an ``.npz``, as float32; objects are refused.
+
+    Raises:
+        InputError: it is missing or broken.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name].astype(np.float32) for name in archive.files}
+    except FileNotFoundError:
+        raise InputError(f"'{path}' is missing.") from None
+    except (OSError, ValueError, EOFError, BadZipFile, AttributeError) as error:
+        raise InputError(f"'{path}' is not a readable .npz archive: {error}.") from None
+
+
+def save_scalar(path: Path, unit: Float[ndarray, "h w"], mask: Bool[ndarray, "h w"], colours: str) -> None:
+    """Write values in [0, 1] through a named Matplotlib colour map, as a palette PNG that is transparent outside ``mask``."""
+    import matplotlib as mpl
+    from PIL import Image
+
+    table = mpl.colormaps[colours](np.linspace(0, 1, MASKED))[:, :3]
+    palette = np.zeros((256, 3), np.uint8)
+    palette[:MASKED] = np.round(table * 255)
+    index = np.round(np.nan_to_num(unit).clip(0, 1) * (MASKED - 1)).astype(np.uint8)
+    image = Image.fromarray(np.where(mask, index, np.uint8(MASKED)))
+    image.putpalette(palette.tobytes())
+    _write(image, path, transparency=MASKED)
+
+
+def save_normals(path: Path, normals: Float[ndarray, "h w 3"], mask: Bool[ndarray, "h w"]) -> None:
+    """Write unit normals as colours (n + 1) / 2, transparent outside ``mask``."""
+    from PIL import Image
+
+    colour = np.round((np.nan_to_num(normals).clip(-1, 1) + 1) / 2 * 255)
+    rgba = np.where(mask[..., None], np.concatenate([colour, np.full_like(colour[..., :1], 255)], axis=-1), 0)
+    _write(Image.fromarray(rgba.astype(np.uint8), "RGBA"), path)
+
+
+def _write(image: Any, path: Path, **options: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.save(path, optimize=True, **options)
+
+
+def gradient(colours: str, stops: int = 9) -> str:
+    """A CSS gradient of a named Matplotlib colour map, for legends."""
+    import matplotlib as mpl
+    from matplotlib.colors import to_hex
+
+    return f"linear-gradient(90deg,{','.join(to_hex(colour) for colour in mpl.colormaps[colours](np.linspace(0, 1, stops)))})"

@@ -1,0 +1,117 @@
+"""What `explain` wrote about one pixel's ray, read and checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from invgraphics.core.colour import linear_to_srgb
+from invgraphics.report.data.reading import need, number, optional, read_table
+
+NAME = "ray"
+"""Of the files, less their suffixes."""
+DEPTHS = ("true_depth", "expected", "median")
+"""Depths of a pixel, as the file calls them."""
+NUMBERS = ("t", "begin", "end", "alpha", "transmittance", "weight", "red", "green", "blue")
+"""What is known of every contribution."""
+TAIL, FAINT, SMALL = 0.02, 0.02, 0.6
+"""A close-up leaves out this share of the light at either end; it is for rays that meet more than `FAINT`, and shows less than
+`SMALL` of the ray."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ray:
+    """What `invgraphics.tools.explain` wrote: contributions in the order in which they are composited.
+
+    Attributes:
+        facts: the file's table.
+        source: the file.
+        columns: name -> values of the contributions.
+        rgb: their colours, for display.
+        background: for display.
+    """
+
+    facts: dict[str, Any]
+    source: Path
+    columns: dict[str, Float[ndarray, " k"]]
+    rgb: Float[ndarray, "k 3"]
+    background: Float[ndarray, " 3"]
+
+    @property
+    def kind(self) -> str:
+        """``samples``, ``splats`` or ``gaussians``."""
+        return need(self.facts, "kind", str, self.source)
+
+    @property
+    def pixel(self) -> dict[str, Any]:
+        """Facts of the pixel."""
+        return need(self.facts, "pixel", dict, self.source)
+
+    @property
+    def depths(self) -> dict[str, float]:
+        """Those of `DEPTHS` that are known."""
+        known = {key: number(self.pixel.get(key), key, self.source) for key in DEPTHS}
+        return {key: value for key, value in known.items() if value is not None}
+
+    def curve(self, name: str) -> dict[str, Float[ndarray, " p"]]:
+        """``profile`` or ``marched``, empty where there is none; what it lacks is left out."""
+        table = optional(self.facts, name, dict, self.source, {})
+        return {key: np.array(values, float) for key, values in table.items() if values is not None}
+
+    def shown(self, colour: Float[ndarray, "*p 3"]) -> Float[ndarray, "*p 3"]:
+        """Colours of the scene's colour space as a screen shows them."""
+        linear = need(self.facts, "colour", str, self.source) == "linear"
+        values = torch.from_numpy(np.asarray(colour, float))
+        return (linear_to_srgb(values) if linear else values.clamp(0, 1)).numpy()
+
+
+def read_ray(folder: Path) -> Ray:
+    """Read an explanation.
+
+    Raises:
+        InputError: a file is missing or broken.
+    """
+    source = folder / f"{NAME}.json"
+    facts = read_table(source)
+    table = need(facts, "contributions", dict, source)
+    for key in (*NUMBERS, "counted"):
+        need(table, key, list, source)
+    columns = {str(key): np.array(values, float) for key, values in table.items() if values is not None}
+    rgb = np.stack([columns[key] for key in ("red", "green", "blue")], axis=1)
+    return Ray(facts, source, columns, rgb, np.array(need(facts, "background", list, source), float))
+
+
+def whole_ray(ray: Ray) -> tuple[float, float]:
+    """The distances of the whole ray: all that was sampled, or where the Gaussians lie."""
+    near, far = (number(ray.facts.get(key), key, ray.source) for key in ("near", "far"))
+    ends = np.concatenate([ray.columns["begin"], ray.columns["end"], list(ray.depths.values())])
+    if ray.kind == "samples" and near is not None and far is not None and far > near:
+        unbounded = optional(ray.facts, "space", str, ray.source, "box") == "contracted"
+        return near, min(far, 1.5 * float(ends.max())) if unbounded and len(ends) else far
+    if not len(ends):
+        return 0.0, 1.0
+    low, high = float(ends.min()), float(ends.max())
+    pad = 0.06 * max(high - low, 1e-3 * high)
+    return max(low - pad, 0.5 * low), high + pad
+
+
+def close_up(ray: Ray, whole: tuple[float, float]) -> tuple[float, float] | None:
+    """Where the light comes from, if that is a small part of the ray."""
+    order = ray.columns["t"].argsort(kind="stable")
+    reached = np.cumsum(ray.columns["weight"][order])
+    if not len(order) or reached[-1] < FAINT:
+        return None
+    inner = order[np.searchsorted(reached / reached[-1], (TAIL, 1 - TAIL)).clip(max=len(order) - 1)]
+    low, high = float(ray.columns["begin"][inner[0]]), float(ray.columns["end"][inner[1]])
+    for value in ray.depths.values():
+        if low - 2 * (high - low) <= value <= high + 2 * (high - low):
+            low, high = min(low, value), max(high, value)
+    pad = 0.3 * (high - low)
+    low, high = max(low - pad, whole[0]), min(high + pad, whole[1])
+    return (low, high) if high - low < SMALL * (whole[1] - whole[0]) else None

@@ -1,0 +1,56 @@
+"""Factors and variants of a study: which levels its cells have, and what a method with its levels is called."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatch
+from typing import TYPE_CHECKING, Any
+
+from invgraphics.report.data.factors import METHOD, Factor, level_text
+
+if TYPE_CHECKING:
+    from invgraphics.report.data.studies import StudyCell
+
+
+def find_factors(declared: Mapping[str, Any], base: Mapping[str, str], cells: Sequence[StudyCell]) -> tuple[Factor, ...]:
+    """The method first, then what the study declares, then what only its cells vary; a single level is no factor."""
+    levels: dict[str, dict[str, None]] = {METHOD: {}}
+    for path, values in declared.items():
+        listed = values if isinstance(values, list | tuple) else [values]
+        levels[str(path)] = dict.fromkeys(level_text(value) for value in listed)
+    present: dict[str, set[str]] = {}
+    for cell in cells:
+        for path, level in cell.levels.items():
+            levels.setdefault(path, {}).setdefault(level, None)
+            present.setdefault(path, set()).add(level)
+    factors = []
+    for path, found in levels.items():
+        kept = tuple(level for level in found if level in present.get(path, ()))
+        if len(kept) > 1:
+            factors.append(Factor(path, kept, base[path] if base.get(path) in kept else kept[0]))
+    return tuple(factors)
+
+
+def variant_name(cell: StudyCell, factors: Sequence[Factor]) -> str:
+    """Method and levels in words, as short as they stay distinct; factors of other methods are left out."""
+    names = short_names([factor.path for factor in factors])
+    own = [f.path for f in factors if f.path != METHOD and f.path in cell.levels and _concerns(f.path, cell.method)]
+    parts = [cell.method] if any(factor.path == METHOD for factor in factors) else []
+    return ", ".join([*parts, *(f"{names[path]} {cell.levels[path]}" for path in own)]) or cell.method
+
+
+def _concerns(path: str, method: str) -> bool:
+    """Whether a factor is one of ``method``: ``volumetric/*:batches.rays`` names the methods before its colon."""
+    pattern, colon, _ = path.rpartition(":")
+    return not colon or fnmatch(method, pattern)
+
+
+def short_names(paths: Sequence[str]) -> dict[str, str]:
+    """Path -> the shortest end of it that no other path has."""
+    split = {path: path.split(".") for path in paths}
+    names = {}
+    for path, parts in split.items():
+        lengths = range(1, len(parts) + 1)
+        clear = (n for n in lengths if sum(other[-n:] == parts[-n:] for other in split.values()) == 1)
+        names[path] = ".".join(parts[-next(clear, len(parts)) :])
+    return names

@@ -1,0 +1,80 @@
+"""How scores spread over the test views."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.figures.style import GRID, INK, PAGE, PANEL, Figure, canvas, save, series_style
+from invgraphics.report.statistics.summary import Summary
+from invgraphics.report.wording import Quantity
+
+
+def draw_distributions(comparison: Comparison, summary: Summary, folder: Path) -> list[tuple[Quantity, Figure]]:
+    """One strip plot per quality metric: a dot per test view, with median and quartiles."""
+    figures = []
+    for column in (column for column in summary.columns if column.group != "cost"):
+        values = {row.series: per_view(comparison.runs_of(row.label), column.key) for row in summary.methods}
+        if any(values.values()):
+            stem = folder / f"views-{_file_name(column.key)}"
+            figures.append((column, _draw(summary, column, values, stem)))
+    return figures
+
+
+def per_view(runs: Sequence[Run], key: str) -> list[float]:
+    """A metric on each test view, averaged over ``runs``; views without a finite score are left out."""
+    columns = [run.quality[key].per_view for run in runs if key in run.quality and run.quality[key].per_view]
+    means = []
+    for values in zip(*columns, strict=True):
+        finite = [value for value in values if value is not None and math.isfinite(value)]
+        if finite:
+            means.append(statistics.fmean(finite))
+    return means
+
+
+def _file_name(key: str) -> str:
+    """A plug-in may call its metric anything; a file may not."""
+    return "".join(letter if letter.isalnum() else "-" for letter in key)
+
+
+def _draw(summary: Summary, column: Quantity, values: dict[int, list[float]], stem: Path) -> Figure:
+    shown = [row for row in summary.methods if values[row.series]]
+    with canvas(PANEL[0], 92 + 46 * len(shown)) as (figure, axes):
+        for line, row in enumerate(shown):
+            look, scores = series_style(row.series), [value * column.scale for value in values[row.series]]
+            axes.boxplot(
+                [scores],
+                positions=[line],
+                orientation="horizontal",
+                widths=0.6,
+                whis=(0, 100),
+                showcaps=False,
+                manage_ticks=False,
+                boxprops={"color": look.colour},
+                medianprops={"color": look.colour, "linewidth": 2.6},
+                whiskerprops={"color": look.colour},
+            )
+            # A fixed scatter about the line keeps equal scores apart; 7 and 11 share no factor.
+            heights = [line + 0.3 * (((7 * i) % 11) / 10 - 0.5) for i in range(len(scores))]
+            dots: dict[str, Any] = {
+                "markersize": 5.5,
+                "alpha": 0.75,
+                "markeredgecolor": PAGE.light,
+                "markeredgewidth": 0.6,
+                "zorder": 3,
+            }
+            axes.plot(scores, heights, look.marker, color=look.colour, **dots)
+        axes.set_yticks(range(len(shown)), [row.label for row in shown], color=INK.light)
+        axes.set_ylim(len(shown) - 0.45, -0.55)
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0)
+        axes.spines["left"].set_color(GRID.light)
+        unit = f" ({column.unit})" if column.unit else ""
+        axes.set_title(f"{column.label}{unit} per view, {column.better} is better", fontsize=12.5)
+        path = save(figure, stem)
+    medians = "; ".join(f"{row.label} median {column.text(statistics.median(values[row.series]))}" for row in shown)
+    return Figure(path, None, f"{column.label} per view", f"{column.label} on each test view: {medians}.")

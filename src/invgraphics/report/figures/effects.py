@@ -1,0 +1,182 @@
+"""Factor effects as interval plots, and the mean of two factors' combinations as heat maps."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from invgraphics.report.data.factors import METHOD, Factor, Observation
+from invgraphics.report.figures.style import INK, MUTED, Figure, canvas, save, series_style
+from invgraphics.report.statistics.effects import Effect
+from invgraphics.report.statistics.summary import value_of
+from invgraphics.report.wording import Quantity
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+WIDE, NARROW = 860.0, 400.0
+ROW, FRAME = 50.0, 86.0
+"""Heights in CSS pixels: of a comparison, and of title, axis and margins together."""
+
+HEAT_COLOURS = "viridis"
+MOST_HEAT_MAPS = 6
+ON_DARK, ON_LIGHT = "#fdfdfd", "#101214"
+"""Numbers on a heat map's fields, which keep their colour on a dark page."""
+
+
+def draw_intervals(effects: Sequence[Effect], folder: Path) -> Figure | None:
+    """One row per comparison: the mean difference, its interval, and each scene's or method's own mean as small marks."""
+    shown = [effect for effect in effects if math.isfinite(effect.estimate.mean)]
+    if not shown:
+        return None
+    quantity = shown[0].quantity
+    title = f"Paired differences in {quantity.label}"
+    wide = _draw_intervals(shown, title, folder / f"effects-{file_name(quantity.key)}", WIDE)
+    narrow = _draw_intervals(shown, title, folder / f"effects-{file_name(quantity.key)}-narrow", NARROW)
+    return Figure(wide, narrow, title, " ".join(effect.sentence for effect in shown))
+
+
+def file_name(key: str) -> str:
+    """A plug-in may call its metric anything; a file may not."""
+    return "".join(letter if letter.isalnum() else "-" for letter in key)
+
+
+def _draw_intervals(effects: Sequence[Effect], title: str, stem: Path, width: float) -> Path:
+    quantity = effects[0].quantity
+    with canvas(width, FRAME + ROW * len(effects)) as (figure, axes):
+        axes.axvline(0, color=INK.light, linewidth=1.1, zorder=1)
+        colours = {path: i for i, path in enumerate(dict.fromkeys(effect.factor for effect in effects))}
+        for line, effect in enumerate(effects):
+            _draw_row(axes, line, effect, colours[effect.factor], width == NARROW)
+        axes.set_ylim(len(effects) - 0.4, -0.75)
+        axes.set_xlim(*_limits(effects))
+        axes.set_yticks([])
+        axes.spines["left"].set_visible(False)
+        unit = f" ({quantity.unit})" if quantity.unit else ""
+        direction = {"higher": "right is better", "lower": "left is better", "none": ""}[quantity.better]
+        axes.set_xlabel(f"difference in {quantity.label}{unit}" + (f", {direction}" if direction else ""))
+        axes.set_title(title)
+        return save(figure, stem)
+
+
+def _limits(effects: Sequence[Effect]) -> tuple[float, float]:
+    """Room for every mean and zero, and for intervals as far as they do not squeeze the rest; two seeds have wide ones."""
+    scale = effects[0].quantity.scale
+    means = [effect.estimate.mean * scale for effect in effects]
+    reach = max([abs(mean) for mean in means] + [1e-12])
+    halves = sorted(effect.estimate.half_width * scale for effect in effects)
+    room = min(halves[-1], max(2 * reach, 3 * statistics.median(halves)))
+    low, high = min(0.0, *means) - room, max(0.0, *means) + room
+    pad = 0.05 * (high - low) or 1.0
+    return low - pad, high + pad
+
+
+def _draw_row(axes: Axes, line: int, effect: Effect, colour: int, narrow: bool) -> None:
+    look, scale = series_style(colour), effect.quantity.scale
+    value = effect.estimate
+    parts = effect.by_scene or effect.by_method
+    small: dict[str, Any] = {"markersize": 7, "markeredgewidth": 1.4, "color": MUTED.light, "zorder": 2}
+    axes.plot([part.mean * scale for part in parts.values()], [line + 0.2] * len(parts), "|", **small)
+    axes.plot([value.low * scale, value.high * scale], [line, line], color=look.colour, linewidth=2.6, zorder=3)
+    filled: dict[str, Any] = {} if effect.found else {"markerfacecolor": "none", "markeredgewidth": 1.8}
+    axes.plot(value.mean * scale, line, look.marker, color=look.colour, markersize=9, zorder=4, **filled)
+    unit = f" {effect.quantity.unit}" if effect.quantity.unit else ""
+    told = f"{effect.text(value.mean)}{unit} {effect.interval}".rstrip()
+    place: dict[str, Any] = {"xycoords": axes.get_yaxis_transform(), "textcoords": "offset points", "va": "bottom"}
+    axes.annotate(effect.label, (0, line), (2, 7), color=INK.light, fontsize=11.5, **place)
+    if not narrow:
+        axes.annotate(told, (1, line), (-2, 7), color=look.colour, fontsize=11.5, ha="right", **place)
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """The mean of a quantity at each combination of two factors' levels.
+
+    Attributes:
+        rows: the factor down the side.
+        columns: the factor along the top.
+        values: (row level, column level) -> mean in stored units; absent where nothing ran.
+        runs: runs behind each mean.
+        matched: whether all means are over the same scenes, seeds and other levels.
+    """
+
+    rows: Factor
+    columns: Factor
+    values: dict[tuple[str, str], float]
+    runs: int
+    matched: bool
+
+
+def heat_map(pair: tuple[Factor, Factor], quantity: Quantity, observations: Sequence[Observation]) -> HeatMap | None:
+    """Means over what all combinations have in common; over whatever there is where that is nothing."""
+    down, across = pair
+    cells: dict[tuple[str, str], dict[tuple[Any, ...], float]] = {}
+    for observation in observations:
+        value = value_of(observation.run, quantity)
+        if value is None or not math.isfinite(value):
+            continue
+        levels = observation.levels
+        others = tuple(sorted((key, level) for key, level in levels.items() if key not in (down.path, across.path)))
+        place = (levels.get(down.path, ""), levels.get(across.path, ""))
+        cells.setdefault(place, {})[(observation.scene, observation.run.seed, others)] = value
+    rows, columns = ({place[axis] for place in cells} for axis in (0, 1))
+    if min(len(rows), len(columns)) < 2 or len(cells) < len(rows) + len(columns):
+        return None  # a cross through one field, as one factor at a time makes it, combines nothing
+    common = set.intersection(*(set(found) for found in cells.values()))
+    values = {
+        place: statistics.fmean(v for k, v in found.items() if not common or k in common) for place, found in cells.items()
+    }
+    return HeatMap(down, across, values, len(common) or min(map(len, cells.values())), bool(common))
+
+
+def draw_heat_maps(
+    factors: Sequence[Factor], quantity: Quantity, observations: Sequence[Observation], folder: Path
+) -> list[Figure]:
+    """A heat map for each pair of factors, at most ``MOST_HEAT_MAPS``; the factor with fewer levels goes down the side."""
+    figures = []
+    for pair in itertools.combinations(factors, 2):
+        down, across = sorted(pair, key=lambda factor: (factor.path != METHOD, len(factor.levels)))
+        table = heat_map((down, across), quantity, observations)
+        if table is not None and len(figures) < MOST_HEAT_MAPS:
+            figures.append(_draw_heat(table, quantity, folder / f"heat-{len(figures)}"))
+    return figures
+
+
+def _draw_heat(table: HeatMap, quantity: Quantity, stem: Path) -> Figure:
+    import matplotlib as mpl
+    import numpy as np
+
+    rows, columns = table.rows.levels, table.columns.levels
+    grid = np.array([[table.values.get((row, column), np.nan) for column in columns] for row in rows]) * quantity.scale
+    low, high = float(np.nanmin(grid)), float(np.nanmax(grid))
+    span = (high - low) or 1.0
+    title = f"{quantity.heading} by {table.rows.path} and {table.columns.path}"
+    with canvas(max(400.0, 170 + 82 * len(columns)), 96 + 44 * len(rows)) as (figure, axes):
+        axes.imshow(grid, cmap=HEAT_COLOURS, vmin=low, vmax=low + span, aspect="auto")
+        for (row, column), value in np.ndenumerate(grid):
+            if np.isfinite(value):
+                red, green, blue, _ = mpl.colormaps[HEAT_COLOURS]((value - low) / span)
+                ink = ON_LIGHT if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else ON_DARK
+                text = quantity.text(value / quantity.scale)
+                axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=12)
+        axes.set_xticks(range(len(columns)), [_short(level) for level in columns])
+        axes.set_yticks(range(len(rows)), [_short(level) for level in rows])
+        axes.set_xlabel(table.columns.path)
+        axes.grid(visible=False)
+        axes.tick_params(length=0)
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+        axes.set_title(quantity.heading, fontsize=12.5)
+        path = save(figure, stem)
+    told = "; ".join(f"{row}, {column}: {quantity.text(value)}" for (row, column), value in table.values.items())
+    basis = f"mean over {table.runs} runs in each field" if table.matched else "fields rest on different runs"
+    return Figure(path, None, f"{title}, {basis}", f"{title}: {told}.")
+
+
+def _short(level: str) -> str:
+    return level if len(level) <= 22 else f"{level[:21]}…"

@@ -1,0 +1,1 @@
+"""HTML, Markdown, LaTeX, CSV and Parquet of a report."""

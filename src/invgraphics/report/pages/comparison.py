@@ -1,0 +1,116 @@
+"""The HTML page of a comparison and its Markdown twin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.figures.style import SERIES, Figure
+from invgraphics.report.figures.views import has_flip
+from invgraphics.report.pages import facts
+from invgraphics.report.pages.parts import Contrasts, Part
+from invgraphics.report.pages.tables import escape_markdown, markdown_effects, markdown_table
+from invgraphics.report.statistics.cross_render import Crossed
+from invgraphics.report.wording import listing
+
+
+def render(template: str, context: Mapping[str, Any], folder: Folder) -> None:
+    """Write ``index.html``: one file with its style and script inside, its pictures beside it."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("invgraphics.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    shared = {"url": folder.url, "palette": SERIES, "has_flip": has_flip(), "public": folder.redactor is not None}
+    html = environment.get_template(template).render({**shared, **context})
+    (folder.root / "index.html").write_text(html, encoding="utf-8")
+
+
+def write_html(part: Part, contrasts: Contrasts, folder: Folder) -> None:
+    """Write the page of a comparison."""
+    comparison = part.comparison
+    context: dict[str, Any] = {
+        "comparison": comparison,
+        "part": part,
+        "contrasts": contrasts,
+        "environment": comparison.environment,
+        "protocol_facts": facts.protocol_facts(comparison),
+        "scene_facts": facts.scene_facts(comparison),
+        "scene_summary": facts.scene_sentence(comparison, "summary"),
+        "scene_stresses": facts.scene_sentence(comparison, "stresses"),
+        "scene_suspicion": facts.scene_sentence(comparison, "suspicion"),
+        "shared_facts": facts.shared_facts(comparison),
+        "cells": facts.reproduction(comparison, folder),
+    }
+    render("page.html", context, folder)
+
+
+def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
+    """Write ``index.md``: the same answer for a repository's front page."""
+    comparison, text = part.comparison, escape_markdown
+    parts = [f"# {text(comparison.question)}", *(f"- {text(sentence)}" for sentence in part.told)]
+    settings = "; ".join(f"{name}: {value}" for name, value in facts.protocol_facts(comparison))
+    stated = comparison.protocol.get("summary")
+    suspicion = facts.scene_sentence(comparison, "suspicion")
+    parts += ["", f"**The camera poses are suspicious.** {text(suspicion)}"] if suspicion else []
+    parts += [
+        "",
+        f"Scene **{text(comparison.scene)}**. {text(settings)}." + (f" Protocol: {text(str(stated))}." if stated else ""),
+    ]
+    parts += ["", "## Summary", "", *markdown_part(part)]
+    if comparison.failures:
+        parts += ["## Failures", ""]
+        parts += [f"- {text(cell.method)}, seed {cell.seed}: {text(cell.error)}" for cell in comparison.failures]
+    if contrasts.tables:
+        parts += ["", "## Differences between methods", "", *(f"- {text(effect.sentence)}" for effect in contrasts.first)]
+        parts += ["", markdown_effects(contrasts.first)]
+    parts += markdown_figures([*([contrasts.figure] if contrasts.figure else []), *part.drawn.figures], folder)
+    parts += ["", "## Provenance", "", *(f"- {text(name)}: {text(value)}" for name, value in facts.shared_facts(comparison))]
+    parts += markdown_commands([comparison.command, *(cell.command for cell in facts.reproduction(comparison, folder))])
+    (folder.root / "index.md").write_text("\n".join(parts) + "\n", encoding="utf-8")
+
+
+def markdown_part(part: Part) -> list[str]:
+    """A scene's table, and what could not be computed."""
+    lines = [markdown_table(part.summary), *(f"**{escape_markdown(text)}**\n" for text in part.summary.disturbances)]
+    for why, labels in part.summary.skipped.items():
+        lines.append(f"Not computed: {escape_markdown(listing(labels))} ({escape_markdown(why)}).")
+    return lines + markdown_crossed(part.crossed)
+
+
+def markdown_crossed(crossed: Crossed | None) -> list[str]:
+    """Fit x render, and what each approximation changes."""
+    if crossed is None:
+        return []
+    text = escape_markdown
+    lines = ["", f"{text(crossed.quantity.heading)} of each fit (row) through each renderer (column); in brackets the image "]
+    lines[-1] += "difference from the fitting renderer, dB."
+    lines += ["", f"| fitted by | {' | '.join(map(text, crossed.renderers))} |", "|---" * (1 + len(crossed.renderers)) + "|"]
+    for row in crossed.rows:
+        cells = [
+            "–" if cell is None else f"{cell.text}{f' ({cell.difference})' if cell.difference else ''}" for cell in row.cells
+        ]
+        lines.append(f"| {text(row.method)} | {' | '.join(cells)} |")
+    if crossed.steps:
+        names = " | ".join(text(row.method) for row in crossed.rows)
+        lines += ["", "Image difference that one approximation makes, dB.", ""]
+        lines += [f"| approximation | {names} |", "|---" * (1 + len(crossed.rows)) + "|"]
+        lines += [f"| {text(step.name)} | {' | '.join(step.differences)} |" for step in crossed.steps]
+    return lines
+
+
+def markdown_figures(figures: Sequence[Figure], folder: Folder) -> list[str]:
+    """Links to plots below their heading; nothing where there are none."""
+    lines = ["", "## Figures", ""] if figures else []
+    return lines + [f"![{escape_markdown(figure.alt)}]({folder.url(figure.path)})" for figure in figures]
+
+
+def markdown_commands(commands: Sequence[str]) -> list[str]:
+    """Commands as code below their heading; nothing where there are none."""
+    known = [" ".join(command.split("\n")) for command in commands if command]
+    return ["", "## Reproduce", "", *(f"    {command}" for command in known)] if known else []

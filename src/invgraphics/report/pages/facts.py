@@ -1,0 +1,171 @@
+"""Facts beside the numbers: protocol, scene, machine, hashes, and the command that makes a cell again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.wording import budget_words, duration, listing
+
+RUN_FILES = ("recipe.toml", "scores.json", "history.jsonl", "provenance.json", "environment.json")
+
+Facts = tuple[tuple[str, str], ...]
+"""(name, value) in the order in which they are shown."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """How one run is reproduced.
+
+    Attributes:
+        method: its method.
+        series: index of its colour.
+        seed: its seed.
+        command: reproduces it; empty where the run does not say.
+        differs: facts in which this run differs from the others.
+        files: (name, link) of the run's files.
+    """
+
+    method: str
+    series: int
+    seed: int
+    command: str
+    differs: Facts
+    files: tuple[tuple[str, str], ...]
+
+
+def protocol_facts(comparison: Comparison) -> Facts:
+    """How the scores were made, short enough to stand beside them."""
+    facts: dict[str, str] = {}
+    if comparison.budget:
+        facts["budget per fit"] = f"{budget_words(comparison.budget)} of optimisation"
+    if comparison.size:
+        facts["picture size"] = f"{comparison.size[0]} × {comparison.size[1]}"
+    if comparison.runs:
+        facts["test views"] = str(len(comparison.runs[0].views))
+        facts["seeds"] = ", ".join(str(seed) for seed in sorted({run.seed for run in comparison.runs}))
+    facts |= preset_facts(comparison.runs, comparison.preset)
+    for key, value in comparison.protocol.items():
+        if key not in ("name", "summary"):
+            facts[_words(key)] = _words(_text(value))
+    return tuple(facts.items())
+
+
+def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
+    """Presets of the fits, what chose them, and the scenes on which their values were chosen.
+
+    Args:
+        runs: the fits.
+        stated: preset of the whole comparison, for where no run says more.
+    """
+    presets = _grouped([(run.preset or stated, run.method) for run in runs]) or stated
+    choices = {str(run.provenance.get("preset_choice") or "") for run in runs}
+    if choices - {""}:
+        presets += f", {choices.pop()}" if len(choices) == 1 else ", chosen from each fit's budget"
+    scenes = _grouped([(_text(run.provenance.get("preset_chosen_on") or []), run.method) for run in runs])
+    return {name: text for name, text in (("preset", presets), ("preset chosen on", scenes)) if text}
+
+
+def _grouped(pairs: Sequence[tuple[str, str]]) -> str:
+    """The value that all owners have; else each value with its owners in brackets, empty values left out."""
+    owners: dict[str, list[str]] = {}
+    for value, owner in dict.fromkeys(pairs):
+        owners.setdefault(value, []).append(owner)
+    if len(owners) <= 1:
+        return "".join(owners)
+    return "; ".join(f"{value} ({listing(names)})" for value, names in owners.items() if value)
+
+
+def scene_facts(comparison: Comparison) -> Facts:
+    """What is known about the scene, notes included."""
+    facts: dict[str, str] = {}
+    for key, value in comparison.scene_info.items():
+        if key in ("summary", "stresses", "notes"):
+            continue
+        facts[{"train": "training views", "val": "validation views", "test": "test views"}.get(key, _words(key))] = _text(value)
+    if comparison.noise_ceiling is not None:
+        facts["noise ceiling of the truth"] = f"{comparison.noise_ceiling:.2f} dB PSNR"
+    notes = comparison.scene_info.get("notes")
+    if isinstance(notes, Mapping):
+        facts |= {_words(str(key)): _text(value) for key, value in notes.items() if key not in ("summary", "stresses")}
+    return tuple((key, value) for key, value in facts.items() if value)
+
+
+def scene_sentence(comparison: Comparison, key: str) -> str:
+    """What the scene's description says under ``key``, wherever it stands."""
+    notes = comparison.scene_info.get("notes")
+    found = comparison.scene_info.get(key) or (notes.get(key) if isinstance(notes, Mapping) else None)
+    return str(found) if found else ""
+
+
+def shared_facts(comparison: Comparison) -> Facts:
+    """Provenance and machine facts on which all runs agree, and what is known of the whole comparison."""
+    tables = [_run_facts(run) for run in comparison.runs]
+    shared = {key: value for key, value in tables[0].items() if all(t.get(key) == value for t in tables)} if tables else {}
+    for key, value in comparison.environment.items():
+        shared.setdefault(_words(str(key)), _text(value))
+    if comparison.wall_seconds is not None:
+        shared["whole command took"] = duration(comparison.wall_seconds)
+    return tuple(shared.items())
+
+
+def reproduction(comparison: Comparison, folder: Folder) -> tuple[Cell, ...]:
+    """Every run with its command and its files, methods in order."""
+    shared = dict(shared_facts(comparison))
+    cells = []
+    for series, method in enumerate(comparison.methods):
+        for run in comparison.runs_of(method):
+            own = {key: value for key, value in _run_facts(run).items() if shared.get(key) != value}
+            command = str(run.provenance.get("command", ""))
+            files = []
+            for name in RUN_FILES:
+                if (run.folder / name).is_file():
+                    files.append((name, folder.publish(run.folder / name, f"runs/{series}-seed-{run.seed}/{name}")))
+            cells.append(Cell(method, series, run.seed, command, tuple(own.items()), tuple(files)))
+    return tuple(cells)
+
+
+def plain_facts(table: Mapping[str, Any]) -> Facts:
+    """A record as it is, in words; empty values are left out."""
+    return tuple((_words(str(key)), text) for key, value in table.items() if (text := _text(value)))
+
+
+def _run_facts(run: Run) -> dict[str, str]:
+    """Hashes, versions and machine of one run, under the names that people read."""
+    names = {
+        "truth_sha256": "truth SHA-256",
+        "train_sha256": "training images SHA-256",
+        "cameras_sha256": "cameras SHA-256",
+        "recipe_sha256": "recipe SHA-256",
+        "code_version": "code version",
+        "resize": "resampling filter",
+        "budget": "budget",
+        "test_poses": "test poses",
+        "load_average": "load average",
+    }
+    facts = {label: _text(run.provenance[key]) for key, label in names.items() if run.provenance.get(key)}
+    for key, value in run.environment.items():
+        facts.setdefault(_words(str(key)), _text(value))
+    return {key: value for key, value in facts.items() if value}
+
+
+def _words(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _text(value: Any) -> str:
+    """A value as a person writes it; tables inside tables become ``key: value`` lists."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{_words(str(key))}: {_text(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(_text(item) for item in value)
+    return str(value)

@@ -1,0 +1,180 @@
+"""What a page shows of one scene: tables, plots and pictures, for a comparison and for each scene of a study alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.factors import METHOD, Factor, Observation
+from invgraphics.report.data.records import Comparison
+from invgraphics.report.figures.curves import draw_curves
+from invgraphics.report.figures.distributions import draw_distributions
+from invgraphics.report.figures.effects import draw_intervals
+from invgraphics.report.figures.style import Figure
+from invgraphics.report.figures.tradeoffs import draw_tradeoffs
+from invgraphics.report.figures.views import ViewPage, draw_views, publish_truth
+from invgraphics.report.statistics.cross_render import Crossed, cross
+from invgraphics.report.statistics.effects import Effect, effects_on
+from invgraphics.report.statistics.summary import Reach, Row, Summary, quality_columns, summarise, time_to_quality
+from invgraphics.report.statistics.verdict import verdict
+from invgraphics.report.wording import Quantity
+
+TINY = 320
+"""Pictures narrower than this are enlarged on the page, with hard pixel edges: what is compared is pixels."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Everything that was drawn for one scene.
+
+    Attributes:
+        curves: time to quality.
+        tradeoffs: quality against each cost.
+        distributions: per metric, its spread over views.
+        views: the chosen test views.
+    """
+
+    curves: Figure | None
+    tradeoffs: list[Figure]
+    distributions: list[tuple[Quantity, Figure]]
+    views: tuple[ViewPage, ...]
+
+    @property
+    def figures(self) -> list[Figure]:
+        """Every plot, in the order of the page."""
+        return [*([self.curves] if self.curves else []), *self.tradeoffs, *(figure for _, figure in self.distributions)]
+
+
+@dataclass(frozen=True)
+class Thumbnail:
+    """A small picture of the truth; ``anchor`` is empty where the page does not show that view in full."""
+
+    url: str
+    name: str
+    anchor: str
+
+
+@dataclass(frozen=True)
+class Contrasts:
+    """Comparisons of levels on every quality metric.
+
+    Attributes:
+        tables: (metric, its comparisons); the first metric is the one that sentences and plot are about.
+        figure: interval plot of the first metric.
+    """
+
+    tables: tuple[tuple[Quantity, list[Effect]], ...]
+    figure: Figure | None
+
+    @property
+    def first(self) -> list[Effect]:
+        """Comparisons on the first metric."""
+        return self.tables[0][1] if self.tables else []
+
+
+@dataclass(frozen=True)
+class Part:
+    """One scene on a page.
+
+    Attributes:
+        key: prefix of its anchors and folders; empty where the page has a single part.
+        comparison: its methods or variants.
+        summary: their table.
+        told: what the numbers say.
+        reach: who reaches a quality when.
+        drawn: plots and pictures.
+        thumbnails: the truth of every test view.
+        crossed: the same fits through other renderers, where that was asked for.
+    """
+
+    key: str
+    comparison: Comparison
+    summary: Summary
+    told: list[str]
+    reach: Reach | None
+    drawn: Drawn
+    thumbnails: list[Thumbnail]
+    crossed: Crossed | None
+
+    @property
+    def groups(self) -> list[tuple[str, str, list[int]]]:
+        """(heading, explanation, columns) of the tables: pictures with costs, geometry apart so that both fit a page."""
+        columns = list(enumerate(self.summary.columns))
+        pictures = [index for index, column in columns if column.group != "geometry"]
+        geometry = [index for index, column in columns if column.group == "geometry"]
+        groups = [("", "", pictures)]
+        if geometry:
+            groups.append(("Geometry", "Depth and normals are scored where truth and prediction are both opaque.", geometry))
+        return groups
+
+    @property
+    def several_seeds(self) -> bool:
+        """Whether a spread over seeds is shown."""
+        return any(row.seeds > 1 for row in self.summary.methods)
+
+    def has_values(self, row: Row, columns: Sequence[int]) -> bool:
+        """Whether a row says anything in some columns."""
+        return any(row.cells[index].mean is not None for index in columns)
+
+    @property
+    def tiny(self) -> bool:
+        """Whether pictures are shown enlarged, with hard pixel edges."""
+        return bool(self.drawn.views) and self.drawn.views[0].width < TINY
+
+    def anchor(self, name: str) -> str:
+        """The page-wide name of something in this part."""
+        return f"{self.key}-{name}" if self.key else name
+
+
+def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[dict[str, Any]] = ()) -> Part:
+    """Draw a scene's plots and pictures below ``folder.figures``, and say what its numbers mean.
+
+    Args:
+        comparison: the scene's runs.
+        folder: where to write.
+        approximations: pairs of renderers that a study compares on every fit.
+
+    Raises:
+        InputError: a picture or an array is missing or broken.
+    """
+    summary = summarise(comparison)
+    drawn = Drawn(
+        views=draw_views(comparison, folder),  # first, because it reads the files that may be broken
+        curves=draw_curves(comparison, summary, folder.figures),
+        tradeoffs=draw_tradeoffs(summary, folder.figures),
+        distributions=draw_distributions(comparison, summary, folder.figures),
+    )
+    thumbnails = _thumbnails(comparison, drawn, folder)
+    told, reach = verdict(comparison, summary), time_to_quality(comparison)
+    crossed = cross(comparison, approximations, folder)
+    return Part(folder.part, comparison, summary, told, reach, drawn, thumbnails, crossed)
+
+
+def draw_contrasts(
+    quantities: Sequence[Quantity], factors: Sequence[Factor], runs: Sequence[Observation], folder: Folder
+) -> Contrasts:
+    """Compare the factors' levels on every metric, and plot the first."""
+    tables = tuple((quantity, found) for quantity in quantities if (found := effects_on(quantity, factors, runs)))
+    return Contrasts(tables, draw_intervals(tables[0][1], folder.figures) if tables else None)
+
+
+def method_contrasts(comparison: Comparison, folder: Folder) -> Contrasts:
+    """A comparison's methods against each other; nothing where a single seed leaves no interval to state."""
+    methods = tuple(method for method in comparison.methods if comparison.runs_of(method))
+    if len(methods) < 2 or len({run.seed for run in comparison.runs}) < 2:
+        return Contrasts((), None)
+    runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
+    return draw_contrasts(quality_columns(comparison), [Factor(METHOD, methods, methods[0])], runs, folder)
+
+
+def _thumbnails(comparison: Comparison, drawn: Drawn, folder: Folder) -> list[Thumbnail]:
+    if not comparison.runs:
+        return []
+    run, shown = comparison.runs[0], {view.index for view in drawn.views}
+    prefix = f"{folder.part}-" if folder.part else ""
+    return [
+        Thumbnail(publish_truth(run, index, folder), name, f"{prefix}view-{index}" if index in shown else "")
+        for index, name in enumerate(run.views)
+    ]

@@ -1,0 +1,190 @@
+"""The HTML page of a study and its Markdown twin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.factors import METHOD
+from invgraphics.report.data.studies import Study, StudyCell
+from invgraphics.report.figures.analyses import AnalysisPart
+from invgraphics.report.figures.style import Figure
+from invgraphics.report.pages import facts
+from invgraphics.report.pages.comparison import markdown_commands, markdown_figures, markdown_part, render
+from invgraphics.report.pages.parts import Contrasts, Part
+from invgraphics.report.pages.tables import escape_markdown, markdown_effects
+from invgraphics.report.statistics.intervals import CONFIDENCE, ENOUGH, RESAMPLES
+from invgraphics.report.statistics.summary import value_of
+from invgraphics.report.wording import Quantity, budget_words, duration, listing
+
+DESIGNS = {
+    "factorial": "full factorial: every combination of all levels",
+    "one-at-a-time": "one factor at a time: all others stay at their base level",
+    "list": "an explicit list of combinations",
+}
+
+
+@dataclass(frozen=True)
+class StudyPage:
+    """Everything that a study's page shows.
+
+    Attributes:
+        study: what was read.
+        parts: each scene.
+        contrasts: the factors' effects.
+        heat: heat maps of pairs of factors.
+        quantity: the metric that sentences, plots and the matrix are about; ``None`` where nothing ran.
+        analyses: computations beside the fits.
+    """
+
+    study: Study
+    parts: tuple[Part, ...]
+    contrasts: Contrasts
+    heat: list[Figure]
+    quantity: Quantity | None
+    analyses: list[AnalysisPart]
+
+    @property
+    def headline(self) -> list[str]:
+        """What is missing, then a sentence for each pair of levels."""
+        effects = self.contrasts.first
+        return [*_progress(self.study), *(effect.sentence for effect in effects), *_scope(self)]
+
+
+@dataclass(frozen=True)
+class MatrixCell:
+    """One field of the matrix: ``status``, the score or the word that stands there, and where it leads."""
+
+    status: str
+    text: str
+    link: str
+    hint: str
+
+
+@dataclass(frozen=True)
+class MatrixRow:
+    """A variant and its fields, scene by scene and seed by seed; a field is ``None`` where the design has no such cell."""
+
+    variant: str
+    cells: tuple[MatrixCell | None, ...]
+
+
+def write_study_html(page: StudyPage, folder: Folder) -> None:
+    """Write the page of a study."""
+    study = page.study
+    context: dict[str, Any] = {
+        "page": page,
+        "study": study,
+        "contrasts": page.contrasts,
+        "parts": page.parts,
+        "environment": study.environment,
+        "facts_of_study": study_facts(study),
+        "matrix": _matrix(page, folder),
+        "failures": [(index, cell) for index, cell in enumerate(study.cells) if cell.status == "failed"],
+        "design": DESIGNS.get(study.design, study.design),
+        "machine": facts.plain_facts(study.environment),
+        "cells": {
+            part.key: facts.reproduction(part.comparison, Folder(folder.root, part.key, folder.redactor)) for part in page.parts
+        },
+        "rules": {"enough": ENOUGH, "resamples": RESAMPLES, "percent": f"{100 * CONFIDENCE:g}"},
+    }
+    render("study.html", context, folder)
+
+
+def study_facts(study: Study) -> facts.Facts:
+    """The design in a line."""
+    entries = {
+        "scenes": listing(study.scenes),
+        "methods": listing(study.methods),
+        "seeds": ", ".join(map(str, study.seeds)),
+        "cells": _counted(study),
+        "budget per fit": budget_words(study.budget),
+        **facts.preset_facts([replace(cell.run, method=cell.method) for cell in study.cells if cell.run], study.preset),
+        "picture size": study.size,
+    }
+    return tuple((name, value) for name, value in entries.items() if value)
+
+
+def _counted(study: Study) -> str:
+    parts = [f"{study.count(status)} {status}" for status in ("done", "failed", "missing", "skipped") if study.count(status)]
+    return ", ".join(parts)
+
+
+def _progress(study: Study) -> list[str]:
+    failed, missing, total = study.count("failed"), study.count("missing"), len(study.cells)
+    sentences = []
+    if missing:
+        verb = "has" if missing == 1 else "have"
+        sentences.append(f"{missing} of {total} cells {verb} not run yet: what follows may change.")
+    if failed:
+        sentences.append(f"{failed} of {total} cells failed: see below the matrix. Comparisons leave their pairs out.")
+    if skipped := [cell for cell in study.cells if cell.status == "skipped"]:
+        reasons = listing(dict.fromkeys(cell.error for cell in skipped))
+        sentences.append(f"{len(skipped)} of {total} cells were skipped: {reasons}.")
+    return sentences
+
+
+def _scope(page: StudyPage) -> list[str]:
+    """Whom the intervals speak of."""
+    estimates = [effect.estimate for effect in page.contrasts.first if effect.estimate.unit != "none"]
+    if not estimates:
+        return []
+    if any(estimate.unit == "scene" for estimate in estimates):
+        return ["The unit is the scene: intervals speak of scenes like these."]
+    scenes = "this scene" if max(estimate.scenes for estimate in estimates) == 1 else "these scenes, each counted equally"
+    return [f"The unit is the seed: intervals speak of new fits on {scenes}, not of other scenes."]
+
+
+def _matrix(page: StudyPage, folder: Folder) -> list[MatrixRow]:
+    study = page.study
+    places = {(cell.variant, cell.scene, cell.seed): index for index, cell in enumerate(study.cells)}
+    rows = []
+    for variant in study.variants:
+        found = [places.get((variant, scene, seed)) for scene in study.scenes for seed in study.seeds]
+        fields = tuple(None if i is None else _field(study.cells[i], i, page.quantity, folder) for i in found)
+        rows.append(MatrixRow(variant, fields))
+    return rows
+
+
+def _field(cell: StudyCell, index: int, quantity: Quantity | None, folder: Folder) -> MatrixCell:
+    where = f"{cell.variant}, {cell.scene}, seed {cell.seed}"
+    took = f", {duration(cell.seconds)}" if cell.seconds is not None else ""
+    if cell.status == "failed":
+        return MatrixCell("failed", "failed", f"#failure-{index}", f"{where}: {cell.error.splitlines()[0]}")
+    if cell.status == "skipped":
+        return MatrixCell("missing", "skipped", "", f"{where}: {cell.error}")
+    if cell.run is None:
+        return MatrixCell("missing", "–", "", f"{where}: has not run")
+    value = value_of(cell.run, quantity) if quantity is not None else None
+    scores = cell.run.folder / ("scores.json" if cell.run.protocol == "default" else f"scores.{cell.run.protocol}.json")
+    text = "done" if value is None or quantity is None else quantity.text(value)
+    return MatrixCell("done", text, folder.publish(scores, f"cells/{index:04d}.json"), f"{where}: done{took}")
+
+
+def write_study_markdown(page: StudyPage, folder: Folder) -> None:
+    """Write ``index.md``: the same answers for a repository's front page."""
+    study, text = page.study, escape_markdown
+    lines = [f"# {text(study.question or study.name)}", "", *(f"- {text(sentence)}" for sentence in page.headline)]
+    lines += ["", "## Design", "", f"{text(DESIGNS.get(study.design, study.design))}.", ""]
+    lines += [f"- {text(name)}: {text(value)}" for name, value in study_facts(study)]
+    lines += [f"- {text(_factor_word(factor.path))}: {text(', '.join(factor.levels))}" for factor in study.factors]
+    if page.contrasts.tables:
+        lines += ["", "## Effects", "", markdown_effects(page.contrasts.first)]
+    for part in page.parts:
+        lines += ["", f"## Scene {text(part.comparison.scene)}", "", *markdown_part(part)]
+    if page.analyses:
+        lines += ["", "## Approximations by themselves", ""]
+        lines += [f"- {text(part.sentence)}" for part in page.analyses]
+    if study.failures:
+        lines += ["", "## Failures", ""]
+        lines += [f"- {text(f'{cell.variant}, {cell.scene}, seed {cell.seed}: {cell.error}')}" for cell in study.failures]
+    figures = [*([page.contrasts.figure] if page.contrasts.figure else []), *page.heat]
+    figures += [part.figure for part in page.analyses]
+    lines += markdown_figures(figures + [figure for part in page.parts for figure in part.drawn.figures], folder)
+    lines += markdown_commands([study.command])
+    (folder.root / "index.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _factor_word(path: str) -> str:
+    return "method" if path == METHOD else path

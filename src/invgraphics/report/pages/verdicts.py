@@ -1,0 +1,245 @@
+"""The page of a study that judges its cells: headline, matrix, curves, broken rules and every number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.studies import STUDY, Known, Study, StudyCell
+from invgraphics.report.figures.curve_grid import draw_curve_panels
+from invgraphics.report.figures.style import Figure
+from invgraphics.report.pages import facts
+from invgraphics.report.pages.comparison import markdown_commands, markdown_figures, render
+from invgraphics.report.pages.longtable import write_table
+from invgraphics.report.pages.study import study_facts
+from invgraphics.report.pages.tables import escape_markdown
+from invgraphics.report.statistics.rules import (
+    RULES,
+    STANDINGS,
+    JudgedCell,
+    Verdict,
+    dead_share,
+    headline,
+    judge,
+    psnr_of,
+    unused,
+    worst_view,
+)
+from invgraphics.report.wording import ABSENT, duration
+
+COLUMNS = ("PSNR", "Budget", "Steps", "Fit", "Cell took", "Forecast", "Primitives", "Dead", "Memory", "Forecast")
+COLUMNS += ("Worst view", "Code")
+UNITS = ("dB", "", "", "s", "", "", "", "", "MB", "MB", "dB", "")
+
+
+@dataclass(frozen=True)
+class Field:
+    """A cell as it is shown.
+
+    Attributes:
+        judged: the cell and its verdicts.
+        name: its label without the method, and without the seed where all cells have the same.
+        anchor: its place on the page.
+        text: its score, or the word that stands there.
+        numbers: under ``COLUMNS``.
+        files: (name, link) of its run's records.
+    """
+
+    judged: JudgedCell
+    name: str
+    anchor: str
+    text: str
+    numbers: tuple[str, ...]
+    files: tuple[tuple[str, str], ...]
+
+    @property
+    def sign(self) -> str:
+        """Its standing without colour."""
+        return STANDINGS[self.judged.standing][1]
+
+    @property
+    def hint(self) -> str:
+        """Its standing in words, with what it breaks."""
+        told = [STANDINGS[self.judged.standing][0], *(verdict.sentence for verdict in self.judged.red)]
+        told += [self.judged.cell.error] if self.judged.standing == "skipped" else []
+        return f"{self.judged.cell.label}: {' '.join(told)}"
+
+
+@dataclass(frozen=True)
+class RuleCount:
+    """How often a rule was kept and broken."""
+
+    title: str
+    ok: int
+    known: int
+    red: int
+
+
+@dataclass(frozen=True)
+class VerdictPage:
+    """Everything that the page shows.
+
+    Attributes:
+        study: what was read.
+        fields: every cell, in order.
+        rows: (scene, rest of the label, one field per method or ``None``), the matrix.
+        figures: curves of each scene and size.
+        stale: known deviations that no cell shows any more.
+    """
+
+    study: Study
+    fields: tuple[Field, ...]
+    rows: tuple[tuple[str, str, tuple[Field | None, ...]], ...]
+    figures: list[Figure]
+    stale: tuple[Known, ...]
+
+    @property
+    def headline(self) -> list[str]:
+        """How many cells are green, and what is not."""
+        return headline([field.judged for field in self.fields])
+
+    @property
+    def broken(self) -> list[tuple[Field, Verdict]]:
+        """Every broken rule, those without a known cause first."""
+        pairs = [(field, verdict) for field in self.fields for verdict in field.judged.red]
+        return sorted(pairs, key=lambda pair: pair[1].outcome == "known")
+
+    @property
+    def counts(self) -> list[RuleCount]:
+        """Rule by rule."""
+        verdicts = [verdict for field in self.fields for verdict in field.judged.verdicts]
+        found = {key: [verdict.outcome for verdict in verdicts if verdict.rule == key] for key in RULES}
+        return [
+            RuleCount(RULES[key], *(all_of.count(kind) for kind in ("ok", "known", "red"))) for key, all_of in found.items()
+        ]
+
+
+def write_verdict_report(study: Study, folder: Folder, source: Path) -> None:
+    """Write the page, its Markdown twin and ``verdicts.csv``; records of runs are copied where they lie elsewhere.
+
+    Args:
+        study: what was read.
+        folder: where to write.
+        source: the study's own folder.
+    """
+    judged = judge(study.cells, study.known)
+    fields = tuple(_field(one, _name(one.cell, study), f"cell-{index}", folder) for index, one in enumerate(judged))
+    panels: dict[str, list[JudgedCell]] = {}
+    for one in judged:
+        panels.setdefault(_place(one.cell), []).append(one)
+    figures = draw_curve_panels(panels, study.methods, folder.figures)
+    page = VerdictPage(study, fields, _matrix(study, fields), figures, unused(judged, study.known))
+    folder.publish(source / STUDY, STUDY)
+    _write_verdicts(page, folder.root / "verdicts")
+    _write_markdown(page, folder)
+    machine = facts.plain_facts(study.environment)
+    context: dict[str, Any] = {"page": page, "study": study, "environment": study.environment, "machine": machine}
+    context |= {"facts_of_study": study_facts(study), "columns": list(zip(COLUMNS, UNITS, strict=True)), "standings": STANDINGS}
+    render("verdicts.html", context | {"rules": RULES, "series": {name: i for i, name in enumerate(study.methods)}}, folder)
+
+
+def _place(cell: StudyCell) -> str:
+    """Scene and size in words; of a path, what follows its last slash."""
+    return f"{_scene(cell)}, {cell.size} px" if cell.size else _scene(cell)
+
+
+def _scene(cell: StudyCell) -> str:
+    return cell.scene if cell.scene.startswith("$") else cell.scene.rstrip("/").rpartition("/")[2]
+
+
+def _name(cell: StudyCell, study: Study) -> str:
+    name = cell.label.removeprefix(cell.method).strip()
+    return name.removesuffix(f"seed={cell.seed}").strip() if len(study.seeds) == 1 else name
+
+
+def _field(one: JudgedCell, name: str, anchor: str, folder: Folder) -> Field:
+    cell, run = one.cell, one.cell.run
+    psnr = psnr_of(cell)
+    text = ABSENT if psnr is None else f"{psnr:.2f}"
+    text = {"failed": "failed", "skipped": "skipped", "missing": ABSENT}.get(cell.status, text)
+    took, forecast = (ABSENT if value is None else duration(value) for value in (cell.seconds, cell.forecast))
+    if run is None:
+        rest = [ABSENT] * (len(COLUMNS) - 6)
+        return Field(one, name, anchor, text, (ABSENT, cell.budget, ABSENT, ABSENT, took, forecast, *rest), ())
+    worst, share = worst_view(run), dead_share(run)
+    forecast_bytes = run.provenance.get("memory_forecast_bytes")
+    numbers = (
+        text,
+        cell.budget,
+        _number(run.cost.get("steps")),
+        _number(run.cost.get("fit_seconds")),
+        took,
+        forecast,
+        _number(run.cost.get("primitives")),
+        ABSENT if share is None else f"{100 * share:.2g}%",
+        _number(run.cost.get("peak_memory_bytes"), 1e-6),
+        _number(forecast_bytes if isinstance(forecast_bytes, int | float) else None, 1e-6),
+        ABSENT if worst is None else f"{worst[1]:.2f} ({worst[0]})",
+        str(run.provenance.get("code_version", "")).rpartition("+")[2] or ABSENT,
+    )
+    names = [name for name in facts.RUN_FILES if (run.folder / name).is_file()]
+    files = tuple((name, folder.publish(run.folder / name, f"runs/{cell.id}/{name}")) for name in names)
+    return Field(one, name, anchor, text, numbers, files)
+
+
+def _number(value: float | None, scale: float = 1.0) -> str:
+    return ABSENT if value is None else f"{value * scale:,.0f}"
+
+
+def _matrix(study: Study, fields: Sequence[Field]) -> tuple[tuple[str, str, tuple[Field | None, ...]], ...]:
+    """Scenes in the order of the study, then sizes, then budgets; methods across."""
+    rows: dict[tuple[str, str], dict[str, Field]] = {}
+    order: dict[tuple[str, str], tuple[Any, ...]] = {}
+    for field in fields:
+        cell = field.judged.cell
+        rest = field.name.partition(" ")[2]
+        key = (cell.scene, f"{cell.size + ' px, ' if cell.size else ''}{rest}")
+        rows.setdefault(key, {})[cell.method] = field
+        width = int(cell.size.partition(" ")[0]) if cell.size else 0
+        order[key] = (study.scenes.index(cell.scene), width, cell.amount or ("", 0.0), cell.seed)
+    return tuple(
+        (_scene_word(scene), rest, tuple(rows[scene, rest].get(method) for method in study.methods))
+        for scene, rest in sorted(rows, key=lambda key: order[key])
+    )
+
+
+def _scene_word(scene: str) -> str:
+    """A built-in scene's name, or the last part of a path."""
+    return scene.rstrip("/").rpartition("/")[2]
+
+
+def _write_verdicts(page: VerdictPage, stem: Path) -> None:
+    """One row per cell and rule."""
+    kinds: dict[str, Any] = dict.fromkeys(("cell", "rule", "outcome"), "text")
+    kinds |= {"value": "float", "limit": "float", "sentence": "text", "cause": "text", "issue": "text"}
+    rows = []
+    for field in page.fields:
+        for verdict in field.judged.verdicts:
+            row = {"cell": field.judged.cell.label, "rule": verdict.rule, "outcome": verdict.outcome, "value": verdict.value}
+            row |= {"limit": verdict.limit, "sentence": verdict.sentence, "cause": verdict.cause, "issue": verdict.issue}
+            rows.append(row)
+    write_table(kinds, rows, stem)
+
+
+def _write_markdown(page: VerdictPage, folder: Folder) -> None:
+    text = escape_markdown
+    lines = [f"# {text(page.study.question or page.study.name)}", "", *(f"- {text(sentence)}" for sentence in page.headline)]
+    lines += ["", "| rule | kept | red, cause known | red |", "|---|--:|--:|--:|"]
+    lines += [f"| {text(one.title)} | {one.ok} | {one.known} | {one.red} |" for one in page.counts]
+    if page.broken:
+        lines += ["", "## Broken rules", ""]
+        for field, verdict in page.broken:
+            cause = (
+                f" Known cause: {verdict.cause}{f' (issue {verdict.issue})' if verdict.issue else ''}" if verdict.cause else ""
+            )
+            lines.append(f"- {field.sign} {text(f'{field.judged.cell.method} {field.name}')}: {text(verdict.sentence + cause)}")
+    lines += ["", "## Cells", "", f"PSNR in dB. {', '.join(f'{sign} {words}' for words, sign in STANDINGS.values())}.", ""]
+    lines += [f"| scene | | {' | '.join(map(text, page.study.methods))} |", "|---" * (2 + len(page.study.methods)) + "|"]
+    for scene, rest, fields in page.rows:
+        cells = " | ".join("" if field is None else f"{field.text} {field.sign}" for field in fields)
+        lines.append(f"| {text(scene)} | {text(rest)} | {cells} |")
+    lines += markdown_figures(page.figures, folder) + markdown_commands([page.study.command])
+    (folder.root / "index.md").write_text("\n".join(lines) + "\n", encoding="utf-8")

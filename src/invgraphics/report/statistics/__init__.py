@@ -1,0 +1,1 @@
+"""Intervals, effects, Pareto fronts and verdicts."""

@@ -1,0 +1,190 @@
+"""The same fits through several renderers: fit x render tables, and what each approximation alone changes."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.reading import need, read_run, read_table
+from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.statistics.summary import quality_columns, value_of
+from invgraphics.report.wording import Quantity
+
+RECORD = "renderings.json"
+IDENTICAL = 90.0
+"""Pictures closer than this many dB are called the same: they are kept as float16, whose rounding alone is above 75 dB."""
+SHOWN_VIEW = 0
+"""The test view that is shown through every renderer."""
+
+
+@dataclass(frozen=True)
+class Renderings:
+    """A fit through several renderers.
+
+    Attributes:
+        fit: the run, whose own renderer is the first of ``seen``.
+        seen: renderer -> the run that shows the fit with it.
+        differences: two renderers -> root mean square per view between their pictures, colours in [0, 1].
+    """
+
+    fit: Run
+    seen: dict[str, Run]
+    differences: dict[frozenset[str], tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class CrossCell:
+    """A fit through a renderer.
+
+    Attributes:
+        text: its score against the truth.
+        difference: of its picture from the fitting renderer's, PSNR in dB; empty for that renderer itself.
+        own: whether this is the fitting renderer.
+        best: whether no renderer shows this fit better.
+        picture: a test view; empty where there is none.
+    """
+
+    text: str
+    difference: str
+    own: bool
+    best: bool
+    picture: str
+
+
+@dataclass(frozen=True)
+class CrossRow:
+    """What one method fitted; a cell is ``None`` where it was not rendered so."""
+
+    method: str
+    series: int
+    cells: tuple[CrossCell | None, ...]
+
+
+@dataclass(frozen=True)
+class StepRow:
+    """An approximation, the renderers without and with it, and the difference it makes to each method's fit, dB."""
+
+    name: str
+    exact: str
+    approximate: str
+    differences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Crossed:
+    """Fit x render of one scene.
+
+    Attributes:
+        quantity: the score against the truth.
+        renderers: columns.
+        rows: methods that were fitted.
+        steps: approximations, where the study names some.
+        seeds: fits behind each number.
+    """
+
+    quantity: Quantity
+    renderers: tuple[str, ...]
+    rows: tuple[CrossRow, ...]
+    steps: tuple[StepRow, ...]
+    seeds: int
+
+
+def read_renderings(run: Run, clean: Callable[[str], str] = str) -> Renderings | None:
+    """The renderings of a fit; ``None`` where there are none.
+
+    Args:
+        run: the fit.
+        clean: makes names public.
+
+    Raises:
+        InputError: a file is missing or broken; the sentence names it.
+    """
+    source = run.folder / RECORD
+    if not source.is_file():
+        return None
+    table = read_table(source)
+    seen = {}
+    for entry in need(table, "renderings", list, source):
+        place, name = need(entry, "run", str, source), clean(need(entry, "renderer", str, source))
+        seen[name] = run if place == "." else read_run(run.folder / place, run.protocol)
+    differences = {}
+    for entry in need(table, "differences", list, source):
+        pair = frozenset(clean(str(name)) for name in need(entry, "renderers", list, source))
+        differences[pair] = tuple(float(value) for value in need(entry, "rmse", list, source))
+    return Renderings(run, seen, differences)
+
+
+def cross(comparison: Comparison, approximations: Sequence[dict[str, Any]], folder: Folder) -> Crossed | None:
+    """The fit x render table of a scene; ``None`` where nothing was rendered twice."""
+    clean = folder.redactor.text if folder.redactor is not None else str
+    fits = [found for run in comparison.runs if (found := read_renderings(run, clean)) is not None]
+    columns = quality_columns(comparison)
+    if not fits or not columns:
+        return None
+    renderers = tuple(dict.fromkeys(name for fit in fits for name in fit.seen))
+    rows = []
+    for series, method in enumerate(comparison.methods):
+        own = [fit for fit in fits if fit.fit.method == method]
+        if own:
+            cells = tuple(_cell(own, name, columns[0], folder) for name in renderers)
+            rows.append(CrossRow(method, series, _mark_best(own, renderers, cells, columns[0])))
+    groups = [[fit for fit in fits if fit.fit.method == row.method] for row in rows]
+    steps = tuple(
+        StepRow(str(pair["name"]), exact, other, tuple(_decibels(group, frozenset((exact, other))) for group in groups))
+        for pair in approximations
+        for exact, other in [(clean(str(pair["exact"])), clean(str(pair["approximate"])))]
+    )
+    return Crossed(columns[0], renderers, tuple(rows), steps, max(map(len, groups)))
+
+
+def _score(fits: Sequence[Renderings], name: str, quantity: Quantity) -> float | None:
+    values = [value for fit in fits if name in fit.seen and (value := value_of(fit.seen[name], quantity)) is not None]
+    return statistics.fmean(values) if values else None
+
+
+def _cell(fits: Sequence[Renderings], name: str, quantity: Quantity, folder: Folder) -> CrossCell | None:
+    score = _score(fits, name, quantity)
+    if score is None:
+        return None
+    first = next(fit for fit in fits if name in fit.seen)
+    own = first.seen[name] is first.fit
+    difference = "" if own else _decibels(fits, None, name)
+    path = first.seen[name].folder / "test" / f"{SHOWN_VIEW:04d}.png"
+    place = f"crossed/{_file(first.fit.method)}-{_file(name)}.png"
+    picture = folder.publish(path, place) if path.is_file() else ""
+    return CrossCell(quantity.text(score), difference, own, best=False, picture=picture)
+
+
+def _mark_best(
+    fits: Sequence[Renderings], renderers: Sequence[str], cells: Sequence[CrossCell | None], quantity: Quantity
+) -> tuple[CrossCell | None, ...]:
+    scores = {
+        cell.text: quantity.sort_key(_score(fits, name, quantity) or 0.0)
+        for name, cell in zip(renderers, cells, strict=True)
+        if cell
+    }
+    best = min(scores, key=lambda text: scores[text]) if len(scores) > 1 else None
+    return tuple(cell and replace(cell, best=cell.text == best) for cell in cells)
+
+
+def _decibels(fits: Sequence[Renderings], pair: frozenset[str] | None, name: str = "") -> str:
+    """PSNR between two renderers' pictures, from the mean square over all views and fits; of ``name`` and the fit's own."""
+    squares: list[float] = []
+    for fit in fits:
+        own = next(iter(fit.seen))
+        wanted = frozenset((own, name)) if pair is None else pair
+        if wanted <= set(fit.seen):
+            squares += [value**2 for value in fit.differences.get(wanted, ())]
+    if not squares:
+        return "–"
+    mean = statistics.fmean(squares)
+    decibels = math.inf if mean == 0 else -10 * math.log10(mean)
+    return "same" if decibels > IDENTICAL else f"{decibels:.1f}"
+
+
+def _file(name: str) -> str:
+    return "".join(letter if letter.isalnum() else "-" for letter in name)

@@ -1,0 +1,253 @@
+"""Verdicts on the cells of a study: which rule each keeps or breaks, with the numbers and one sentence."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from typing import Literal
+
+from invgraphics.report.data.factors import METHOD
+from invgraphics.report.data.records import Run
+from invgraphics.report.data.studies import Known, StudyCell
+from invgraphics.report.wording import duration, listing
+
+RULES = {
+    "budget": "A longer budget never scores lower (0.2 dB)",
+    "monitor": "No monitor score falls more than 0.5 dB below its best",
+    "views": "No view is more than 8 dB below the median view",
+    "dead": "Fewer than 1% of the primitives are dead",
+    "memory": "Peak memory stays within the forecast",
+    "finite": "Every fit ends, and every number is finite",
+    "late": "No cell takes an hour longer than forecast",
+}
+"""Key -> what every cell must hold to."""
+
+BUDGET_DB, MONITOR_DB, VIEW_DB, DEAD_SHARE, LATE_SECONDS = 0.2, 0.5, 8.0, 0.01, 3600.0
+
+Outcome = Literal["ok", "red", "known", "none"]
+"""``known`` is red with a cause that the study states; ``none`` says that the rule does not apply."""
+
+Standing = Literal["green", "known", "red", "skipped", "missing"]
+
+STANDINGS: dict[Standing, tuple[str, str]] = {
+    "green": ("green", "✓"),
+    "known": ("red with a known cause", "△"),
+    "red": ("red", "✗"),
+    "skipped": ("skipped", "○"),
+    "missing": ("not run yet", "–"),
+}
+"""Standing -> (in words, sign); the sign says it without colour."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One rule on one cell.
+
+    Attributes:
+        rule: key of ``RULES``.
+        outcome: whether it holds.
+        sentence: the numbers in words, or why the rule does not apply.
+        value: what was measured, in the limit's unit; ``None`` where the rule does not apply.
+        limit: what it was compared with.
+        cause: why it is red, where that is known.
+        issue: where that is followed up.
+    """
+
+    rule: str
+    outcome: Outcome
+    sentence: str
+    value: float | None = None
+    limit: float | None = None
+    cause: str = ""
+    issue: str = ""
+
+
+@dataclass(frozen=True)
+class JudgedCell:
+    """A cell and the verdict of every rule; none for a cell that was skipped or has not run."""
+
+    cell: StudyCell
+    verdicts: tuple[Verdict, ...]
+
+    @property
+    def red(self) -> tuple[Verdict, ...]:
+        """Rules that it breaks, whether the cause is known or not."""
+        return tuple(verdict for verdict in self.verdicts if verdict.outcome in ("red", "known"))
+
+    @property
+    def standing(self) -> Standing:
+        """The worst of its verdicts, or why it has none."""
+        if self.cell.status == "skipped":
+            return "skipped"
+        if self.cell.status == "missing":
+            return "missing"
+        outcomes = {verdict.outcome for verdict in self.red}
+        return "red" if "red" in outcomes else "known" if outcomes else "green"
+
+
+def judge(cells: Sequence[StudyCell], known: Sequence[Known] = ()) -> tuple[JudgedCell, ...]:
+    """The verdict of every rule on every cell that has run."""
+    return tuple(JudgedCell(cell, tuple(_excused(cell, one, known) for one in _verdicts(cell, cells))) for cell in cells)
+
+
+def unused(judged: Sequence[JudgedCell], known: Sequence[Known]) -> tuple[Known, ...]:
+    """Known deviations that no cell shows, although all cells that they name have run."""
+    left = []
+    for entry in known:
+        named = [one for one in judged if fnmatchcase(one.cell.label, entry.cells)]
+        shown = any(verdict.rule == entry.rule for one in named for verdict in one.red)
+        if not shown and not any(one.standing in ("missing", "skipped") for one in named):
+            left.append(entry)
+    return tuple(left)
+
+
+def headline(judged: Sequence[JudgedCell]) -> list[str]:
+    """How many cells are green, what the others are, and why some were skipped."""
+    counts = {key: sum(one.standing == key for one in judged) for key in STANDINGS}
+    rest = [f"{counts[key]} {words}" for key, (words, _) in STANDINGS.items() if key != "green" and counts[key]]
+    first = f"{counts['green']} of {len(judged)} cells are green" + (f"; {', '.join(rest)}." if rest else ".")
+    return [
+        first,
+        *(f"Skipped: {why}." for why in dict.fromkeys(one.cell.error for one in judged if one.standing == "skipped")),
+    ]
+
+
+def psnr_of(cell: StudyCell) -> float | None:
+    """The cell's PSNR over its test views, dB."""
+    score = None if cell.run is None else cell.run.quality.get("psnr")
+    return None if score is None else score.mean
+
+
+def worst_view(run: Run) -> tuple[str, float, float] | None:
+    """(name, PSNR, PSNR below the median) of the worst view, dB; ``None`` where single views have no scores."""
+    score = run.quality.get("psnr")
+    values = [
+        (value, view) for value, view in zip(score.per_view if score else (), run.views, strict=False) if value is not None
+    ]
+    if not values:
+        return None
+    worst, view = min(values)
+    return view, worst, statistics.median(value for value, _ in values) - worst
+
+
+def dead_share(run: Run) -> float | None:
+    """Share of primitives that can no longer change at the end of the fit; ``None`` where none were counted."""
+    if (share := run.cost.get("dead")) is not None:
+        return share
+    return next((entry.dead for entry in reversed(run.history) if entry.dead is not None), None)
+
+
+def _verdicts(cell: StudyCell, cells: Sequence[StudyCell]) -> list[Verdict]:
+    if cell.status == "failed":
+        rest = [Verdict(rule, "none", "The fit failed.") for rule in RULES if rule not in ("finite", "late")]
+        return [*rest, Verdict("finite", "red", f"The fit failed: {cell.error}"), _late(cell)]
+    if cell.run is None:
+        return []
+    of_run: tuple[Callable[[Run], Verdict], ...] = (_monitor, _views, _dead, _memory, _finite)
+    return [_budget(cell, cells), *(rule(cell.run) for rule in of_run), _late(cell)]
+
+
+def _excused(cell: StudyCell, verdict: Verdict, known: Sequence[Known]) -> Verdict:
+    if verdict.outcome != "red":
+        return verdict
+    for entry in known:
+        if entry.rule == verdict.rule and fnmatchcase(cell.label, entry.cells):
+            return replace(verdict, outcome="known", cause=entry.cause, issue=entry.issue)
+    return verdict
+
+
+def _verdict(rule: str, broken: bool, sentence: str, value: float, limit: float) -> Verdict:
+    return Verdict(rule, "red" if broken else "ok", sentence, value, limit)
+
+
+def _budget(cell: StudyCell, cells: Sequence[StudyCell]) -> Verdict:
+    """Against the best of all shorter budgets, so that a fall and a later recovery are told apart."""
+    own = psnr_of(cell)
+    shorter = [
+        (value, other)
+        for other in cells
+        if cell.amount and other.amount and _without_budget(other) == _without_budget(cell)
+        if other.amount[0] == cell.amount[0] and other.amount[1] < cell.amount[1]
+        if (value := psnr_of(other)) is not None
+    ]
+    if own is None or not shorter:
+        return Verdict("budget", "none", "No shorter budget of the same fit is done.")
+    best, other = max(shorter, key=lambda pair: pair[0])
+    sentence = f"{own:.2f} dB after {cell.budget}, {abs(own - best):.2f} dB {'above' if own >= best else 'below'} the "
+    return _verdict("budget", best - own > BUDGET_DB, f"{sentence}{best:.2f} dB of {other.budget}.", own - best, -BUDGET_DB)
+
+
+def _without_budget(cell: StudyCell) -> tuple[object, ...]:
+    levels = {path: level for path, level in cell.levels.items() if path.rpartition(":")[2] != "budget" and path != METHOD}
+    return cell.scene, cell.method, cell.seed, cell.size, tuple(sorted(levels.items()))
+
+
+def _monitor(run: Run) -> Verdict:
+    """The largest fall below the best so far, and where the curve ends."""
+    curve = [(entry, entry.psnr) for entry in run.history if entry.psnr is not None]
+    if len(curve) < 2:
+        return Verdict("monitor", "none", "The monitor has looked less than twice.")
+    best, fall, place = -math.inf, 0.0, ""
+    for entry, psnr in curve:
+        best = max(best, psnr)
+        if best - psnr > fall:
+            fall, place = (
+                best - psnr,
+                f"at {entry.share:.0%} of the budget" if entry.share is not None else f"at step {entry.step}",
+            )
+    ended = best - curve[-1][1]
+    end = f"ended {ended:.2f} dB below its best of {best:.2f} dB" if ended > 0 else f"ended at its best, {best:.2f} dB"
+    sentence = f"Fell {fall:.2f} dB below the best so far {place} and {end}." if fall > 0 else f"Never fell, and {end}."
+    return _verdict("monitor", fall > MONITOR_DB, sentence, fall, MONITOR_DB)
+
+
+def _views(run: Run) -> Verdict:
+    found = worst_view(run)
+    if found is None:
+        return Verdict("views", "none", "Single views have no scores.")
+    view, worst, below = found
+    sentence = f"The worst view, {view}, scores {worst:.2f} dB, {below:.2f} dB below the median."
+    return _verdict("views", below > VIEW_DB, sentence, below, VIEW_DB)
+
+
+def _dead(run: Run) -> Verdict:
+    share, count = dead_share(run), run.cost.get("primitives")
+    if share is None:
+        return Verdict("dead", "none", "The field has no primitives." if not count else "Dead primitives were not counted.")
+    total = f" of {count:,.0f}" if count else ""
+    return _verdict("dead", share >= DEAD_SHARE, f"{100 * share:.2g}%{total} primitives are dead.", share, DEAD_SHARE)
+
+
+def _memory(run: Run) -> Verdict:
+    peak, forecast = run.cost.get("peak_memory_bytes"), run.provenance.get("memory_forecast_bytes")
+    if peak is None or not isinstance(forecast, int | float) or isinstance(forecast, bool):
+        return Verdict("memory", "none", "The run holds no forecast of its memory.")
+    sentence = f"Peak of {peak / 1e6:,.0f} MB, forecast {forecast / 1e6:,.0f} MB."
+    return _verdict("memory", peak > forecast, sentence, peak, float(forecast))
+
+
+def _finite(run: Run) -> Verdict:
+    """Metrics that were left out because they are not finite count, as do lines of the history."""
+    found = [name for name, score in run.quality.items() if not _all_finite([score.mean, *score.per_view])]
+    found += [name for name, why in run.skipped.items() if "finite" in why]
+    found += [name for name, value in run.cost.items() if value is not None and not math.isfinite(value)]
+    found += [f"{name} at step {entry.step}" for entry in run.history for name in entry.broken]
+    if found:
+        return Verdict(
+            "finite", "red", f"Not finite: {listing(found[:5])}{' and more' if len(found) > 5 else ''}.", len(found), 0.0
+        )
+    return Verdict("finite", "ok", "All metrics, costs and curves are finite.", 0.0, 0.0)
+
+
+def _all_finite(values: Sequence[float | None]) -> bool:
+    return all(value is not None and math.isfinite(value) for value in values)
+
+
+def _late(cell: StudyCell) -> Verdict:
+    if cell.seconds is None or cell.forecast is None:
+        return Verdict("late", "none", "The time or its forecast is not known.")
+    sentence = f"Took {duration(cell.seconds)}, forecast {duration(cell.forecast)}."
+    return _verdict("late", cell.seconds - cell.forecast > LATE_SECONDS, sentence, cell.seconds, cell.forecast + LATE_SECONDS)

@@ -1,0 +1,286 @@
+"""From runs to a table: means over seeds, best values, Pareto fronts, times to quality."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from invgraphics.report.data.records import Comparison, Failure, Run, Score
+from invgraphics.report.statistics.intervals import mean_half_width
+from invgraphics.report.wording import ABSENT, COSTS, TIMES, Quantity, budget_words, metric_label, quality_quantity
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number of the summary.
+
+    Attributes:
+        mean: over seeds, in stored units; ``None`` where there is none.
+        std: sample standard deviation over seeds; ``None`` for a single one.
+        half_width: half of the mean's t-interval over seeds; 0 for a single one.
+        text: the mean as written.
+        spread: the deviation as written; empty for a single seed.
+        best: no method's written value is better.
+        note: number of the footnote that explains an absence; 0 for none.
+    """
+
+    mean: float | None
+    std: float | None
+    text: str
+    spread: str
+    best: bool = False
+    note: int = 0
+    half_width: float = 0.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method or a trivial baseline.
+
+    Attributes:
+        label: its name.
+        kind: what it is; ``failed`` is a method without a single run.
+        series: index of its colour, the same in every plot; -1 for a baseline.
+        seeds: number of runs that succeeded.
+        failures: its failed cells.
+        cells: one per column.
+        complete: it has as many runs as the method with the most. Others are shown but never ranked: a hard seed that is
+            missing makes a mean look better than it is.
+        disturbed: why its times are not ranked: what is wrong with the clock of its fits; empty where nothing is.
+    """
+
+    label: str
+    kind: Literal["method", "baseline", "failed"]
+    series: int
+    seeds: int
+    failures: tuple[Failure, ...]
+    cells: tuple[Cell, ...]
+    complete: bool = True
+    disturbed: str = ""
+
+    def ranked_in(self, column: Quantity) -> bool:
+        """Whether its number in a column may be called best: a disturbed clock says nothing."""
+        return self.complete and not (self.disturbed and column.key in TIMES)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The summary table.
+
+    Attributes:
+        columns: quality first, then cost.
+        rows: methods in order, then baselines.
+        notes: footnotes; note i is ``notes[i - 1]``.
+        skipped: why -> labels of the metrics that no run has for that reason.
+    """
+
+    columns: tuple[Quantity, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...]
+    skipped: dict[str, list[str]]
+
+    def column(self, key: str) -> int | None:
+        """Position of a quantity, ``None`` when the table has no such column."""
+        return next((index for index, column in enumerate(self.columns) if column.key == key), None)
+
+    def cell(self, row: Row, key: str) -> Cell | None:
+        """The cell of ``row`` in the column ``key``."""
+        index = self.column(key)
+        return None if index is None else row.cells[index]
+
+    @property
+    def methods(self) -> tuple[Row, ...]:
+        """Rows of methods that have at least one run."""
+        return tuple(row for row in self.rows if row.kind == "method")
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """A sentence for each method whose times are not ranked."""
+        return tuple(f"The times of {row.label} are not ranked: {row.disturbed}." for row in self.methods if row.disturbed)
+
+    @property
+    def baselines(self) -> tuple[Row, ...]:
+        """Rows of trivial predictors."""
+        return tuple(row for row in self.rows if row.kind == "baseline")
+
+
+def summarise(comparison: Comparison) -> Summary:
+    """The summary of a comparison: means over seeds, the best of each column marked."""
+    columns = table_columns(comparison)
+    notes: list[str] = []
+    rows = []
+    most = max((len(comparison.runs_of(method)) for method in comparison.methods), default=0)
+    for series, method in enumerate(comparison.methods):
+        runs, failures = comparison.runs_of(method), comparison.failures_of(method)
+        cells = tuple(_method_cell(column, runs, notes) for column in columns)
+        kind: Literal["method", "failed"] = "method" if runs else "failed"
+        rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs)))
+    for name, quality in comparison.baselines.items():
+        cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
+        rows.append(Row(name, "baseline", -1, 1, (), cells))
+    return Summary(columns, _mark_best(columns, rows), tuple(notes), _skipped(comparison))
+
+
+def quality_columns(comparison: Comparison) -> tuple[Quantity, ...]:
+    """Every quality metric that at least one run or baseline has, in the order of the first that has it."""
+    found: dict[str, Score] = {}
+    for quality in [run.quality for run in comparison.runs] + list(comparison.baselines.values()):
+        for key, score in quality.items():
+            found.setdefault(key, score)
+    return tuple(quality_quantity(key, score) for key, score in found.items())
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points that no other point dominates, both coordinates smaller-is-better, by first coordinate.
+
+    A point dominates another when it is nowhere worse and somewhere better; equal points stand together.
+    """
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=lambda i: points[i]):
+        if not front or points[index][1] < points[front[-1]][1] or points[index] == points[front[-1]]:
+            front.append(index)
+    return front
+
+
+def seconds_to_reach(run: Run, level: float) -> float | None:
+    """Seconds of optimisation after which the monitored PSNR first was at least ``level`` dB."""
+    return next((entry.seconds for entry in run.history if entry.psnr is not None and entry.psnr >= level), None)
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Who reaches a quality when.
+
+    Attributes:
+        levels: PSNR thresholds in dB, rising.
+        rows: (method, series, one text per level).
+    """
+
+    levels: tuple[int, ...]
+    rows: tuple[tuple[str, int, tuple[str, ...]], ...]
+
+
+def time_to_quality(comparison: Comparison, count: int = 4) -> Reach | None:
+    """Median seconds over seeds to reach ``count`` round PSNR levels between the slowest start and the best end."""
+    starts, peaks = [], []
+    for method in comparison.methods:
+        curves = [[entry.psnr for entry in run.history if entry.psnr is not None] for run in comparison.runs_of(method)]
+        curves = [curve for curve in curves if curve]
+        if curves:
+            starts.append(statistics.median(curve[0] for curve in curves))
+            peaks.append(statistics.median_low(max(curve) for curve in curves))
+    if not starts:
+        return None
+    low, high = max(starts), max(peaks)
+    first, last = math.ceil(low + 0.1), math.floor(high)
+    if last < first:
+        return None
+    step = max(1, (last - first) // max(1, count - 1))
+    levels = tuple(range(last, first - 1, -step))[:count][::-1]
+    rows = []
+    for series, method in enumerate(comparison.methods):
+        runs = comparison.runs_of(method)
+        if runs:
+            rows.append((method, series, tuple(_reach_text(runs, level) for level in levels)))
+    return Reach(levels, tuple(rows))
+
+
+def _reach_text(runs: Sequence[Run], level: float) -> str:
+    times = [time for run in runs if (time := seconds_to_reach(run, level)) is not None]
+    if 2 * len(times) <= len(runs):
+        return "not reached"
+    return f"{statistics.median(times):.1f} s"
+
+
+def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
+    """Columns of the summary: quality metrics, then the costs that any run has."""
+    time_budget = budget_words(comparison.budget).endswith(" s")
+    costs = []
+    for cost in COSTS:
+        redundant = cost.key == "render_seconds_per_view"
+        if redundant or all(run.cost.get(cost.key) is None for run in comparison.runs):
+            continue
+        given = cost.key == "fit_seconds" and time_budget  # what every method was given is no merit of any
+        costs.append(replace(cost, better="none") if given else cost)
+    return quality_columns(comparison) + tuple(costs)
+
+
+def _mean(score: Score | None) -> float | None:
+    return None if score is None else score.mean
+
+
+def _known(values: Sequence[float | None]) -> list[float]:
+    return [value for value in values if value is not None]
+
+
+def value_of(run: Run, column: Quantity) -> float | None:
+    """A run's value of a quantity, in stored units."""
+    return _mean(run.quality.get(column.key)) if column.group != "cost" else run.cost.get(column.key)
+
+
+def _method_cell(column: Quantity, runs: Sequence[Run], notes: list[str]) -> Cell:
+    values = _known([value_of(run, column) for run in runs])
+    reasons = [_absence(run, column) for run in runs if value_of(run, column) is None]
+    reasons = list(dict.fromkeys(reason for reason in reasons if reason))
+    if not reasons:
+        return _cell(column, values)
+    text = f"{column.label}: {'; '.join(reasons)}"
+    if values:
+        text += f" ({len(runs) - len(values)} of {len(runs)} seeds)"
+    if text not in notes:
+        notes.append(text)
+    return _cell(column, values, notes.index(text) + 1)
+
+
+def _absence(run: Run, column: Quantity) -> str:
+    if column.group == "cost":
+        return ""  # NeRFs have no primitives; that needs no apology
+    if column.key in run.quality:
+        return "the score is not a number"
+    return run.skipped.get(column.key, "the run does not report it")
+
+
+def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
+    if not values:
+        return Cell(None, None, "n/a" if note else ABSENT, "", note=note)
+    mean = statistics.fmean(values)
+    std = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+    half = 0.0 if std is None else mean_half_width(std, len(values))
+    return Cell(mean, std, column.text(mean), "" if std is None else column.spread(mean, std), note=note, half_width=half)
+
+
+def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Mark, among methods, every cell that reads the same as the best one; a contest needs two methods."""
+    marked = [list(row.cells) for row in rows]
+    for index, column in enumerate(columns):
+        values = {i: row.cells[index].mean for i, row in enumerate(rows) if row.kind == "method" and row.ranked_in(column)}
+        known = {i: value for i, value in values.items() if value is not None}
+        if column.better == "none" or len(known) < 2:
+            continue
+        best = min(known.values(), key=column.sort_key)
+        for i, value in known.items():
+            if column.text(value) == column.text(best):
+                marked[i][index] = replace(marked[i][index], best=True)
+    return tuple(replace(row, cells=tuple(cells)) for row, cells in zip(rows, marked, strict=True))
+
+
+def _disturbed(runs: Sequence[Run]) -> str:
+    """Whose clocks were disturbed among a method's fits, and how."""
+    seeds = {run.seed: run.disturbed for run in runs if run.disturbed}
+    return "; ".join(f"seed {seed} {how}" for seed, how in seeds.items())
+
+
+def _skipped(comparison: Comparison) -> dict[str, list[str]]:
+    reasons: dict[str, list[str]] = {}
+    for run in comparison.runs:
+        for key, why in run.skipped.items():
+            reasons.setdefault(key, []).append(why)
+    present = {column.key for column in quality_columns(comparison)}
+    labels: dict[str, list[str]] = {}
+    for key, why in reasons.items():
+        if key not in present:
+            labels.setdefault("; ".join(dict.fromkeys(why)), []).append(metric_label(key))
+    return labels

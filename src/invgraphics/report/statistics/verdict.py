@@ -1,0 +1,155 @@
+"""What the numbers say, in sentences: who wins at what cost, and how sure one may be."""
+
+from __future__ import annotations
+
+import math
+
+from invgraphics.report.data.factors import METHOD, Factor, Observation
+from invgraphics.report.data.records import Comparison
+from invgraphics.report.statistics.effects import effects_on
+from invgraphics.report.statistics.rules import DEAD_SHARE
+from invgraphics.report.statistics.summary import Row, Summary
+from invgraphics.report.wording import Quantity, budget_words, listing, times
+
+
+def verdict(comparison: Comparison, summary: Summary) -> list[str]:
+    """Sentences in order of importance. Each follows from the summary table alone."""
+    sentences = [*_quality(comparison, summary), *_costs(summary), *_warnings(comparison, summary)]
+    return [sentence for sentence in sentences if sentence]
+
+
+def _ranking(summary: Summary, column: Quantity) -> list[tuple[float, Row]]:
+    """(value, row) of the methods that have all their seeds, best first."""
+    rows = [row for row in summary.methods if row.ranked_in(column)]
+    values = [(cell.mean, row) for row in rows if (cell := summary.cell(row, column.key)) and cell.mean is not None]
+    return sorted(values, key=lambda entry: column.sort_key(entry[0]))
+
+
+def _quality(comparison: Comparison, summary: Summary) -> list[str]:
+    columns = [column for column in summary.columns if column.group != "cost"]
+    ranking = _ranking(summary, columns[0]) if columns else []
+    if not ranking:
+        return []
+    column, (value, winner) = columns[0], ranking[0]
+    given = f"Given {budget_words(comparison.budget)} each, " if comparison.budget else ""
+    unit = f" {column.unit}" if column.unit else ""
+    extreme = "highest" if column.better == "higher" else "lowest"
+    record = f"the {extreme} {column.label}," if len(ranking) > 1 else f"a {column.label} of"
+    sentence = f"{given}{winner.label} reaches {record} {column.text(value)}{unit}"
+    gaps = []
+    if len(ranking) > 1:
+        gaps.append((abs(value - ranking[1][0]), f"ahead of {ranking[1][1].label}"))
+    reference = _best_baseline(summary, column)
+    if reference is not None:
+        ahead = column.sort_key(value) < column.sort_key(reference[0])
+        gaps.append(
+            (
+                abs(value - reference[0]),
+                f"{'ahead of' if ahead else 'behind'} the better trivial baseline ({reference[1].label})",
+            )
+        )
+    if column.key == "psnr" and comparison.noise_ceiling is not None:
+        side = "below" if value < comparison.noise_ceiling else "above"
+        name = f"{side} the truth's own noise ceiling ({column.text(comparison.noise_ceiling)}{unit})"
+        gaps.append((abs(comparison.noise_ceiling - value), name))
+    worded = [f"{column.text(gap)}{unit} {where}" for gap, where in gaps]
+    sentence += f": {listing(worded)}." if worded and math.isfinite(value) else "."
+    return [sentence, _resolution(comparison, summary, column, ranking), _other_metrics(summary, columns[1:], winner)]
+
+
+def _best_baseline(summary: Summary, column: Quantity) -> tuple[float, Row] | None:
+    found = [(cell.mean, row) for row in summary.baselines if (cell := summary.cell(row, column.key)) and cell.mean is not None]
+    return min(found, key=lambda entry: column.sort_key(entry[0])) if found else None
+
+
+def _resolution(comparison: Comparison, summary: Summary, column: Quantity, ranking: list[tuple[float, Row]]) -> str:
+    """Whether seeds resolve the lead of the first over the second."""
+    if len(ranking) < 2:
+        return ""
+    if max(row.seeds for _, row in ranking) < 2:
+        return "One seed per method: how much of a small difference is chance cannot be told from this page."
+    first, second = (row.label for _, row in ranking[:2])
+    runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
+    effects = effects_on(column, [Factor(METHOD, (first, second), second)], runs)
+    if not effects or effects[0].estimate.unit == "none":
+        return ""
+    lead, unit = effects[0], f" {column.unit}" if column.unit else ""
+    low, high = sorted((abs(lead.estimate.low), abs(lead.estimate.high)))
+    if lead.found:
+        return f"Over {lead.estimate.size} that lead lies in [{lead.text(low)}, {lead.text(high)}]{unit} (95% interval)."
+    half = lead.text(lead.estimate.half_width)
+    if lead.estimate.seeds[1] == 2:
+        return (
+            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: only one above about "
+            f"{half}{unit} could be told from it; three seeds or more see smaller ones."
+        )
+    return f"Over {lead.estimate.size} that lead may be chance: only one above about {half}{unit} could be told from it."
+
+
+def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> str:
+    agree: list[str] = []
+    others: dict[str, list[str]] = {}
+    for column in columns:
+        ranking = _ranking(summary, column)
+        best = [row for row in summary.methods if (cell := summary.cell(row, column.key)) and cell.best]
+        if len(ranking) < 2 or not best:
+            continue
+        if best == [winner]:
+            agree.append(column.label)
+        elif winner not in best:
+            others.setdefault(listing(row.label for row in best), []).append(column.label)
+    parts = [f"It also leads in {listing(agree)}" if agree else ""]
+    parts += [f"{who} {'lead' if ' and ' in who else 'leads'} in {listing(labels)}" for who, labels in others.items()]
+    text = "; ".join(part for part in parts if part)
+    return f"{text}." if text else ""
+
+
+def _costs(summary: Summary) -> list[str]:
+    words = {
+        "render_fps": "renders fastest",
+        "model_bytes": "has the smallest model",
+        "peak_memory_bytes": "needs the least memory",
+    }
+    parts = []
+    for column in summary.columns:
+        ranking = _ranking(summary, column) if column.key in words else []
+        if len(ranking) < 2:
+            continue
+        (value, row), (second, _) = ranking[0], ranking[1]
+        ratio = second / value if column.better == "lower" and value else value / second if second else math.inf
+        if math.isfinite(ratio) and ratio >= 1.05:
+            parts.append(
+                f"{row.label} {words[column.key]} ({column.text(value)} {column.unit}, {times(ratio)}× better than the next)"
+            )
+    text = "; ".join(parts)
+    return [f"{text}."] if text else []
+
+
+def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
+    sentences = []
+    columns = [column for column in summary.columns if column.group != "cost"]
+    reference = _best_baseline(summary, columns[0]) if columns else None
+    if reference is not None:
+        column = columns[0]
+        below = [
+            row.label for value, row in _ranking(summary, column) if column.sort_key(value) >= column.sort_key(reference[0])
+        ]
+        if below:
+            sentences.append(f"{listing(below)} did not beat the trivial baseline '{reference[1].label}' in {column.label}.")
+    dead = [run for run in comparison.runs if (run.cost.get("dead") or 0) > DEAD_SHARE]
+    for run in dead:
+        share = f"{100 * (run.cost['dead'] or 0):.2g} %"
+        sentences.append(f"No gradient can change {share} of the primitives of {run.method} (seed {run.seed}).")
+    told: dict[str, str] = {}
+    for run in comparison.runs:
+        if run.shortfall:
+            told.setdefault(run.method, run.shortfall)
+    sentences += told.values()
+    short = [row.label for row in summary.methods if not row.complete]
+    if short:
+        words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"
+        sentences.append(f"{listing(short)} {words} left out of the ranking.")
+    if comparison.failures:
+        cells = len(comparison.runs) + len(comparison.failures)
+        sentences.append(f"{len(comparison.failures)} of {cells} cells failed; they are listed below the table.")
+    return sentences

@@ -1,0 +1,1 @@
+"""Run folders on disk: the public format of runs, comparisons and studies."""

@@ -1,0 +1,1 @@
+"""Factorial studies: cells, forecast, record, analyses."""

@@ -1,0 +1,206 @@
+"""A study, from its description to its runs: validate everything, forecast, run what is missing, record."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from invgraphics import plugins
+from invgraphics.core import Scene
+from invgraphics.errors import InputError
+from invgraphics.experiments.build import training_data
+from invgraphics.experiments.executors.base import INTERRUPTED, Executor, Outcome, Resources
+from invgraphics.experiments.executors.local import cores
+from invgraphics.experiments.identity import TruthDigest, identify
+from invgraphics.experiments.progress import Reporter
+from invgraphics.experiments.renderings import check_eyes, rendered
+from invgraphics.experiments.request import AblateRequest
+from invgraphics.recipes.presets import announcements
+from invgraphics.runs.folder import RunFolder
+from invgraphics.scenes.open import SceneOptions, absent_data, open_scene
+from invgraphics.studies.analyses import write_analyses
+from invgraphics.studies.cells import Planned, make_plan, select
+from invgraphics.studies.forecast import Cost, Forecast, duration, total, try_method
+from invgraphics.studies.record import RECORD, CellState, Record, summarise_study
+from invgraphics.studies.study import Study, locate, name_of, read_study
+from invgraphics.training.budget import Budget
+
+__all__ = ["RECORD", "ablate"]
+
+Size = int | tuple[int, int] | None
+"""Longest side in pixels, or (width, height)."""
+
+
+@dataclass
+class _Progress:
+    """How far the runs are, and how long they took compared with the forecast."""
+
+    expected: dict[str, float]
+    began: float
+    spent: float = 0.0
+    done: int = 0
+    failed: int = 0
+
+    def count(self, outcome: Outcome) -> tuple[float, str]:
+        """Take a run into account; returns the finished share and what to say."""
+        self.done += 1
+        self.failed += outcome.status != 0
+        self.spent += self.expected[outcome.request.out]
+        everything = max(sum(self.expected.values()), 1e-9)
+        left = (time.monotonic() - self.began) * (everything / max(self.spent, 1e-9) - 1)
+        failures = f", {self.failed} failed" if self.failed else ""
+        share = 1.0 if self.done == len(self.expected) else min(self.spent / everything, 0.999)
+        return share, f"{self.done} of {len(self.expected)} runs{failures}, about {duration(left)} left"
+
+
+def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple[Path, list[dict[str, Any]]]:
+    """Make every run of a study that is missing; ``study.json`` is true at any moment.
+
+    Args:
+        request: the study, and where and how to run it.
+        confirm: is shown the forecast before the first run, and may raise to call it off.
+
+    Returns:
+        The study's folder, and the entries of ``study.json`` of the cells that failed.
+
+    Raises:
+        InputError: anything that cannot be used; found before the first run.
+        KeyboardInterrupt: interrupted; the runs that were under way have checkpoints.
+    """
+    path = locate(request.study)
+    study = read_study(path).overridden(request)
+    # Pinned also where a run has the machine to itself, so that its bits do not depend on who starts it.
+    threads = torch.get_num_threads() if request.jobs == 1 else max(1, cores() // request.jobs)
+    resources = Resources(jobs=request.jobs, threads=threads, gpus=request.gpus, address=request.address, logs=True)
+    executor: Executor = plugins.load("executors", request.executor)(resources)
+    plan = make_plan(study, request)
+    chosen = {planned.id for planned in select(plan, request)}
+    folder = RunFolder(Path(request.out))
+    folder.create()
+    with folder.held():
+        record = Record(folder, summarise_study(study, name_of(path), request, resources), plan)
+        fits = {planned.id: planned for planned in plan}
+        states = {name: _state(planned, request.keep, name in chosen) for name, planned in fits.items()}
+        samples, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
+        for name, planned in fits.items():
+            if states[name].status == "missing" and _is_finished(planned, truths[_place(planned)], threads):
+                states[name] = CellState("done")
+        missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
+        costs = _try_methods(missing, samples)
+        missing.sort(key=lambda planned: _expense(planned, study, costs))
+        expected = {planned.id: costs[_kind(planned)].seconds(Budget.parse(planned.fit.budget)) for planned in missing}
+        later = sum(state.status in ("later", "skipped") for state in states.values())
+        forecast = total([(costs[_kind(p)], Budget.parse(p.fit.budget)) for p in missing], len(fits), request.jobs, later)
+        _check_disk(forecast, folder.root)
+        for sentence in announcements(planned.method.choice for planned in plan):
+            print(sentence, file=sys.stderr)
+        confirm(forecast)
+        record.start(states | {name: CellState("missing", forecast=round(t, 1)) for name, t in expected.items()})
+        write_analyses(study.analyses, folder.root)
+        _run(executor, missing, expected, (record, folder.root / "jobs"))
+        return folder.root, record.failed()
+
+
+def _state(planned: Planned, keep: bool, chosen: bool) -> CellState:
+    """How far a cell is, as far as that can be told without its scene.
+
+    Args:
+        planned: the cell and its run.
+        keep: whether a finished run counts although the code has changed since: its folder's name tells recipe, scene and
+            request.
+        chosen: whether the cell is part of this command.
+    """
+    if keep and _is_kept(planned):
+        return CellState("done")
+    if reason := absent_data(planned.cell.scene):
+        return CellState("skipped", reason)
+    return CellState("missing" if chosen else "later")
+
+
+def _is_kept(planned: Planned) -> bool:
+    run = RunFolder(Path(planned.fit.out))
+    if not run.finished or not rendered(run, planned.fit, planned.method):
+        return False
+    return run.read_json("provenance.json").get("recipe_sha256") == planned.method.digest
+
+
+def _place(planned: Planned) -> tuple[str, Size]:
+    """What a cell's truth depends on."""
+    return planned.cell.scene, planned.fit.size
+
+
+def _kind(planned: Planned) -> tuple[str, str, Size]:
+    """What a cell's cost depends on, as far as it is measured."""
+    return planned.cell.method, planned.method.preset, planned.fit.size
+
+
+def _expense(planned: Planned, study: Study, costs: dict[tuple[str, str, Size], Cost]) -> tuple[int, float, int]:
+    """Cheap cells come first; of several seeds, the first with all its cells."""
+    size = planned.fit.size
+    seconds = costs[_kind(planned)].fit_seconds(Budget.parse(planned.fit.budget))
+    return study.seeds.index(planned.cell.seed), seconds, max(size) if isinstance(size, tuple) else size or 0
+
+
+def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple[str, Size], TruthDigest]]:
+    """Open every scene once per size, rendering what has to be; one scene of each size is kept, of the others fingerprints.
+
+    Raises:
+        InputError: a scene cannot be used, or not with every level of the data's factors.
+    """
+    samples: dict[Size, Scene] = {}
+    truths = {}
+    for place in dict.fromkeys(map(_place, plan)):
+        name, size = place
+        group = [planned for planned in plan if _place(planned) == place]
+        with Reporter(f"rendering {name}") as reporter:
+            options = SceneOptions(size=size, test_views=group[0].fit.test_views, spp=group[0].fit.spp)
+            scene = open_scene(name, options, lambda done, n, what, r=reporter: r.show(done / max(n, 1), what))
+        for data in dict.fromkeys(training_data(planned.fit) for planned in group):
+            data.check(scene)
+        methods = {planned.method.digest: planned.method for planned in group}.values()
+        check_eyes(group[0].fit.render_with, methods, scene)
+        truths[place] = TruthDigest.of(scene)
+        samples.setdefault(size, scene)
+    return samples, truths
+
+
+def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
+    run = RunFolder(Path(planned.fit.out))
+    same = run.finished and run.identity == identify(planned.fit, planned.method, truth, threads)
+    return same and rendered(run, planned.fit, planned.method)
+
+
+def _try_methods(missing: Sequence[Planned], samples: dict[Size, Scene]) -> dict[tuple[str, str, Size], Cost]:
+    """What a run of each method costs with each preset at each size, measured on one scene of that size."""
+    costs: dict[tuple[str, str, Size], Cost] = {}
+    for planned in missing:
+        if _kind(planned) not in costs:
+            costs[_kind(planned)] = try_method(planned.fit, planned.method, samples[planned.fit.size])
+    return costs
+
+
+def _check_disk(forecast: Forecast, folder: Path) -> None:
+    free = shutil.disk_usage(folder).free
+    if forecast.size > free:
+        raise InputError(f"The study will write {forecast.size / 1e9:.2g} GB, and {folder} has {free / 1e9:.2g} GB left.")
+
+
+def _run(executor: Executor, missing: list[Planned], expected: dict[str, float], files: tuple[Record, Path]) -> None:
+    """Run what is missing; ``files`` are the record, and the folder for jobs and their logs."""
+    record, jobs = files
+    progress = _Progress({p.fit.out: expected[p.id] for p in missing}, time.monotonic())
+    fits = [planned.fit for planned in missing]
+    with Reporter("study", quiet_seconds=0) as reporter, closing(executor.run(fits, jobs)) as outcomes:
+        for outcome in outcomes:
+            if outcome.status == INTERRUPTED:
+                raise KeyboardInterrupt
+            record.note(outcome)
+            reporter.show(*progress.count(outcome))

@@ -1,0 +1,120 @@
+"""The cells of a study as runs: settings resolved and checked, folders named."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from invgraphics.errors import InputError
+from invgraphics.experiments.build import device_of, requested_method, training_data
+from invgraphics.experiments.identity import define
+from invgraphics.experiments.recorder import Cadence
+from invgraphics.experiments.request import AblateRequest, FitRequest, slug
+from invgraphics.metrics.protocols import protocol_named
+from invgraphics.recipes.recipe import Method
+from invgraphics.scenes.open import is_rendered
+from invgraphics.studies.factors import BUDGET, SIZE, in_scope, path_of
+from invgraphics.studies.study import Cell, Study
+from invgraphics.training.budget import Budget
+
+LONGEST_NAME = 100
+"""Characters of a run's folder name, its hash left out."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A cell and the run that answers it; several cells may share a run.
+
+    Attributes:
+        cell: of the study.
+        fit: the run, in its own folder.
+        method: its resolved recipe.
+    """
+
+    cell: Cell
+    fit: FitRequest
+    method: Method
+
+    @property
+    def id(self) -> str:
+        """Name of the run's folder."""
+        return Path(self.fit.out).name
+
+    @property
+    def label(self) -> str:
+        """Method, scene@size, other levels, budget and seed: what ``--cells`` and known deviations are matched with."""
+        size = self.fit.size if not isinstance(self.fit.size, tuple) else "x".join(map(str, self.fit.size))
+        where = self.cell.scene_name if size is None else f"{self.cell.scene_name}@{size}"
+        return " ".join([self.cell.method, where, *_levels(self.cell), self.fit.budget, f"seed={self.cell.seed}"])
+
+
+def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
+    """Every cell with its run, all settings checked.
+
+    Raises:
+        InputError: unknown method, key, protocol or device, or a level that does not fit; the sentence names the cell.
+    """
+    protocol_named(study.protocol)
+    device_of(request.device)
+    Cadence.parse(request.checkpoint_every)
+    methods: dict[tuple[Any, ...], Method] = {}
+    folders: dict[str, Path] = {}  # a run that several cells share is named after the first
+    plan = []
+    for cell in study.expand():
+        fit = study.fit_request(cell, request)
+        fit = fit if is_rendered(fit.scene) else replace(fit, spp=None)
+        key = (cell.method, fit.preset, fit.budget, fit.recipe_overrides)
+        try:
+            if key not in methods:
+                methods[key] = requested_method(cell.method, fit)
+            training_data(fit)
+        except InputError as error:
+            raise _in_cell(cell, error) from error
+        definition = define(fit, methods[key])
+        folder = folders.setdefault(definition, Path(fit.out) / "runs" / f"{_readable(cell)}-{definition[:10]}")
+        plan.append(Planned(cell, replace(fit, out=str(folder)), methods[key]))
+    return plan
+
+
+def select(plan: list[Planned], request: AblateRequest) -> list[Planned]:
+    """The part of a plan that ``--cells`` and ``--most-seconds`` leave; budgets in steps have no seconds to compare.
+
+    Raises:
+        InputError: nothing is left.
+    """
+    most = request.most_seconds
+    kept = [
+        planned
+        for planned in plan
+        if (request.cells is None or fnmatchcase(planned.label, request.cells))
+        and (most is None or (Budget.parse(planned.fit.budget).seconds or 0) <= most)
+    ]
+    if not kept:
+        remedy = f"A cell's label reads '{plan[0].label}'; a * stands for any characters."
+        raise InputError("No cell of the study is left to run.", remedy)
+    return kept
+
+
+def _in_cell(cell: Cell, error: InputError) -> InputError:
+    """An error with the cell that it came from."""
+    levels = {name: level for name, level in cell.levels.items() if in_scope(name, cell.method)}
+    where = f"{cell.method} with {', '.join(f'{name} = {level}' for name, level in levels.items())}" if levels else cell.method
+    remedy = error.remedy
+    if error.sentence.startswith("Unknown key"):
+        remedy += '\nA key that only some methods have names them: "METHOD:key", where a * stands for any characters.'
+    return InputError(f"{where}: {error.sentence}", remedy)
+
+
+def _levels(cell: Cell, without: tuple[str, ...] = (BUDGET, SIZE)) -> list[str]:
+    """Each level that concerns the cell's method, but those in ``without``, as ``key=level`` with the key's last part."""
+    scoped = {path_of(name): level for name, level in cell.levels.items() if in_scope(name, cell.method)}
+    return [f"{path.rpartition('.')[2]}={level}" for path, level in scoped.items() if path not in without]
+
+
+def _readable(cell: Cell) -> str:
+    """What a person sees of a run's folder name."""
+    words = [cell.scene_name, slug(cell.method), *_levels(cell, ()), f"seed={cell.seed}"]
+    return re.sub(r"[^\w.=+-]+", "-", "-".join(words))[:LONGEST_NAME]

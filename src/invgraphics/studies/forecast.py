@@ -1,0 +1,119 @@
+"""What a study will cost, from trying each of its methods for two steps and a small picture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from invgraphics.core import Scene
+from invgraphics.errors import InputError, NumericalError
+from invgraphics.experiments.build import build_model, build_plan, device_of, training_data, use_kernels
+from invgraphics.experiments.evaluate import expected_seconds
+from invgraphics.experiments.renderings import eye_named, through
+from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.start import CHECKPOINT_COPIES
+from invgraphics.metrics.cost import model_bytes
+from invgraphics.recipes.recipe import Method
+from invgraphics.scenes.corrupt import corrupt
+from invgraphics.training.budget import Budget
+from invgraphics.training.fit import Fit
+
+START_SECONDS = 6.0
+"""Until a process has loaded torch, the compiled kernels and a scene; measured on two laptop cores."""
+
+PIXEL_BYTES = 20
+"""A test view's colour, alpha and normal (float16), depth (float32) and 8-bit picture, before compression."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one run of a method needs.
+
+    Attributes:
+        step: seconds of a training step.
+        other: seconds of everything but the fit: start and evaluation.
+        size: bytes of the run folder.
+    """
+
+    step: float
+    other: float
+    size: int
+
+    def seconds(self, budget: Budget) -> float:
+        """Seconds of a run with this budget."""
+        return self.other + self.fit_seconds(budget)
+
+    def fit_seconds(self, budget: Budget) -> float:
+        """Seconds of the fit alone."""
+        limits = [] if budget.seconds is None else [budget.seconds]
+        limits += [] if budget.steps is None else [budget.steps * self.step]
+        return min(limits, default=0.0)
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What is left of a study.
+
+    Attributes:
+        runs: of the whole study.
+        missing: of them, still to be made.
+        seconds: of all missing runs, on this machine.
+        size: bytes that they will write.
+        later: of them, neither finished nor part of this command.
+    """
+
+    runs: int
+    missing: int
+    seconds: float
+    size: int
+    later: int = 0
+
+    @property
+    def hours(self) -> float:
+        """Hours of all missing runs."""
+        return self.seconds / 3600
+
+    def __str__(self) -> str:
+        runs = f"{self.runs} runs, {self.runs - self.missing - self.later} of them finished"
+        runs += f", {self.later} left out" if self.later else ""
+        return f"{runs}; the rest takes about {duration(self.seconds)} and {self.size / 1e9:.2g} GB."
+
+
+def try_method(request: FitRequest, method: Method, scene: Scene) -> Cost:
+    """Measure one method on one scene.
+
+    Raises:
+        InputError: field, renderer or scene do not go together.
+    """
+    device = device_of(request.device)
+    use_kernels(request.kernels)
+    pixels = sum(view.camera.width * view.camera.height for view in scene.test)
+    shown = corrupt(scene, training_data(request), request.seed)
+    try:
+        fit = Fit(build_plan(method, shown, Budget.parse(request.budget), request.seed, device))
+        fit.step()  # the first compiles and allocates
+        began = time.perf_counter()
+        fit.step()
+        step = time.perf_counter() - began
+        evaluation = expected_seconds(fit.plan.field, fit.plan.renderer, scene, device)
+        for name in request.render_with:
+            seen = through(method, eye_named(name))
+            evaluation += expected_seconds(*build_model(seen, scene, request.seed, device), scene, device)
+        size = CHECKPOINT_COPIES * model_bytes((fit.plan.field, fit.plan.renderer))
+    except InputError:
+        raise
+    except (NumericalError, MemoryError, RuntimeError):  # its cell will fail with a sentence, and the others go on
+        return Cost(0.0, START_SECONDS, 0)
+    return Cost(step, START_SECONDS + evaluation, size + PIXEL_BYTES * pixels * (1 + len(request.render_with)))
+
+
+def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int, later: int = 0) -> Forecast:
+    """The forecast for missing runs with these costs, ``jobs`` at a time; a study has ``runs``, ``later`` of them left out."""
+    seconds = sum(cost.seconds(budget) for cost, budget in costs) / jobs
+    return Forecast(runs, len(costs), seconds, sum(cost.size for cost, _ in costs), later)
+
+
+def duration(seconds: float) -> str:
+    """A length of time in the unit that suits it."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,241 @@
+"""Studies: a question, factors and their levels as data, and the cells that they expand to. Imports nothing heavy.
+
+A factor's name is the dotted path of what it sets: a key of the recipes (``field.encoding.log2_size``), a key of the training
+data (``data.train_views``, see `invgraphics.scenes.corrupt.TrainingData`), or ``budget``, ``size`` or ``preset``. A factor that
+only some methods have names them first, ``volumetric/hash:field.encoding.log2_size`` or ``volumetric/*:batches.rays``; cells of
+the other methods carry its base level in the table, and are not multiplied by it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import tomllib
+from dataclasses import dataclass, replace
+from dataclasses import field as default
+from pathlib import Path
+from typing import Any, Literal
+
+from invgraphics.config import fill
+from invgraphics.data import find
+from invgraphics.errors import InputError, did_you_mean
+from invgraphics.experiments.request import AblateRequest, FitRequest
+from invgraphics.studies.checks import checked, completed
+from invgraphics.studies.factors import (
+    BUDGET,
+    PRESET,
+    SETTINGS,
+    SIZE,
+    Levels,
+    covers,
+    in_scope,
+    levels_of,
+    override,
+    path_of,
+)
+
+FILE = "study.toml"
+
+
+@dataclass(frozen=True)
+class Approximation:
+    """Two renderers that differ in one approximation only, to be compared on every fit.
+
+    Attributes:
+        name: of the approximation.
+        exact: renderer without it, one of the study's ``render_with``.
+        approximate: renderer with it, likewise.
+    """
+
+    name: str
+    exact: str
+    approximate: str
+
+
+@dataclass(frozen=True)
+class KnownDeviation:
+    """A verdict that is expected to be red, with its cause; the page still shows it.
+
+    Attributes:
+        cells: pattern of the cells' labels, for instance ``splatting/* fence@800 *`` (see `Cell.label`).
+        rule: that they break, one of `invgraphics.report.statistics.rules.RULES`.
+        cause: why, one sentence.
+        issue: where it is followed up: a number or a link.
+    """
+
+    cells: str
+    rule: Literal["budget", "monitor", "views", "dead", "memory", "finite", "late"]
+    cause: str
+    issue: int | str = ""
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a ``study.toml`` says.
+
+    Attributes:
+        question: what the study is to answer, one sentence.
+        scenes: built-in scenes or paths of data sets. One that begins with a variable, ``$INVGRAPHICS_DATA/fox``, is left out
+            where that data is not there, and the record says why.
+        methods: ``renderer/recipe``, or paths of recipes.
+        report: what the page is about: ``effects`` of the factors, or ``verdicts`` on every cell.
+        design: ``factorial`` runs every combination of levels; ``one-at-a-time`` the base, and each other level of one factor
+            with the rest at the base; ``list`` the ``cells``.
+        factors: factor -> its levels; tables within are joined by dots. A ``list`` takes them from its cells.
+        base: values that hold where nothing else is said, of factors and of other keys. A factor that is not in it has its
+            first level as base.
+        cells: for ``list``: levels that differ from the base, and ``scenes``, ``methods`` and ``seeds`` of its own where a cell
+            is not for all of the study's.
+        seeds: each cell is fitted once per seed.
+        budget: of each fit, ``60s`` or ``5000steps``.
+        protocol: how to score.
+        test_views: how many test views to score, or ``all``.
+        size: longest side in pixels, or [width, height]; ``None`` for the scenes' own.
+        spp: samples per pixel of scenes that are rendered; ``None`` for their own.
+        preset: preset of the recipes; ``None`` for the one that suits each cell's budget.
+        render_with: renderers that show every fitted field besides its own (see `invgraphics.experiments.renderings`).
+        approximations: pairs of these renderers whose pictures of the same fit are compared.
+        analyses: computations beside the fits (see `invgraphics.studies.analyses`).
+        known: for ``verdicts``: what is known to deviate, and why.
+    """
+
+    question: str
+    scenes: tuple[str, ...]
+    methods: tuple[str, ...]
+    report: Literal["effects", "verdicts"] = "effects"
+    design: Literal["factorial", "one-at-a-time", "list"] = "factorial"
+    factors: dict[str, Any] = default(default_factory=dict)
+    base: dict[str, Any] = default(default_factory=dict)
+    cells: tuple[dict[str, Any], ...] = ()
+    seeds: tuple[int, ...] = (0,)
+    budget: str = "60s"
+    protocol: str = "default"
+    test_views: int | Literal["all"] = 16
+    size: int | tuple[int, int] | None = None
+    spp: int | None = None
+    preset: str | None = None
+    render_with: tuple[str, ...] = ()
+    approximations: tuple[Approximation, ...] = ()
+    analyses: tuple[str, ...] = ()
+    known: tuple[KnownDeviation, ...] = ()
+
+    def points(self) -> list[Levels]:
+        """Every combination of levels that the design asks for, in the order of the factors; at least the base."""
+        base = {name: self.base[name] for name in self.factors}
+        if self.design == "factorial":
+            return [dict(zip(self.factors, levels, strict=True)) for levels in itertools.product(*self.factors.values())]
+        if self.design == "one-at-a-time":
+            others = [base | {name: level} for name, levels in self.factors.items() for level in levels if level != base[name]]
+            return [base, *others]
+        return [base | levels_of(cell) for cell in self.cells]
+
+    def expand(self) -> list[Cell]:
+        """Every run that the study needs, each once: seeds outermost, so that an unfinished study is balanced."""
+        cells: dict[str, Cell] = {}
+        points = list(zip(self.points(), self.cells, strict=True)) if self.cells else [(point, {}) for point in self.points()]
+        for seed, scene, (point, listed), method in itertools.product(self.seeds, self.scenes, points, self.methods):
+            if not covers(listed, scene, method, seed):
+                continue
+            levels = {name: level if in_scope(name, method) else self.base[name] for name, level in point.items()}
+            cells.setdefault(json.dumps([scene, method, seed, levels]), Cell(scene, method, seed, levels))
+        return list(cells.values())
+
+    def fit_request(self, cell: Cell, request: AblateRequest) -> FitRequest:
+        """The run of one cell; its folder is still to be named."""
+        values = self.base | cell.levels
+        settings = {path_of(name): value for name, value in values.items() if in_scope(name, cell.method)}
+        given = {name: settings.pop(name, getattr(self, name)) for name in SETTINGS}
+        size = given[SIZE]
+        return FitRequest(
+            method=cell.method,
+            scene=cell.scene,
+            seed=cell.seed,
+            out=request.out,
+            budget=str(given[BUDGET]),
+            preset=given[PRESET],
+            overrides=tuple(override(path, value) for path, value in settings.items()),
+            size=(size[0], size[1]) if isinstance(size, list) else size,
+            spp=self.spp,
+            test_views=None if self.test_views == "all" else self.test_views,
+            device=request.device,
+            kernels=request.kernels,
+            protocol=self.protocol,
+            checkpoint_every=request.checkpoint_every,
+            existing="reuse",
+            truth=str(Path(request.out) / "truth"),
+            render_with=self.render_with,
+        )
+
+    def overridden(self, request: AblateRequest) -> Study:
+        """The study with what the command line says instead.
+
+        Raises:
+            InputError: it names a budget, a size or seeds, and the study itself varies them; or a seed twice.
+        """
+        varied = {path_of(name) for name in self.base} | {name for cell in self.cells for name in cell}
+        names = ("seeds", "budget", "size", "test_views", "spp")
+        given = {name: getattr(request, name) for name in names if getattr(request, name) is not None}
+        if refused := [name for name in given if name in varied]:
+            raise InputError(f"--{refused[0]} cannot be given: the study itself says it in its factors, base or cells.")
+        return checked(replace(self, **given), f"The study '{request.study}'")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of a study.
+
+    Attributes:
+        scene: its scene.
+        method: its method.
+        seed: its seed.
+        levels: level of every factor; of one that the method does not have, the base level.
+    """
+
+    scene: str
+    method: str
+    seed: int
+    levels: Levels
+
+    @property
+    def scene_name(self) -> str:
+        """The scene without its path."""
+        return Path(self.scene).name if self.scene.startswith("$") else Path(self.scene).resolve().name
+
+
+def locate(name: str) -> Path:
+    """The file of a built-in study, or of one's own: the path of a TOML file or of its folder.
+
+    Raises:
+        InputError: there is none; the built-in studies are listed.
+    """
+    for path in (Path(name), Path(name) / FILE):
+        if path.suffix == ".toml" and path.is_file():
+            return path
+    known = [path.parent.name for path in sorted(find("studies").glob(f"*/{FILE}"))]
+    if name in known:
+        return find("studies", name) / FILE
+    guess = did_you_mean(name, known)
+    raise InputError(f"There is no study '{name}'.{guess}", f"Built-in studies: {', '.join(known)}; or the path of a {FILE}.")
+
+
+def name_of(path: Path) -> str:
+    """A study's name: that of its folder, or of its file where that has a name of its own."""
+    return path.resolve().parent.name if path.name == FILE else path.stem
+
+
+def read_study(path: Path) -> Study:
+    """Read a study and check all that can be checked without its methods and scenes.
+
+    Raises:
+        InputError: not TOML; a key is unknown, missing or of the wrong type; a factor is empty or repeats a level; a design
+            lacks what it needs. The sentence names the file.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}.") from error
+    try:
+        study = fill(Study, table)
+    except InputError as error:
+        raise InputError(f"{path}: {error.sentence}", error.remedy) from error
+    return checked(completed(study, str(path)), str(path))

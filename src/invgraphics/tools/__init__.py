@@ -1,0 +1,10 @@
+"""What is done with a finished run: films, exports, poses, explanations, scores under other protocols."""
+
+_GAUSSIANS = "invgraphics.tools.export:export_gaussians"
+EXPORTERS = {
+    "ply": _GAUSSIANS,
+    "splat": _GAUSSIANS,
+    "spz": _GAUSSIANS,
+    "mesh": "invgraphics.tools.mesh:export_mesh",
+}
+"""What a run's model can be exported to, and the function that does it (see `invgraphics.tools.export`)."""

@@ -1,0 +1,222 @@
+"""One pixel of a run, explained: everything along its ray written to a folder, for a figure and a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from PIL import Image
+from torch import Tensor
+
+from invgraphics.core import Camera, Context, Rendering, Scene, View
+from invgraphics.errors import InputError
+from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.fitted import Fitted, open_fitted
+from invgraphics.runs.folder import write_json
+from invgraphics.tools.along import Contributions, Profile, along_ray
+from invgraphics.training.limits import dead_gaussians
+
+Split = Literal["test", "train"]
+
+TABLE, FACTS, PICTURE, TRUTH = "ray.csv", "ray.json", "picture.png", "truth.png"
+"""Files of an explanation."""
+DIGITS = 7
+"""Significant digits of numbers in files, as many as float32 has."""
+
+
+@dataclass(frozen=True)
+class ExplainRequest:
+    """What to explain.
+
+    Attributes:
+        run: folder of the run.
+        view: index of the view in its split.
+        pixel: column and row, from 0, from the upper left corner.
+        split: whose views are counted.
+        out: folder to write; ``None`` for one inside the run.
+        scene: another copy of the run's scene.
+    """
+
+    run: Path
+    view: int
+    pixel: tuple[int, int]
+    split: Split = "test"
+    out: Path | None = None
+    scene: str | None = None
+
+    @property
+    def folder(self) -> Path:
+        """Where the explanation goes."""
+        column, row = self.pixel
+        return self.out or self.run / "explained" / f"{self.split}-{self.view:04d}-{column}-{row}"
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A pixel and what it is made of.
+
+    Attributes:
+        folder: holds `TABLE`, `FACTS`, `PICTURE` and `TRUTH`.
+        contributions: in the order in which they are composited.
+        rendered: colour of the pixel as `render` shows it, in front of the scene's background.
+        composited: the same from the contributions.
+        facts: what else there is to know, as in the file.
+    """
+
+    folder: Path
+    contributions: Contributions
+    rendered: Tensor
+    composited: Tensor
+    facts: dict[str, Any]
+
+
+def explain(request: ExplainRequest) -> Explanation:
+    """Open a run, take a pixel apart, and write what was found.
+
+    Raises:
+        InputError: the run cannot be opened, has no such view or pixel, or its renderer has nothing to show along rays.
+    """
+    fitted = open_fitted(request.run, request.scene).in_its_frame()
+    view = _view(fitted.scene, request)
+    camera = view.camera.to(fitted.device)
+    ctx = Context(fitted.scene.bounds.to(fitted.device), training=False)
+    found = on_cpu(along_ray(fitted.field, fitted.renderer, camera, request.pixel, ctx))
+    picture = render_view(fitted.field, fitted.renderer, view.camera, fitted.scene, fitted.device, geometry=False)
+
+    column, row = request.pixel
+    background = fitted.scene.background
+    rendered = picture.over(background)[row, column]
+    composited = found.colour + (1 - found.opacity) * background
+    facts = _facts(fitted, request, view, found, picture)
+    facts["pixel"] |= {"rendered": _row(rendered), "composited": _row(composited)}
+    explanation = Explanation(request.folder, found, rendered, composited, facts)
+    _write(explanation, view, picture, fitted.scene)
+    return explanation
+
+
+def on_cpu(found: Contributions) -> Contributions:
+    """The same contributions, all tensors on the CPU."""
+
+    def moved(value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return value.cpu()
+        if isinstance(value, tuple):
+            return tuple(moved(item) for item in value)
+        if hasattr(value, "__dataclass_fields__"):
+            return type(value)(**{name: moved(item) for name, item in vars(value).items()})
+        return value
+
+    return moved(found)
+
+
+def _view(scene: Scene, request: ExplainRequest) -> View:
+    """The view that is asked for.
+
+    Raises:
+        InputError: there is no such view, or it has no such pixel.
+    """
+    views = getattr(scene, request.split)
+    if not 0 <= request.view < len(views):
+        raise InputError(f"--view cannot be {request.view}.", f"Expected a {request.split} view, 0 to {len(views) - 1}.")
+    camera: Camera = views[request.view].camera
+    column, row = request.pixel
+    if not (0 <= column < camera.width and 0 <= row < camera.height):
+        raise InputError(
+            f"The pixel {column},{row} lies outside {request.split} view {request.view}, of {camera.width}x{camera.height} "
+            "pixels.",
+            f"Expected a column from 0 to {camera.width - 1} and a row from 0 to {camera.height - 1}.",
+        )
+    return views[request.view]
+
+
+def _facts(fitted: Fitted, request: ExplainRequest, view: View, found: Contributions, picture: Rendering) -> dict[str, Any]:
+    """Everything that the figure says, except for the pixel's two colours."""
+    scene, (column, row) = fitted.scene, request.pixel
+    ray = scene.bounds.clip(view.camera.rays(view.camera.focal.new_tensor([[column + 0.5, row + 0.5]])))
+    return {
+        "schema": 1,
+        "method": fitted.method.name,
+        "scene": scene.name,
+        "split": request.split,
+        "view": request.view,
+        "name": view.name,
+        "colour": scene.colour,
+        "background": _row(scene.background),
+        "kind": found.kind,
+        "near": _number(ray.near[0]),
+        "far": _number(ray.far[0]),
+        "space": scene.bounds.space,
+        "pixel": {
+            "column": column,
+            "row": row,
+            "alpha": _number(found.opacity),
+            "depth": _number(picture.depth[row, column]),
+            "expected": _number(found.expected_depth),
+            "median": _number(found.median_depth),
+            "true": _row(view.over(scene.background)[row, column]),
+            "true_alpha": None if view.alpha is None else _number(view.opacity()[row, column]),
+            "true_depth": None if view.depth is None else _number(view.depth[row, column]),
+        },
+        "contributions": _columns(found),
+        "dead": _dead(fitted),
+        "profile": _profile(found.profile),
+        "marched": _profile(found.marched),
+        "passes": [{name: _row(value) for name, value in vars(one).items()} for one in found.passes],
+    }
+
+
+def _dead(fitted: Fitted) -> dict[str, Any] | None:
+    """Share, number and causes of primitives that no gradient can change; ``None`` for fields without Gaussians."""
+    dead = dead_gaussians(fitted.field, [view.camera for view in fitted.scene.train])
+    return None if dead is None else {"share": _number(dead.share), "sentence": dead.sentence()}
+
+
+def _columns(found: Contributions) -> dict[str, list[Any] | None]:
+    """Name -> values of all contributions."""
+    columns: dict[str, list[Any] | None] = {
+        name: _row(getattr(found, name)) for name in ("t", "begin", "end", "alpha", "transmittance", "weight")
+    }
+    columns["density"] = None if found.density is None else _row(found.density)
+    columns |= {name: _row(found.rgb[:, index]) for index, name in enumerate(("red", "green", "blue"))}
+    columns["counted"] = found.counted.int().tolist()
+    return columns
+
+
+def _profile(profile: Profile | None) -> dict[str, list[Any] | None] | None:
+    if profile is None:
+        return None
+    return {name: None if value is None else _row(value) for name, value in vars(profile).items()}
+
+
+def _row(values: Tensor) -> list[float | None]:
+    return [_number(value) for value in values.double().tolist()]
+
+
+def _number(value: Tensor | float) -> float | None:
+    """A number of as many digits as it has, ``None`` where it is not finite."""
+    number = float(value)
+    return float(f"{number:.{DIGITS}g}") if math.isfinite(number) else None
+
+
+def _write(explanation: Explanation, view: View, picture: Rendering, scene: Scene) -> None:
+    """Write the folder.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    folder = explanation.folder
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"The folder {folder} cannot be written: {error.strerror}.", "Choose another --out.") from error
+    for name, colour in ((PICTURE, picture.over(scene.background)), (TRUTH, view.over(scene.background))):
+        Image.fromarray(display(colour, scene).numpy()).save(folder / name)
+    columns = {name: values for name, values in explanation.facts["contributions"].items() if values is not None}
+    with (folder / TABLE).open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+    write_json(folder / FACTS, explanation.facts)

@@ -1,0 +1,187 @@
+"""Writing a run's model as a file that other programs read, and saying what the file lost."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from invgraphics import plugins
+from invgraphics.core import Camera, Context, Field, Gaussians, Quantity, Renderer, Scene, harmonics
+from invgraphics.core.samples import FieldValues, Samples
+from invgraphics.errors import InputError, NotComposableError
+from invgraphics.experiments.evaluate import render_view
+from invgraphics.experiments.fitted import Fitted, open_fitted
+from invgraphics.experiments.progress import Reporter
+from invgraphics.fields.transformed import move_gaussians
+from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
+from invgraphics.runs.folder import make_parent
+from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_file
+
+RESOLUTION, RESOLUTIONS = 192, (8, 512)
+"""Voxels along a mesh's longest edge: usual, fewest and most (for which fused pictures take 6 GB of memory)."""
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What to write.
+
+    Attributes:
+        run: folder of the run.
+        to: a name in `invgraphics.tools.EXPORTERS`.
+        out: the file.
+        scene: another copy of the run's scene.
+        world: how the axes of the data set's world point, for formats that want certain axes.
+        level: density or signed distance of a mesh's surface; ``None`` for the default.
+        resolution: voxels along the longest edge that a mesh is made from.
+        sh_degree: degree of the spherical harmonics that are written, zeros where the run has fewer bands; ``None`` for what
+            readers of the format expect: 3 for PLY, elsewhere the run's own.
+    """
+
+    run: Path
+    to: str
+    out: Path
+    scene: str | None = None
+    world: str = WORLD
+    level: float | None = None
+    resolution: int = RESOLUTION
+    sh_degree: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= harmonics.MAX_DEGREE:
+            raise InputError(f"--sh-degree cannot be {self.sh_degree}.", f"Expected 0 to {harmonics.MAX_DEGREE}.")
+        low, high = RESOLUTIONS
+        if not low <= self.resolution <= high:
+            raise InputError(f"--resolution cannot be {self.resolution}.", f"Expected a number of voxels, {low} to {high}.")
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written: a file, and facts about it, name -> value in words."""
+
+    path: Path
+    facts: dict[str, str]
+
+
+class FixedGaussians(Field):
+    """Gaussians as they are, to be rendered and not fitted."""
+
+    provides = Quantity.GAUSSIANS
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        super().__init__()
+        self._gaussians = gaussians
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        """Gaussians have no pointwise reading here."""
+        raise NotComposableError(f"FixedGaussians has no {want.words()} at points.", "It provides gaussians.")
+
+    def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
+        """The Gaussians."""
+        return self._gaussians if want == Quantity.GAUSSIANS else super().primitives(want, ctx)
+
+    def primitive_count(self) -> int:
+        """Their number."""
+        return len(self._gaussians)
+
+
+def export_run(request: ExportRequest) -> Exported:
+    """Write the file.
+
+    Raises:
+        InputError: the run cannot be opened, its model cannot be written in this way, or the file cannot be written.
+    """
+    fitted = open_fitted(request.run, request.scene).in_its_frame()
+    make_parent(request.out)
+    return plugins.load("exporters", request.to)(fitted, request)
+
+
+def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
+    """Write the Gaussians as the renderer reads them, in world coordinates, and render the file once more.
+
+    Raises:
+        InputError: the model has no Gaussians, or they do not fit into the format.
+    """
+    if Quantity.GAUSSIANS not in fitted.field.provides:
+        raise InputError(
+            f"The model of '{request.run}' ({fitted.method.name}) has no Gaussians to write as {request.to}.",
+            "Runs of splatting methods have some.",
+        )
+    scene = fitted.scene
+    axes = plugins.load("formats", request.to).axes
+    with torch.no_grad():
+        local = fitted.field.primitives(Quantity.GAUSSIANS, Context(scene.bounds.to(fitted.device)))
+    placed = on_cpu(move_gaussians(on_cpu(local), file_from_local(scene, axes, request.world).float()))
+    expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
+    placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
+    shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
+    note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
+    antialiased = getattr(fitted.method.recipe.renderer, "compensate", False)
+    write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)))
+
+    _, written = read_gaussians(request.out)
+    back = move_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
+    loss = agreement(local, on_device(back, fitted.device), fitted)
+    degree = harmonics.degree_of(written.gaussians.sh.shape[1])
+    had = harmonics.degree_of(local.sh.shape[1])
+    return Exported(
+        request.out,
+        {
+            "Gaussians": str(len(written.gaussians)),
+            "bytes": str(request.out.stat().st_size),
+            "SH degree": str(degree) if degree == had else f"{degree} (the run has {had})",
+            "axes": axes or "the data set's world",
+            "PSNR to the run's own pictures": decibels(loss),
+        },
+    )
+
+
+def with_degree(gaussians: Gaussians, degree: int | None) -> Gaussians:
+    """The Gaussians with spherical harmonics of ``degree``: further bands are zero, or cut off; ``None`` changes nothing."""
+    if degree is None:
+        return gaussians
+    wanted, (count, have, _) = harmonics.count(degree), gaussians.sh.shape
+    sh = torch.cat([gaussians.sh[:, :wanted], gaussians.sh.new_zeros(count, max(0, wanted - have), 3)], dim=1)
+    return replace(gaussians, sh=sh)
+
+
+def agreement(gaussians: Gaussians, others: Gaussians, fitted: Fitted) -> list[float]:
+    """PSNR in dB between the pictures of two sets of Gaussians, one value for each test view; infinite where equal."""
+    psnr = []
+    with Reporter("comparing") as reporter:
+        for index, view in enumerate(fitted.scene.test):
+            ours, theirs = (
+                shown(each, fitted.renderer, view.camera, fitted.scene, fitted.device) for each in (gaussians, others)
+            )
+            error = float((ours - theirs).square().mean())
+            psnr.append(-10 * math.log10(error) if error else math.inf)
+            reporter.show((index + 1) / len(fitted.scene.test), f"view {index + 1} of {len(fitted.scene.test)}")
+    return psnr
+
+
+def shown(gaussians: Gaussians, renderer: Renderer, camera: Camera, scene: Scene, device: torch.device) -> Tensor:
+    """The picture of Gaussians over the scene's background, clipped to [0, 1], shape (height, width, 3)."""
+    picture = render_view(FixedGaussians(gaussians), renderer, camera, scene, device, geometry=False)
+    return picture.over(scene.background).clamp(0, 1)
+
+
+def decibels(values: list[float]) -> str:
+    """Mean and worst of several PSNRs in words."""
+    if math.isinf(min(values)):
+        return "equal"
+    mean = sum(values) / len(values)
+    return f"{mean:.1f} dB on average over {len(values)} test views, {min(values):.1f} dB at worst"
+
+
+def on_device(gaussians: Gaussians, device: torch.device) -> Gaussians:
+    """Move all tensors, outside the graph."""
+    names = ("means", "quaternions", "scales", "opacities", "sh")
+    return replace(gaussians, **{name: getattr(gaussians, name).detach().to(device) for name in names})
+
+
+def on_cpu(gaussians: Gaussians) -> Gaussians:
+    """Move all tensors to the CPU, outside the graph."""
+    return on_device(gaussians, torch.device("cpu"))

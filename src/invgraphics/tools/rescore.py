@@ -1,0 +1,175 @@
+"""Scoring saved pictures again, under named conventions: what a run, or another tool's pictures, would be said to reach."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import cache
+from typing import Any
+
+from invgraphics.core import Rendering, View
+from invgraphics.errors import InputError, did_you_mean
+from invgraphics.experiments.progress import Reporter
+from invgraphics.metrics.conventions import Convention, Protocol
+from invgraphics.metrics.measures import score_under, summarise_under
+from invgraphics.metrics.protocols import ViewScore, score, summarise
+from invgraphics.tools.predictions import PictureSet
+from invgraphics.tools.rescoring import KNOWN, Rescored, Rules, background_name, evaluated, labels, scores_of
+
+SHARED = ("psnr", "ssim", "lpips")
+"""Metrics that are recomputed where a run's own scores hold the others already."""
+
+
+def rules_named(names: str) -> list[Rules]:
+    """Protocols from a comma-separated list, or from ``all``.
+
+    Raises:
+        InputError: a name is unknown, or there is none.
+    """
+    wanted = list(KNOWN) if names.strip() == "all" else [name.strip() for name in names.split(",") if name.strip()]
+    known = f"Known protocols: {', '.join(KNOWN)}; or all."
+    if not wanted:
+        raise InputError("No protocol is named.", known)
+    for name in wanted:
+        if name not in KNOWN:
+            raise InputError(f"There is no protocol '{name}'.{did_you_mean(name, KNOWN)}", known)
+    return [KNOWN[name] for name in dict.fromkeys(wanted)]
+
+
+def check_same_truth(sets: Sequence[PictureSet]) -> None:
+    """Refuse sets of pictures whose scores must not stand side by side.
+
+    Raises:
+        InputError: views, size, background or true pixels differ; the sentence names both sets and what differs.
+    """
+    for other in sets[1:]:
+        first = sets[0]
+        left_size, right_size = (f"{side.size[0]}x{side.size[1]}" for side in (first, other))
+        facts: tuple[tuple[str, Any, Any], ...] = (
+            ("numbers of views", len(first.names), len(other.names)),
+            ("sizes", left_size, right_size),
+            ("backgrounds", background_name(first.background), background_name(other.background)),
+            ("true pixels", first.sha256[:12], other.sha256[:12]),
+        )
+        for what, left, right in facts:
+            if left != right:
+                raise InputError(
+                    f"'{first.folder}' and '{other.folder}' have different {what} ({left} and {right}).",
+                    "Numbers compare only on the same true pictures: same scene, views, resize and background.",
+                )
+
+
+def why_unsuited(pictures: PictureSet, rules: Rules, allow_8bit: bool = False) -> str:
+    """Why these pictures cannot be scored under a protocol, because they lack something; empty if they can.
+
+    Args:
+        pictures: what is to be scored.
+        rules: the protocol.
+        allow_8bit: whether 8-bit predictions may stand in for unrounded ones.
+    """
+    if isinstance(rules, Protocol):
+        unrounded, background, widest = not rules.quantise, "scene", None
+    else:
+        unrounded, background, widest = rules.prediction == "none", rules.background, rules.widest
+    if unrounded and pictures.eight_bit and not allow_8bit:
+        return "needs unrounded predictions, and these are 8-bit pictures (--allow-8bit scores them all the same)"
+    if pictures.transparency == "open" and background == "scene" and pictures.background is None:
+        return "needs the data set's background: name it with --background"
+    if pictures.transparency == "fixed" and background not in ("scene", pictures.background):
+        wanted = background if isinstance(background, str) else background_name(background)
+        present = background_name(pictures.background)
+        return f"puts the scene in front of {wanted}; here it is in front of {present} already, without alpha to change that"
+    if pictures.provenance and widest is not None and pictures.size[0] > widest:
+        return f"its loader scales pictures wider than {widest} pixels down to that: fit at that size"
+    return ""
+
+
+def rescore(sets: Sequence[PictureSet], rules: Sequence[Rules], allow_8bit: bool = False) -> list[Rescored]:
+    """Score every set under every protocol.
+
+    Raises:
+        InputError: the sets differ in their truth, or a picture cannot be read or has another size than its truth.
+    """
+    check_same_truth(sets)
+    total, done = sum(len(one.names) for one in sets), 0
+    result = []
+    with Reporter("rescoring") as reporter:
+        for pictures, label in zip(sets, labels([one.folder for one in sets]), strict=True):
+            lacking = {one.name: why_unsuited(pictures, one, allow_8bit) for one in rules}
+            scores: dict[str, list[ViewScore]] = {one.name: [] for one in rules if not lacking[one.name]}
+            only = {name: SHARED if evaluated(pictures, name) else None for name in scores}
+            for index in range(len(pictures.names)):
+                truth, predicted = pictures.truth(index), _predictions(pictures, index)
+                for name, views in scores.items():
+                    rules_here = KNOWN[name]
+                    rendering = predicted(_wants_bytes(pictures, truth, rules_here))
+                    if isinstance(rules_here, Convention):
+                        views.append(score_under(rendering, truth, pictures.scene, rules_here))
+                    else:
+                        views.append(score(rendering, truth, pictures.scene, rules_here, only[name]))
+                done += 1
+                reporter.show(done / total, f"{label}, view {index + 1} of {len(pictures.names)}")
+            tables = {one.name: _table(pictures, one, scores.get(one.name), lacking[one.name]) for one in rules}
+            result.append(Rescored(pictures, label, tables))
+    return result
+
+
+def _predictions(pictures: PictureSet, index: int) -> Callable[[bool], Rendering]:
+    """A view's prediction, read once from half-precision floats and once from its picture."""
+    return cache(lambda exact: _checked(pictures, index, exact))
+
+
+def _wants_bytes(pictures: PictureSet, truth: View, rules: Rules) -> bool:
+    """Whether a protocol looks at the very picture that is saved: rounded, over the scene's background."""
+    if isinstance(rules, Protocol):
+        return rules.quantise
+    same = truth.alpha is None or rules.background in ("scene", pictures.background)
+    return rules.prediction == "nearest" and same
+
+
+def _checked(pictures: PictureSet, index: int, exact: bool) -> Rendering:
+    rendering = pictures.prediction(index, exact)
+    (height, width), (true_height, true_width) = rendering.alpha.shape, pictures.truth(index).image.shape[:2]
+    if (height, width) != (true_height, true_width):
+        raise InputError(
+            f"In '{pictures.folder}' the prediction of view '{pictures.names[index]}' is {width}x{height} pixels, "
+            f"the truth is {true_width}x{true_height}."
+        )
+    return rendering
+
+
+def _table(pictures: PictureSet, rules: Rules, views: Sequence[ViewScore] | None, lacking: str) -> dict[str, Any]:
+    """The content of a scores file."""
+    if views is None:
+        names = SHARED if isinstance(rules, Protocol) else tuple(rules.measures)
+        quality, skipped = {}, dict.fromkeys(names, lacking)
+    elif isinstance(rules, Protocol):
+        quality, skipped = summarise(views, rules)
+    else:
+        quality, skipped = summarise_under(views, rules)
+    run = pictures.provenance
+    own = scores_of(pictures, "default") or {}
+    stated = asdict(rules)
+    eight_bit = pictures.eight_bit and (stated.get("prediction") == "none" or stated.get("quantise") is False)
+    caution = ("Unrounded predictions are wanted; 8-bit pictures stand in for them.",) if eight_bit and not lacking else ()
+    return {
+        "schema": 1,
+        "method": run.get("method", pictures.folder.name),
+        "preset": run.get("preset", ""),
+        "scene": own.get("scene", run.get("scene", "")),
+        "seed": run.get("seed"),
+        "protocol": rules.name,
+        "views": list(pictures.names),
+        "cost": own.get("cost", {}),
+        "quality": quality,
+        "skipped": skipped,
+        "rescored": True,
+        "conventions": stated,
+        "truth": {
+            "sha256": pictures.sha256,
+            "size": list(pictures.size),
+            "background": pictures.background,
+            "transparency": pictures.transparency,
+        },
+        "notes": [*pictures.notes, *caution],
+    }

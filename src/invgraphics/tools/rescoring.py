@@ -1,0 +1,208 @@
+"""What rescoring says: scores files, the table of the same pictures under all protocols, and the spread between them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from invgraphics.errors import InputError
+from invgraphics.metrics.conventions import CONVENTIONS, PROTOCOLS, Colour, Convention, Protocol
+from invgraphics.runs.folder import write_json
+from invgraphics.tools.predictions import PictureSet
+
+Rules = Protocol | Convention
+
+KNOWN: dict[str, Rules] = {**PROTOCOLS, **CONVENTIONS}
+"""Every protocol by name, ours first."""
+
+COLUMNS = {"psnr": ("PSNR (dB)", 3), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4), "lpips_vgg": ("LPIPS (VGG)", 4)}
+"""Metric -> heading and decimals, in the table's order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rescored:
+    """One set of pictures under several protocols.
+
+    Attributes:
+        pictures: what was scored.
+        label: short name, unique among those scored together.
+        scores: protocol -> content of its scores file.
+    """
+
+    pictures: PictureSet
+    label: str
+    scores: dict[str, dict[str, Any]]
+
+
+def background_name(colour: Colour | None) -> str:
+    """A background for a person."""
+    named = {(1.0, 1.0, 1.0): "white", (0.0, 0.0, 0.0): "black", None: "not stated"}
+    return named.get(colour) or "({:.3g}, {:.3g}, {:.3g})".format(*colour or ())
+
+
+def labels(folders: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that tell them apart; numbered where whole paths are equal."""
+    parts = [folder.resolve().parts[1:] or ("root",) for folder in folders]
+    for length in range(1, max(map(len, parts)) + 1):
+        ends = ["/".join(part[-length:]) for part in parts]
+        if len(set(ends)) == len(ends):
+            return ends
+    return [f"{part[-1]} {number}" for number, part in enumerate(parts, 1)]
+
+
+def write_scores(rescored: Rescored, out: Path | None) -> list[Path]:
+    """Write a scores file for each protocol under which something was scored; returns their paths.
+
+    They go into the run itself; or into ``out``, which other tools' folders need, since nothing is written into them. Scores
+    that `evaluate` made from the model are never replaced.
+    """
+    pictures = rescored.pictures
+    if out is None and not pictures.provenance:
+        return []
+    folder = pictures.folder if out is None else out
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for protocol, scores in rescored.scores.items():
+        if not scores["quality"] or (out is None and evaluated(pictures, protocol)):
+            continue
+        written.append(folder / _file_of(protocol))
+        write_json(written[-1], scores)
+    return written
+
+
+def _file_of(protocol: str) -> str:
+    return "scores.json" if protocol == "default" else f"scores.{protocol}.json"
+
+
+def scores_of(pictures: PictureSet, protocol: str) -> dict[str, Any] | None:
+    """The run's scores file for a protocol; ``None`` where there is none.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    path = pictures.folder / _file_of(protocol)
+    if not pictures.provenance or not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path} cannot be read as JSON: {error}.", "Remove it, or score the run again.") from error
+
+
+def evaluated(pictures: PictureSet, protocol: str) -> bool:
+    """Whether the run has scores under a protocol that were made from its model."""
+    return "rescored" not in (scores_of(pictures, protocol) or {"rescored": True})
+
+
+def rows_of(rescored: Rescored) -> tuple[list[str], list[list[str]]]:
+    """Headings and rows of the table of one set of pictures; the last row is the spread that conventions alone cause."""
+    shown = {key: column for key, column in COLUMNS.items() if _values(rescored, key)}
+    rows = []
+    for name, scores in rescored.scores.items():
+        cells = [_cell(scores["quality"].get(key), decimals) for key, (_, decimals) in shown.items()]
+        rows.append([name, *cells, *stated(KNOWN[name])])
+    if len(rows) > 1 and shown:
+        spread = [f"{spread_of(rescored, key):.{decimals}f}" for key, (_, decimals) in shown.items()]
+        rows.append(["spread", *spread, "", "", ""])
+    return ["protocol", *(heading for heading, _ in shown.values()), "background", "prediction", "truth"], rows
+
+
+def spread_of(rescored: Rescored, metric: str) -> float:
+    """Largest less smallest mean of a metric over the protocols that have it."""
+    values = _values(rescored, metric)
+    return max(values) - min(values)
+
+
+def stated(rules: Rules) -> tuple[str, str, str]:
+    """Background, and the rounding of prediction and truth, in words."""
+    words = {"none": "float", "nearest": "8-bit, rounded", "down": "8-bit, truncated"}
+    if isinstance(rules, Protocol):
+        rounding = words["nearest" if rules.quantise else "none"]
+        return rules.background, rounding, rounding
+    background = rules.background if isinstance(rules.background, str) else background_name(rules.background)
+    return background, words[rules.prediction], words[rules.truth]
+
+
+def winners(results: Sequence[Rescored], metric: str) -> str:
+    """Who is best under each protocol, in a sentence; empty where a single set was scored, or the metric is missing."""
+    best: dict[str, list[str]] = {}
+    for protocol in results[0].scores:
+        found = {one.label: one.scores[protocol]["quality"].get(metric) for one in results}
+        known = {label: entry for label, entry in found.items() if entry is not None}
+        if len(known) == len(results) > 1:
+            sign = 1 if next(iter(known.values()))["higher_is_better"] else -1
+            best.setdefault(max(known, key=lambda label: sign * known[label]["mean"]), []).append(protocol)
+    if not best:
+        return ""
+    if len(best) == 1:
+        return f"Best {metric}: {next(iter(best))}, whatever the protocol."
+    parts = "; ".join(f"{label} under {', '.join(protocols)}" for label, protocols in best.items())
+    return f"Best {metric} depends on the protocol: {parts}."
+
+
+def reasons(rescored: Rescored) -> list[str]:
+    """What was skipped and why, one line for each reason; then what was assumed, one line for each assumption."""
+    skipped: dict[str, dict[str, list[str]]] = {}
+    noted: dict[str, list[str]] = {}
+    for protocol, scores in rescored.scores.items():
+        for metric, reason in scores["skipped"].items():
+            skipped.setdefault(reason, {}).setdefault(protocol, []).append(metric)
+        for note in scores["notes"]:
+            noted.setdefault(note, []).append(protocol)
+    lines = []
+    for reason, where in skipped.items():
+        places = "; ".join(f"{protocol} ({', '.join(metrics)})" for protocol, metrics in where.items())
+        lines.append(f"Skipped: {places}: {reason}.")
+    everywhere = len(rescored.scores)
+    return lines + [note if len(names) == everywhere else f"{note} ({', '.join(names)})" for note, names in noted.items()]
+
+
+def write_tables(results: Sequence[Rescored], out: Path) -> list[Path]:
+    """Write ``rescore.md`` (the tables) and ``rescore.csv`` (one line for each number) into ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    lines = ["# The same pictures under several protocols", ""]
+    for one in results:
+        columns, rows = rows_of(one)
+        width, height = one.pictures.size
+        lines += [f"## {one.label}", "", f"{len(one.pictures.names)} views of {width}x{height} pixels.", ""]
+        lines += [_markdown(row) for row in (columns, ["---"] * len(columns), *rows)]
+        lines += ["", *(f"- {line}" for line in reasons(one)), ""]
+    lines += ["## Sources", ""]
+    lines += [f"- {name}: {rules.summary}. {_source(rules)}" for name, rules in KNOWN.items() if name in results[0].scores]
+    page = out / "rescore.md"
+    page.write_text("\n".join(line for line in lines).strip() + "\n", encoding="utf-8")
+    return [page, _write_csv(results, out / "rescore.csv")]
+
+
+def _write_csv(results: Sequence[Rescored], path: Path) -> Path:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["pictures", "protocol", "metric", "mean", "unit", "background", "prediction", "truth", "skipped"])
+        for one in results:
+            for protocol, scores in one.scores.items():
+                rest = stated(KNOWN[protocol])
+                for metric, entry in scores["quality"].items():
+                    writer.writerow([one.label, protocol, metric, repr(entry["mean"]), entry["unit"], *rest, ""])
+                for metric, reason in scores["skipped"].items():
+                    writer.writerow([one.label, protocol, metric, "", "", *rest, reason])
+    return path
+
+
+def _values(rescored: Rescored, metric: str) -> list[float]:
+    return [scores["quality"][metric]["mean"] for scores in rescored.scores.values() if metric in scores["quality"]]
+
+
+def _cell(entry: dict[str, Any] | None, decimals: int) -> str:
+    return "-" if entry is None else f"{entry['mean']:.{decimals}f}"
+
+
+def _markdown(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _source(rules: Rules) -> str:
+    return "Our own." if isinstance(rules, Protocol) else f"Read in {rules.source}."

@@ -1,0 +1,236 @@
+"""Meshes of fields: a ball keeps its radius, Gaussians fuse to a closed surface, files open elsewhere."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+from training_fixtures import SMALL
+
+from invgraphics.cli import main
+from invgraphics.cli.export import Export
+from invgraphics.core import Bounds, Camera, Context, Quantity, Rendering
+from invgraphics.errors import InputError
+from invgraphics.experiments import fitted as opened
+from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.run import fit_run
+from invgraphics.fields.analytic import GaussianBlob, Sphere
+from invgraphics.metrics.surfaces import points_on, surface_distance
+from invgraphics.renderers.splatting import Splatting, SplattingConfig
+from invgraphics.studies.approximations import field_of, round_ones
+from invgraphics.testing import TwoBalls, toy_cameras
+from invgraphics.tools.export import ExportRequest, export_run
+from invgraphics.tools.surface_extraction import Lattice, Surface, default_level, field_surface, fused_surface, without_specks
+
+BOX = Bounds(-torch.ones(3), torch.ones(3))
+
+
+def _volume(surface: Surface) -> float:
+    """Signed volume by the divergence theorem: positive where faces look outwards."""
+    a, b, c = surface.vertices.double()[surface.faces].unbind(dim=1)
+    return float((a * torch.linalg.cross(b, c)).sum() / 6)
+
+
+class _Density(Sphere):
+    """A ball without a signed distance."""
+
+    provides = Quantity.DENSITY | Quantity.RADIANCE
+
+
+@pytest.mark.parametrize("kind", [Sphere, _Density])
+def test_a_ball_keeps_its_radius(kind: type[Sphere]) -> None:
+    centre = torch.tensor([0.1, -0.2, 0.05])
+    surface = field_surface(kind(50.0, 0.6, centre, colour=(0.2, 0.6, 0.4)), BOX, 40)
+    radii = (surface.vertices - centre).norm(dim=1)
+    # Half a voxel of 2/40 for a density with a jump; next to nothing for a distance.
+    assert float((radii - 0.6).abs().max()) < (0.026 if kind is _Density else 2e-3)
+    assert _volume(surface) == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.05)
+    assert surface.open_edges == 0
+    assert surface.rgb.unique(dim=0).flatten().tolist() == pytest.approx([0.2, 0.6, 0.4])
+
+
+def test_the_level_of_a_density_is_where_the_surface_is() -> None:
+    blob = GaussianBlob(peak=100.0, covariance=0.09)
+    for level in (default_level(BOX), 60.0):
+        surface = field_surface(blob, BOX, 48, level)
+        expected = 0.3 * math.sqrt(2 * math.log(100 / level))
+        assert float((surface.vertices.norm(dim=1) - expected).abs().max()) < 0.01
+    # The stated meaning: 1% of the diagonal of this density has alpha 1/2.
+    assert 1 - math.exp(-default_level(BOX) * 0.01 * 2 * math.sqrt(3)) == pytest.approx(0.5)
+    with pytest.raises(InputError, match="no level 200"):
+        field_surface(blob, BOX, 16, 200.0)
+
+
+def test_a_solid_that_leaves_the_box_is_closed_there() -> None:
+    surface = field_surface(_Density(50.0, 1.2), BOX, 24)
+    assert surface.open_edges == 0
+    assert float(surface.vertices.abs().max()) < 1.05
+
+
+def test_colours_are_those_of_the_place() -> None:
+    surface = field_surface(TwoBalls(), BOX, 40)
+    left, right = surface.vertices[:, 0] < 0, surface.vertices[:, 0] > 0.2
+    assert bool((surface.rgb[left, 0] > surface.rgb[left, 2]).all()), "the left ball is red"
+    assert bool((surface.rgb[right, 0] < surface.rgb[right, 2]).all()), "the right ball is blue"
+
+
+def test_colours_are_seen_from_outside() -> None:
+    """A field whose colour is the direction of looking: it is the inward normal."""
+
+    class Looking(_Density):
+        def radiance_along(self, direction: torch.Tensor) -> torch.Tensor:
+            return direction
+
+    surface = field_surface(Looking(50.0, 0.6), BOX, 40)
+    along = (surface.rgb * surface.vertices).sum(dim=1) / 0.6
+    assert float(along.max()) < -0.5  # stairs of voxels turn some normals
+    assert float(along.mean()) < -0.9
+
+
+def test_specks_are_left_out() -> None:
+    """A small tetrahedron beside a ball."""
+    ball = field_surface(_Density(50.0, 0.6), BOX, 40)
+    n = len(ball.vertices)
+    corners = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    places = torch.cat([ball.vertices, 0.9 + 0.01 * torch.eye(4)[:, :3]])
+    both = Surface(places, torch.cat([ball.faces, corners + n]), torch.zeros(n + 4, 3))
+    kept = without_specks(both)
+    assert (len(kept.faces), len(kept.vertices), kept.dropped) == (len(ball.faces), n, 1)
+    assert torch.equal(kept.vertices[kept.faces], ball.vertices[ball.faces])
+
+
+def _all_around() -> list[Camera]:
+    cameras = [*toy_cameras(24, 72), *toy_cameras(8, 72, turn=0.5)]
+    upside_down = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    return [*cameras, *(camera.moved(upside_down @ camera.cam_to_world) for camera in cameras)]
+
+
+def _ball(camera: Camera, radius: float) -> Rendering:
+    """A ball at the origin in closed form, coloured by place."""
+    rays = camera.rays()
+    middle = -(rays.origins * rays.directions).sum(dim=1)
+    half = radius**2 - (rays.origins + middle[:, None] * rays.directions).square().sum(dim=1)
+    depth = torch.where(half > 0, middle - half.clamp_min(0).sqrt(), torch.inf)
+    place = rays.at(torch.where(half > 0, depth, 0.0))
+    alpha = (half > 0).float()
+    normal = torch.nn.functional.normalize(place, dim=1) * alpha[:, None]
+    return Rendering((place + 1) / 2 * alpha[:, None], alpha, depth, normal).reshape(camera.height, camera.width)
+
+
+def test_exact_depth_pictures_fuse_to_the_ball() -> None:
+    cameras = _all_around()
+    surface = fused_surface(cameras, lambda index: _ball(cameras[index], 0.55), BOX, 48)
+    radii = surface.vertices.norm(dim=1)
+    assert float((radii - 0.55).abs().mean()) < 0.01  # a quarter of a voxel
+    assert _volume(surface) == pytest.approx(4 / 3 * math.pi * 0.55**3, rel=0.08)  # three such quarters
+    assert surface.open_edges == 0
+    assert float((surface.rgb - (surface.vertices + 1) / 2).abs().mean()) < 0.03
+
+
+def test_gaussians_on_a_sphere_fuse_to_the_sphere() -> None:
+    """Splats are fat: seen aslant, their surface lies up to two standard deviations outside of their centres."""
+    direction = torch.nn.functional.normalize(torch.randn(3000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    means = 0.55 * direction
+    field = field_of(round_ones(means, torch.full((3000,), 0.02), torch.full((3000,), 0.95), (means + 1) / 2)).float()
+    renderer, cameras = Splatting(SplattingConfig(depth="median", normals="depth")), _all_around()[::2]
+
+    def render(index: int) -> Rendering:
+        with torch.no_grad():
+            return renderer.render_image(field, cameras[index], Context(BOX, geometry=True))[0]
+
+    surface = fused_surface(cameras, render, BOX, 48)
+    radii = surface.vertices.norm(dim=1)
+    assert 0.55 < float(radii.median()) < 0.59
+    assert _volume(surface) == pytest.approx(4 / 3 * math.pi * 0.57**3, rel=0.12)
+    assert surface.open_edges < 0.02 * len(surface.faces)
+    assert float((surface.rgb - (surface.vertices / 0.57 * 0.55 + 1) / 2).abs().mean()) < 0.06
+
+
+def test_what_no_picture_saw_stays_open() -> None:
+    """A wall seen from one side: one sheet, not two."""
+    camera = toy_cameras(1, 48)[0]
+    axis = camera.cam_to_world[:3, 2]
+    rays = camera.rays()
+    depth = ((-camera.position) @ axis / (rays.directions @ axis)).view(48, 48)  # the plane through the origin
+    wall = Rendering(torch.full((48, 48, 3), 0.5), torch.ones(48, 48), depth)
+    surface = fused_surface([camera], lambda _: wall, BOX, 24)
+    assert float((surface.vertices @ axis).abs().max()) < 0.02  # a quarter of a voxel
+    assert surface.open_edges > 0
+    with pytest.raises(InputError, match="depth pictures"):
+        fused_surface([camera], lambda _: replace(wall, depth=torch.full((48, 48), torch.inf)), BOX, 24)
+
+
+def test_lattice_covers_the_box_with_cubes() -> None:
+    lattice = Lattice.across(Bounds(torch.zeros(3), torch.tensor([2.0, 1.0, 0.5])), 8)
+    assert lattice.shape == (8, 4, 2)
+    centres = lattice.centres(0, len(lattice))
+    assert (centres.amin(dim=0).tolist(), centres.amax(dim=0).tolist()) == ([0.125] * 3, [1.875, 0.875, 0.375])
+
+
+def test_surface_distances_in_closed_form() -> None:
+    """Two concentric spheres are as far apart as their radii; half a sphere is right but not complete."""
+    small, large = (field_surface(Sphere(1.0, radius), BOX, 48) for radius in (0.5, 0.6))
+    generator = torch.Generator().manual_seed(0)
+    inner, outer = (points_on(s.vertices, s.faces, 20_000, generator) for s in (small, large))
+    found = surface_distance(inner, outer)
+    assert (found.accuracy, found.completeness, found.chamfer) == pytest.approx((0.1, 0.1, 0.1), abs=2e-3)
+    half = surface_distance(outer[outer[:, 2] > 0], outer)
+    assert half.accuracy == 0
+    assert half.completeness > 0.1
+    assert surface_distance(outer[outer[:, 2] > 0], outer, outer[outer[:, 2] > 0]).completeness == 0
+    # Points are uniform by area: as many in the upper half as in the lower one, and a spherical zone has its height's share.
+    assert float((inner[:, 2] > 0.25).double().mean()) == pytest.approx(0.25, abs=0.015)
+
+
+@pytest.fixture(scope="module")
+def runs(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("meshes")
+    steps = {"volumetric/hash": "300steps", "splatting/gaussians": "200steps"}
+    return {
+        method: fit_run(
+            FitRequest(
+                method=method, scene=str(toy_folder), out=str(root / method[:5]), budget=budget, overrides=(*SMALL[method],)
+            )
+        )
+        for method, budget in steps.items()
+    }
+
+
+@pytest.mark.parametrize("method", ["volumetric/hash", "splatting/gaussians"])
+def test_a_run_becomes_a_file(runs: dict[str, Path], tmp_path: Path, capsys, monkeypatch, method: str) -> None:
+    """In the world's coordinates, readable by plyfile; the toy's balls are where they are."""
+    similarity = torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0]))
+    similarity[:3, 3] = torch.tensor([10.0, 0.0, 0.0])
+    opener = opened.open_scene
+    monkeypatch.setattr(opened, "open_scene", lambda *words: replace(opener(*words), world_from_local=similarity))
+    out = tmp_path / "model.ply"
+    level = ["--level", "1"] if method == "volumetric/hash" else []
+    assert main.run(["export", str(runs[method]), "--to", "mesh", "--out", str(out), "--resolution", "32", *level]) == main.DONE
+    said = capsys.readouterr().out
+    assert ("density 1 per local unit" if level else "median depth of 12 training views") in said
+    file = PlyData.read(out)
+    vertex = file["vertex"].data
+    places = np.stack([vertex[axis] for axis in "xyz"], axis=1)
+    assert f"{len(places):,}" in said
+    local = torch.from_numpy((places - [10, 0, 0]) / 2).float()
+    distance = ((local[:, None] - TwoBalls().centres).norm(dim=-1) - TwoBalls().radii).amin(dim=1).abs()
+    assert float(distance.median()) < 0.12
+    faces = np.stack(file["face"].data["vertex_indices"])
+    assert faces.shape[1] == 3
+    assert faces.max() < len(places)
+    assert vertex["red"].dtype == np.uint8
+    assert vertex["red"].std() > (1 if level else 10)
+
+
+def test_bad_requests_get_a_sentence(runs: dict[str, Path], tmp_path: Path) -> None:
+    assert Export(tmp_path, "mesh", tmp_path).resolution == ExportRequest(tmp_path, "mesh", tmp_path).resolution
+    with pytest.raises(InputError, match="--resolution"):
+        ExportRequest(runs["volumetric/hash"], "mesh", tmp_path / "a.ply", resolution=2)
+    with pytest.raises(InputError, match="no density with a level"):
+        export_run(ExportRequest(runs["splatting/gaussians"], "mesh", tmp_path / "a.ply", level=3.0))
+    with pytest.raises(InputError, match="no level"):
+        export_run(ExportRequest(runs["volumetric/hash"], "mesh", tmp_path / "a.ply", level=1e9, resolution=16))
+    assert not list(tmp_path.iterdir())
