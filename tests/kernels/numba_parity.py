@@ -55,8 +55,8 @@ def samples() -> list[str]:
     for number, true in zip(numba.hash_render(*call), reference.hash_render(*call), strict=True):
         assert true.abs().max() > 0.1
         assert (number - true).abs().max() <= 1e-4 * true.abs().max()
-    parts = ("hash.encode", "hash.encode_back", "composite.accumulate", "composite.accumulate_back", "hash_render.render")
-    return assembly(*parts)
+    parts = ("hash.encode.encode", "hash.encode.encode_back", "rays.composite.accumulate", "rays.composite.accumulate_back")
+    return assembly(*parts, "ngp.render.render")
 
 
 def box_of_rays() -> tuple[Bounds, Rays]:
@@ -88,14 +88,14 @@ def pictures() -> list[str]:
     ours, theirs = (k.ray_march(rays, occupied, bounds, MarchSteps(0.01), rays.near) for k in (numba, reference))
     assert len(ours.ray) > 0
     assert all(torch.equal(getattr(ours, name), getattr(theirs, name)) for name in ("ray", "t0", "t1", "resume"))
-    return assembly("raster.rasterise", "raster_backward.walk_back", "march.walk")
+    return assembly("splat.raster.rasterise", "splat.raster_backward.walk_back", "rays.march.walk")
 
 
 def assembly(*names: str) -> list[str]:
     """Machine code of everything that kernels, named ``module.function``, were compiled to."""
     code = []
     for name in names:
-        module, _, function = name.partition(".")
+        module, _, function = name.rpartition(".")
         # By path: the package's attributes of these names are its operations.
         kernel = getattr(import_module(f"invgraphics.kernels.numba.{module}"), function)
         code += kernel.inspect_asm().values()

@@ -3,9 +3,12 @@
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from invgraphics.kernels.numba import runtime
 
 BITS = """
 import hashlib, torch
@@ -61,6 +64,11 @@ def run(code: str, cache: Path, *, cold: bool) -> list[str]:
     assert process.returncode == 0, process.stderr[-3000:]
     assert ("compiling kernels" in process.stderr) == cold
     return process.stdout.split()
+
+
+def test_the_processes_that_fill_the_cache_find_their_functions() -> None:
+    module = import_module(runtime.WARMUP)
+    assert all(callable(getattr(module, part)) for part in runtime.PARTS)
 
 
 def test_kernels_are_compiled_here_where_no_other_process_can(tmp_path: Path) -> None:
