@@ -84,7 +84,7 @@ def check_eyes(names: Sequence[str], methods: Iterable[Method], scene: Scene) ->
     for method in methods if eyes else ():
         for eye in eyes:
             try:
-                _, renderer = build_model(through(method, eye), scene, 0, torch.device("cpu"))
+                renderer = build_model(through(method, eye), scene, 0, torch.device("cpu")).renderer
             except InputError as error:
                 raise InputError(f"{method.name} cannot be rendered with {eye.name}: {error.sentence}", error.remedy) from error
             if renderer.state_dict() and eye.table != method.table["renderer"]:

@@ -129,7 +129,7 @@ def _rehearse(folder: RunFolder, fit: Fit, method: Method, memory: PeakMemory) -
 def _prediction(request: FitRequest, fit: Fit, memory: MemoryForecast) -> str:
     """What the person is in for, said before the work starts."""
     views = len(fit.plan.scene.test)
-    seconds = expected_seconds(fit.plan.field, fit.plan.renderer, fit.plan.scene, fit.plan.device)
+    seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     scene = fit.plan.scene
     return f"{request.method} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
@@ -147,10 +147,9 @@ def _evaluate(folder: RunFolder, scene: Scene, fit: Fit, request: FitRequest, me
     """Score the fit on the undisturbed scene. ``scores.json`` comes last, because a run that has it is finished."""
     folder.write_json("fit.json", spent)
     costs = fit_costs(spent)
-    model = (fit.plan.field, fit.plan.renderer)
     if request.protocol != "default":
-        evaluate(folder, scene, model, request.protocol, costs, method, fit.plan.poses)
-    evaluate(folder, scene, model, "default", costs, method, fit.plan.poses)
+        evaluate(folder, scene, fit.plan.model, request.protocol, costs, method, fit.plan.poses)
+    evaluate(folder, scene, fit.plan.model, "default", costs, method, fit.plan.poses)
 
 
 def describe(

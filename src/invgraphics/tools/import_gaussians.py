@@ -88,15 +88,15 @@ def import_run(request: ImportRequest) -> Path:
         folder.clear()
         identity = _identity(method, scene, origin)
         describe(folder, request, method, (scene, scene), identity, device, origin)
-        field, renderer = build_model(method, scene, request.seed, device)
-        assert isinstance(field, GaussianField)
-        fill(field, gaussians)
-        checkpoint.save(folder.checkpoint, {"field": field.state_dict(), "renderer": renderer.state_dict()})
+        model = build_model(method, scene, request.seed, device)
+        assert isinstance(model.field, GaussianField)
+        fill(model.field, gaussians)
+        checkpoint.save(folder.checkpoint, model.state_dict())
         folder.append_history({"step": 0, "seconds": 0.0, "progress": 1.0, "primitives": len(gaussians)})
         costs = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}
         folder.write_json("fit.json", {"steps": None, "seconds": None})
         for rules in dict.fromkeys([request.protocol, "default"]):
-            evaluate(folder, scene, (field, renderer), rules, costs, method)
+            evaluate(folder, scene, model, rules, costs, method)
     return folder.root
 
 
