@@ -26,7 +26,7 @@ from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
 from invgraphics.training.localise import Descent, descend
-from invgraphics.training.losses import PhotometricConfig
+from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import OptimiserConfig
 from invgraphics.training.poses import Poses, PosesConfig, motion_about, windows
 
@@ -250,7 +250,7 @@ def test_poses_come_back(blobs: Scene) -> None:
     plan = Plan(
         model=Model(Blobs(), VolumetricConfig(StratifiedConfig(32)).build(shown), shown.bounds),
         scene=shown,
-        losses=[PhotometricConfig().build()],
+        losses=[PhotometricLoss()],
         hooks=[],
         optimiser=config.optimiser(OptimiserConfig(), seen=1.0),
         batches=BatchConfig(rays=1200, views=6),

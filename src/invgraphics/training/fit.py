@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Any
 
@@ -108,7 +108,8 @@ class Fit:
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
-        loss = torch.stack([loss(rendering, trace, batch, ctx) for loss in plan.losses]).sum()
+        composited = replace(rendering, rgb=rendering.over(batch.background))
+        loss = torch.stack([loss(composited, trace, batch, ctx) for loss in plan.losses]).sum()
         value = loss.item()
         if not torch.isfinite(loss):
             raise NumericalError(self._blame(rendering))
