@@ -15,7 +15,7 @@ from invgraphics.core.field import Gaussians
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
 from invgraphics.kernels.numba.runtime import compile_here
-from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
+from invgraphics.kernels.types import FusedNGP, HashGrid, MarchSteps
 
 WIDER = {"xmm": ("ymm", "zmm"), "ymm": ("zmm",), "zmm": ()}
 
@@ -49,10 +49,10 @@ def samples() -> list[str]:
     assert_equal(lambda d, c: numba.composite(d, c, ray, 30), lambda d, c: reference.composite(d, c, ray, 30), inputs)
     networks = [((torch.randn(16, 8), torch.randn(16)), (torch.randn(4, 16), torch.randn(4)))]
     networks += [((torch.randn(5, 7), torch.randn(5)), (torch.randn(3, 5), torch.randn(3)))]
-    field = HashField(torch.randn(grid.entries, 2), grid, *networks, "exp", -2.0, 2, "srgb")
+    field = FusedNGP(torch.randn(grid.entries, 2), grid, *networks, "exp", -2.0, 2, "srgb")
     bounds, rays = box_of_rays()
     call = rays, torch.rand(8, 8, 8) < 0.5, bounds, MarchSteps(0.05), field
-    for number, true in zip(numba.hash_render(*call), reference.hash_render(*call), strict=True):
+    for number, true in zip(numba.ngp_render(*call), reference.ngp_render(*call), strict=True):
         assert true.abs().max() > 0.1
         assert (number - true).abs().max() <= 1e-4 * true.abs().max()
     parts = ("hash.encode.encode", "hash.encode.encode_back", "rays.composite.accumulate", "rays.composite.accumulate_back")

@@ -43,8 +43,8 @@ def setting(make_scene: Callable[..., Scene]) -> tuple[Scene, Volumetric, Camera
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[None]:
     """One entry for each picture made in one pass."""
     made: list[None] = []
-    original = kernels.hash_render
-    monkeypatch.setattr(kernels, "hash_render", lambda *args: (made.append(None), original(*args))[1])
+    original = kernels.ngp_render
+    monkeypatch.setattr(kernels, "ngp_render", lambda *args: (made.append(None), original(*args))[1])
     return made
 
 
@@ -95,8 +95,8 @@ def test_training_marches_in_one_pass_and_sees_the_same(setting, monkeypatch) ->
     """Loss and gradients are those of a march, looks, and another march; in boxes only, and with steps of one length."""
     scene, renderer, camera = setting
     field, rays, made = fitted(FIELD, scene), camera.rays(), []
-    original = kernels.hash_march
-    monkeypatch.setattr(kernels, "hash_march", lambda *args: (made.append(None), original(*args))[1])
+    original = kernels.ngp_march
+    monkeypatch.setattr(kernels, "ngp_march", lambda *args: (made.append(None), original(*args))[1])
 
     def gradient() -> torch.Tensor:
         ctx = Context(scene.bounds, training=True, generator=torch.Generator().manual_seed(5))
@@ -115,7 +115,7 @@ def test_training_marches_in_one_pass_and_sees_the_same(setting, monkeypatch) ->
 
 def test_growing_steps_are_marched_in_parts(setting, monkeypatch) -> None:
     scene, _, camera = setting
-    monkeypatch.setattr(kernels, "hash_march", lambda *args: pytest.fail("no such kernel for these steps"))
+    monkeypatch.setattr(kernels, "ngp_march", lambda *args: pytest.fail("no such kernel for these steps"))
     renderer = Volumetric(replace(SAMPLER, cone=0.01).build(scene))
     picture, _ = renderer.render_rays(fitted(FIELD, scene), camera.rays(), Context(scene.bounds, training=True))
     assert bool(picture.rgb.isfinite().all())

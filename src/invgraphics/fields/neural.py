@@ -28,7 +28,7 @@ from invgraphics.core.scene import Scene
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies, frequency_width
 from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.mlp import Mlp, truncated_exp
-from invgraphics.kernels.types import HashField
+from invgraphics.kernels.types import FusedNGP
 
 CPU_CHUNK = 8192
 """Samples that go through the networks at once on a CPU: larger activations cost more in page faults than in arithmetic."""
@@ -195,7 +195,7 @@ class NeuralField(Field):
             features=torch.cat(handed) if Quantity.FEATURES in want else None,
         )
 
-    def hash_field(self, bounds: Bounds) -> HashField | None:
+    def hash_field(self, bounds: Bounds) -> FusedNGP | None:
         """The parts of a plain hash grid over ``bounds``, two features per entry.
 
         ``None`` for other encodings and networks, elsewhere, and while a window is open.
@@ -211,7 +211,7 @@ class NeuralField(Field):
         geometry, colour = (net.layers() for net in (self.geometry_net, self.colour_net))
         bands = config.direction_degree if config.direction == "sh" else 0
         density = config.density_activation, config.density_bias, bands, self.colour, self._contracted_density
-        return HashField(encoding.table.detach(), encoding.grid, geometry, colour, *density)
+        return FusedNGP(encoding.table.detach(), encoding.grid, geometry, colour, *density)
 
     @property
     def _contracted_density(self) -> float:

@@ -157,10 +157,10 @@ class Occupancy(Sampler):
         """A march that stops by itself, if there is a kernel for what the field is made of and for these steps."""
         parts, steps = hash_field(density.field, ctx.bounds), self.steps(ctx)
         even = ctx.bounds.space == "box" or steps.contracted
-        if parts is None or not even or steps.cone > 0 or not kernels.compiled("hash_march", parts.table):
+        if parts is None or not even or steps.cone > 0 or not kernels.compiled("ngp_march", parts.table):
             return None
         start = self._start(rays, steps, ctx)
-        return kernels.hash_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
+        return kernels.ngp_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
 
     def steps(self, ctx: Context) -> MarchSteps:
         """How long steps are now."""

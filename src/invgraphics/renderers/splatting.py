@@ -80,7 +80,7 @@ class Splatting(Renderer):
             footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.receivers
         )
         rendering = self._picture(sums, alpha, camera, footprints)
-        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.pull, gaussians.opacities, gaussians.scales)
+        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.absgrad, gaussians.opacities, gaussians.scales)
         return rendering, Trace(screen=screen, rays=alpha.numel())
 
     def project(self, gaussians: Gaussians, camera: Camera) -> tuple[Footprints, Float[Tensor, "n 3"]]:
@@ -93,7 +93,7 @@ class Splatting(Renderer):
         if footprints.means2d.requires_grad:
             footprints.means2d.retain_grad()
             if config.absolute_gradients:
-                footprints = replace(footprints, pull=torch.zeros_like(footprints.means2d, requires_grad=True))
+                footprints = replace(footprints, absgrad=torch.zeros_like(footprints.means2d, requires_grad=True))
         return footprints, rgb
 
     def _picture(
@@ -117,8 +117,8 @@ class Splatting(Renderer):
 
 
 def _distance_coefficients(footprints: Footprints) -> Float[Tensor, "n 3"]:
-    """`Footprints.planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
-    at_mean, slopes = footprints.planes[:, :1], footprints.planes[:, 1:]
+    """`Footprints.depth_planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
+    at_mean, slopes = footprints.depth_planes[:, :1], footprints.depth_planes[:, 1:]
     return torch.cat([slopes, at_mean - (slopes * footprints.means2d).sum(dim=1, keepdim=True)], dim=1)
 
 

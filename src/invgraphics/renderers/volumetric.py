@@ -99,11 +99,11 @@ class Volumetric(RayRenderer):
         if torch.is_grad_enabled() or ctx.training or normals or not isinstance(sampler, Occupancy):
             return None
         parts = hash_field(field, ctx.bounds)
-        if parts is None or sampler.config.stop == "never" or not kernels.compiled("hash_render", parts.table):
+        if parts is None or sampler.config.stop == "never" or not kernels.compiled("ngp_render", parts.table):
             return None
         rays, given = camera.rays(), (sampler.occupied, ctx.bounds, sampler.steps(ctx), parts)
         limits = sampler.config.transmittance, UNSEEN
-        sums, alpha = kernels.hash_render(ctx.bounds.clip(rays), *given, *limits, camera.width)
+        sums, alpha = kernels.ngp_render(ctx.bounds.clip(rays), *given, *limits, camera.width)
         flat = picture(sums[:, :3], alpha, sums[:, 3], None, rays.far)
         return flat.reshape(camera.height, camera.width)
 

@@ -244,7 +244,8 @@ def _splats(gaussians: Gaussians, renderer: Splatting, camera: Camera, point: Fl
     drawn = int((weight > 0).sum())  # the renderer stops when next to no light is left
     order, alpha, weight = order[:drawn], alpha[:drawn], weight[:drawn]
     clear = torch.cumprod(torch.nn.functional.pad(1 - alpha, (1, 0), value=1.0), dim=0)[:-1]
-    t = footprints.planes[order, 0] + ((point - footprints.means2d[order]) * footprints.planes[order, 1:]).sum(dim=1)
+    planes = footprints.depth_planes[order]
+    t = planes[:, 0] + ((point - footprints.means2d[order]) * planes[:, 1:]).sum(dim=1)
     rays = camera.rays(point)
     # Along the ray a Gaussian's standard deviation is 1 / |diag(1/s) Rᵀ d|; a disc has none.
     axes = quaternion_to_matrix(gaussians.quaternions[order])

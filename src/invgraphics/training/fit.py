@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from invgraphics.core import Batch, Context, Model, RayRenderer, Rendering, Scene, Trace
 from invgraphics.errors import NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.waiting import limit_spinning
+from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.clock import SchedulerTimes
