@@ -78,7 +78,7 @@ def test_differences_are_those_of_the_pictures(run: Path) -> None:
 
 def test_a_rendering_is_the_fitted_field_through_that_renderer(run: Path, toy_folder: Path) -> None:
     scene = open_scene(str(toy_folder), SceneOptions(test_views=16))
-    field, _ = build_model(load_method(METHOD, None, SMALL[METHOD]), scene, 0, torch.device("cpu"))
+    field = build_model(load_method(METHOD, None, SMALL[METHOD]), scene, 0, torch.device("cpu")).field
     field.load_state_dict(checkpoint.load(run / checkpoint.NAME)["field"])
     with torch.no_grad():
         renderer = GaussianSorted(GaussianSortedConfig("splat"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from invgraphics import kernels
-from invgraphics.core import Field, RayRenderer, Renderer, Scene, check
+from invgraphics.core import Model, RayRenderer, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.progress import Reporter
 from invgraphics.recipes.recipe import Method
@@ -41,33 +41,30 @@ def open_with_progress(spec: str, options: SceneOptions) -> Scene:
         return open_scene(spec, options, lambda done, total, what: reporter.show(done / max(total, 1), what))
 
 
-def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -> tuple[Field, Renderer]:
-    """Field and renderer of a method for a scene, checked against each other; initial values depend on ``seed`` only."""
+def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -> Model:
+    """Build a method's field and renderer for a scene; initial values depend on ``seed`` only."""
     torch.manual_seed(seed)
-    field: Field = method.recipe.field.build(scene)
-    renderer: Renderer = method.recipe.renderer.build(scene)
-    check(field, renderer)
+    model = Model(method.recipe.field.build(scene), method.recipe.renderer.build(scene), scene.bounds)
     training = method.recipe.training
     if training is not None and training.poses is not None and training.poses.optimise:
-        for encoding in windows(field, renderer):
+        for encoding in windows(model):
             encoding.add_window()
-    return field.to(device), renderer.to(device)
+    return model.to(device)
 
 
 def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: torch.device) -> Plan:
     """Everything a fit is made of."""
     recipe = method.recipe
-    field, renderer = build_model(method, scene, seed, device)
+    model = build_model(method, scene, seed, device)
     poses = make_poses(recipe.training, scene)
     return Plan(
-        field=field,
-        renderer=renderer,
+        model=model,
         scene=scene,
         losses=[loss.build() for loss in recipe.losses],
         hooks=[hook.build() for hook in recipe.hooks],
         optimiser=recipe.optimiser
         if poses is None
-        else poses.config.optimiser(recipe.optimiser, _seen(recipe, renderer, scene)),
+        else poses.config.optimiser(recipe.optimiser, _seen(recipe, model.renderer, scene)),
         batches=recipe.batches if poses is None else poses.config.batches(recipe.batches),
         budget=budget,
         seed=seed,

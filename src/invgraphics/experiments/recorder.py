@@ -58,7 +58,7 @@ class Monitor:
         return -10 * math.log10(max(float(torch.stack(errors).mean()), 1e-10))
 
     def _predict(self, fit: Fit, camera: Camera, flat: Tensor, ctx: Context, background: Tensor) -> Tensor:
-        renderer, field = fit.plan.renderer, fit.plan.field
+        renderer, field = fit.plan.model.renderer, fit.plan.model.field
         if isinstance(renderer, RayRenderer):
             pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
             rays: Rays = camera.rays(pixels).to(self._device)
@@ -150,10 +150,10 @@ class Recorder:
         line["psnr"] = psnr
         if math.isfinite(self._loss):
             line["loss"] = self._loss
-        count = fit.plan.field.primitive_count()
+        count = fit.plan.model.field.primitive_count()
         if count is not None:
             line["primitives"] = count
-        dead = dead_gaussians(fit.plan.field, [view.camera for view in fit.plan.scene.train])
+        dead = dead_gaussians(fit.plan.model.field, [view.camera for view in fit.plan.scene.train])
         if dead is not None:
             line["dead"] = round(dead.share, 6)
         self._folder.append_history(line)

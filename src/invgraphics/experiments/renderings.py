@@ -44,7 +44,7 @@ def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method
     for method in methods if variants else ():
         for variant in variants:
             try:
-                _, renderer = build_model(through(method, variant), scene, 0, torch.device("cpu"))
+                renderer = build_model(through(method, variant), scene, 0, torch.device("cpu")).renderer
             except InputError as error:
                 raise InputError(
                     f"{method.name} cannot be rendered with {variant.name}: {error.sentence}", error.remedy

@@ -121,7 +121,7 @@ def _rehearse(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
 def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     """What the person is in for, said before the work starts."""
     views = len(fit.plan.scene.test)
-    seconds = expected_seconds(fit.plan.field, fit.plan.renderer, fit.plan.scene, fit.plan.device)
+    seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     scene = fit.plan.scene
     return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
@@ -138,9 +138,8 @@ def _declare_clocks(folder: RunFolder, spent: Mapping[str, Any]) -> None:
 def _evaluate(job: Job, scene: Scene, fit: Fit, spent: dict[str, Any]) -> None:
     """Score the fit on the undisturbed scene. ``scores.json`` comes last, because a run that has it is finished."""
     job.folder.write_json("fit.json", spent)
-    model = (fit.plan.field, fit.plan.renderer)
     for protocol in job.protocols:
-        evaluate(job.folder, scene, model, protocol, fit_costs(spent), job.method, fit.plan.poses)
+        evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
 
 
 def describe(job: Job, scenes: tuple[Scene, Scene], identity: str, origin: Mapping[str, Any] | None = None) -> None:

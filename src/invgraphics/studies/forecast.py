@@ -95,10 +95,10 @@ def try_method(job: Job, scene: Scene) -> Cost:
         began = time.perf_counter()
         fit.step()
         step = time.perf_counter() - began
-        evaluation = expected_seconds(fit.plan.field, fit.plan.renderer, scene, device)
+        evaluation = expected_seconds(fit.plan.model, scene)
         for variant in job.variants:
-            evaluation += expected_seconds(*build_model(through(job.method, variant), scene, seed, device), scene, device)
-        size = CHECKPOINT_COPIES * model_bytes((fit.plan.field, fit.plan.renderer))
+            evaluation += expected_seconds(build_model(through(job.method, variant), scene, seed, device), scene)
+        size = CHECKPOINT_COPIES * model_bytes(fit.plan.model.parts.values())
     except InputError:
         raise
     except (NumericalError, MemoryError, RuntimeError):  # its cell will fail with a sentence, and the others go on

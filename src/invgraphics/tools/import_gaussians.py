@@ -86,15 +86,15 @@ def import_run(request: ImportRequest) -> Path:
         folder.clear()
         identity = _identity(job.method, scene, origin)
         describe(job, (scene, scene), identity, origin | {"budget": IMPORTED, "command": request.shell()})
-        field, renderer = build_model(job.method, scene, job.request.seed, job.device)
-        assert isinstance(field, GaussianField)
-        fill(field, gaussians)
-        checkpoint.save(folder.checkpoint, {"field": field.state_dict(), "renderer": renderer.state_dict()})
+        model = build_model(job.method, scene, job.request.seed, job.device)
+        assert isinstance(model.field, GaussianField)
+        fill(model.field, gaussians)
+        checkpoint.save(folder.checkpoint, model.state_dict())
         folder.append_history({"step": 0, "seconds": 0.0, "progress": 1.0, "primitives": len(gaussians)})
         costs = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}
         folder.write_json("fit.json", {"steps": None, "seconds": None})
         for protocol in job.protocols:
-            evaluate(folder, scene, (field, renderer), protocol, costs, job.method)
+            evaluate(folder, scene, model, protocol, costs, job.method)
     return folder.root
 
 

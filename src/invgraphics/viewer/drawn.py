@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from invgraphics.core import Context, Gaussians, Quantity, Scene, View
+from invgraphics.core import Gaussians, Quantity, Scene, View
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.harmonics import BAND_0
 from invgraphics.core.transforms import quaternion_to_matrix
@@ -78,9 +78,9 @@ class Photographs:
 
 def draw_splats(subject: Subject, into: Any) -> Any:
     """Add a run's Gaussians to a browser's scene; returns their handle. Colours are those of band 0."""
-    ctx = Context(subject.scene.bounds.to(subject.fitted.device))
+    ctx = subject.fitted.model.context()
     with torch.no_grad():
-        gaussians: Gaussians = subject.fitted.field.primitives(Quantity.GAUSSIANS, ctx)
+        gaussians: Gaussians = subject.fitted.model.field.primitives(Quantity.GAUSSIANS, ctx)
         rgb = (0.5 + BAND_0 * gaussians.sh[:, 0]).clamp(0, 1)
         rgb = linear_to_srgb(rgb) if subject.scene.colour == "linear" else rgb
         unit = enlargement(gaussians)

@@ -12,7 +12,6 @@ import torch
 from invgraphics.core import Camera, Quantity, RayRenderer, Rendering, Scene, View
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
@@ -50,17 +49,16 @@ class Subject:
     @property
     def by_rays(self) -> bool:
         """Whether the pixels are independent, so that a picture can be rendered in parts."""
-        return isinstance(self.fitted.renderer, RayRenderer)
+        return isinstance(self.fitted.model.renderer, RayRenderer)
 
     @property
     def has_gaussians(self) -> bool:
         """Whether the browser can draw the model."""
-        return Quantity.GAUSSIANS in self.fitted.field.provides
+        return Quantity.GAUSSIANS in self.fitted.model.field.provides
 
     def render(self, camera: Camera, geometry: bool) -> Rendering:
         """One picture on the CPU, as an evaluation makes it; with normals if ``geometry``."""
-        fitted = self.fitted
-        return render_view(fitted.field, fitted.renderer, camera, fitted.scene, fitted.device, geometry)
+        return self.fitted.model.render(camera, normals=geometry)
 
     def placed(self, camera: Camera, scene: Scene) -> Camera:
         """A camera of ``scene``'s local frame in this run's own: both stand for the same one in the data set's world."""
@@ -91,17 +89,16 @@ class Subject:
         """
         fitted = self.fitted
         self._stamps = stamps_of(fitted.folder, fitted.source)  # first: a file that comes meanwhile is news again
-        state = checkpoint.load(fitted.source.checkpoint, fitted.device)
+        state = checkpoint.load(fitted.source.checkpoint, fitted.model.device)
         try:
-            fitted.field.load_state_dict(state.get("field", {}))
-            fitted.renderer.load_state_dict(state.get("renderer", {}) if fitted.source is fitted.folder else {})
+            fitted.model.load_state_dict(state if fitted.source is fitted.folder else {"field": state.get("field", {})})
         except RuntimeError as error:
             raise InputError(f"{fitted.source.root} has become another run.", "Start the viewer again.") from error
         self.steps, self.seconds = self._progress()
 
     def facts(self) -> dict[str, str]:
         """What there is to say about the run, name -> value in words."""
-        primitives = self.fitted.field.primitive_count()
+        primitives = self.fitted.model.field.primitive_count()
         facts = {"scene": self.scene.name, "fit": f"step {self.steps:,}, {self.seconds:.1f} s"}
         if primitives is not None:
             facts["primitives"] = f"{primitives:,}"
