@@ -80,7 +80,7 @@ def test_what_an_import_suspects_is_repeated_before_the_fit(
 ) -> None:
     suspect = {"suspicion": "3 of 9 contradict"}
     scene = open_scene(str(toy_folder), SceneOptions())
-    monkeypatch.setattr(module, "open_requested", lambda _: replace(scene, notes=scene.notes | suspect))
+    monkeypatch.setattr(module, "open_with_progress", lambda *_: replace(scene, notes=scene.notes | suspect))
     out = fit_run(_request(toy_folder, tmp_path / "run", budget="2steps"))
     assert "SUSPICIOUS poses: 3 of 9 contradict" in capsys.readouterr().err
     assert json.loads((out / "provenance.json").read_text())["notes"]["suspicion"] == "3 of 9 contradict"
