@@ -17,11 +17,14 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.compare import compare
 from invgraphics.experiments.evaluate import evaluate_run
-from invgraphics.experiments.renderings import check_eyes, eye_named, rendered
+from invgraphics.experiments.fitted import open_fitted
+from invgraphics.experiments.renderings import check_variants, rendered, variant_named
 from invgraphics.experiments.request import AblateRequest, CompareRequest, FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.recipes.recipe import load_method
+from invgraphics.recipes.schema import Recipe
 from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
+from invgraphics.renderers.volumetric import Volumetric
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -130,6 +133,29 @@ def test_a_changed_renderer_is_another_one_than_the_fits_own(run: Path, request_
     assert names == [(f"{METHOD}:dilation=0.1", "."), (METHOD, "rendered/splatting-gaussians")]
 
 
+def test_constants_stand_in_for_what_another_fit_would_have_learnt(toy_folder: Path, tmp_path: Path) -> None:
+    """A field fitted without an occupancy grid, marched through a full one."""
+    variant = "volumetric/hash:sampler.resolution=8:sampler.steps_per_diagonal=64"
+    shared = {"method": "volumetric/nerf", "scene": str(toy_folder), "budget": "4steps", "test_views": 1}
+    out = str(tmp_path / "run")
+    run = fit_run(FitRequest(**shared, overrides=tuple(SMALL["volumetric/nerf"]), out=out, render_with=(variant,)))
+    record = _record(run)
+    assert [entry["renderer"] for entry in record["renderings"]] == ["volumetric/nerf", variant]
+    fitted = open_fitted(run)
+    config = variant_recipe(variant).renderer.sampler
+    marched = replace(fitted.model, renderer=Volumetric(config.build(fitted.scene)))
+    with np.load(run / record["renderings"][1]["run"] / "test" / "0000.npz") as kept:
+        picture = marched.render(fitted.scene.test[0].camera)
+        np.testing.assert_allclose(kept["rgb"], picture.rgb.numpy(), atol=1e-3)
+    opened = open_fitted(run / record["renderings"][1]["run"])
+    opened.load(checkpoint.load(run / checkpoint.NAME))  # as the viewer does, of a fit that goes on
+
+
+def variant_recipe(name: str) -> Recipe:
+    method, *settings = name.split(":")
+    return load_method(method, None, [f"renderer.{item}" for item in settings]).recipe
+
+
 @pytest.mark.parametrize(
     ("methods", "names", "sentence"),
     [
@@ -142,7 +168,7 @@ def test_a_changed_renderer_is_another_one_than_the_fits_own(run: Path, request_
 )
 def test_what_makes_no_sense_is_refused(methods: tuple[str, ...], names: tuple[str, ...], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        check_eyes(names, [load_method(name) for name in methods], toy_scene(views=2, size=8))
+        check_variants(names, [load_method(name) for name in methods], toy_scene(views=2, size=8))
 
 
 def test_compare_refuses_before_the_first_fit(toy_folder: Path, tmp_path: Path) -> None:
@@ -156,9 +182,10 @@ def test_compare_refuses_before_the_first_fit(toy_folder: Path, tmp_path: Path) 
 
 
 def test_names_are_read() -> None:
-    assert eye_named(RAY).table == {"type": "gaussian_sorted", "opacity": "splat", "order": "ray", "smallest": 1 / 1020}
+    assert variant_named(RAY).table == {"type": "gaussian_sorted", "opacity": "splat", "order": "ray", "smallest": 1 / 1020}
     assert (
-        eye_named("gaussian-volume/exact:opacity=physical:steps=7").folder == "gaussian-volume-exact-opacity=physical-steps=7"
+        variant_named("gaussian-volume/exact:opacity=physical:steps=7").folder
+        == "gaussian-volume-exact-opacity=physical-steps=7"
     )
 
 

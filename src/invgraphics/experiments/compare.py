@@ -19,7 +19,7 @@ from invgraphics.experiments.executors.base import INTERRUPTED
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.recorder import Cadence
-from invgraphics.experiments.renderings import check_eyes
+from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named
@@ -82,7 +82,7 @@ def _validate(request: CompareRequest) -> Scene:
     data = training_data(request)
     RunFolder(Path(request.out)).create()
     scene = open_requested(request)
-    check_eyes(request.render_with, methods, scene)
+    check_variants(request.render_with, methods, scene)
     return corrupt(scene, data, request.seeds[0])
 
 

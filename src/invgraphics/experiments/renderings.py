@@ -34,8 +34,8 @@ FOLDER = "rendered"
 
 
 @dataclass(frozen=True)
-class Eye:
-    """A renderer to look at a fitted field with.
+class RendererVariant:
+    """A renderer, with settings, that shows a field fitted with another one.
 
     Attributes:
         name: as it was asked for, ``METHOD`` or ``METHOD:key=value:key=value`` with keys of the recipe's renderer.
@@ -60,37 +60,36 @@ class Eye:
 _SETTING = r":(?=[\w.]+=)"
 
 
-def eye_named(name: str) -> Eye:
-    """Read what ``--render-with`` names.
+def variant_named(name: str) -> RendererVariant:
+    """The renderer variant that ``--render-with`` names.
 
     Raises:
         InputError: unknown method or setting, or a renderer of several parts whose recipe does not say which.
     """
     method, *settings = re.split(_SETTING, name)
     recipe = load_method(method, None, tuple(f"renderer.{item}" for item in settings))
-    return Eye(name, recipe.table["renderer"])
+    return RendererVariant(name, recipe.table["renderer"])
 
 
-def check_eyes(names: Sequence[str], methods: Iterable[Method], scene: Scene) -> None:
+def check_variants(names: Sequence[str], methods: Iterable[Method], scene: Scene) -> None:
     """Refuse renderers that cannot show what the methods fit, before anything is fitted.
 
     Raises:
-        InputError: a renderer is named twice, has parameters of its own, which only a fit could set, or needs what a field
-            does not provide.
+        InputError: a renderer is named twice, has learnt state for which no constants stand in, or needs what a field does
+            not provide.
     """
-    eyes = [eye_named(name) for name in names]
-    if len({eye.folder for eye in eyes}) != len(eyes):
+    variants = [variant_named(name) for name in names]
+    if len({variant.folder for variant in variants}) != len(variants):
         raise InputError("A renderer is named twice in --render-with.")
-    for method in methods if eyes else ():
-        for eye in eyes:
+    for method in methods if variants else ():
+        for variant in variants:
             try:
-                renderer = build_model(through(method, eye), scene, 0, torch.device("cpu")).renderer
+                model = build_model(with_renderer(method, variant), scene, 0, torch.device("cpu"))
+                if variant.table != method.table["renderer"]:
+                    model.renderer.untrained()
             except InputError as error:
-                raise InputError(f"{method.name} cannot be rendered with {eye.name}: {error.sentence}", error.remedy) from error
-            if renderer.state_dict() and eye.table != method.table["renderer"]:
-                raise InputError(
-                    f"{eye.name} cannot render what {method.name} fits: its renderer learns, so it needs a fit of its own."
-                )
+                sentence = f"{method.name} cannot be rendered with {variant.name}: {error.sentence}"
+                raise InputError(sentence, error.remedy) from error
 
 
 def rendered(folder: RunFolder, request: FitRequest, method: Method) -> bool:
@@ -101,7 +100,7 @@ def rendered(folder: RunFolder, request: FitRequest, method: Method) -> bool:
         record = folder.read_json(RECORD)
     except InputError:
         return False
-    return record.get("identity") == _identity(folder, [eye_named(name) for name in request.render_with], method)
+    return record.get("identity") == _identity(folder, [variant_named(name) for name in request.render_with], method)
 
 
 def render_missing(folder: RunFolder, request: FitRequest, method: Method, scene: Scene) -> None:
@@ -116,20 +115,20 @@ def render_missing(folder: RunFolder, request: FitRequest, method: Method, scene
     if rendered(folder, request, method):
         return
     (folder.root / RECORD).unlink(missing_ok=True)
-    eyes = [eye_named(name) for name in request.render_with]
+    variants = [variant_named(name) for name in request.render_with]
     shown = {}
-    for eye in _with_own(eyes, method):
-        if eye.table == method.table["renderer"]:
-            shown[eye.name] = "."
+    for variant in _with_own(variants, method):
+        if variant.table == method.table["renderer"]:
+            shown[variant.name] = "."
         else:
-            shown[eye.name] = f"{FOLDER}/{eye.folder}"
-            _render(RunFolder(folder.root / FOLDER / eye.folder), folder, (method, eye), scene, request.protocol)
+            shown[variant.name] = f"{FOLDER}/{variant.folder}"
+            _render(RunFolder(folder.root / FOLDER / variant.folder), folder, (method, variant), scene, request.protocol)
     pictures = {name: _pictures(folder.root / place, scene) for name, place in shown.items()}
     folder.write_json(
         RECORD,
         {
             "schema": 1,
-            "identity": _identity(folder, eyes, method),
+            "identity": _identity(folder, variants, method),
             "fitted_by": method.name,
             "views": [view.name for view in scene.test],
             "renderings": [{"renderer": name, "run": place} for name, place in shown.items()],
@@ -141,11 +140,11 @@ def render_missing(folder: RunFolder, request: FitRequest, method: Method, scene
     )
 
 
-def _render(folder: RunFolder, fit: RunFolder, model: tuple[Method, Eye], scene: Scene, protocol: str) -> None:
+def _render(folder: RunFolder, fit: RunFolder, model: tuple[Method, RendererVariant], scene: Scene, protocol: str) -> None:
     """Make one rendering, unless it is there."""
-    method, eye = model
-    seen = through(method, eye)
-    identity = _sha256([fit.identity, eye.digest])
+    method, variant = model
+    seen = with_renderer(method, variant)
+    identity = _sha256([fit.identity, variant.digest])
     if folder.finished and folder.identity == identity:
         return
     folder.create()
@@ -163,30 +162,30 @@ def _render(folder: RunFolder, fit: RunFolder, model: tuple[Method, Eye], scene:
         "truth": (up / provenance["truth"]).as_posix(),
         "fitted_run": up.as_posix(),
         "fitted_by": method.name,
-        "rendered_by": eye.name,
+        "rendered_by": variant.name,
     }
     folder.write_json("provenance.json", provenance | changed)
     for rules in dict.fromkeys([protocol, "default"]):
         evaluate_saved(folder, scene, rules)
 
 
-def through(method: Method, eye: Eye) -> Method:
-    """A method with another renderer."""
-    name = f"{method.name} rendered with {eye.name}"
-    return resolve(name, method.preset, method.table | {"renderer": eye.table})
+def with_renderer(method: Method, variant: RendererVariant) -> Method:
+    """A method whose renderer is replaced by a variant."""
+    name = f"{method.name} rendered with {variant.name}"
+    return resolve(name, method.preset, method.table | {"renderer": variant.table})
 
 
-def _with_own(eyes: Sequence[Eye], method: Method) -> list[Eye]:
+def _with_own(variants: Sequence[RendererVariant], method: Method) -> list[RendererVariant]:
     """The renderer of the fit, under the name that was asked for if it was, and all others."""
     own = method.table["renderer"]
-    named = [eye for eye in eyes if eye.table == own]
-    others = [eye for eye in eyes if eye.table != own]
-    taken = any(eye.name == method.name for eye in others)
-    return [*(named or [Eye(f"{method.name} as fitted" if taken else method.name, own)]), *others]
+    named = [variant for variant in variants if variant.table == own]
+    others = [variant for variant in variants if variant.table != own]
+    taken = any(variant.name == method.name for variant in others)
+    return [*(named or [RendererVariant(f"{method.name} as fitted" if taken else method.name, own)]), *others]
 
 
-def _identity(folder: RunFolder, eyes: Sequence[Eye], method: Method) -> str:
-    return _sha256([folder.identity, *([eye.name, eye.digest] for eye in _with_own(eyes, method))])
+def _identity(folder: RunFolder, variants: Sequence[RendererVariant], method: Method) -> str:
+    return _sha256([folder.identity, *([variant.name, variant.digest] for variant in _with_own(variants, method))])
 
 
 def _sha256(parts: Any) -> str:

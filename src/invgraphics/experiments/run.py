@@ -34,7 +34,7 @@ from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Cadence, Monitor, Recorder
-from invgraphics.experiments.renderings import check_eyes, render_missing
+from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
@@ -67,7 +67,7 @@ def fit_run(request: FitRequest) -> Path:
     repeatable(device)
     with folder.held():
         scene = open_requested(request)
-        check_eyes(request.render_with, [method], scene)
+        check_variants(request.render_with, [method], scene)
         shown = corrupt(scene, data, request.seed)
         identity = identify(request, method, TruthDigest.of(scene), torch.get_num_threads())
         same = folder.identity == identity

@@ -21,7 +21,7 @@ from invgraphics.experiments.executors.base import INTERRUPTED, Executor, Outcom
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.progress import Reporter
-from invgraphics.experiments.renderings import check_eyes, rendered
+from invgraphics.experiments.renderings import check_variants, rendered
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs.folder import RunFolder
@@ -166,7 +166,7 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple
         for data in dict.fromkeys(training_data(planned.fit) for planned in group):
             data.check(scene)
         methods = {planned.method.digest: planned.method for planned in group}.values()
-        check_eyes(group[0].fit.render_with, methods, scene)
+        check_variants(group[0].fit.render_with, methods, scene)
         truths[place] = TruthDigest.of(scene)
         samples.setdefault(size, scene)
     return samples, truths

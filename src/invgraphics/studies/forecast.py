@@ -10,7 +10,7 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.build import build_model, build_plan, device_of, training_data, use_kernels
 from invgraphics.experiments.evaluate import expected_seconds
-from invgraphics.experiments.renderings import eye_named, through
+from invgraphics.experiments.renderings import variant_named, with_renderer
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import CHECKPOINT_COPIES
 from invgraphics.metrics.cost import model_bytes
@@ -98,7 +98,7 @@ def try_method(request: FitRequest, method: Method, scene: Scene) -> Cost:
         step = time.perf_counter() - began
         evaluation = expected_seconds(fit.plan.model, scene)
         for name in request.render_with:
-            seen = through(method, eye_named(name))
+            seen = with_renderer(method, variant_named(name))
             evaluation += expected_seconds(build_model(seen, scene, request.seed, device), scene)
         size = CHECKPOINT_COPIES * model_bytes(fit.plan.model.parts.values())
     except InputError:
