@@ -17,6 +17,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.compare import compare
 from invgraphics.experiments.evaluate import evaluate_run
+from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.renderings import check_variants, rendered
 from invgraphics.experiments.request import AblateRequest, CompareRequest, FitRequest
