@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -92,7 +92,18 @@ def load_method(name: str, preset: str | None = None, overrides: Sequence[str] =
     Raises:
         InputError: unknown method, preset or key, or a value of the wrong type.
     """
-    table = source(name)
+    return method_from(source(name), name, preset, overrides, budget)
+
+
+def method_from(
+    table: Mapping[str, Any], name: str, preset: str | None = None, overrides: Sequence[str] = (), budget: Budget | None = None
+) -> Method:
+    """A method from a recipe's table as a file holds it, presets included; otherwise as `load_method`.
+
+    Raises:
+        InputError: unknown preset or key, or a value of the wrong type.
+    """
+    table = dict(table)
     _, named, own = split_name(name)
     chosen = select_preset(name, preset if named is None else named, budget, table.pop("presets", {}))
     table = merge(table, chosen.table)
