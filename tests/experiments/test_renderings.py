@@ -17,13 +17,16 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.compare import compare
 from invgraphics.experiments.evaluate import evaluate_run
+from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.renderings import check_variants, rendered
 from invgraphics.experiments.request import AblateRequest, CompareRequest, FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.experiments.variants import variant_named
 from invgraphics.recipes.recipe import load_method
+from invgraphics.recipes.schema import Recipe
 from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
+from invgraphics.renderers.volumetric import Volumetric
 from invgraphics.runs import checkpoint
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.studies.cells import make_plan
@@ -128,6 +131,29 @@ def test_a_changed_renderer_is_another_one_than_the_fits_own(run: Path, request_
     other = replace(request_one, overrides=items, out=str(tmp_path / "b"), render_with=(METHOD, f"{METHOD}:dilation=0.1"))
     names = [(entry["renderer"], entry["run"]) for entry in _record(fit_run(other))["renderings"]]
     assert names == [(f"{METHOD}:dilation=0.1", "."), (METHOD, "rendered/splatting-gaussians")]
+
+
+def test_constants_stand_in_for_what_another_fit_would_have_learnt(toy_folder: Path, tmp_path: Path) -> None:
+    """A field fitted without an occupancy grid, marched through a full one."""
+    variant = "volumetric/hash:sampler.resolution=8:sampler.steps_per_diagonal=64"
+    shared = {"method": "volumetric/nerf", "scene": str(toy_folder), "budget": "4steps", "test_views": 1}
+    out = str(tmp_path / "run")
+    run = fit_run(FitRequest(**shared, overrides=tuple(SMALL["volumetric/nerf"]), out=out, render_with=(variant,)))
+    record = _record(run)
+    assert [entry["renderer"] for entry in record["renderings"]] == ["volumetric/nerf", variant]
+    fitted = open_fitted(run)
+    config = variant_recipe(variant).renderer.sampler
+    marched = replace(fitted.model, renderer=Volumetric(config.build(fitted.scene)))
+    with np.load(run / record["renderings"][1]["run"] / "test" / "0000.npz") as kept:
+        picture = marched.render(fitted.scene.test[0].camera)
+        np.testing.assert_allclose(kept["rgb"], picture.rgb.numpy(), atol=1e-3)
+    opened = open_fitted(run / record["renderings"][1]["run"])
+    opened.load(checkpoint.load(run / checkpoint.NAME))  # as the viewer does, of a fit that goes on
+
+
+def variant_recipe(name: str) -> Recipe:
+    method, *settings = name.split(":")
+    return load_method(method, None, [f"renderer.{item}" for item in settings]).recipe
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,9 @@ from torch import Tensor, nn
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
-from invgraphics.core.field import Field, Renderer, check
+from invgraphics.core.contributions import Contributions
+from invgraphics.core.field import Field
+from invgraphics.core.renderer import Renderer, check
 from invgraphics.core.rendering import Context, Rendering
 
 
@@ -68,6 +70,20 @@ class Model:
         """
         rendering, _ = self.renderer.render_image(self.field, camera.to(self.device), self.context(normals=normals))
         return rendering.detach().to(camera.focal.device)
+
+    @torch.no_grad()
+    def contributions(self, camera: Camera, pixel: tuple[int, int]) -> Contributions:
+        """Everything that `render` composites into one pixel.
+
+        Args:
+            camera: on any device; the contributions are returned on the same one.
+            pixel: column and row, from 0.
+
+        Raises:
+            NotComposableError: the renderer composites nothing along rays that could be listed.
+        """
+        found = self.renderer.contributions(self.field, camera.to(self.device), pixel, self.context())
+        return found.to(camera.focal.device)
 
     def context(self, *, normals: bool = False) -> Context:
         """The circumstances of an evaluation; ``normals`` as for `render`."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.compositing import over
+from invgraphics.core.display import encode_png
 from invgraphics.core.samples import FieldValues, Samples
 
 
@@ -48,6 +49,10 @@ class Rendering:
         """The same picture on another device."""
         normal = None if self.normal is None else self.normal.to(device)
         return Rendering(self.rgb.to(device), self.alpha.to(device), self.depth.to(device), normal)
+
+    def _repr_png_(self) -> bytes | None:
+        """The picture in a notebook, over white, taken as display sRGB; ``None`` for pixels that are no picture."""
+        return encode_png(self.over(torch.ones(3, device=self.rgb.device))) if self.rgb.ndim == 3 else None
 
     @staticmethod
     def cat(parts: Sequence[Rendering]) -> Rendering:

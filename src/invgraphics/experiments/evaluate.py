@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Callable
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -53,11 +54,54 @@ def evaluate(
 
     Where the fit has refined its training poses, test poses are aligned and refined first (see `experiments.posed`).
     """
-    rules = protocol_named(protocol)
     (folder.root / "test").mkdir(exist_ok=True)
+    found = score_model(
+        model,
+        scene,
+        protocol,
+        method.name,
+        poses,
+        keep=lambda index, picture: _save_view(folder.root / "test" / f"{index:04d}", picture, scene),
+    )
+    result = {
+        "schema": 1,
+        "method": method.name,
+        "preset": method.preset,
+        "preset_choice": method.preset_choice,
+        "seed": folder.read_json("provenance.json")["seed"],
+        **found,
+        "cost": costs | found["cost"],
+    }
+    if disturbed := disturbance(costs.get("fit_processor_share")):
+        result["disturbed"] = disturbed
+    if poses is not None:
+        result["test_poses"] = protocol_note(method)
+    folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)
+    return result
+
+
+def score_model(
+    model: Model,
+    scene: Scene,
+    protocol: str,
+    title: str,
+    poses: Poses | None = None,
+    keep: Callable[[int, Rendering], None] = lambda index, picture: None,
+) -> dict[str, Any]:
+    """Render and score all test views of ``scene``; the part of the scores that needs no run folder.
+
+    Args:
+        model: what is scored.
+        scene: undisturbed.
+        protocol: name of the rules.
+        title: what the model is called, on the progress bar and in sentences.
+        poses: of the training views, where the fit has refined them: test poses are then aligned and refined first.
+        keep: is given each picture with the number of its view.
+    """
+    rules = protocol_named(protocol)
     scores, seconds, observed = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
-    with Reporter(f"{method.name} evaluation") as reporter:
+    with Reporter(f"{title} evaluation") as reporter:
         model.render(scene.test[0].camera.resized(16, 16))  # first use pays for allocation
         for index, view in enumerate(scene.test):
             camera = view.camera if posed is None else posed.camera(view)
@@ -65,31 +109,20 @@ def evaluate(
             picture, took = _picture(model, camera, normals=view.normal is not None, timed=timed)
             seconds += took
             picture = picture if posed is None else posed.as_seen(picture, camera, view)
-            _save_view(folder.root / "test" / f"{index:04d}", picture, scene)
+            keep(index, picture)
             scores.append(score(picture, view, scene, rules))
             observed.append(observe(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
-    result = {
-        "schema": 1,
-        "method": method.name,
-        "preset": method.preset,
-        "preset_choice": method.preset_choice,
+    return {
         "scene": scene.name,
-        "seed": folder.read_json("provenance.json")["seed"],
         "protocol": protocol,
         "views": [view.name for view in scene.test],
-        "cost": costs | _model_costs(model, scene, statistics.median(seconds)),
+        "cost": _model_costs(model, scene, statistics.median(seconds)),
         "quality": quality if posed is None else quality | posed.quality(),
         "skipped": skipped,
+        **shortfall(title, quality, observed, scene, rules),
     }
-    if disturbed := disturbance(costs.get("fit_processor_share")):
-        result["disturbed"] = disturbed
-    result |= shortfall(method.name, quality, observed, scene, rules)
-    if posed is not None:
-        result["test_poses"] = protocol_note(method)
-    folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)
-    return result
 
 
 def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, Any]:

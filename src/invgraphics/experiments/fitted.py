@@ -43,6 +43,17 @@ class Fitted:
     source: RunFolder
     poses: Poses | None = None
 
+    def load(self, state: Mapping[str, Mapping[str, Any]]) -> None:
+        """Take over a checkpoint's tensors; of a rendering, whose renderer was not fitted, only the field's.
+
+        Raises:
+            RuntimeError: they do not fit the model.
+        """
+        if self.source is self.folder:
+            self.model.load_state_dict(state)
+        else:
+            self.model.field.load_state_dict(state.get("field", {}))
+
     def in_its_frame(self) -> Fitted:
         """The same with the scene where the fit has it: a fit that refines poses may drift from those that it was given."""
         return self if self.poses is None else replace(self, scene=scene_of_fit(self.poses, self.scene))
@@ -75,15 +86,18 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
     model = build_model(method, scene, provenance["seed"], device)
     shown = provenance.get("fitted_run")
+    if shown is not None:
+        model = replace(model, renderer=model.renderer.untrained())
     source = folder if shown is None else RunFolder(folder.root / shown)
     state = checkpoint.load(source.checkpoint, device)
     config = optimised(method)
+    fitted = Fitted(folder, method, scene, model, source)
     try:
         poses = Poses.restored(config, state["poses"]).to(device) if config is not None and "poses" in state else None
-        model.load_state_dict(state if shown is None else {"field": state.get("field", {})})
+        fitted.load(state)
     except RuntimeError as error:
         raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
-    return Fitted(folder, method, scene, model, source, poses)
+    return replace(fitted, poses=poses)
 
 
 def _method(folder: RunFolder, provenance: Mapping[str, Any]) -> Method:

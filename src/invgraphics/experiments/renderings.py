@@ -23,7 +23,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.evaluate import evaluate_saved
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.variants import RendererVariant, through
+from invgraphics.experiments.variants import RendererVariant, with_renderer
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder
 
@@ -36,23 +36,20 @@ def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method
     """Refuse renderers that cannot show what the methods fit, before anything is fitted.
 
     Raises:
-        InputError: a renderer is named twice, has parameters of its own, which only a fit could set, or needs what a field
-            does not provide.
+        InputError: a renderer is named twice, has learnt state for which no constants stand in, or needs what a field does
+            not provide.
     """
     if len({variant.folder for variant in variants}) != len(variants):
         raise InputError("A renderer is named twice in --render-with.")
     for method in methods if variants else ():
         for variant in variants:
             try:
-                renderer = build_model(through(method, variant), scene, 0, torch.device("cpu")).renderer
+                model = build_model(with_renderer(method, variant), scene, 0, torch.device("cpu"))
+                if variant.table != method.table["renderer"]:
+                    model.renderer.untrained()
             except InputError as error:
-                raise InputError(
-                    f"{method.name} cannot be rendered with {variant.name}: {error.sentence}", error.remedy
-                ) from error
-            if renderer.state_dict() and variant.table != method.table["renderer"]:
-                raise InputError(
-                    f"{variant.name} cannot render what {method.name} fits: its renderer learns, so it needs a fit of its own."
-                )
+                sentence = f"{method.name} cannot be rendered with {variant.name}: {error.sentence}"
+                raise InputError(sentence, error.remedy) from error
 
 
 def rendered(job: Job) -> bool:
@@ -106,7 +103,7 @@ def _render(
 ) -> None:
     """Make one rendering, unless it is there."""
     method, variant = model
-    seen = through(method, variant)
+    seen = with_renderer(method, variant)
     identity = _sha256([fit.identity, variant.digest])
     if folder.finished and folder.identity == identity:
         return

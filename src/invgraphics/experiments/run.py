@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,16 +48,31 @@ def fit_run(request: FitRequest) -> Path:
     """Make the run that ``request`` describes; returns its folder.
 
     Raises:
+        InputError, KeyboardInterrupt, NumericalError: as `make_run`.
+    """
+    job = Job.of(request)
+    make_run(job)
+    return job.folder.root
+
+
+def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None] | None = None) -> None:
+    """Make a run in its folder; one that is there already is kept, continued or replaced, as the request says.
+
+    Args:
+        job: of the run.
+        scene: that the job names, where it is open already.
+        on_step: is given the fit before its first step and after each one.
+
+    Raises:
         InputError: anything about the request or the folder that cannot be used; nothing has been computed then.
         KeyboardInterrupt: the run was interrupted and holds a checkpoint.
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
-    job = Job.of(request)
-    folder, method = job.folder, job.method
+    folder, method, request = job.folder, job.method, job.request
     _check_existing(folder, request)
     repeatable(job.device)
     with folder.held():
-        scene = open_with_progress(request.scene, job.options)
+        scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
         shown = corrupt(scene, job.data, request.seed)
         identity = identify(job, TruthDigest.of(scene), torch.get_num_threads())
@@ -68,11 +83,11 @@ def fit_run(request: FitRequest) -> Path:
             )
         if same and folder.finished:
             render_missing(job, scene)
-            return folder.root
+            return
         use_kernels(request.kernels)
         began_at = load_average()
         with PeakMemory(job.device) as memory:
-            fit = Fit(started(build_plan(method, shown, job.budget, request.seed, job.device), method, request.scene))
+            fit = prepare(job, shown)
             if same and folder.resumable:
                 clocks = folder.read_json("fit.json")
                 fit.load(checkpoint.load(folder.checkpoint, job.device), float(clocks["seconds"]))
@@ -86,13 +101,22 @@ def fit_run(request: FitRequest) -> Path:
                 warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
             for sentence in (*announcements([method.choice]), _prediction(job, fit, forecast)):
                 print(sentence, file=sys.stderr)
-            Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots).run()
+            Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots, on_step).run()
         spent = {"steps": fit.steps, **fit.clocks(), "peak_memory_bytes": memory.peak_bytes, "cores": cores()}
         spent |= {"load_average": {"start": began_at, "end": load_average()}}
         _declare_clocks(folder, spent)
         _evaluate(job, scene, fit, spent)
         render_missing(job, scene)
-    return folder.root
+
+
+def prepare(job: Job, shown: Scene) -> Fit:
+    """The fit of a job before its first step, on the scene as the fit sees it.
+
+    Raises:
+        InputError: method and scene do not go together, or what the method starts from cannot be used.
+    """
+    plan = build_plan(job.method, shown, job.budget, job.request.seed, job.device)
+    return Fit(started(plan, job.method, job.request.scene))
 
 
 def _check_existing(folder: RunFolder, request: FitRequest) -> None:

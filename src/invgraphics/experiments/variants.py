@@ -49,7 +49,7 @@ def variant_named(name: str) -> RendererVariant:
     return RendererVariant(name, recipe.table["renderer"])
 
 
-def through(method: Method, variant: RendererVariant) -> Method:
+def with_renderer(method: Method, variant: RendererVariant) -> Method:
     """A method with another renderer."""
     name = f"{method.name} rendered with {variant.name}"
     return resolve(name, method.preset, method.table | {"renderer": variant.table})

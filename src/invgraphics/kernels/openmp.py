@@ -8,7 +8,7 @@ import threading
 from functools import cache
 from pathlib import Path
 
-import invgraphics
+from invgraphics.thread_pools import SPIN_SETTING_IS_LATE
 
 MAPS = Path("/proc/self/maps")
 """Linux: what this process has loaded."""
@@ -29,7 +29,7 @@ def limit_spinning() -> int:
     Returns:
         How many runtimes were told; 0 where the variable was in force from the start.
     """
-    if not invgraphics.SPIN_SETTING_IS_LATE or not sys.platform.startswith("linux"):
+    if not SPIN_SETTING_IS_LATE or not sys.platform.startswith("linux"):
         return 0
     return sum(_hold_team(path) for path in _loaded())
 

@@ -12,7 +12,7 @@ from invgraphics.experiments.build import build_model, build_plan, use_kernels
 from invgraphics.experiments.evaluate import expected_seconds
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.start import CHECKPOINT_COPIES
-from invgraphics.experiments.variants import through
+from invgraphics.experiments.variants import with_renderer
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.scenes.corrupt import corrupt
 from invgraphics.training.budget import Budget
@@ -97,7 +97,7 @@ def try_method(job: Job, scene: Scene) -> Cost:
         step = time.perf_counter() - began
         evaluation = expected_seconds(fit.plan.model, scene)
         for variant in job.variants:
-            evaluation += expected_seconds(build_model(through(job.method, variant), scene, seed, device), scene)
+            evaluation += expected_seconds(build_model(with_renderer(job.method, variant), scene, seed, device), scene)
         size = CHECKPOINT_COPIES * model_bytes(fit.plan.model.parts.values())
     except InputError:
         raise

@@ -11,12 +11,11 @@ from typing import Any, Literal
 from PIL import Image
 from torch import Tensor
 
-from invgraphics.core import Camera, Rendering, Scene, View
+from invgraphics.core import Camera, Contributions, Profile, Rendering, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs.folder import write_json
-from invgraphics.tools.along import Contributions, Profile, along_ray
 from invgraphics.training.limits import dead_gaussians
 
 Split = Literal["test", "train"]
@@ -81,10 +80,8 @@ def explain(request: ExplainRequest) -> Explanation:
     """
     fitted = open_fitted(request.run, request.scene).in_its_frame()
     view = _view(fitted.scene, request)
-    model = fitted.model
-    camera = view.camera.to(model.device)
-    found = on_cpu(along_ray(model.field, model.renderer, camera, request.pixel, model.context()))
-    picture = model.render(view.camera, normals=False)
+    found = fitted.model.contributions(view.camera, request.pixel)
+    picture = fitted.model.render(view.camera, normals=False)
 
     column, row = request.pixel
     background = fitted.scene.background
@@ -95,21 +92,6 @@ def explain(request: ExplainRequest) -> Explanation:
     explanation = Explanation(request.folder, found, rendered, composited, facts)
     _write(explanation, view, picture, fitted.scene)
     return explanation
-
-
-def on_cpu(found: Contributions) -> Contributions:
-    """The same contributions, all tensors on the CPU."""
-
-    def moved(value: Any) -> Any:
-        if isinstance(value, Tensor):
-            return value.cpu()
-        if isinstance(value, tuple):
-            return tuple(moved(item) for item in value)
-        if hasattr(value, "__dataclass_fields__"):
-            return type(value)(**{name: moved(item) for name, item in vars(value).items()})
-        return value
-
-    return moved(found)
 
 
 def _view(scene: Scene, request: ExplainRequest) -> View:

@@ -110,7 +110,7 @@ def _timelapse(fitted: Fitted, request: FilmRequest) -> tuple[int, Iterator[np.n
         picture = np.zeros((1, 1, 3), np.uint8)
         for path in snapshots:
             state = checkpoint.load(path, fitted.model.device)
-            fitted.model.load_state_dict(state)
+            fitted.load(state)
             picture = _picture(fitted, camera)
             if Quantity.GAUSSIANS in fitted.model.field.provides:
                 picture = np.concatenate([picture, _ellipsoids(fitted, camera)], axis=1)

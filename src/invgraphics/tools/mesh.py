@@ -14,7 +14,6 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.starting import depth_points
 from invgraphics.formats.mesh_ply import write_mesh
 from invgraphics.metrics.surfaces import points_on, surface_distance
-from invgraphics.renderers.splatting import Splatting
 from invgraphics.tools.export import Exported, ExportRequest
 from invgraphics.tools.surface_extraction import BAND, Surface, default_level, field_surface, fused_surface
 
@@ -70,10 +69,7 @@ def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
     if request.level is not None:
         remedy = "Leave --level out: its depth pictures are fused."
         raise InputError(f"The model of '{request.run}' ({fitted.method.name}) has no density with a level.", remedy)
-    model, depth = fitted.model, "mean"
-    if isinstance(model.renderer, Splatting):
-        sharp = Splatting(replace(model.renderer.config, depth="median", normals="depth"))
-        model, depth = replace(model, renderer=sharp), "median"
+    model = replace(fitted.model, renderer=fitted.model.renderer.for_depth_fusion())
     scene = fitted.scene
     count = min(MOST_PICTURES, len(scene.train))
     views = [scene.train[round(index * (len(scene.train) - 1) / max(1, count - 1))] for index in range(count)]
@@ -85,7 +81,8 @@ def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
             return model.render(cameras[index])
 
         surface = fused_surface(cameras, render, scene.bounds, request.resolution)
-    how = f"{depth} depth of {count} training views, {request.resolution} voxels along the longest edge, band of {BAND:g}"
+    kind = model.renderer.depth_kind
+    how = f"{kind} depth of {count} training views, {request.resolution} voxels along the longest edge, band of {BAND:g}"
     return surface, how
 
 

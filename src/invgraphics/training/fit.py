@@ -86,6 +86,11 @@ class Fit:
         return Optimiser(self.plan.optimiser, parameters, self.plan.scene.extent)
 
     @property
+    def model(self) -> Model:
+        """What is being fitted, as it is now."""
+        return self.plan.model
+
+    @property
     def progress(self) -> float:
         """Share of the budget that is spent."""
         return self.plan.budget.progress(self.seconds, self.steps)

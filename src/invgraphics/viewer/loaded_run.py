@@ -91,7 +91,7 @@ class LoadedRun:
         self._stamps = file_stamps(fitted.folder, fitted.source)  # first: a file written meanwhile is newer
         state = checkpoint.load(fitted.source.checkpoint, fitted.model.device)
         try:
-            fitted.model.load_state_dict(state if fitted.source is fitted.folder else {"field": state.get("field", {})})
+            fitted.load(state)
         except RuntimeError as error:
             raise InputError(f"{fitted.source.root} has become another run.", "Start the viewer again.") from error
         self.steps, self.seconds = self._progress()
