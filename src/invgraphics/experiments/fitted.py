@@ -15,7 +15,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
 from invgraphics.experiments.posed import optimised, scene_of_fit
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.waiting import limit_spinning
+from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder

@@ -15,7 +15,7 @@ from typing_extensions import override
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.kernels.reference.march import step_lengths
-from invgraphics.kernels.types import March, MarchSteps, hash_field
+from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.samplers import uniform
 from invgraphics.renderers.termination import visible_samples
 from invgraphics.renderers.visibility import visible_cells
@@ -169,12 +169,12 @@ class Occupancy(Sampler):
     @torch.no_grad()
     def _march_fused(self, rays: Rays, field: Field, ctx: Context) -> March | None:
         """A march with early termination, where a fused kernel supports the field and these steps; else ``None``."""
-        parts, steps = hash_field(field, ctx.bounds), self.steps(ctx)
+        parts, steps = field.fused(ctx.bounds), self.steps(ctx)
         even = ctx.bounds.space == "box" or steps.contracted
-        if parts is None or not even or steps.cone > 0 or not kernels.compiled("hash_march", parts.table):
+        if parts is None or not even or steps.cone > 0 or not kernels.compiled("ngp_march", parts.table):
             return None
         start = self._start(rays, steps, ctx)
-        return kernels.hash_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
+        return kernels.ngp_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
 
     def steps(self, ctx: Context) -> MarchSteps:
         """How long steps are now."""

@@ -97,7 +97,7 @@ class Splatting(Renderer):
             footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.receivers
         )
         rendering = self._rendering(sums, alpha, camera, footprints)
-        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.pull, gaussians.opacities, gaussians.scales)
+        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.absgrad, gaussians.opacities, gaussians.scales)
         return rendering, Trace(screen=screen, rays=alpha.numel())
 
     def project(self, gaussians: Gaussians, camera: Camera) -> tuple[Footprints, Float[Tensor, "n 3"]]:
@@ -110,7 +110,7 @@ class Splatting(Renderer):
         if footprints.means2d.requires_grad:
             footprints.means2d.retain_grad()
             if config.absolute_gradients:
-                footprints = replace(footprints, pull=torch.zeros_like(footprints.means2d, requires_grad=True))
+                footprints = replace(footprints, absgrad=torch.zeros_like(footprints.means2d, requires_grad=True))
         return footprints, rgb
 
     @override
@@ -132,7 +132,7 @@ class Splatting(Renderer):
         weight = blending_weights(alpha[None])[0]
         drawn = int((weight > 0).sum())  # compositing stops when next to no light is left
         order, alpha, weight = order[:drawn], alpha[:drawn], weight[:drawn]
-        planes = footprints.planes[order]
+        planes = footprints.depth_planes[order]
         t = planes[:, 0] + ((point - footprints.means2d[order]) * planes[:, 1:]).sum(dim=1)
         rays = camera.ray(pixel)
         sigma = torch.zeros_like(t) if self.config.shape == "disc" else _deviations(gaussians, order, rays)
@@ -176,8 +176,8 @@ def _deviations(gaussians: Gaussians, order: Int[Tensor, " k"], rays: Rays) -> F
 
 
 def _distance_coefficients(footprints: Footprints) -> Float[Tensor, "n 3"]:
-    """`Footprints.planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
-    at_mean, slopes = footprints.planes[:, :1], footprints.planes[:, 1:]
+    """`Footprints.depth_planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
+    at_mean, slopes = footprints.depth_planes[:, :1], footprints.depth_planes[:, 1:]
     return torch.cat([slopes, at_mean - (slopes * footprints.means2d).sum(dim=1, keepdim=True)], dim=1)
 
 

@@ -118,7 +118,7 @@ def summarise_study(study: Study, name: str, request: AblateRequest, resources: 
         **{key: getattr(study, key) for key in keys},
         "approximations": [asdict(pair) for pair in study.approximations],
         "known": [asdict(deviation) for deviation in study.known],
-        "protocol": asdict(protocol_named(study.protocol)),
+        "protocol": protocol_named(study.protocol).record(),
         "command": request.shell(),
         "environment": machine,
     }
