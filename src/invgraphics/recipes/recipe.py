@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -111,6 +111,19 @@ def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
 
     recipe = fill(Recipe, table).capped()
     return Method(name, preset, recipe, to_table(recipe))
+
+
+RENAMED = {"compensate": "antialiased", "receivers": "max_grad_splats", "wave": "chunk"}
+"""Keys of ``[renderer]`` in recipes of older runs, and their names now."""
+
+
+def migrate(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's table with the keys of its renderer as they are named now."""
+
+    def renamed(part: Any) -> Any:
+        return {RENAMED.get(key, key): renamed(value) for key, value in part.items()} if isinstance(part, Mapping) else part
+
+    return {key: renamed(value) if key == "renderer" else value for key, value in table.items()}
 
 
 def source(name: str) -> dict[str, Any]:
