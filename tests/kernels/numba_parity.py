@@ -12,10 +12,11 @@ from torch import Tensor
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
 from invgraphics.kernels.numba.runtime import compile_here
-from invgraphics.kernels.types import FusedNGP, HashGrid, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 WIDER = {"xmm": ("ymm", "zmm"), "ymm": ("zmm",), "zmm": ()}
 

@@ -5,11 +5,12 @@ from dataclasses import replace
 import torch
 
 from invgraphics.core.bounds import Bounds, contract
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
 from invgraphics.kernels.numba.rays.march import most_steps
 from invgraphics.kernels.reference.march import step_lengths
-from invgraphics.kernels.types import FusedNGP, HashGrid, March, MarchSteps
+from invgraphics.kernels.types import March, MarchSteps
 
 F64 = torch.float64
 STEPS = MarchSteps(0.03, limit=10_000, contracted=True)

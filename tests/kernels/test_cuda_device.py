@@ -7,8 +7,8 @@ import torch
 
 from invgraphics import kernels
 from invgraphics.bench.subject import activated, camera, gaussian_field
+from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
-from invgraphics.kernels.types import HashGrid
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 

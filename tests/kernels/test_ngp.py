@@ -9,9 +9,10 @@ import torch
 from torch.nn.functional import normalize
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
-from invgraphics.kernels.types import FusedNGP, HashGrid, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 GRID = HashGrid(levels=6, log2_size=12, base=8, finest=128)
 

@@ -80,7 +80,7 @@ def test_everything_else_is_composed(setting, calls, what: str) -> None:
     assert bool(picture.rgb.isfinite().all())
 
 
-def test_other_networks_are_no_hash_field(setting) -> None:
+def test_other_networks_are_not_fused(setting) -> None:
     scene, *_ = setting
     for change in (
         {"geometry": "sdf"},
@@ -88,7 +88,7 @@ def test_other_networks_are_no_hash_field(setting) -> None:
         {"layers": 2, "skip": 0},
         {"encoding": replace(GRID, features=4)},
     ):
-        assert replace(FIELD, **change).build(scene).hash_field(scene.bounds) is None
+        assert replace(FIELD, **change).build(scene).fused(scene.bounds) is None
 
 
 def test_training_marches_in_one_pass_and_sees_the_same(setting, monkeypatch) -> None:
@@ -125,7 +125,7 @@ def test_a_field_over_other_bounds_is_composed(setting, calls) -> None:
     """Its own bounds say where it is, whatever is looked at."""
     scene, renderer, camera = setting
     field = fitted(FIELD, scene)
-    assert field.hash_field(scene.bounds) is not None
+    assert field.fused(scene.bounds) is not None
     half = replace(scene.bounds, lo=scene.bounds.lo / 2, hi=scene.bounds.hi / 2)
     with torch.no_grad():
         renderer.render_image(field, camera, Context(half))

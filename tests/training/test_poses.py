@@ -10,12 +10,12 @@ from torch import Tensor
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, Field, FieldValues, Model, Quantity, Samples, Scene, View
 from invgraphics.core.colour import quantise
+from invgraphics.core.ngp import HashGrid
 from invgraphics.core.transforms import se3_exp
 from invgraphics.experiments.build import build_model, build_plan
 from invgraphics.fields.encodings.frequency import FrequencyConfig
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.kernels import reference
-from invgraphics.kernels.types import HashGrid
 from invgraphics.metrics.poses import pose_errors
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig

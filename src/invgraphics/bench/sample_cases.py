@@ -17,7 +17,8 @@ from invgraphics.bench.results import BOTH, FORWARD
 from invgraphics.bench.splat_cases import both_ways, without_gradient
 from invgraphics.bench.subject import bounds, camera, occupied
 from invgraphics.core import Rays
-from invgraphics.kernels.types import FusedNGP, HashGrid, MarchSteps
+from invgraphics.core.ngp import FusedNGP, HashGrid
+from invgraphics.kernels.types import MarchSteps
 
 GATE = {"levels": 16, "log2_size": 15, "points": 1 << 16}
 """The size that the project's promise about hash grids is made for."""

@@ -13,6 +13,7 @@ from torch import Tensor
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.dispatch import choose
 from invgraphics.kernels.dispatch import compiled as compiled
@@ -20,7 +21,7 @@ from invgraphics.kernels.dispatch import in_use as in_use
 from invgraphics.kernels.dispatch import use as use
 from invgraphics.kernels.dispatch import using as using
 from invgraphics.kernels.dispatch import warm_up as warm_up
-from invgraphics.kernels.types import Bins, Footprints, FusedNGP, HashGrid, March, MarchSteps
+from invgraphics.kernels.types import Bins, Footprints, March, MarchSteps
 
 
 def hash_encode(

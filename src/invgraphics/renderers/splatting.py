@@ -40,33 +40,35 @@ class SplattingConfig:
         shape: ``ellipsoid`` projects to an ellipse, to first order (EWA); ``disc`` drops the shortest axis and meets each
             pixel's ray exactly (2DGS).
         dilation: variance in square pixels added to every footprint (low-pass filter); of the smallest one, for discs.
-        compensate: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
+        antialiased: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
         depth: ``expected`` averages the distances of a pixel's splats by weight; ``median`` takes that of the splat at which
             half of the light is gone. For evaluation: gradients pass through the expected one only.
         normals: ``shortest`` averages the splats' shortest axes; ``depth`` takes the slope of the depth map.
         absolute_gradients: whether density control sees the sum of absolute gradients over pixels (AbsGS), in which opposite
             pulls do not cancel.
-        receivers: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
+        max_grad_splats: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
             limited bandwidth uses 10).
         tile: edge of a tile in pixels (Numba takes 32 at most); ``None`` leaves it to the kernel.
     """
 
+    title: ClassVar[str] = "splatting"
+
     shape: Literal["ellipsoid", "disc"] = "ellipsoid"
     dilation: float = 0.3
-    compensate: bool = False
+    antialiased: bool = False
     depth: Literal["expected", "median"] = "expected"
     normals: Literal["shortest", "depth"] = "shortest"
     absolute_gradients: bool = False
-    receivers: int = 0
+    max_grad_splats: int = 0
     tile: int | None = None
 
     def __post_init__(self) -> None:
-        if self.dilation < 0 or self.receivers < 0:
-            raise ValueError("dilation and receivers must not be negative")
+        if self.dilation < 0 or self.max_grad_splats < 0:
+            raise ValueError("dilation and max_grad_splats must not be negative")
         if self.tile is not None and self.tile < 1:
             raise ValueError(f"tile must be at least 1, not {self.tile}")
-        if self.shape == "disc" and (self.compensate or self.absolute_gradients):
-            raise ValueError("discs know neither 'compensate' nor 'absolute_gradients'")
+        if self.shape == "disc" and (self.antialiased or self.absolute_gradients):
+            raise ValueError("discs know neither 'antialiased' nor 'absolute_gradients'")
 
     def build(self, scene: Scene) -> Splatting:
         """The renderer; it needs nothing from the scene."""
@@ -94,7 +96,7 @@ class Splatting(Renderer):
             features.append(_normals(gaussians, camera))
         size = camera.width, camera.height
         sums, alpha = kernels.splat_rasterise(
-            footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.receivers
+            footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.max_grad_splats
         )
         rendering = self._rendering(sums, alpha, camera, footprints)
         screen = Screen(footprints.means2d, footprints.radii, *size, footprints.absgrad, gaussians.opacities, gaussians.scales)
@@ -106,7 +108,7 @@ class Splatting(Renderer):
         if config.shape == "disc":
             footprints, rgb = kernels.splat_project_discs(gaussians, camera, config.dilation)
         else:
-            footprints, rgb = kernels.splat_project(gaussians, camera, config.dilation, config.compensate)
+            footprints, rgb = kernels.splat_project(gaussians, camera, config.dilation, config.antialiased)
         if footprints.means2d.requires_grad:
             footprints.means2d.retain_grad()
             if config.absolute_gradients:

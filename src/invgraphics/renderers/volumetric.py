@@ -26,7 +26,6 @@ from invgraphics.core import (
     Scene,
     Trace,
 )
-from invgraphics.kernels.types import hash_field
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.occupancy import Occupancy
 from invgraphics.renderers.quadrature import integrate
@@ -48,6 +47,8 @@ class VolumetricConfig:
             distance over it, local units; 0 leaves them alone. Few pixels see what is near a camera, and each sees it large
             (Philip and Deschaintre 2023, Floaters no more).
     """
+
+    title: ClassVar[str] = "volume rendering"
 
     sampler: Annotated[Any, Slot("samplers")] = field(default_factory=StratifiedConfig)
     gradient_reach: float = 0.0
@@ -99,7 +100,7 @@ class Volumetric(RayRenderer):
         sampler, normals = self.sampler, ctx.geometry and Quantity.NORMAL in field.provides
         if torch.is_grad_enabled() or ctx.training or normals or not isinstance(sampler, Occupancy):
             return None
-        parts = hash_field(field, ctx.bounds)
+        parts = field.fused(ctx.bounds)
         if parts is None or sampler.config.stop == "never" or not kernels.compiled("ngp_render", parts.table):
             return None
         rays, given = camera.rays(), (sampler.occupied, ctx.bounds, sampler.steps(ctx), parts)

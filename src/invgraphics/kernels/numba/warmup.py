@@ -10,6 +10,7 @@ import torch
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.hash.grid import grid_sample
@@ -21,7 +22,7 @@ from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
-from invgraphics.kernels.types import FusedNGP, HashGrid, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 
 def warm_up() -> float:

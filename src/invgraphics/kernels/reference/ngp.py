@@ -11,11 +11,12 @@ from torch.nn.functional import linear, relu, softplus
 
 from invgraphics.core import harmonics
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.reference.composite import OPAQUE, composite, transmittance
 from invgraphics.kernels.reference.hash import hash_encode
 from invgraphics.kernels.reference.march import ray_march
-from invgraphics.kernels.types import EXP_LIMIT, FusedNGP, March, MarchSteps
+from invgraphics.kernels.types import EXP_LIMIT, March, MarchSteps
 
 UNLIMITED = 1 << 62
 """`MarchSteps.limit` that no ray reaches."""

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.hash.cells import BLOCK
@@ -18,7 +19,7 @@ from invgraphics.kernels.numba.ngp.queue import EDGE, fill, no_rays, step_of, st
 from invgraphics.kernels.numba.rays.composite import absorb
 from invgraphics.kernels.numba.rays.march import ROOM, most_steps, packed, surroundings
 from invgraphics.kernels.numba.runtime import array, inlined, parallel, prange, scratch, threads
-from invgraphics.kernels.types import FusedNGP, March, MarchSteps
+from invgraphics.kernels.types import March, MarchSteps
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 

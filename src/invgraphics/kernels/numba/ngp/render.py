@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.hash.cells import BLOCK
@@ -31,7 +32,7 @@ from invgraphics.kernels.numba.ngp.queue import EDGE, fill, no_rays, step_of, st
 from invgraphics.kernels.numba.rays.composite import absorb
 from invgraphics.kernels.numba.rays.march import surroundings
 from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, parallel, prange, threads
-from invgraphics.kernels.types import FusedNGP, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
