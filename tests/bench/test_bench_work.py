@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from invgraphics import kernels
 from invgraphics.bench import iterations, limits, memory, peers, run, sample_cases, splat_cases, subject
 from invgraphics.bench.results import BOTH, FORWARD, Results
-from invgraphics.bench.run import Request, bench, measure_case
+from invgraphics.bench.run import BenchRequest, bench, measure_case
 from invgraphics.bench.timing import Effort
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.neural import CPU_CHUNK, NeuralFieldConfig
@@ -113,7 +113,7 @@ def test_whole_steps_are_measured_beside_their_part(monkeypatch) -> None:
 @pytest.mark.usefixtures("tiny")
 def test_a_run_measures_both_implementations_and_their_limit() -> None:
     said: list[str] = []
-    results = bench(Request(("splats", "hash"), quick=True, say=said.append))
+    results = bench(BenchRequest(("splats", "hash"), quick=True, progress=said.append))
     for operation in ("splats", "splat_project", "hash_encode"):
         for name in ("reference", "numba"):
             for direction in (FORWARD, BOTH):
@@ -131,7 +131,7 @@ def test_without_numba_the_reference_is_measured_alone(monkeypatch) -> None:
     for module in (run, limits, splat_cases):
         monkeypatch.setattr(module, "unavailable_reason", missing)
     monkeypatch.setattr(run, "cpu_implementations", lambda: ("reference",))
-    results = bench(Request(("splats", "iterations", "peers"), quick=True))
+    results = bench(BenchRequest(("splats", "iterations", "peers"), quick=True))
     assert {m.implementation for m in results.measurements} == {"reference", "machine"}
     assert {skipped.what for skipped in results.skipped} == {"numba kernels", "cuda kernels", "iterations", "peers"}
     assert results.find("splats", "reference", BOTH).share is None
@@ -141,7 +141,7 @@ def test_without_numba_the_reference_is_measured_alone(monkeypatch) -> None:
 def test_sizes_too_slow_for_the_reference_say_so() -> None:
     results = Results()
     (case,) = [case for case in splat_cases.splats(True) if case.operation == "splat_rasterise"]
-    found = measure_case(case, Request(quick=True), results.skipped)
+    found = measure_case(case, BenchRequest(quick=True), results.skipped)
     assert {m.implementation for m in found} == {"numba"}
     assert "splat_rasterise gaussians=100" in results.skipped[0].what
 
@@ -150,12 +150,15 @@ def test_memory_of_compositing_holds_at_least_its_outputs() -> None:
     if not memory.CLEAR.exists():
         pytest.skip("no /proc")
     results = Results()
-    memory.SUBJECTS, everything = {"composite": memory.Subject("sample", memory.SAMPLES, ("numba",))}, memory.SUBJECTS
+    memory.MEMORY_CASES, everything = (
+        {"composite": memory.MemoryCase("sample", memory.SAMPLES, ("numba",))},
+        memory.MEMORY_CASES,
+    )
     try:
-        memory.footprints(("numba",), results)
+        memory.measure_memory(("numba",), results)
     finally:
-        memory.SUBJECTS = everything
-    (found,) = results.footprints
+        memory.MEMORY_CASES = everything
+    (found,) = results.memory
     # Weights, transmittance behind, and gradients of the depth and of four channels.
     assert 4 * (1 + 1 + 1 + 4) < found.each < 200
 
