@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import KDTree
 
 from invgraphics import kernels
-from invgraphics.bench import iterations, limits, memory, peers, run, sample_cases, splat_cases, subject
+from invgraphics.bench import iterations, limits, memory, peers, run, sample_cases, splat_cases, workload
 from invgraphics.bench.results import BOTH, FORWARD, Results
 from invgraphics.bench.run import BenchRequest, bench, measure_case
 from invgraphics.bench.timing import Effort
@@ -38,20 +38,20 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_object_is_repeatable_and_its_gaussians_overlap_their_neighbours() -> None:
-    field = subject.gaussian_field(3000)
-    assert torch.equal(field.means, subject.gaussian_field(3000).means)
+    field = workload.gaussian_field(3000)
+    assert torch.equal(field.means, workload.gaussian_field(3000).means)
     means = field.means.detach()
     ball = (means[:1000] - torch.tensor([-0.4, 0.1, -0.2])).norm(dim=1)
     assert torch.allclose(ball, torch.full_like(ball, 0.4), atol=1e-5)
     nearest = KDTree(means.numpy()).query(means.numpy(), k=4)[0][:, 1:].mean(axis=1)
     ratio = np.median(field.log_scales.detach().exp().numpy() / nearest[:, None])
-    assert ratio == pytest.approx(subject.SCALE, rel=0.05)
+    assert ratio == pytest.approx(workload.SCALE, rel=0.05)
     assert float(field.opacity_logits.detach().std()) == pytest.approx(2, rel=0.1)
 
 
 def test_occupied_cells_hold_the_object_and_little_else() -> None:
-    cells = subject.occupied(64)
-    unit = subject.bounds().to_unit(subject.gaussian_field(500, seed=7).means.detach())
+    cells = workload.occupied(64)
+    unit = workload.bounds().to_unit(workload.gaussian_field(500, seed=7).means.detach())
     x, y, z = (unit * 64).long().unbind(1)
     assert bool(cells[x, y, z].all())
     assert 0.01 < float(cells.float().mean()) < 0.2
@@ -90,7 +90,7 @@ def test_networks_alone_are_the_fields_networks() -> None:
         encoding=HashConfig(levels=2, log2_size=4), layers=1, width=8, skip=-1, geometry_features=3,
         colour_width=8, direction="sh", density_activation="exp",
     )  # fmt: skip
-    field = config.build(subject.scene(subject.gaussian_field(50), 1, 8))
+    field = config.build(workload.scene(workload.gaussian_field(50), 1, 8))
     gradients = iterations.networks_alone(field, CPU_CHUNK + 5)()
     parameters = sum(1 for _ in (*field.geometry_net.parameters(), *field.colour_net.parameters()))
     assert [part[0].shape for part in gradients] == [(CPU_CHUNK, 4), (5, 4)]
@@ -101,7 +101,7 @@ def test_whole_steps_are_measured_beside_their_part(monkeypatch) -> None:
     monkeypatch.setattr(iterations, "WARM_STEPS", 2)
     monkeypatch.setattr(iterations, "WARM_SAMPLES", 256)
     monkeypatch.setattr(iterations, "SAMPLES", 512)
-    monkeypatch.setattr(iterations, "nerf_scene", lambda: subject.scene(subject.gaussian_field(200), 2, 16))
+    monkeypatch.setattr(iterations, "nerf_scene", lambda: workload.scene(workload.gaussian_field(200), 2, 16))
     once = Effort(0.0, 1, 1)
     found = iterations.splat_step(100, 16, once) + iterations.nerf_step({"levels": 2, "log2_size": 5, "hidden": 8}, once)
     assert [m.operation for m in found] == [

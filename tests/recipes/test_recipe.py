@@ -5,7 +5,6 @@ import tomllib
 import pytest
 import torch
 
-from invgraphics.core import check
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.recipes.recipe import load_method, methods, presets, resolve
@@ -28,10 +27,9 @@ def test_recipe_reads_and_survives_a_round_trip(name: str, preset: str) -> None:
 @pytest.mark.parametrize("space", ["box", "contracted"])
 def test_recipe_conforms(name: str, space: str) -> None:
     scene = toy_scene(views=3, size=8, space=space)
-    field, renderer = build_model(load_method(name), scene, 0, torch.device("cpu"))
-    check(field, renderer)
-    check_field(field, scene)
-    check_renderer(renderer, field, scene)
+    model = build_model(load_method(name), scene, 0, torch.device("cpu"))
+    check_field(model.field, scene)
+    check_renderer(model.renderer, model.field, scene)
 
 
 def test_overrides_take_toml_values() -> None:

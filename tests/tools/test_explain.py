@@ -13,7 +13,6 @@ from training_fixtures import SMALL
 
 from invgraphics.cli import main
 from invgraphics.core import Bounds, Camera, Context
-from invgraphics.experiments.evaluate import render_view
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
@@ -49,7 +48,7 @@ def runs(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 def test_what_is_listed_adds_up_to_the_rendered_pixel(runs: dict[str, Path], tmp_path: Path, method: str, split) -> None:
     fitted = open_fitted(runs[method])
     camera = getattr(fitted.scene, split)[1].camera
-    picture = render_view(fitted.field, fitted.renderer, camera, fitted.scene, fitted.device).over(fitted.scene.background)
+    picture = fitted.model.render(camera).over(fitted.scene.background)
     for column, row in ((9, 12), (14, 10), (0, 0)):
         explained = explain(ExplainRequest(runs[method], 1, (column, row), split, tmp_path))
         with (tmp_path / "ray.csv").open() as file:

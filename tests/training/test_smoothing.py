@@ -80,7 +80,7 @@ def test_mip_recipe_smooths_from_the_first_step(make_fit, scene) -> None:
     more = ["field.count=60", "field.max_init=60", "field.sh_degree=1", "hooks.1.every=4", "hooks.1.threshold=1e-6"]
     fit = make_fit("splatting/gaussians-mip", scene, 12, 0, *more)
     fit.run(lambda loss: False)
-    field = fit.plan.field
+    field = fit.plan.model.field
     assert field.primitive_count() > 60
     assert len(field.smoothing) == field.primitive_count()
     assert bool((field.smoothing > 0).all())

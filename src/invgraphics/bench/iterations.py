@@ -15,7 +15,7 @@ from invgraphics.bench.splat_cases import GATE as SPLAT_GATE
 from invgraphics.bench.splat_cases import both_ways, splat_pipeline
 from invgraphics.bench.timing import Effort, alternate
 from invgraphics.bench.workload import activated, gaussian_field, leaves, scene
-from invgraphics.core import Field, Renderer, Scene, harmonics
+from invgraphics.core import Model, Scene, harmonics
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.gaussian import GaussianField
 from invgraphics.fields.neural import CPU_CHUNK, NeuralField, NeuralFieldConfig
@@ -26,7 +26,7 @@ from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
 from invgraphics.training.hooks import FitState, Hook
-from invgraphics.training.losses import Loss, PhotometricConfig, SsimConfig
+from invgraphics.training.losses import Loss, PhotometricLoss, SsimLoss
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
 
 VIEWS = 4
@@ -69,8 +69,8 @@ def splat_fit(field: GaussianField, pictures: Scene) -> Fit:
     """A fit that starts from the Gaussians of ``pictures``, with perturbed colours so that gradients are not zero."""
     with torch.no_grad():
         field.sh_dc += 0.1 * torch.randn(field.sh_dc.shape, generator=torch.Generator().manual_seed(1))
-    losses = [PhotometricConfig(0.8, "l1").build(), SsimConfig(0.2).build()]
-    return _fit(field, SplattingConfig().build(pictures), pictures, losses, [], BatchConfig())
+    losses = [PhotometricLoss(0.8, "l1"), SsimLoss(0.2)]
+    return _fit(Model(field, SplattingConfig().build(pictures), pictures.bounds), pictures, losses, [], BatchConfig())
 
 
 class _CountSamples(Hook):
@@ -117,13 +117,14 @@ def nerf_fit(pictures: Scene, levels: int, log2_size: int, hidden: int, warm_ste
         resolution=64, steps_per_diagonal=256, grace=REFRESH, warmup=WARM_STEPS, every=REFRESH, decay=0.5, stop="evaluation"
     )
     torch.manual_seed(0)
-    field, renderer, counter = config.build(pictures), VolumetricConfig(sampler).build(pictures), _CountSamples()
-    losses: list[Loss] = [PhotometricConfig(distance="huber").build()]
-    warmup_fit = _fit(field, renderer, pictures, losses, [], BatchConfig(rays=256, views=VIEWS, samples=WARM_SAMPLES), lr=1e-2)
+    field, counter = config.build(pictures), _CountSamples()
+    model = Model(field, VolumetricConfig(sampler).build(pictures), pictures.bounds)
+    losses: list[Loss] = [PhotometricLoss(distance="huber")]
+    warmup_fit = _fit(model, pictures, losses, [], BatchConfig(rays=256, views=VIEWS, samples=WARM_SAMPLES), lr=1e-2)
     for _ in range(warm_steps):
         warmup_fit.step()
     batches = BatchConfig(rays=1024, views=VIEWS, samples=SAMPLES)
-    return NerfFit(_fit(field, renderer, pictures, losses, [counter], batches, lr=1e-2), field, counter)
+    return NerfFit(_fit(model, pictures, losses, [counter], batches, lr=1e-2), field, counter)
 
 
 def nerf_step(sizes: dict[str, int], effort: Effort) -> list[Measurement]:
@@ -167,8 +168,7 @@ def networks_alone(field: NeuralField, samples: int) -> Callable[[], object]:
 
 
 def _fit(
-    field: Field,
-    renderer: Renderer,
+    model: Model,
     pictures: Scene,
     losses: list[Loss],
     hooks: list[Hook],
@@ -176,7 +176,7 @@ def _fit(
     lr: float = 1e-4,
 ) -> Fit:
     optimiser = OptimiserConfig({"field": GroupConfig("field", lr)})
-    return Fit(Plan(field, renderer, pictures, losses, hooks, optimiser, batches, Budget(steps=ALL_STEPS)))
+    return Fit(Plan(model, pictures, losses, hooks, optimiser, batches, Budget(steps=ALL_STEPS)))
 
 
 def steps(quick: bool, effort: Effort) -> list[Measurement]:

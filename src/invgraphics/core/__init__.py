@@ -12,6 +12,7 @@ from invgraphics.core.field import Renderer as Renderer
 from invgraphics.core.field import Sampler as Sampler
 from invgraphics.core.field import check as check
 from invgraphics.core.field import no_grad_density as no_grad_density
+from invgraphics.core.model import Model as Model
 from invgraphics.core.rays import Rays as Rays
 from invgraphics.core.rendering import Context as Context
 from invgraphics.core.rendering import Rendering as Rendering

@@ -44,6 +44,11 @@ class Rendering:
         normal = None if self.normal is None else self.normal.detach()
         return Rendering(self.rgb.detach(), self.alpha.detach(), self.depth.detach(), normal)
 
+    def to(self, device: torch.device | str) -> Rendering:
+        """The same picture on another device."""
+        normal = None if self.normal is None else self.normal.to(device)
+        return Rendering(self.rgb.to(device), self.alpha.to(device), self.depth.to(device), normal)
+
     @staticmethod
     def cat(parts: Sequence[Rendering]) -> Rendering:
         """Join packed renderings, in order."""

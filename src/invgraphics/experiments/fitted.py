@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from invgraphics import plugins
-from invgraphics.core import Field, Renderer, Scene
+from invgraphics.core import Model, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
 from invgraphics.experiments.posed import optimised, scene_of_fit
@@ -31,9 +31,7 @@ class Fitted:
         folder: of the run.
         method: its recipe.
         scene: undisturbed, at the run's size and with its test views.
-        field: fitted.
-        renderer: fitted as well, where it has parameters.
-        device: where both are.
+        model: fitted, on the run's device.
         source: the folder that holds the checkpoint: the run itself, or the run that a rendering shows.
         poses: of the training views as the fit saw them, where it refined them.
     """
@@ -41,9 +39,7 @@ class Fitted:
     folder: RunFolder
     method: Method
     scene: Scene
-    field: Field
-    renderer: Renderer
-    device: torch.device
+    model: Model
     source: RunFolder
     poses: Poses | None = None
 
@@ -77,18 +73,17 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     provenance = folder.read_json("provenance.json")
     method = replace(_method(folder, provenance), preset_choice=str(provenance.get("preset_choice", "")))
     device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
-    field, renderer = build_model(method, scene, provenance["seed"], device)
+    model = build_model(method, scene, provenance["seed"], device)
     shown = provenance.get("fitted_run")
     source = folder if shown is None else RunFolder(folder.root / shown)
     state = checkpoint.load(source.checkpoint, device)
     config = optimised(method)
     try:
         poses = Poses.restored(config, state["poses"]).to(device) if config is not None and "poses" in state else None
-        field.load_state_dict(state.get("field", {}))
-        renderer.load_state_dict(state.get("renderer", {}) if shown is None else {})
+        model.load_state_dict(state if shown is None else {"field": state.get("field", {})})
     except RuntimeError as error:
         raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
-    return Fitted(folder, method, scene, field, renderer, device, source, poses)
+    return Fitted(folder, method, scene, model, source, poses)
 
 
 def _method(folder: RunFolder, provenance: Mapping[str, Any]) -> Method:

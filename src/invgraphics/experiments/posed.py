@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from invgraphics.core import Camera, Field, Renderer, Rendering, Scene, View
+from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.metrics.poses import PoseErrors, Similarity, pose_errors
 from invgraphics.recipes.recipe import Method
 from invgraphics.training.localise import Descent, descend
@@ -91,10 +91,10 @@ class PosedEvaluation:
     Args:
         poses: of the fit.
         scene: undisturbed.
-        model: fitted field and renderer.
+        model: fitted.
     """
 
-    def __init__(self, poses: Poses, scene: Scene, model: tuple[Field, Renderer]) -> None:
+    def __init__(self, poses: Poses, scene: Scene, model: Model) -> None:
         self._scene, self._model, self._config = scene, model, poses.config
         self.errors = training_errors(poses, scene)
         self._into_fit = inverse(self.errors.similarity)

@@ -3,43 +3,24 @@
 from __future__ import annotations
 
 import math
-import re
 import signal
 import time
-from dataclasses import dataclass
 from types import FrameType
 
 import torch
 from torch import Tensor
 
 from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
-from invgraphics.errors import InputError
 from invgraphics.experiments.posed import carried, into_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
+from invgraphics.training.budget import Cadence
 from invgraphics.training.fit import Fit
 from invgraphics.training.limits import dead_gaussians
 
 MARKS = (0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Points of the fit at which the monitor looks."""
-
-
-@dataclass(frozen=True)
-class Cadence:
-    """How often a checkpoint is written: every so many steps or seconds."""
-
-    steps: int | None = None
-    seconds: float | None = None
-
-    @staticmethod
-    def parse(text: str) -> Cadence:
-        """Read ``100steps`` or ``30s``."""
-        found = re.fullmatch(r"\s*([0-9]+)\s*(steps?|s)\s*", text)
-        if found is None or int(found.group(1)) == 0:
-            raise InputError(f"'{text}' says no interval for checkpoints.", "Expected something like 100steps or 30s.")
-        amount = int(found.group(1))
-        return Cadence(seconds=float(amount)) if found.group(2) == "s" else Cadence(steps=amount)
 
 
 class Monitor:
@@ -77,7 +58,7 @@ class Monitor:
         return -10 * math.log10(max(float(torch.stack(errors).mean()), 1e-10))
 
     def _predict(self, fit: Fit, camera: Camera, flat: Tensor, ctx: Context, background: Tensor) -> Tensor:
-        renderer, field = fit.plan.renderer, fit.plan.field
+        renderer, field = fit.plan.model.renderer, fit.plan.model.field
         if isinstance(renderer, RayRenderer):
             pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
             rays: Rays = camera.rays(pixels).to(self._device)
@@ -169,10 +150,10 @@ class Recorder:
         line["psnr"] = psnr
         if math.isfinite(self._loss):
             line["loss"] = self._loss
-        count = fit.plan.field.primitive_count()
+        count = fit.plan.model.field.primitive_count()
         if count is not None:
             line["primitives"] = count
-        dead = dead_gaussians(fit.plan.field, [view.camera for view in fit.plan.scene.train])
+        dead = dead_gaussians(fit.plan.model.field, [view.camera for view in fit.plan.scene.train])
         if dead is not None:
             line["dead"] = round(dead.share, 6)
         self._folder.append_history(line)

@@ -11,9 +11,9 @@ from typing import Any, Literal
 from PIL import Image
 from torch import Tensor
 
-from invgraphics.core import Camera, Context, Rendering, Scene, View
+from invgraphics.core import Camera, Rendering, Scene, View
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs.folder import write_json
 from invgraphics.tools.along import Contributions, Profile, along_ray
@@ -81,10 +81,10 @@ def explain(request: ExplainRequest) -> Explanation:
     """
     fitted = open_fitted(request.run, request.scene).in_its_frame()
     view = _view(fitted.scene, request)
-    camera = view.camera.to(fitted.device)
-    ctx = Context(fitted.scene.bounds.to(fitted.device), training=False)
-    found = on_cpu(along_ray(fitted.field, fitted.renderer, camera, request.pixel, ctx))
-    picture = render_view(fitted.field, fitted.renderer, view.camera, fitted.scene, fitted.device, geometry=False)
+    model = fitted.model
+    camera = view.camera.to(model.device)
+    found = on_cpu(along_ray(model.field, model.renderer, camera, request.pixel, model.context()))
+    picture = model.render(view.camera, normals=False)
 
     column, row = request.pixel
     background = fitted.scene.background
@@ -170,7 +170,7 @@ def _facts(fitted: Fitted, request: ExplainRequest, view: View, found: Contribut
 
 def _dead(fitted: Fitted) -> dict[str, Any] | None:
     """Share, number and causes of primitives that no gradient can change; ``None`` for fields without Gaussians."""
-    dead = dead_gaussians(fitted.field, [view.camera for view in fitted.scene.train])
+    dead = dead_gaussians(fitted.model.field, [view.camera for view in fitted.scene.train])
     return None if dead is None else {"share": _number(dead.share), "sentence": dead.sentence()}
 
 

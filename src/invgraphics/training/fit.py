@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from invgraphics.core import Batch, Context, Field, RayRenderer, Renderer, Rendering, Scene, Trace, check
+from invgraphics.core import Batch, Context, Model, RayRenderer, Rendering, Scene, Trace
 from invgraphics.errors import NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.openmp import limit_spinning
@@ -29,8 +29,7 @@ class Plan:
     """Everything a fit is made of.
 
     Attributes:
-        field: what is fitted.
-        renderer: what it is seen through.
+        model: what is fitted, and seen.
         scene: what it is compared with.
         losses: their sum is minimised.
         hooks: called around each step, in order.
@@ -42,8 +41,7 @@ class Plan:
         poses: of the training cameras, where they are fitted too.
     """
 
-    field: Field
-    renderer: Renderer
+    model: Model
     scene: Scene
     losses: Sequence[Loss]
     hooks: Sequence[Hook]
@@ -57,19 +55,15 @@ class Plan:
     @property
     def modules(self) -> dict[str, nn.Module]:
         """Everything with parameters, by the names that begin theirs."""
-        named: dict[str, nn.Module] = {"field": self.field, "renderer": self.renderer}
-        if self.poses is not None:
-            named["poses"] = self.poses
-        return named
+        return self.model.parts | ({} if self.poses is None else {"poses": self.poses})
 
 
 class Fit:
     """A fit in progress. `step` advances it; `state` and `load` carry it over an interruption, bit by bit on a CPU."""
 
     def __init__(self, plan: Plan) -> None:
-        check(plan.field, plan.renderer)
         for hook in plan.hooks:
-            hook.check(plan.field, plan.renderer)
+            hook.check(plan.model.field, plan.model.renderer)
         keep_freed_memory()
         limit_spinning()
         self.plan = plan
@@ -79,7 +73,7 @@ class Fit:
         self._bounds = plan.scene.bounds.to(plan.device)
         self._generator = torch.Generator().manual_seed(plan.seed)
         self._batches = Batches(plan.batches, plan.scene, self._generator, plan.device, plan.poses)
-        self._windows = [] if plan.poses is None else windows(plan.field, plan.renderer)
+        self._windows = [] if plan.poses is None else windows(plan.model)
         self._optimiser = self._make_optimiser()
 
     def _make_optimiser(self) -> Optimiser:
@@ -108,13 +102,14 @@ class Fit:
         """
         began, cpu_began = time.perf_counter(), time.process_time()
         plan, ctx = self.plan, self.context()
-        state = FitState(plan.field, plan.renderer, self._optimiser, plan.scene, ctx, self.steps)
+        state = FitState(plan.model.field, plan.model.renderer, self._optimiser, plan.scene, ctx, self.steps)
         self._optimiser.set_progress(ctx.progress)
         self._open_windows(ctx.progress)
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
-        loss = torch.stack([loss(rendering, trace, batch, ctx) for loss in plan.losses]).sum()
+        composited = replace(rendering, rgb=rendering.over(batch.background))
+        loss = torch.stack([loss(composited, trace, batch, ctx) for loss in plan.losses]).sum()
         value = loss.item()
         if not torch.isfinite(loss):
             raise NumericalError(self._blame(rendering))
@@ -127,7 +122,7 @@ class Fit:
         self._optimiser.step()
         for hook in plan.hooks:
             hook.after_step(state)
-        plan.renderer.update(plan.field, ctx)
+        plan.model.renderer.update(plan.model.field, ctx)
         self.steps += 1
         if plan.device.type == "cuda":
             torch.cuda.synchronize(plan.device)
@@ -141,7 +136,7 @@ class Fit:
                 encoding.detail.fill_(self.plan.poses.config.detail(progress))
 
     def _render(self, ctx: Context) -> tuple[Rendering, Trace, Batch]:
-        renderer, fitted = self.plan.renderer, self.plan.field
+        renderer, fitted = self.plan.model.renderer, self.plan.model.field
         if isinstance(renderer, RayRenderer):
             rays, batch = self._batches.rays(ctx.progress)
             rendering, trace = renderer.render_rays(fitted, rays, ctx)
