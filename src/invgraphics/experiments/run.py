@@ -90,7 +90,7 @@ def fit_run(request: FitRequest) -> Path:
             else:
                 folder.clear()
             describe(folder, request, method, (scene, shown), identity, device)
-            forecast = _rehearse(folder, fit, method, memory)
+            forecast = _warm_up(folder, fit, method, memory)
             if "suspicion" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
             for sentence in (*announcements([method.choice]), _prediction(request, fit, forecast)):
@@ -113,13 +113,13 @@ def _check_existing(folder: RunFolder, request: FitRequest) -> None:
     folder.create()
 
 
-def _rehearse(folder: RunFolder, fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
+def _warm_up(folder: RunFolder, fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
     """Take a step and a look of the monitor that count for nothing; the memory that they needed tells what the fit will need.
 
     Raises:
         InputError: the primitives would need more memory than the machine has.
     """
-    fit.rehearse()
+    fit.warmup_step()
     Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
     forecast = memory_forecast(fit.plan, method, memory.peak_bytes)
     folder.write_json("provenance.json", folder.read_json("provenance.json") | {"memory_forecast_bytes": forecast.bytes})

@@ -15,6 +15,7 @@ from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.presets import select_preset
+from invgraphics.recipes.renamed import with_current_names, with_first_names
 from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
@@ -53,8 +54,8 @@ class Method:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the resolved table."""
-        return hashlib.sha256(json.dumps(self.table, sort_keys=True).encode()).hexdigest()
+        """SHA-256 of the resolved table, the same whatever its keys are called by now."""
+        return hashlib.sha256(json.dumps(with_first_names(self.table), sort_keys=True).encode()).hexdigest()
 
 
 def methods() -> dict[str, str]:
@@ -106,10 +107,15 @@ def assign(table: dict[str, Any], items: Sequence[str]) -> None:
 
 
 def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
-    """A method from a complete table, for instance from a run's ``recipe.toml``."""
+    """A method from a complete table, for instance from a run's ``recipe.toml``; keys may have names of earlier versions.
+
+    Raises:
+        InputError: unknown key, a value of the wrong type, or a hook that the field cannot serve.
+    """
     from invgraphics.recipes.schema import Recipe
 
-    recipe = fill(Recipe, table).capped()
+    recipe = fill(Recipe, with_current_names(table)).capped()
+    recipe.check_hooks()
     return Method(name, preset, recipe, to_table(recipe))
 
 

@@ -69,7 +69,7 @@ class Fit:
     def __init__(self, plan: Plan) -> None:
         check(plan.field, plan.renderer)
         for hook in plan.hooks:
-            hook.check(plan.field, plan.renderer)
+            hook.check(plan.field)
         keep_freed_memory()
         limit_spinning()
         self.plan = plan
@@ -164,8 +164,8 @@ class Fit:
         where = broken[0] if broken else "the loss"
         return f"Step {self.steps}: {where} is not finite; the fit stops here."
 
-    def rehearse(self) -> None:
-        """Take one step and undo it, so that compiling and allocating at first use is on no clock."""
+    def warmup_step(self) -> None:
+        """Take one step and restore the state before it, so that compiling and allocating at first use is on no clock."""
         before = {part: {name: value.clone() for name, value in tensors.items()} for part, tensors in self.state().items()}
         clocks, seconds = self.clocks(), self.seconds
         self.step()

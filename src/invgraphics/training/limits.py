@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from invgraphics.core import Camera, Field, Quantity, Renderer
+from invgraphics.core import Camera, Field
 from invgraphics.kernels.types import ALPHA_MIN
-from invgraphics.training.density_control import Splats, check_splats
+from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters
 from invgraphics.training.hooks import FitState, Hook
 
 VANISHING_SLOPE = 2.0**-23
@@ -54,26 +54,25 @@ class LimitsConfig:
                 "'min_opacity' and 'max_opacity' must ascend between 0 and 1, 'min_scale' at 0 or above, 'every' at 1 or above."
             )
 
-    def build(self) -> Hook:
+    def build(self) -> Limits:
         """The hook."""
-        return _Limits(self)
+        return Limits(self)
 
 
-class _Limits(Hook):
-    """Keeps the scale limits between their computations, so that a resumed fit repeats the same steps."""
+class Limits(Hook):
+    """Clamps opacities and scales after each step; the scale limits are kept for fits that are resumed."""
+
+    name = "limits"
+    requires = GAUSSIANS
 
     def __init__(self, config: LimitsConfig) -> None:
         self._config = config
         self._log_limit = torch.zeros(0)
 
     @override
-    def check(self, field: Field, renderer: Renderer) -> None:
-        check_splats("limits", field)
-
-    @override
     @torch.no_grad()
     def after_step(self, state: FitState) -> None:
-        config, field = self._config, cast(Splats, state.field)
+        config, field = self._config, cast(GaussianParameters, state.field)
         field.opacity_logits.clamp_(_logit(config.min_opacity), _logit(config.max_opacity))
         if config.min_scale:
             if len(self._log_limit) != len(field.means) or state.step % config.every == 0:
@@ -154,9 +153,9 @@ def dead_gaussians(field: Field, cameras: Sequence[Camera]) -> DeadGaussians | N
         field: what is fitted, or was.
         cameras: the training cameras.
     """
-    if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "opacity_logits"):
+    if not GAUSSIANS.met_by(field):
         return None
-    gaussians = cast(Splats, field)
+    gaussians = cast(GaussianParameters, field)
     opacity = gaussians.opacity_logits.float().sigmoid()
     largest = gaussians.log_scales.amax(dim=1).exp()
     return DeadGaussians(
