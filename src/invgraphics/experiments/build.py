@@ -14,11 +14,11 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.request import DATA, Settings
 from invgraphics.recipes.recipe import Method, assign, load_method
 from invgraphics.recipes.schema import Recipe
-from invgraphics.scenes.corrupt import TrainingData
+from invgraphics.scenes.degrade import TrainingData
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Plan
-from invgraphics.training.poses import make_poses, windows
+from invgraphics.training.poses import coarse_to_fine_encodings, make_poses
 
 
 def requested_method(name: str, request: Settings) -> Method:
@@ -75,7 +75,7 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -
     check(field, renderer)
     training = method.recipe.training
     if training is not None and training.poses is not None and training.poses.optimise:
-        for encoding in windows(field, renderer):
+        for encoding in coarse_to_fine_encodings(field, renderer):
             encoding.add_window()
     return field.to(device), renderer.to(device)
 

@@ -24,7 +24,7 @@ from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 from invgraphics.training.budget import Budget
 
 
@@ -82,7 +82,7 @@ def _validate(request: CompareRequest) -> Scene:
     RunFolder(Path(request.out)).create()
     scene = open_requested(request)
     check_eyes(request.render_with, methods, scene)
-    return corrupt(scene, data, request.seeds[0])
+    return degrade(scene, data, request.seeds[0])
 
 
 def _summary(request: CompareRequest, scene: Scene) -> dict[str, Any]:

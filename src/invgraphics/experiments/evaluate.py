@@ -14,11 +14,11 @@ from PIL import Image
 
 from invgraphics.core import Camera, Context, Field, Renderer, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
-from invgraphics.experiments.shortfall import observe, shortfall
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
@@ -69,7 +69,7 @@ def evaluate(
     field, renderer = model
     device = next(field.parameters()).device
     (folder.root / "test").mkdir(exist_ok=True)
-    scores, seconds, observed = [], [], []
+    scores, seconds, statistics_of_views = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
     with Reporter(f"{method.name} evaluation") as reporter:
         render_view(field, renderer, scene.test[0].camera.resized(16, 16), scene, device)  # first use pays for allocation
@@ -78,10 +78,10 @@ def evaluate(
             timed = index % ceil(len(scene.test) / TIMED) == 0
             picture, took = _picture(model, camera, scene, normals=view.normal is not None, timed=timed)
             seconds += took
-            picture = picture if posed is None else posed.as_seen(picture, camera, view)
+            picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
             _save_view(folder.root / "test" / f"{index:04d}", picture, scene)
             scores.append(score(picture, view, scene, rules))
-            observed.append(observe(picture, view.camera, scene))
+            statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
     result = {
@@ -99,7 +99,7 @@ def evaluate(
     }
     if disturbed := disturbance(costs.get("fit_processor_share")):
         result["disturbed"] = disturbed
-    result |= shortfall(method.name, quality, observed, scene, rules)
+    result |= below_baseline(method.name, quality, statistics_of_views, scene, rules)
     if posed is not None:
         result["test_poses"] = protocol_note(method)
     folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)

@@ -13,7 +13,7 @@ from invgraphics import plugins
 from invgraphics.core import Field, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
-from invgraphics.experiments.posed import optimised, scene_of_fit
+from invgraphics.experiments.posed import refined_poses, scene_in_fit_frame
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.waiting import limit_spinning
 from invgraphics.recipes.recipe import Method, resolve
@@ -49,7 +49,7 @@ class Fitted:
 
     def in_its_frame(self) -> Fitted:
         """The same with the scene where the fit has it: a fit that refines poses may drift from those that it was given."""
-        return self if self.poses is None else replace(self, scene=scene_of_fit(self.poses, self.scene))
+        return self if self.poses is None else replace(self, scene=scene_in_fit_frame(self.poses, self.scene))
 
 
 def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
@@ -81,7 +81,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     shown = provenance.get("fitted_run")
     source = folder if shown is None else RunFolder(folder.root / shown)
     state = checkpoint.load(source.checkpoint, device)
-    config = optimised(method)
+    config = refined_poses(method)
     try:
         poses = Poses.restored(config, state["poses"]).to(device) if config is not None and "poses" in state else None
         field.load_state_dict(state.get("field", {}))

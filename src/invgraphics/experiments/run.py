@@ -43,7 +43,7 @@ from invgraphics.recipes.presets import announcements
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder, write_json
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import choices
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -68,7 +68,7 @@ def fit_run(request: FitRequest) -> Path:
     with folder.held():
         scene = open_requested(request)
         check_eyes(request.render_with, [method], scene)
-        shown = corrupt(scene, data, request.seed)
+        shown = degrade(scene, data, request.seed)
         identity = identify(request, method, TruthDigest.of(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:

@@ -36,12 +36,17 @@ class Similarity:
         """As one affine matrix, for `invgraphics.core.transforms`."""
         return rigid(self.scale * self.rotation, self.translation)
 
+    def inverse(self) -> Similarity:
+        """The similarity from the target back to the source."""
+        rotation = self.rotation.T
+        return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
     def points(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Move points."""
+        """Transform points."""
         return transform_points(self.matrix, points.double())
 
     def poses(self, cam_to_world: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
-        """Move cameras: their positions are scaled, their axes stay orthonormal."""
+        """Transform cameras: their positions are scaled, their axes stay orthonormal."""
         moved = cam_to_world.double().clone()
         moved[..., :3, :3] = self.rotation @ moved[..., :3, :3]
         moved[..., :3, 3] = self.points(cam_to_world[..., :3, 3])

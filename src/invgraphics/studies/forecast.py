@@ -15,7 +15,7 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import CHECKPOINT_COPIES
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 
@@ -89,7 +89,7 @@ def try_method(request: FitRequest, method: Method, scene: Scene) -> Cost:
     device = device_of(request.device)
     use_kernels(request.kernels)
     pixels = sum(view.camera.width * view.camera.height for view in scene.test)
-    shown = corrupt(scene, training_data(request), request.seed)
+    shown = degrade(scene, training_data(request), request.seed)
     try:
         fit = Fit(build_plan(method, shown, Budget.parse(request.budget), request.seed, device))
         fit.step()  # the first compiles and allocates

@@ -16,7 +16,7 @@ from invgraphics.core.transforms import apply_similarity, focal_from_fov, se3_ex
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display, render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.experiments.posed import carried, into_fit, inverse
+from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.poses import Similarity, rotation_angle
 from invgraphics.runs.folder import make_parent, write_json
@@ -79,12 +79,14 @@ def locate(request: LocateRequest) -> dict[str, Any]:
     make_parent(request.out)
     drift = Similarity(1.0, torch.eye(3).double(), torch.zeros(3).double())
     if fitted.poses is not None:
-        drift = into_fit(fitted.poses, fitted.scene)
+        drift = world_to_fit(fitted.poses, fitted.scene)
     photo = _photo(pixels, request, fitted.scene)
     starts = [replace(photo, camera=photo.camera.moved(pose)) for pose in _starts(request, fitted.scene)]
     with Reporter(f"locate {request.photo.name}") as reporter:
-        found, tried = _search(fitted, [replace(v, camera=carried(v.camera, drift)) for v in starts], request, reporter)
-    return _written(request, fitted, (found, tried), inverse(drift))
+        found, tried = _search(
+            fitted, [replace(v, camera=transform_camera(v.camera, drift)) for v in starts], request, reporter
+        )
+    return _written(request, fitted, (found, tried), drift.inverse())
 
 
 def _photo(pixels: UInt8[np.ndarray, "h w c"], request: LocateRequest, scene: Scene) -> View:
@@ -158,7 +160,7 @@ def _written(
     found, tried = result
     scene = fitted.scene
     loss = difference((fitted.field, fitted.renderer), found, scene)
-    pose = carried(found.camera, back).cam_to_world
+    pose = transform_camera(found.camera, back).cam_to_world
     record: dict[str, Any] = {
         "schema": 1,
         "photo": str(request.photo),

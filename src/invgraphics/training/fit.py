@@ -21,7 +21,7 @@ from invgraphics.training.clock import SchedulerTimes
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
 from invgraphics.training.losses import Loss
 from invgraphics.training.optimiser import Optimiser, OptimiserConfig
-from invgraphics.training.poses import Poses, windows
+from invgraphics.training.poses import Poses, coarse_to_fine_encodings
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Fit:
         self._bounds = plan.scene.bounds.to(plan.device)
         self._generator = torch.Generator().manual_seed(plan.seed)
         self._batches = Batches(plan.batches, plan.scene, self._generator, plan.device, plan.poses)
-        self._windows = [] if plan.poses is None else windows(plan.field, plan.renderer)
+        self._coarse_to_fine = [] if plan.poses is None else coarse_to_fine_encodings(plan.field, plan.renderer)
         self._optimiser = self._make_optimiser()
 
     def _make_optimiser(self) -> Optimiser:
@@ -110,7 +110,7 @@ class Fit:
         plan, ctx = self.plan, self.context()
         state = FitState(plan.field, plan.renderer, self._optimiser, plan.scene, ctx, self.steps)
         self._optimiser.set_progress(ctx.progress)
-        self._open_windows(ctx.progress)
+        self._set_coarse_to_fine(ctx.progress)
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
@@ -136,10 +136,10 @@ class Fit:
         self.cpu_seconds += time.process_time() - cpu_began
         return value
 
-    def _open_windows(self, progress: float) -> None:
-        for encoding in self._windows:
+    def _set_coarse_to_fine(self, progress: float) -> None:
+        for encoding in self._coarse_to_fine:
             if encoding.detail is not None and self.plan.poses is not None:
-                encoding.detail.fill_(self.plan.poses.config.detail(progress))
+                encoding.detail.fill_(self.plan.poses.config.alpha(progress))
 
     def _render(self, ctx: Context) -> tuple[Rendering, Trace, Batch]:
         renderer, fitted = self.plan.renderer, self.plan.field

@@ -65,8 +65,8 @@ class PosesConfig:
         if not self.resolution or not all(0 < scale <= 1 for scale in self.resolution):
             raise ValueError("'resolution' must hold scales in (0, 1].")
 
-    def detail(self, progress: float) -> float:
-        """How far the window over the encodings' levels is open, from 0 to 1."""
+    def alpha(self, progress: float) -> float:
+        """Coarse-to-fine parameter of the encodings: share of the levels in use, from 0 to 1 (BARF, equation 14)."""
         start, end = self.window
         return min(max((progress - start) / max(end - start, 1e-9), 0.0), 1.0)
 
@@ -104,7 +104,7 @@ class PosesConfig:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """What else a fit finds out, besides the scene.
+    """Options for optimising camera poses along with the scene.
 
     Attributes:
         poses: the training cameras' poses; ``None`` takes them as they are given.
@@ -208,6 +208,6 @@ def motion_about(twist: Float[Tensor, "*n 6"], depth: Float[Tensor, "*n"]) -> Fl
     return motion + kept - turned
 
 
-def windows(field: Field, renderer: Renderer) -> list[Windowed]:
-    """All encodings that can hold levels back."""
+def coarse_to_fine_encodings(field: Field, renderer: Renderer) -> list[Windowed]:
+    """Encodings of the field and the renderer whose finer levels can be faded in."""
     return [module for part in (field, renderer) for module in part.modules() if isinstance(module, Windowed)]

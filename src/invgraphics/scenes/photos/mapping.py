@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.scenes.photos.job import DATABASE, PhotoJob
-from invgraphics.scenes.photos.pairs import Evidence
+from invgraphics.scenes.photos.pairs import VerifiedMatches
 from invgraphics.scenes.photos.prepare import PHOTOS, Prepared
 from invgraphics.scenes.photos.sfm import Verification, match, reset_cameras
 from invgraphics.scenes.photos.strategies import Strategy
@@ -34,7 +34,7 @@ class Matched:
 
     job: PhotoJob
     photos: Sequence[Prepared]
-    evidence: Evidence
+    evidence: VerifiedMatches
     work: Path
 
 

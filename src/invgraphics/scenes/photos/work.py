@@ -19,7 +19,7 @@ from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, SCHEMA, TOP_VIEW, PhotoJob
 from invgraphics.scenes.photos.maker import JOB, RESULT
 from invgraphics.scenes.photos.mapping import Matched
-from invgraphics.scenes.photos.pairs import read_evidence
+from invgraphics.scenes.photos.pairs import read_verified_matches
 from invgraphics.scenes.photos.plot import top_view
 from invgraphics.scenes.photos.prepare import PREPARED, Preparation, prepare
 from invgraphics.scenes.photos.quality import NOTHING, describe, refusal, unplaced
@@ -70,7 +70,7 @@ def main(work: Path) -> None:
     wanted = sfm.pairs(len(preparation.photos), job.matching)
     sfm.match(wanted, preparation.photos, work / DATABASE, clock.show, sfm.Verification(job.seed))
     clock.start("poses")
-    evidence = read_evidence(work / DATABASE, preparation.photos)
+    evidence = read_verified_matches(work / DATABASE, preparation.photos)
     matched = Matched(job, preparation.photos, evidence, work)
     best, attempts = try_strategies(matched, clock.show)
     quality = _finish(matched, preparation.skipped, best, result, clock) | {"choice": choice(attempts), "attempts": attempts}
@@ -108,11 +108,11 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         **figures,
         "bend_px": bend,
         "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],
-        "suspicion": best.suspicion,
+        "suspicion": best.consistency,
         "usable": refused is None,
         "refusal": refused,
         "skipped": skipped,
-        "unplaced": unplaced(photos, matched.evidence, {camera["name"] for camera in figures["cameras"]}, best.strays),
+        "unplaced": unplaced(photos, matched.evidence, {camera["name"] for camera in figures["cameras"]}, best.outliers),
         "seconds": clock.seconds,
     }
 
