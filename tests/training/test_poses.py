@@ -25,7 +25,7 @@ from invgraphics.testing import toy_cameras
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
-from invgraphics.training.localise import Descent, descend
+from invgraphics.training.localise import PoseDescent, refine_pose
 from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import OptimiserConfig
 from invgraphics.training.poses import Poses, PosesConfig, coarse_to_fine_encodings, motion_about
@@ -253,7 +253,7 @@ def test_poses_come_back(blobs: Scene) -> None:
         scene=shown,
         losses=[PhotometricLoss()],
         hooks=[],
-        optimiser=config.optimiser(OptimiserConfig(), seen=1.0),
+        optimiser=config.optimiser(OptimiserConfig(), view_share=1.0),
         batches=BatchConfig(rays=1200, views=6),
         budget=Budget(steps=250),
         poses=poses,
@@ -271,7 +271,7 @@ def test_a_photograph_finds_its_pose(blobs: Scene) -> None:
     wrong = view.camera.moved(view.camera.cam_to_world @ se3_exp(torch.tensor([0.08, -0.06, 0.1, 0.1, -0.1, 0.15])))
     model = (Blobs(), VolumetricConfig(StratifiedConfig(32)).build(blobs))
     misplaced = View(wrong, view.image, view.name)
-    found = descend(model, misplaced, blobs, Descent(steps=150, lr=2e-2, final=5e-4, rays=300))
+    found = refine_pose(model, misplaced, blobs, PoseDescent(steps=150, lr=2e-2, final=5e-4, rays=300))
     error = (found.cam_to_world - view.camera.cam_to_world).norm()
     assert float(error) < 0.15 * float((wrong.cam_to_world - view.camera.cam_to_world).norm())
 

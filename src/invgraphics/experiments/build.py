@@ -93,7 +93,7 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
         hooks=[hook.build() for hook in recipe.hooks],
         optimiser=recipe.optimiser
         if poses is None
-        else poses.config.optimiser(recipe.optimiser, _seen(recipe, renderer, scene)),
+        else poses.config.optimiser(recipe.optimiser, _view_share(recipe, renderer, scene)),
         batches=recipe.batches if poses is None else poses.config.batches(recipe.batches),
         budget=budget,
         seed=seed,
@@ -102,8 +102,8 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
     )
 
 
-def _seen(recipe: Recipe, renderer: Renderer, scene: Scene) -> float:
-    """Share of the training views that one step sees."""
+def _view_share(recipe: Recipe, renderer: Renderer, scene: Scene) -> float:
+    """Share of the training views in one step's batch."""
     views = len(scene.train)
     return min(recipe.batches.views, views) / views if isinstance(renderer, RayRenderer) else 1 / views
 

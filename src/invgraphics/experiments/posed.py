@@ -1,4 +1,4 @@
-"""Evaluation of a fit that chose its training poses: both worlds are aligned, and test views look for their own poses.
+"""Evaluation of fits with refined training poses: the fit's frame is aligned, and test poses are refined to their views.
 
 The fit may have drifted by a similarity, so the undisturbed test poses are carried into its world by the one between true and
 refined training poses. What remains of their errors belongs to the cameras rather than to the scene, so each is refined
@@ -16,7 +16,7 @@ from torch import Tensor
 from invgraphics.core import Camera, Field, Renderer, Rendering, Scene, View
 from invgraphics.metrics.poses import PoseErrors, Similarity, pose_errors
 from invgraphics.recipes.recipe import Method
-from invgraphics.training.localise import Descent, descend
+from invgraphics.training.localise import PoseDescent, refine_pose
 from invgraphics.training.poses import Poses, PosesConfig
 
 
@@ -99,8 +99,8 @@ class PosedEvaluation:
         start = transform_camera(view.camera, self._world_to_fit)
         if not self._config.test_steps:
             return start
-        descent = Descent(self._config.test_steps)
-        return descend(self._model, replace(view, camera=start), self._scene, descent)
+        descent = PoseDescent(self._config.test_steps)
+        return refine_pose(self._model, replace(view, camera=start), self._scene, descent)
 
     def to_scene_frame(self, picture: Rendering, used: Camera, view: View) -> Rendering:
         """The rendering with depth in the scene's units and normals in the scene's frame."""

@@ -1,4 +1,4 @@
-"""How far estimated cameras are from the true ones, after the similarity that no photograph can tell.
+"""Errors of estimated camera poses after alignment by a similarity (the gauge freedom of structure from motion).
 
 Structure from motion and joint optimisation know the world up to a similarity (gauge freedom), so estimated poses are moved by
 the best one first: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns", on the
@@ -87,7 +87,7 @@ def align_similarity(
     source_rotations: Float[Tensor, "n 3 3"] | None = None,
     target_rotations: Float[Tensor, "n 3 3"] | None = None,
 ) -> Similarity:
-    """The similarity that takes the source's camera centres to the target's with the least sum of squared distances.
+    """Least-squares similarity from the source's camera centres to the target's (Umeyama 1991).
 
     Umeyama's closed form decides alone where the centres span at least a plane. Where either set lies on a line (`THINNEST`)
     and orientations are given, the relative rotations ``target_rotation @ source_rotation.T`` have as much say about the

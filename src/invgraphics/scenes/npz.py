@@ -1,4 +1,4 @@
-"""A scene in one ``.npz``: the simplest thing a person can write with ``numpy.savez``.
+"""Scenes in one ``.npz`` file, as ``numpy.savez`` writes it.
 
 ============== ============================== =====================================================================
 key            shape                          meaning

@@ -21,7 +21,7 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.poses import Similarity, rotation_angle
 from invgraphics.runs.folder import make_parent, write_json
 from invgraphics.scenes.images import make_view, read_pixels
-from invgraphics.training.localise import Descent, descend, difference
+from invgraphics.training.localise import PoseDescent, photometric_error, refine_pose
 
 COARSEST = 32
 """Longest side in pixels at which all starts are compared."""
@@ -138,15 +138,15 @@ def _search(
     """The best view after every round; each round keeps half of those it got. Also what became of the starts."""
     model, scene = (fitted.field, fitted.renderer), fitted.scene
     coarse = min(1.0, COARSEST / max(starts[0].camera.width, starts[0].camera.height))
-    losses = [difference(model, view, scene, coarse) for view in starts]
+    losses = [photometric_error(model, view, scene, coarse) for view in starts]
     order = sorted(range(len(starts)), key=losses.__getitem__)[: request.starts]
     kept = [(starts[i], i) for i in order]
     tried = [{"start": i, "loss_at_start": losses[i]} for i in order]
     for number, (scale, share, lr, final) in enumerate(LEVELS):
         fine = max(scale, coarse)
-        descent = Descent(max(1, round(request.steps * share)), lr, final, fine)
-        kept = [(replace(view, camera=descend(model, view, scene, descent)), i) for view, i in kept]
-        ranked = sorted((difference(model, view, scene, fine), place) for place, (view, _) in enumerate(kept))
+        descent = PoseDescent(max(1, round(request.steps * share)), lr, final, fine)
+        kept = [(replace(view, camera=refine_pose(model, view, scene, descent)), i) for view, i in kept]
+        ranked = sorted((photometric_error(model, view, scene, fine), place) for place, (view, _) in enumerate(kept))
         for loss, place in ranked:
             next(entry for entry in tried if entry["start"] == kept[place][1])[f"loss_at_scale_{fine:g}"] = loss
         kept = [kept[place] for _, place in ranked[: max(1, len(ranked) // 2)]]
@@ -159,7 +159,7 @@ def _written(
 ) -> dict[str, Any]:
     found, tried = result
     scene = fitted.scene
-    loss = difference((fitted.field, fitted.renderer), found, scene)
+    loss = photometric_error((fitted.field, fitted.renderer), found, scene)
     pose = transform_camera(found.camera, back).cam_to_world
     record: dict[str, Any] = {
         "schema": 1,

@@ -30,8 +30,8 @@ class Plan:
 
     Attributes:
         field: what is fitted.
-        renderer: what it is seen through.
-        scene: what it is compared with.
+        renderer: what it is fitted through.
+        scene: training views, bounds and background.
         losses: their sum is minimised.
         hooks: called around each step, in order.
         optimiser: parameter groups and Adam's settings.
@@ -56,7 +56,7 @@ class Plan:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Everything with parameters, by the names that begin theirs."""
+        """Modules with parameters, by the prefixes of the parameters' names."""
         named: dict[str, nn.Module] = {"field": self.field, "renderer": self.renderer}
         if self.poses is not None:
             named["poses"] = self.poses
@@ -64,7 +64,7 @@ class Plan:
 
 
 class Fit:
-    """A fit in progress. `step` advances it; `state` and `load` carry it over an interruption, bit by bit on a CPU."""
+    """A fit in progress: `step` advances it; `state` and `load` resume it after an interruption, bit-exactly on a CPU."""
 
     def __init__(self, plan: Plan) -> None:
         check(plan.field, plan.renderer)
@@ -101,7 +101,7 @@ class Fit:
         return Context(self._bounds, training=True, progress=self.progress, generator=self._generator)
 
     def step(self) -> float:
-        """One step: draw, render, compare, differentiate, move. Returns the loss.
+        """One optimisation step: draw a batch, render, composite, sum the losses, backpropagate, update. Returns the loss.
 
         Raises:
             NumericalError: the loss is not finite; names the step and the first tensor that is not.
@@ -118,7 +118,7 @@ class Fit:
         loss = torch.stack([loss(composited, trace, batch, ctx) for loss in plan.losses]).sum()
         value = loss.item()
         if not torch.isfinite(loss):
-            raise NumericalError(self._blame(rendering))
+            raise NumericalError(self._first_not_finite(rendering))
         self._optimiser.zero_grad()
         if loss.requires_grad:
             loss.backward()
@@ -152,8 +152,8 @@ class Fit:
             rendering, trace = renderer.render_image(fitted, camera, ctx)
         return rendering, trace, batch
 
-    def _blame(self, rendering: Rendering) -> str:
-        """The first tensor that is not finite, in the order in which a reader would look."""
+    def _first_not_finite(self, rendering: Rendering) -> str:
+        """A sentence that names the first tensor that is not finite: parameters first, then the rendering."""
         candidates: dict[str, Tensor] = {
             f"{owner}.{name}": parameter
             for owner, module in self.plan.modules.items()
@@ -180,18 +180,18 @@ class Fit:
         return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "ran_seconds": ran, "waited_seconds": waited}
 
     def resume_clocks(self, record: Mapping[str, Any]) -> None:
-        """Go on from what `clocks` said, but for ``seconds``, which `load` takes."""
+        """Continue from a record of `clocks`, but for ``seconds``, which `load` takes."""
         self.cpu_seconds = float(record.get("cpu_seconds") or 0.0)
         self._earlier = float(record.get("ran_seconds") or 0.0), float(record.get("waited_seconds") or 0.0)
         self._scheduler = SchedulerTimes()
 
     def run(self, after_step: Callable[[float], bool]) -> None:
-        """Step until the budget is spent or ``after_step(loss)`` says stop (by returning True)."""
+        """Step until the budget is spent or ``after_step(loss)`` returns True."""
         while self.progress < 1 and not after_step(self.step()):
             pass
 
     def state(self) -> dict[str, dict[str, Tensor]]:
-        """Every tensor of the fit, by section. Contains no clock reading."""
+        """Every tensor of the fit, by section; no clock readings."""
         return {
             **{owner: dict(module.state_dict()) for owner, module in self.plan.modules.items()},
             "optimiser": self._optimiser.state(),
@@ -202,7 +202,7 @@ class Fit:
         }
 
     def load(self, state: dict[str, dict[str, Tensor]], seconds: float) -> None:
-        """Go on from a `state`; ``seconds`` is the optimisation time already spent."""
+        """Resume from a `state`; ``seconds`` is the optimisation time already spent."""
         for owner, module in self.plan.modules.items():
             module.load_state_dict(state.get(owner, {}))
         self._optimiser = self._make_optimiser()

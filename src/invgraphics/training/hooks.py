@@ -76,7 +76,7 @@ class Hook:
         """Called after the optimiser's step."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Tensors a resumed fit needs."""
+        """Tensors that a resumed fit needs."""
         return {}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""Limits that keep every Gaussian trainable: bounds on opacity and scale, and a count of those that no gradient can change."""
+"""Bounds on opacities and scales that keep gradients of Gaussians alive, and a count of the dead ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CHUNK = 1 << 15
 
 @dataclass(frozen=True)
 class LimitsConfig:
-    """Projection of opacities and scales onto intervals in which gradients can move them, after every step.
+    """Clamps opacities and scales, after every step, to intervals in which they have gradients.
 
     Without it, long fits drive logits to where the float32 sigmoid has no slope, and scales to where the rasteriser's low-pass
     filter hides them; density control then copies what can no longer change.
@@ -94,7 +94,7 @@ def _logit(opacity: float) -> float:
 
 
 def pixel_sizes(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
-    """Edge length of a pixel at each point, in the camera that is nearest in units of its focal length, whatever it faces.
+    """Size of a pixel at each point, local units: the smallest distance over focal length of any camera, in view or not.
 
     A lower bound of what any of the cameras can resolve there, from distances alone.
     """
@@ -116,7 +116,7 @@ DEAD_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class DeadGaussians:
-    """Which of n Gaussians no gradient can change, by cause.
+    """Masks of the Gaussians whose gradients vanish, by cause.
 
     Attributes:
         saturated: opacities whose sigmoid has no slope in float32.
@@ -130,12 +130,12 @@ class DeadGaussians:
 
     @property
     def any(self) -> Bool[Tensor, " n"]:
-        """Dead for one reason or another."""
+        """Gaussians that are dead for any cause."""
         return self.saturated | self.faded | self.collapsed
 
     @property
     def share(self) -> float:
-        """Part of all Gaussians that is dead, in [0, 1]."""
+        """Share of the Gaussians that are dead, in [0, 1]."""
         return float(self.any.float().mean()) if len(self.faded) else 0.0
 
     def sentence(self) -> str:
@@ -147,7 +147,7 @@ class DeadGaussians:
 
 @torch.no_grad()
 def dead_gaussians(field: Field, cameras: Sequence[Camera]) -> DeadGaussians | None:
-    """Gaussians whose position, size, opacity or colour can no longer change; ``None`` for a field without Gaussians.
+    """Find Gaussians whose gradients vanish; ``None`` for a field without Gaussians.
 
     Args:
         field: what is fitted, or was.

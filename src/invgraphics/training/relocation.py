@@ -127,7 +127,7 @@ class Relocation(Hook):
 
 
 def _draw(chances: Float[Tensor, " n"], count: int, state: FitState) -> Int[Tensor, " k"]:
-    """Rows drawn with replacement by their chances; on the CPU, where the fit's generator lives."""
+    """Multinomial sample of rows with replacement; on the CPU, where the fit's generator lives."""
     cumulated = chances.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=state.ctx.generator, dtype=torch.float64) * cumulated[-1]
     return torch.searchsorted(cumulated, draws, right=True).clamp_max(len(chances) - 1).to(chances.device)
@@ -155,7 +155,7 @@ def relocated_opacity(
 
 
 def _perturb(state: FitState, strength: float, dead: float) -> None:
-    """Langevin noise on the means, in the shape of each Gaussian, for nearly transparent ones only."""
+    """Add Langevin noise with each Gaussian's covariance to the means of nearly transparent Gaussians (equation 8)."""
     field = cast(GaussianParameters, state.field)
     gate = torch.sigmoid(GATE_SLOPE * (dead - torch.sigmoid(field.opacity_logits)))
     rows = (gate > NEGLIGIBLE).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, §4.1): no Gaussian is finer than what a photograph can show."""
+"""The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, §4.1): a low-pass filter at the training views' sampling rate."""
 
 from __future__ import annotations
 
@@ -79,9 +79,9 @@ class Smoothing(Hook):
 
 
 def pixel_distances(points: Float[Tensor, "n 3"], cameras: Sequence[Camera], margin: float, near: float) -> Float[Tensor, " n"]:
-    """Distance between neighbouring pixels' rays at each point, in the camera that sees it most finely.
+    """Sampling interval at each point: depth over focal length in the camera with the highest sampling rate there.
 
-    Points that no camera sees get the largest distance of those that are seen; 0 if none is.
+    Points in no camera's view get the largest interval of those in view; 0 if none is.
     """
     cameras = [camera.to(points.device) for camera in cameras]
     world_to_cam = torch.stack([camera.world_to_cam[:3] for camera in cameras]).to(points)

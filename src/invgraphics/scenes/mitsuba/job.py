@@ -1,4 +1,4 @@
-"""What the parent process asks the rendering process for, and the hash under which the answer is kept."""
+"""Rendering jobs, and the hash that is their key in the cache."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the cache holds a larger rendering of a scene, whose pictures can be averaged instead of rendering smaller ones."""
+"""Find a larger cached rendering of a scene whose pictures can be area-averaged instead of rendering smaller ones."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _is_larger(source: Source, job: Job) -> bool:
 
 
 def _effective(source: Source, size: tuple[int, int]) -> SamplesPerPixel:
-    """SamplesPerPixel per averaged pixel."""
+    """Samples per averaged pixel."""
     pixels, new_pixels = math.prod(source.size), math.prod(size)
     train, val, half = (
         count * pixels // new_pixels for count in (source.samples.train, source.samples.val, source.samples.test // 2)

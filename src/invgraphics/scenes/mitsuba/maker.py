@@ -1,4 +1,4 @@
-"""`make`: the one door to the rendered scenes. Looks in the cache, and has what is missing rendered by a process of its own."""
+"""`make`: a built-in scene's rendered truth, from the cache or else from a rendering process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a ``scene.toml`` says: the schema of a scene description."""
+"""Schema and reader of a scene description, ``scene.toml``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class SamplesPerPixel:
-    """SamplesPerPixel per pixel of each split; those of ``test`` are taken in two independent halves."""
+    """Samples per pixel of each split; those of ``test`` are taken in two independent halves."""
 
     train: int = 256
     val: int = 256

@@ -23,10 +23,10 @@ _SMALLEST_MODEL = 3
 
 @dataclass(frozen=True)
 class Matched:
-    """What every strategy starts from.
+    """Features and verified matches that every strategy starts from.
 
     Attributes:
-        job: what was asked for.
+        job: settings of the import.
         photos: the working copies.
         evidence: verified pairs.
         work: folder of the data base; its features and matches stay as they are.
