@@ -15,11 +15,11 @@ from PIL import Image
 
 from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
-from invgraphics.experiments.shortfall import observe, shortfall
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
@@ -108,10 +108,10 @@ def score_model(
             timed = index % ceil(len(scene.test) / TIMED) == 0
             picture, took = _picture(model, camera, normals=view.normal is not None, timed=timed)
             seconds += took
-            picture = picture if posed is None else posed.as_seen(picture, camera, view)
+            picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
             keep(index, picture)
             scores.append(score(picture, view, scene, rules))
-            observed.append(observe(picture, view.camera, scene))
+            observed.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
     return {
@@ -121,7 +121,7 @@ def score_model(
         "cost": _model_costs(model, scene, statistics.median(seconds)),
         "quality": quality if posed is None else quality | posed.quality(),
         "skipped": skipped,
-        **shortfall(title, quality, observed, scene, rules),
+        **below_baseline(title, quality, observed, scene, rules),
     }
 
 
