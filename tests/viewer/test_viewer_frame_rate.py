@@ -98,3 +98,27 @@ def test_two_runs_share_the_tenth_of_a_second(layout: str) -> None:
     for _ in range(12):
         move()
     assert max(move()[0] for _ in range(30)) <= TENTH
+
+
+def test_refinement_over_empty_background_does_not_slow_the_next_movement() -> None:
+    """Strips of the lower half of the image cost nothing."""
+    clock = Clock()
+
+    class HalfEmpty(FakeRun):
+        def render(self, camera: Camera, geometry: bool) -> Rendering:
+            below_centre = float(camera.centre[1]) < camera.height / 2  # a strip of the lower half
+            self.per_pixel = 1e-9 if below_centre else 1e-5
+            return super().render(camera, geometry)
+
+    run = HalfEmpty(clock, 1e-5, 0.0, independent_pixels=True)
+    renderer = ProgressiveRenderer((run,), clock)  # type: ignore[arg-type]
+    request = RenderRequest(ViewerCamera(torch.eye(4), 0.8, 1.5), (900, 600))
+    for _ in range(12):
+        next(renderer.render(request, lambda _: None))
+    frames: list[Frame] = []
+    for _ in renderer.render(request, frames.append):
+        pass
+    assert frames[-1].final
+    began = clock.now
+    next(renderer.render(request, frames.append))
+    assert clock.now - began <= TENTH

@@ -212,17 +212,14 @@ class ProgressiveRenderer:
             # A splat's footprint depends on its distance to the image's border, so tiles would not match.
             picture = run.render(camera, geometry)
             return picture if panel.whole else _columns(picture, columns)
-        resolution = self.resolutions[run]
-        rows = camera.height if untiled else resolution.strip_rows(columns[1] - columns[0])
+        # Strips do not adapt the resolution: one of empty background is fast, and the next movement would be slow.
+        rows = camera.height if untiled else self.resolutions[run].strip_rows(columns[1] - columns[0])
         parts = []
         for top in range(0, camera.height, rows):
             if parts:
                 yield 0.0
             strip = subregion(camera, columns, (top, min(top + rows, camera.height)))
-            began = self._clock()
             parts.append(run.render(strip, geometry))
-            if not untiled and strip.height == rows:
-                resolution.update(strip.width * rows, self._clock() - began)
         return Rendering.cat(parts)
 
     def _compose(self, request: RenderRequest, sides: Sequence[_Side], letterbox: LetterboxedView | None) -> Frame:
