@@ -85,6 +85,10 @@ class Points:
     def __len__(self) -> int:
         return len(self.position)
 
+    def joined(self, others: Points) -> Points:
+        """These points, then the others."""
+        return Points(torch.cat([self.position, others.position]), torch.cat([self.rgb, others.rgb]))
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
