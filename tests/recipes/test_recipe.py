@@ -8,7 +8,6 @@ import tomllib
 import pytest
 import torch
 
-from invgraphics.core import check
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.recipes.recipe import load_method, methods, presets, resolve
@@ -31,10 +30,9 @@ def test_recipe_reads_and_survives_a_round_trip(name: str, preset: str) -> None:
 @pytest.mark.parametrize("space", ["box", "contracted"])
 def test_recipe_conforms(name: str, space: str) -> None:
     scene = toy_scene(views=3, size=8, space=space)
-    field, renderer = build_model(load_method(name), scene, 0, torch.device("cpu"))
-    check(field, renderer)
-    check_field(field, scene)
-    check_renderer(renderer, field, scene)
+    model = build_model(load_method(name), scene, 0, torch.device("cpu"))
+    check_field(model.field, scene)
+    check_renderer(model.renderer, model.field, scene)
 
 
 def test_overrides_take_toml_values() -> None:
@@ -107,9 +105,21 @@ def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
     (hook,) = [hook for hook in table["hooks"] if hook["type"] == "density_control"]
     for new, old in {"revised_opacity": "share_opacity", "cap_ramp": "pace", "latest_start_step": "start_steps"}.items():
         hook[old] = hook.pop(new)
+    for new, old in {"antialiased": "compensate", "max_grad_splats": "receivers"}.items():
+        table["renderer"][old] = table["renderer"].pop(new)
     assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
     again = resolve(method.name, "long", table)
     assert again.recipe == method.recipe and again.table == method.table
     assert again.digest == method.digest == hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
     with pytest.raises(InputError, match=r"Unknown key 'hooks\.1\.pace'"):
         resolve(method.name, "", table | {"hooks": [table["hooks"][0], {"type": "density_control", "pace": 1, "cap_ramp": 1}]})
+
+
+def test_renderers_of_older_runs_still_resolve() -> None:
+    now = load_method("splatting/gaussians-mip", None, ["renderer.max_grad_splats=10"])
+    renderer = {key: value for key, value in now.table["renderer"].items() if key not in ("antialiased", "max_grad_splats")}
+    older = now.table | {"renderer": renderer | {"compensate": True, "receivers": 10}}
+    assert resolve(now.name, now.preset, older).table == now.table
+    hashed = load_method("volumetric/hash").table
+    sampler = {("wave" if key == "chunk" else key): value for key, value in hashed["renderer"]["sampler"].items()}
+    assert resolve("mine", "", hashed | {"renderer": hashed["renderer"] | {"sampler": sampler}}).table == hashed

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from invgraphics import kernels
-from invgraphics.core import Bounds, Context, Field, FieldValues, Quantity, Samples, Scene, View
+from invgraphics.core import Bounds, Context, Field, FieldValues, Model, Quantity, Samples, Scene, View
 from invgraphics.core.colour import quantise
+from invgraphics.core.ngp import HashGrid
 from invgraphics.core.transforms import se3_exp
 from invgraphics.experiments.build import build_model, build_plan
 from invgraphics.fields.encodings.frequency import FrequencyConfig
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.kernels import reference
-from invgraphics.kernels.types import HashGrid
 from invgraphics.metrics.poses import pose_errors
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
@@ -120,9 +120,9 @@ def liven(field: Field) -> None:
 def test_gradients_of_a_pose(family: str, scene: Scene, small: Callable) -> None:
     """Through the field's positions and directions, against finite differences in float64."""
     name, settings = RENDERERS[family]
-    field, renderer = build_model(small(name, *settings), scene, 0, CPU)
-    liven(field)
-    field, renderer = field.double(), renderer.double()
+    model = build_model(small(name, *settings), scene, 0, CPU)
+    liven(model.field)
+    field, renderer = model.field.double(), model.renderer.double()
     camera = scene.train[0].camera.resized(8, 8).to(torch.float64)
     ctx = Context(scene.bounds.to(torch.float64))
     cotangent = torch.rand(8, 8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
@@ -147,12 +147,12 @@ def test_marching_keeps_the_gradients_of_positions(stop: str, scene: Scene, smal
     gradients = []
     for how in (stop, "never"):
         settings = [f"renderer.sampler.stop={how}", "renderer.sampler.transmittance=0.0"]
-        field, renderer = build_model(small("volumetric/hash", *settings), scene, 0, CPU)
-        liven(field)
+        model = build_model(small("volumetric/hash", *settings), scene, 0, CPU)
+        liven(model.field)
         twist = torch.zeros(6, requires_grad=True)
         camera = scene.train[0].camera
         moved = camera.moved(camera.cam_to_world @ se3_exp(twist))
-        picture, _ = renderer.render_image(field, moved, Context(scene.bounds))
+        picture, _ = model.renderer.render_image(model.field, moved, model.context())
         gradients.append(torch.autograd.grad(picture.rgb.square().sum(), twist)[0])
     assert float(gradients[0].abs().min()) > 0
     torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-4, atol=1e-4 * float(gradients[1].abs().max()))
@@ -237,7 +237,7 @@ def test_resumed_with_poses_equals_uninterrupted(name: str, scene: Scene, small:
     assert same(whole.state(), second.state())
     assert whole.plan.poses is not None
     assert all(bool(turn.any()) for turn in whole.plan.poses.rotation)
-    opened = [encoding.detail for encoding in coarse_to_fine_encodings(whole.plan.field, whole.plan.renderer)]
+    opened = [encoding.detail for encoding in coarse_to_fine_encodings(whole.plan.model)]
     assert all(detail is not None and float(detail) == 1.0 for detail in opened)
     assert bool(opened) == name.startswith("volumetric")
 
@@ -248,8 +248,7 @@ def test_poses_come_back(blobs: Scene) -> None:
     config = PosesConfig(rotation_lr=3e-2, translation_lr=1e-2, window=(0.0, 0.0), rotation_warmup=0.0, translation_warmup=0.0)
     poses = Poses.of(config, shown)
     plan = Plan(
-        field=Blobs(),
-        renderer=VolumetricConfig(StratifiedConfig(32)).build(shown),
+        model=Model(Blobs(), VolumetricConfig(StratifiedConfig(32)).build(shown), shown.bounds),
         scene=shown,
         losses=[PhotometricLoss()],
         hooks=[],
@@ -269,7 +268,7 @@ def test_poses_come_back(blobs: Scene) -> None:
 def test_a_photograph_finds_its_pose(blobs: Scene) -> None:
     view = blobs.test[0]
     wrong = view.camera.moved(view.camera.cam_to_world @ se3_exp(torch.tensor([0.08, -0.06, 0.1, 0.1, -0.1, 0.15])))
-    model = (Blobs(), VolumetricConfig(StratifiedConfig(32)).build(blobs))
+    model = Model(Blobs(), VolumetricConfig(StratifiedConfig(32)).build(blobs), blobs.bounds)
     misplaced = View(wrong, view.image, view.name)
     found = refine_pose(model, misplaced, blobs, PoseDescent(steps=150, lr=2e-2, final=5e-4, rays=300))
     error = (found.cam_to_world - view.camera.cam_to_world).norm()

@@ -105,9 +105,9 @@ def test_resuming_gives_the_same_bits(make_fit, scene) -> None:
     kept = {part: {name: value.clone() for name, value in tensors.items()} for part, tensors in first.state().items()}
     second.load(kept, 0.0)
     second.run(lambda loss: False)
-    assert whole.plan.field.primitive_count() > 150
-    for name, value in whole.plan.field.state_dict().items():
-        assert torch.equal(value, second.plan.field.state_dict()[name]), name
+    assert whole.plan.model.field.primitive_count() > 150
+    for name, value in whole.plan.model.field.state_dict().items():
+        assert torch.equal(value, second.plan.model.field.state_dict()[name]), name
 
 
 def test_refusals(make_fit, scene) -> None:
@@ -115,5 +115,5 @@ def test_refusals(make_fit, scene) -> None:
         RelocationConfig(every=0)
     with pytest.raises(ValueError, match="dead"):
         RelocationConfig(dead=0.0)
-    with pytest.raises(InputError, match="'relocation' needs Gaussians, which NeuralField does not have"):
-        RelocationConfig().build().check(make_fit("volumetric/hash", scene, 1).plan.field)
+    with pytest.raises(InputError, match="relocation"):
+        RelocationConfig().build().check(make_fit("volumetric/hash", scene, 1).plan.model.field, None)

@@ -13,7 +13,9 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
+from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.compositing import straight_over
+from invgraphics.core.display import contact_sheet, encode_png, figure_html
 
 Pixels = UInt8[Tensor, "h w c"] | Float[Tensor, "h w c"]
 
@@ -63,6 +65,10 @@ class View:
         if self.alpha is None:
             return self.colour(index)
         return straight_over(self.colour(index), self.opacity(index), background)
+
+    def _repr_png_(self) -> bytes:
+        """The photograph in a notebook, over white, taken as display sRGB."""
+        return encode_png(self.over(torch.ones(3, device=self.image.device)))
 
 
 def _floats(values: Tensor) -> Tensor:
@@ -149,6 +155,21 @@ class Scene:
                     sha.update(repr((tuple(values.shape), str(values.dtype))).encode())
                     sha.update(np.ascontiguousarray(values.cpu().numpy()).tobytes())
         return sha.hexdigest()
+
+    def _repr_html_(self) -> str:
+        """A contact sheet and the scene's facts, in a notebook."""
+        pictures = [view.over(self.background).cpu() for view in (*self.train[:12], *self.test[:4])]
+        shown = [linear_to_srgb(picture) for picture in pictures] if self.colour == "linear" else pictures
+        sizes = {f"{view.camera.width} x {view.camera.height}" for view in (*self.train, *self.test)}
+        facts = {
+            "scene": self.name,
+            "views": f"{len(self.train)} to fit, {len(self.val)} to watch, {len(self.test)} to score",
+            "pixels": ", ".join(sorted(sizes)),
+            "bounds": f"{self.bounds.space}, {self.bounds.lo.tolist()} to {self.bounds.hi.tolist()}",
+            "colour": f"{self.colour}, {'with alpha' if self.has_alpha else 'opaque'}",
+            "points": "none" if self.points is None else f"{len(self.points):,}",
+        }
+        return figure_html(contact_sheet(shown), facts)
 
     def camera_digest(self) -> str:
         """SHA-256 of all cameras of all splits, in world order of the views."""

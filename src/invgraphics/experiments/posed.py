@@ -1,6 +1,6 @@
 """Evaluation of fits with refined training poses: the fit's frame is aligned, and test poses are refined to their views.
 
-The fit may have drifted by a similarity, so the undisturbed test poses are carried into its world by the one between true and
+The fit may have drifted by a similarity, so the test poses are transformed to its frame by the one between true and
 refined training poses. What remains of their errors belongs to the cameras rather than to the scene, so each is refined
 to its photograph before it is scored (BARF, §4.1).
 """
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from invgraphics.core import Camera, Field, Renderer, Rendering, Scene, View
+from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.metrics.poses import PoseErrors, Similarity, pose_errors
 from invgraphics.recipes.recipe import Method
 from invgraphics.training.localise import PoseDescent, refine_pose
@@ -86,10 +86,10 @@ class PosedEvaluation:
     Args:
         poses: of the fit.
         scene: as loaded, its poses not degraded.
-        model: fitted field and renderer.
+        model: fitted.
     """
 
-    def __init__(self, poses: Poses, scene: Scene, model: tuple[Field, Renderer]) -> None:
+    def __init__(self, poses: Poses, scene: Scene, model: Model) -> None:
         self._scene, self._model, self._config = scene, model, poses.config
         self.errors = training_errors(poses, scene)
         self._world_to_fit = self.errors.similarity.inverse()

@@ -78,7 +78,7 @@ class FitRequest(Settings):
     """One run.
 
     Attributes:
-        method: ``renderer/recipe`` or the path of a recipe.
+        method: ``renderer/recipe`` or the path of a recipe; changes may follow (see `invgraphics.recipes.recipe.split_name`).
         seed: of initial values and of the fit.
         existing: what to do with a run that is already there: ``refuse``; ``resume`` it, if it is the same; or ``reuse`` what
             is the same and replace what is not.
@@ -207,4 +207,4 @@ class AblateRequest:
 
 def slug(method: str) -> str:
     """A method's name as one folder name."""
-    return method.removesuffix(".toml").strip("/").replace("/", "-")
+    return method.removesuffix(".toml").strip("/").replace("/", "-").replace(":", "-")

@@ -34,7 +34,7 @@ MS_SSIM_SHORTEST = 161
 
 
 def psnr(pair: Pair, how: Psnr = _PSNR) -> float:
-    """Peak signal-to-noise ratio in dB over the pixels that count, -10 log10(MSE) for colours in [0, 1]; at most 100."""
+    """Peak signal-to-noise ratio in dB, -10 log10(MSE) for colours in [0, 1], over unmasked pixels; at most `PSNR_CAP`."""
     squared = (pair.image.double() - pair.truth.double()).square()
     channels = squared.unbind(dim=-1) if how.channels == "apart" else (squared.mean(dim=-1),)
     values = [-10 * math.log10(max(pair.mean_within(errors), 10 ** (-PSNR_CAP / 10))) for errors in channels]

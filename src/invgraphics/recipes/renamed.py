@@ -12,6 +12,8 @@ RENAMED_KEYS: dict[str, dict[str, str]] = {
         "start_steps": "latest_start_step",
     },
     "hooks.relocation": {"pace": "cap_ramp"},
+    "renderer.splatting": {"compensate": "antialiased", "receivers": "max_grad_splats"},
+    "renderer.sampler.occupancy": {"wave": "chunk"},
 }
 """Part of a recipe -> its keys' first names -> today's.
 

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import device_of
 from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.base import Outcome, Resources
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest
-from invgraphics.metrics.protocols import protocol_named
 from invgraphics.runs.folder import RunFolder
 from invgraphics.studies.cells import Planned
 from invgraphics.studies.study import Study
-from invgraphics.training.budget import Budget
 
 RECORD = "study.json"
 """What a study's folder holds beside its runs: the design, and the state of every cell."""
@@ -85,8 +83,8 @@ class Record:
 
 
 def _entry(planned: Planned, before: dict[str, Any]) -> dict[str, Any]:
-    cell, budget = planned.cell, Budget.parse(planned.fit.budget)
-    ended = before.get("status") == "failed" or (before.get("status") == "done" and RunFolder(Path(planned.fit.out)).finished)
+    cell, budget = planned.cell, planned.job.budget
+    ended = before.get("status") == "failed" or (before.get("status") == "done" and planned.job.folder.finished)
     return {
         "id": planned.id,
         "label": planned.label,
@@ -106,11 +104,12 @@ def _entry(planned: Planned, before: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def summarise_study(study: Study, name: str, request: AblateRequest, resources: Resources) -> dict[str, Any]:
-    """Everything of ``study.json`` but the cells."""
+def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resources], job: Job) -> dict[str, Any]:
+    """Everything of ``study.json`` but the cells; ``job`` is one of theirs."""
+    request, resources = asked
     keys = ("question", "design", "factors", "base", "scenes", "methods", "seeds", "budget", "preset", "size", "test_views")
     keys += ("render_with", "analyses", "report")
-    machine = environment(device_of(request.device))
+    machine = environment(job.device)
     machine |= {"threads": resources.threads, "executor": request.executor, "jobs": resources.jobs}
     return {
         "schema": 1,
@@ -118,7 +117,7 @@ def summarise_study(study: Study, name: str, request: AblateRequest, resources: 
         **{key: getattr(study, key) for key in keys},
         "approximations": [asdict(pair) for pair in study.approximations],
         "known": [asdict(deviation) for deviation in study.known],
-        "protocol": protocol_named(study.protocol).record(),
+        "protocol": job.protocol.record(),
         "command": request.shell(),
         "environment": machine,
     }

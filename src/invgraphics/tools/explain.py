@@ -11,12 +11,11 @@ from typing import Any, Literal
 from PIL import Image
 from torch import Tensor
 
-from invgraphics.core import Camera, Context, Rendering, Scene, View
+from invgraphics.core import Camera, Contributions, Profile, Rendering, Scene, View
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs.folder import write_json
-from invgraphics.tools.along import Contributions, Profile, along_ray
 from invgraphics.training.limits import dead_gaussians
 
 Split = Literal["test", "train"]
@@ -81,10 +80,8 @@ def explain(request: ExplainRequest) -> Explanation:
     """
     fitted = open_fitted(request.run, request.scene).in_its_frame()
     view = _view(fitted.scene, request)
-    camera = view.camera.to(fitted.device)
-    ctx = Context(fitted.scene.bounds.to(fitted.device), training=False)
-    found = on_cpu(along_ray(fitted.field, fitted.renderer, camera, request.pixel, ctx))
-    picture = render_view(fitted.field, fitted.renderer, view.camera, fitted.scene, fitted.device, geometry=False)
+    found = fitted.model.contributions(view.camera, request.pixel)
+    picture = fitted.model.render(view.camera, normals=False)
 
     column, row = request.pixel
     background = fitted.scene.background
@@ -95,21 +92,6 @@ def explain(request: ExplainRequest) -> Explanation:
     explanation = Explanation(request.folder, found, rendered, composited, facts)
     _write(explanation, view, picture, fitted.scene)
     return explanation
-
-
-def on_cpu(found: Contributions) -> Contributions:
-    """The same contributions, all tensors on the CPU."""
-
-    def moved(value: Any) -> Any:
-        if isinstance(value, Tensor):
-            return value.cpu()
-        if isinstance(value, tuple):
-            return tuple(moved(item) for item in value)
-        if hasattr(value, "__dataclass_fields__"):
-            return type(value)(**{name: moved(item) for name, item in vars(value).items()})
-        return value
-
-    return moved(found)
 
 
 def _view(scene: Scene, request: ExplainRequest) -> View:
@@ -170,7 +152,7 @@ def _facts(fitted: Fitted, request: ExplainRequest, view: View, found: Contribut
 
 def _dead(fitted: Fitted) -> dict[str, Any] | None:
     """Share, number and causes of primitives that no gradient can change; ``None`` for fields without Gaussians."""
-    dead = dead_gaussians(fitted.field, [view.camera for view in fitted.scene.train])
+    dead = dead_gaussians(fitted.model.field, [view.camera for view in fitted.scene.train])
     return None if dead is None else {"share": _number(dead.share), "sentence": dead.sentence()}
 
 

@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 import torch
 
-from invgraphics.core import Camera, Context, Quantity
+from invgraphics.core import Camera, Quantity
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
 from invgraphics.renderers.ellipsoids import draw_ellipsoids
@@ -109,11 +109,10 @@ def _timelapse(fitted: Fitted, request: FilmRequest) -> tuple[int, Iterator[np.n
     def pictures() -> Iterator[np.ndarray]:
         picture = np.zeros((1, 1, 3), np.uint8)
         for path in snapshots:
-            state = checkpoint.load(path, fitted.device)
-            fitted.field.load_state_dict(state.get("field", {}))
-            fitted.renderer.load_state_dict(state.get("renderer", {}))
+            state = checkpoint.load(path, fitted.model.device)
+            fitted.load(state)
             picture = _picture(fitted, camera)
-            if Quantity.GAUSSIANS in fitted.field.provides:
+            if Quantity.GAUSSIANS in fitted.model.field.provides:
                 picture = np.concatenate([picture, _ellipsoids(fitted, camera)], axis=1)
             yield picture
         for _ in range(round(HOLD_SECONDS * request.rate)):
@@ -124,14 +123,14 @@ def _timelapse(fitted: Fitted, request: FilmRequest) -> tuple[int, Iterator[np.n
 
 def _picture(fitted: Fitted, camera: Camera) -> np.ndarray:
     """8-bit display colours over the scene's background."""
-    rendering = render_view(fitted.field, fitted.renderer, camera, fitted.scene, fitted.device, geometry=False)
+    rendering = fitted.model.render(camera, normals=False)
     return display(rendering.over(fitted.scene.background), fitted.scene).numpy()
 
 
 def _ellipsoids(fitted: Fitted, camera: Camera) -> np.ndarray:
-    ctx = Context(fitted.scene.bounds.to(fitted.device))
+    model = fitted.model
     with torch.no_grad():
-        drawn = draw_ellipsoids(fitted.field.primitives(Quantity.GAUSSIANS, ctx), camera.to(fitted.device))
+        drawn = draw_ellipsoids(model.field.primitives(Quantity.GAUSSIANS, model.context()), camera.to(model.device))
     rendering = replace(drawn, rgb=drawn.rgb.cpu(), alpha=drawn.alpha.cpu())
     return display(rendering.over(fitted.scene.background), fitted.scene).numpy()
 

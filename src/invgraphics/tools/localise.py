@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from invgraphics.core import Camera, Scene, View
 from invgraphics.core.transforms import apply_similarity, focal_from_fov, se3_exp
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
@@ -136,7 +136,7 @@ def _search(
     fitted: Fitted, starts: list[View], request: LocateRequest, reporter: Reporter
 ) -> tuple[View, list[dict[str, Any]]]:
     """The best view after every round; each round keeps half of those it got. Also what became of the starts."""
-    model, scene = (fitted.field, fitted.renderer), fitted.scene
+    model, scene = fitted.model, fitted.scene
     coarse = min(1.0, COARSEST / max(starts[0].camera.width, starts[0].camera.height))
     losses = [photometric_error(model, view, scene, coarse) for view in starts]
     order = sorted(range(len(starts)), key=losses.__getitem__)[: request.starts]
@@ -159,7 +159,7 @@ def _written(
 ) -> dict[str, Any]:
     found, tried = result
     scene = fitted.scene
-    loss = photometric_error((fitted.field, fitted.renderer), found, scene)
+    loss = photometric_error(fitted.model, found, scene)
     pose = transform_camera(found.camera, back).cam_to_world
     record: dict[str, Any] = {
         "schema": 1,
@@ -201,7 +201,7 @@ def _draw(path: Path, fitted: Fitted, found: View) -> None:
     from PIL import Image
 
     scene = fitted.scene
-    picture = render_view(fitted.field, fitted.renderer, found.camera, scene, fitted.device, geometry=False)
+    picture = fitted.model.render(found.camera, normals=False)
     photo, shown = (display(colour, scene) for colour in (found.over(scene.background), picture.over(scene.background)))
     gap = ((photo.float() - shown.float()).abs() * 4).clamp(0, 255).to(torch.uint8)
     edge = torch.full((photo.shape[0], 4, 3), 255, dtype=torch.uint8)

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from invgraphics.core import Batch, Context, Field, RayRenderer, Renderer, Rendering, Scene, Trace, check
+from invgraphics.core import Batch, Context, Model, RayRenderer, Rendering, Scene, Trace
 from invgraphics.errors import NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.waiting import limit_spinning
+from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.clock import SchedulerTimes
@@ -29,8 +29,7 @@ class Plan:
     """Everything a fit is made of.
 
     Attributes:
-        field: what is fitted.
-        renderer: what it is fitted through.
+        model: field and renderer that are fitted.
         scene: training views, bounds and background.
         losses: their sum is minimised.
         hooks: called around each step, in order.
@@ -42,8 +41,7 @@ class Plan:
         poses: of the training cameras, where they are fitted too.
     """
 
-    field: Field
-    renderer: Renderer
+    model: Model
     scene: Scene
     losses: Sequence[Loss]
     hooks: Sequence[Hook]
@@ -57,19 +55,15 @@ class Plan:
     @property
     def modules(self) -> dict[str, nn.Module]:
         """Modules with parameters, by the prefixes of the parameters' names."""
-        named: dict[str, nn.Module] = {"field": self.field, "renderer": self.renderer}
-        if self.poses is not None:
-            named["poses"] = self.poses
-        return named
+        return self.model.parts | ({} if self.poses is None else {"poses": self.poses})
 
 
 class Fit:
     """A fit in progress: `step` advances it; `state` and `load` resume it after an interruption, bit-exactly on a CPU."""
 
     def __init__(self, plan: Plan) -> None:
-        check(plan.field, plan.renderer)
         for hook in plan.hooks:
-            hook.check(plan.field)
+            hook.check(plan.model.field)
         keep_freed_memory()
         limit_spinning()
         self.plan = plan
@@ -79,7 +73,7 @@ class Fit:
         self._bounds = plan.scene.bounds.to(plan.device)
         self._generator = torch.Generator().manual_seed(plan.seed)
         self._batches = Batches(plan.batches, plan.scene, self._generator, plan.device, plan.poses)
-        self._coarse_to_fine = [] if plan.poses is None else coarse_to_fine_encodings(plan.field, plan.renderer)
+        self._coarse_to_fine = [] if plan.poses is None else coarse_to_fine_encodings(plan.model)
         self._optimiser = self._make_optimiser()
 
     def _make_optimiser(self) -> Optimiser:
@@ -90,6 +84,11 @@ class Fit:
             if parameter.requires_grad
         }
         return Optimiser(self.plan.optimiser, parameters, self.plan.scene.extent)
+
+    @property
+    def model(self) -> Model:
+        """What is being fitted, as it is now."""
+        return self.plan.model
 
     @property
     def progress(self) -> float:
@@ -108,7 +107,7 @@ class Fit:
         """
         began, cpu_began = time.perf_counter(), time.process_time()
         plan, ctx = self.plan, self.context()
-        state = FitState(plan.field, plan.renderer, self._optimiser, plan.scene, ctx, self.steps)
+        state = FitState(plan.model.field, plan.model.renderer, self._optimiser, plan.scene, ctx, self.steps)
         self._optimiser.set_progress(ctx.progress)
         self._set_coarse_to_fine(ctx.progress)
         for hook in plan.hooks:
@@ -128,7 +127,7 @@ class Fit:
         self._optimiser.step()
         for hook in plan.hooks:
             hook.after_step(state)
-        plan.renderer.update(plan.field, ctx)
+        plan.model.renderer.update(plan.model.field, ctx)
         self.steps += 1
         if plan.device.type == "cuda":
             torch.cuda.synchronize(plan.device)
@@ -142,7 +141,7 @@ class Fit:
                 encoding.detail.fill_(self.plan.poses.config.alpha(progress))
 
     def _render(self, ctx: Context) -> tuple[Rendering, Trace, Batch]:
-        renderer, fitted = self.plan.renderer, self.plan.field
+        renderer, fitted = self.plan.model.renderer, self.plan.model.field
         if isinstance(renderer, RayRenderer):
             rays, batch = self._batches.rays(ctx.progress)
             rendering, trace = renderer.render_rays(fitted, rays, ctx)

@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from invgraphics.core import Batch, Camera, Context, Field, RayRenderer, Renderer, Scene, View
+from invgraphics.core import Batch, Camera, Context, Model, RayRenderer, Scene, View
 from invgraphics.training.batches import scaled_view
 from invgraphics.training.poses import motion_about, pivot_depth
-
-Model = tuple[Field, Renderer]
 
 
 @dataclass(frozen=True)
@@ -43,22 +41,21 @@ def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) ->
     """Refine a view's camera to its photograph: a rigid motion in the camera's frame that lowers the photometric error.
 
     Args:
-        model: fitted field and renderer; neither is changed.
+        model: fitted; not changed.
         view: photograph, and the camera to start from.
         scene: for its bounds, extent and background.
         descent: steps and learning rates. The pixels of all steps are drawn from one fixed seed.
     """
-    field, renderer = model
-    device = _device(model)
+    device = model.device
     small = _at_scale(view, descent.scale)
     twist = torch.zeros(6, device=device, requires_grad=True)
     reach = torch.tensor([1.0] * 3 + [scene.extent] * 3, device=device)
     adam = torch.optim.Adam([twist], lr=descent.lr)
     generator = torch.Generator().manual_seed(0)
-    ctx = Context(scene.bounds.to(device), training=False)
+    ctx = model.context()
     start = small.camera.to(device)
     pivot = pivot_depth(start, scene)
-    with _frozen(field, renderer):
+    with _frozen(*model.parts.values()):
         for step in range(descent.steps):
             adam.param_groups[0]["lr"] = descent.rate(step)
             camera = start.moved(start.cam_to_world @ motion_about(twist * reach, pivot))
@@ -72,15 +69,12 @@ def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) ->
         return view.camera.moved(pose.to(view.camera.cam_to_world))
 
 
-@torch.no_grad()
 def photometric_error(model: Model, view: View, scene: Scene, scale: float = 1.0) -> float:
     """Mean squared error between a view's photograph and its camera's rendering, both over the scene's background."""
-    field, renderer = model
-    device = _device(model)
     small = _at_scale(view, scale)
-    picture, _ = renderer.render_image(field, small.camera.to(device), Context(scene.bounds.to(device)))
+    picture = model.render(small.camera, normals=False)
     counted = torch.ones_like(small.opacity(), dtype=torch.bool) if small.mask is None else small.mask
-    error = (picture.over(scene.background.to(device)).cpu() - small.over(scene.background)).square()
+    error = (picture.over(scene.background) - small.over(scene.background)).square()
     return float(error[counted].mean())
 
 
@@ -93,24 +87,18 @@ def _predicted_and_true(
     model: Model, camera: Camera, truth: tuple[View, Scene], ctx: Context, draw: tuple[int, torch.Generator]
 ) -> tuple[Tensor, Tensor]:
     """Rendered and true colours at the pixels of one step."""
-    field, renderer = model
     view, scene = truth
     background = scene.background.to(camera.focal.device)
     batch = Batch(view.over(scene.background), view.opacity(), background)
     valid = torch.arange(batch.alpha.numel()) if view.mask is None else view.mask.reshape(-1).nonzero()[:, 0]
-    if isinstance(renderer, RayRenderer):
+    if isinstance(model.renderer, RayRenderer):
         flat = valid[torch.randint(len(valid), (min(draw[0], len(valid)),), generator=draw[1])]
         pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
-        picture, _ = renderer.render_rays(field, camera.rays(pixels.to(background)), ctx)
+        picture, _ = model.renderer.render_rays(model.field, camera.rays(pixels.to(background)), ctx)
         return picture.over(background), batch.target.reshape(-1, 3)[flat].to(background)
-    picture, _ = renderer.render_image(field, camera, ctx)
+    picture, _ = model.renderer.render_image(model.field, camera, ctx)
     where = valid.to(background.device)
     return picture.over(background).reshape(-1, 3)[where], batch.target.to(background).reshape(-1, 3)[where]
-
-
-def _device(model: Model) -> torch.device:
-    parameter: Tensor | None = next(model[0].parameters(), None)
-    return torch.device("cpu") if parameter is None else parameter.device
 
 
 @contextmanager

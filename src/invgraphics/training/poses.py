@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from invgraphics.core import Camera, Field, Renderer, Scene
+from invgraphics.core import Camera, Model, Scene
 from invgraphics.core.transforms import se3_exp
 from invgraphics.fields.encodings.window import Windowed
 from invgraphics.training.batches import BatchConfig
@@ -208,6 +208,6 @@ def motion_about(twist: Float[Tensor, "*n 6"], depth: Float[Tensor, "*n"]) -> Fl
     return motion + kept - turned
 
 
-def coarse_to_fine_encodings(field: Field, renderer: Renderer) -> list[Windowed]:
-    """Encodings of the field and the renderer whose finer levels can be faded in."""
-    return [module for part in (field, renderer) for module in part.modules() if isinstance(module, Windowed)]
+def coarse_to_fine_encodings(model: Model) -> list[Windowed]:
+    """Encodings of the model whose finer levels can be faded in."""
+    return [module for part in model.parts.values() for module in part.modules() if isinstance(module, Windowed)]
