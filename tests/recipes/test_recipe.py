@@ -105,9 +105,9 @@ def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
     (hook,) = [hook for hook in table["hooks"] if hook["type"] == "density_control"]
     for new, old in {"revised_opacity": "share_opacity", "cap_ramp": "pace", "latest_start_step": "start_steps"}.items():
         hook[old] = hook.pop(new)
+    for new, old in {"antialiased": "compensate", "max_grad_splats": "receivers"}.items():
+        table["renderer"][old] = table["renderer"].pop(new)
     assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
-    table["renderer"]["compensate"] = table["renderer"].pop("antialiased")
-    table["renderer"]["receivers"] = table["renderer"].pop("max_grad_splats")
     again = resolve(method.name, "long", table)
     assert again.recipe == method.recipe and again.table == method.table
     assert again.digest == method.digest == hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
@@ -115,9 +115,11 @@ def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
         resolve(method.name, "", table | {"hooks": [table["hooks"][0], {"type": "density_control", "pace": 1, "cap_ramp": 1}]})
 
 
-def test_samplers_of_earlier_versions_open_under_the_same_digest() -> None:
-    method = load_method("volumetric/hash")
-    table = copy.deepcopy(method.table)
-    sampler = table["renderer"]["sampler"]
-    sampler["wave"] = sampler.pop("chunk")
-    assert resolve(method.name, method.preset, table).table == method.table
+def test_renderers_of_older_runs_still_resolve() -> None:
+    now = load_method("splatting/gaussians-mip", None, ["renderer.max_grad_splats=10"])
+    renderer = {key: value for key, value in now.table["renderer"].items() if key not in ("antialiased", "max_grad_splats")}
+    older = now.table | {"renderer": renderer | {"compensate": True, "receivers": 10}}
+    assert resolve(now.name, now.preset, older).table == now.table
+    hashed = load_method("volumetric/hash").table
+    sampler = {("wave" if key == "chunk" else key): value for key, value in hashed["renderer"]["sampler"].items()}
+    assert resolve("mine", "", hashed | {"renderer": hashed["renderer"] | {"sampler": sampler}}).table == hashed

@@ -30,7 +30,7 @@ class Fitted:
     Attributes:
         folder: of the run.
         method: its recipe.
-        scene: undisturbed, at the run's size and with its test views.
+        scene: as loaded, at the run's size and with its test views.
         model: fitted, on the run's device.
         source: the folder that holds the checkpoint: the run itself, or the run that a rendering shows.
         poses: of the training views as the fit saw them, where it refined them.

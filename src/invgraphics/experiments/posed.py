@@ -1,6 +1,6 @@
 """Evaluation of fits with refined training poses: the fit's frame is aligned, and test poses are refined to their views.
 
-The fit may have drifted by a similarity, so the true test cameras are transformed into its frame by the one between true and
+The fit may have drifted by a similarity, so the test poses are transformed to its frame by the one between true and
 refined training poses. What remains of their errors belongs to the cameras rather than to the scene, so each is refined
 to its photograph before it is scored (BARF, §4.1).
 """
@@ -85,7 +85,7 @@ class PosedEvaluation:
 
     Args:
         poses: of the fit.
-        scene: undisturbed.
+        scene: as loaded, its poses not degraded.
         model: fitted.
     """
 

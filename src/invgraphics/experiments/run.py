@@ -160,7 +160,7 @@ def _declare_clocks(folder: RunFolder, spent: Mapping[str, Any]) -> None:
 
 
 def _evaluate(job: Job, scene: Scene, fit: Fit, spent: dict[str, Any]) -> None:
-    """Score the fit on the undisturbed scene. ``scores.json`` comes last, because a run that has it is finished."""
+    """Score the fit on the scene as loaded. ``scores.json`` comes last, because a run that has it is finished."""
     job.folder.write_json("fit.json", spent)
     for protocol in job.protocols:
         evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
@@ -171,7 +171,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str, origin: Mappi
 
     Args:
         job: of the run.
-        scenes: undisturbed, and as the fit sees it.
+        scenes: as loaded, and as the fit sees it.
         identity: of the run.
         origin: provenance that takes precedence, of a model that was not fitted here.
     """

@@ -89,7 +89,7 @@ class FittedRun(ABC):
 
     Attributes:
         method: what was fitted.
-        scene: undisturbed, with the views that score it.
+        scene: as loaded, with the views that score it.
     """
 
     method: Method
@@ -162,7 +162,7 @@ class MemoryRun(FittedRun):
 
     Args:
         job: what to fit, and how.
-        scene: undisturbed.
+        scene: as loaded.
         on_step: is given the fit before its first step and after each one.
 
     Raises:

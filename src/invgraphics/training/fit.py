@@ -29,8 +29,8 @@ class Plan:
     """Everything a fit is made of.
 
     Attributes:
-        model: what is fitted, and seen.
-        scene: what it is compared with.
+        model: field and renderer that are fitted.
+        scene: training views, bounds and background.
         losses: their sum is minimised.
         hooks: called around each step, in order.
         optimiser: parameter groups and Adam's settings.
@@ -54,7 +54,7 @@ class Plan:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Everything with parameters, by the names that begin theirs."""
+        """Modules with parameters, by the prefixes of the parameters' names."""
         return self.model.parts | ({} if self.poses is None else {"poses": self.poses})
 
 

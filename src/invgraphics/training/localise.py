@@ -42,7 +42,7 @@ def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) ->
 
     Args:
         model: fitted; not changed.
-        view: photograph, and where the search starts.
+        view: photograph, and the camera to start from.
         scene: for its bounds, extent and background.
         descent: steps and learning rates. The pixels of all steps are drawn from one fixed seed.
     """
@@ -70,7 +70,7 @@ def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) ->
 
 
 def photometric_error(model: Model, view: View, scene: Scene, scale: float = 1.0) -> float:
-    """Mean squared difference between a photograph and what its camera shows, colours in front of the scene's background."""
+    """Mean squared error between a view's photograph and its camera's rendering, both over the scene's background."""
     small = _at_scale(view, scale)
     picture = model.render(small.camera, normals=False)
     counted = torch.ones_like(small.opacity(), dtype=torch.bool) if small.mask is None else small.mask
@@ -86,7 +86,7 @@ def _at_scale(view: View, scale: float) -> View:
 def _predicted_and_true(
     model: Model, camera: Camera, truth: tuple[View, Scene], ctx: Context, draw: tuple[int, torch.Generator]
 ) -> tuple[Tensor, Tensor]:
-    """Colours seen and photographed at the pixels of one step."""
+    """Rendered and true colours at the pixels of one step."""
     view, scene = truth
     background = scene.background.to(camera.focal.device)
     batch = Batch(view.over(scene.background), view.opacity(), background)

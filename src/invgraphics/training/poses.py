@@ -209,5 +209,5 @@ def motion_about(twist: Float[Tensor, "*n 6"], depth: Float[Tensor, "*n"]) -> Fl
 
 
 def coarse_to_fine_encodings(model: Model) -> list[Windowed]:
-    """All encodings that can hold levels back."""
+    """Encodings of the model whose finer levels can be faded in."""
     return [module for part in model.parts.values() for module in part.modules() if isinstance(module, Windowed)]
