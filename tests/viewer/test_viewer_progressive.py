@@ -14,8 +14,8 @@ from PIL import Image
 
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.runs import checkpoint
+from invgraphics.tools.colorize import EMPTY, ERROR_LIMIT, resize_image
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera
-from invgraphics.viewer.colorize import EMPTY, ERROR_LIMIT, resize_image
 from invgraphics.viewer.loaded_run import LoadedRun, open_run
 from invgraphics.viewer.progressive import ProgressiveRenderer, RenderRequest
 from invgraphics.viewer.resolution import MIN_PIXELS

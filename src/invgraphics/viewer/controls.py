@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from invgraphics.viewer.colorize import OUTPUTS
+from invgraphics.tools.colorize import OUTPUTS
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.progressive import LAYOUTS, Frame
 

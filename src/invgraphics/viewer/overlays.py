@@ -15,8 +15,8 @@ from invgraphics.core import Context, Gaussians, Quantity, Scene, View
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.harmonics import BAND_0
 from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.tools.colorize import Picture, true_image
 from invgraphics.viewer.cameras import fov_and_aspect, rotation_quaternion
-from invgraphics.viewer.colorize import Picture, true_image
 from invgraphics.viewer.loaded_run import LoadedRun
 
 THUMBNAIL = 96

@@ -14,8 +14,8 @@ from numpy import ndarray
 
 from invgraphics.core import Camera, Rendering, View
 from invgraphics.metrics.protocols import PROTOCOLS, score
+from invgraphics.tools.colorize import EMPTY, Picture, colorize, pad_to_window, resize_image, true_image
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera, limit_size, rescale, subregion
-from invgraphics.viewer.colorize import EMPTY, Picture, colorize, pad_to_window, resize_image, true_image
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.render_thread import Task
 from invgraphics.viewer.resolution import SETTLE_SECONDS, AdaptiveResolution

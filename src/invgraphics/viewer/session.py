@@ -14,8 +14,8 @@ from PIL import Image
 
 from invgraphics.core import Scene, View
 from invgraphics.experiments.evaluate import display
+from invgraphics.tools.colorize import NEEDS_TRUTH
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera, limit_size, rotation_quaternion
-from invgraphics.viewer.colorize import NEEDS_TRUTH
 from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Controls
 from invgraphics.viewer.overlays import CameraFrustums, add_splats
 from invgraphics.viewer.progressive import Frame, ProgressiveRenderer, RenderRequest
