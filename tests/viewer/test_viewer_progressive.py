@@ -160,9 +160,9 @@ def test_side_by_side_shows_both_whole(loaded_runs: dict[str, LoadedRun]) -> Non
 class Slow(LoadedRun):
     """A run whose every piece takes long."""
 
-    def render(self, camera, geometry):
+    def render(self, camera, geometry, crop=None):
         time.sleep(0.05)
-        return super().render(camera, geometry)
+        return super().render(camera, geometry, crop)
 
 
 @pytest.mark.parametrize("layout", ["split", "side by side"])
