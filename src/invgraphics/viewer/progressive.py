@@ -7,19 +7,17 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
 import torch
-from jaxtyping import UInt8
-from numpy import ndarray
 
 from invgraphics.core import Camera, Rendering, View
 from invgraphics.metrics.protocols import PROTOCOLS, score
-from invgraphics.tools.colorize import EMPTY, Picture, colorize, pad_to_window, resize_image, true_image
+from invgraphics.tools.colorize import Picture, colorize, resize_image, true_image
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera, limit_size, rescale, subregion
 from invgraphics.viewer.crop import CropBox
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.render_thread import Task
 from invgraphics.viewer.resolution import SETTLE_SECONDS, AdaptiveResolution
+from invgraphics.viewer.window import crop_columns, letterboxed, side_by_side_image
 
 Layout = Literal["first", "second", "split", "side by side"]
 LAYOUTS: tuple[Layout, ...] = ("split", "side by side", "first", "second")
@@ -215,7 +213,7 @@ class ProgressiveRenderer:
         if not run.independent_pixels:
             # A splat's footprint depends on its distance to the image's border, so tiles would not match.
             picture = run.render(camera, geometry, crop)
-            return picture if panel.whole else _columns(picture, columns)
+            return picture if panel.whole else crop_columns(picture, columns)
         # Strips do not adapt the resolution: one of empty background is fast, and the next movement would be slow.
         rows = camera.height if untiled else self.resolutions[run].strip_rows(columns[1] - columns[0])
         parts = []
@@ -247,9 +245,9 @@ class ProgressiveRenderer:
             for picture, (first, last) in zip(seen.pictures, columns, strict=True)
         ]
         if request.layout == "side by side":
-            picture = _beside([_letterboxed(picture, letterbox) for picture in pictures])
+            picture = side_by_side_image([letterboxed(picture, letterbox) for picture in pictures])
         else:
-            picture = _letterboxed(_beside(pictures), letterbox)
+            picture = letterboxed(side_by_side_image(pictures), letterbox)
         return Frame(
             picture,
             (finest.width, finest.height),
@@ -278,28 +276,4 @@ class ProgressiveRenderer:
             (view.camera.width, view.camera.height) if letterbox is None else (letterbox.camera.width, letterbox.camera.height)
         )
         picture = true_image(view, self.runs[0].scene, size)
-        return Frame(_letterboxed(picture, letterbox), size, 0.0, True, f"the photograph {view.name}")
-
-
-def _columns(picture: Rendering, columns: tuple[int, int]) -> Rendering:
-    cut = slice(*columns)
-    normal = None if picture.normal is None else picture.normal[:, cut]
-    return Rendering(picture.rgb[:, cut], picture.alpha[:, cut], picture.depth[:, cut], normal)
-
-
-def _letterboxed(picture: Picture, letterbox: LetterboxedView | None) -> Picture:
-    """Resize an image of a photograph's camera and pad it to the window."""
-    if letterbox is None:
-        return picture
-    full = resize_image(picture, (letterbox.camera.width, letterbox.camera.height))
-    return pad_to_window(full, (letterbox.width, letterbox.height), (letterbox.left, letterbox.top))
-
-
-def _beside(pictures: Sequence[UInt8[ndarray, "h _ 3"]]) -> Picture:
-    """Concatenate images from left to right, separated by a line."""
-    lined = []
-    for picture in pictures[:-1]:
-        ended = picture.copy()
-        ended[:, -1:] = EMPTY
-        lined.append(ended)
-    return np.concatenate([*lined, pictures[-1]], axis=1)
+        return Frame(letterboxed(picture, letterbox), size, 0.0, True, f"the photograph {view.name}")
