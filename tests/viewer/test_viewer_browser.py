@@ -271,12 +271,14 @@ def test_a_crop_box_hides_what_is_outside(watch: Any, runs: dict[str, Path]) -> 
     _open_folder(watcher, "Crop box")
     watcher.tick("Crop")
     assert watcher.page.get_by_text("Cropped: rays are sampled inside the box only.").count() == 1
-    thumb = watcher.page.locator("xpath=//*[text()='x (world units)']/following::*[@role='slider'][1]")
-    thumb.focus()
-    for _ in range(6):
-        watcher.page.keyboard.press("PageUp")
-    for _ in range(90):
-        watcher.page.keyboard.press("ArrowRight")
+    thumb = watcher.page.locator(
+        "xpath=//*[text()='x (world units)']/following::*[contains(@class, 'thumb')][1]"
+    ).bounding_box()
+    x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
+    watcher.page.mouse.move(x, y)
+    watcher.page.mouse.down()
+    watcher.page.mouse.move(x + 130, y, steps=8)
+    watcher.page.mouse.up()
     watcher.page.wait_for_timeout(500)
     watcher.rest()
     assert _apart(watcher.canvas("cropped"), whole) > 2

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from invgraphics.core import Scene, View
+from invgraphics.core import Scene
 from invgraphics.experiments.evaluate import display
 from invgraphics.tools.camera_path import CameraPath, Keyframe
 from invgraphics.tools.colorize import NEEDS_TRUTH
@@ -30,10 +29,11 @@ from invgraphics.viewer.crop import crop_note
 from invgraphics.viewer.crop_panel import CropPanel
 from invgraphics.viewer.film_export import RATE, FilmLook, export_film, film_cameras
 from invgraphics.viewer.loaded_run import LoadedRun
-from invgraphics.viewer.overlays import CameraFrustums, Overlays
+from invgraphics.viewer.overlays import Overlays
 from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
-from invgraphics.viewer.progressive import Frame, ProgressiveRenderer, RenderRequest
-from invgraphics.viewer.render_thread import RenderThread, Task
+from invgraphics.viewer.progressive import Frame, RenderRequest
+from invgraphics.viewer.render_thread import Task
+from invgraphics.viewer.shared_state import SharedState
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
@@ -45,27 +45,6 @@ ARRIVAL = 10.0
 
 RENDERING = "Rendering …"
 """Status until the first frame after a change."""
-
-
-@dataclass(frozen=True, eq=False)
-class SharedState:
-    """State shared by all sessions.
-
-    Attributes:
-        renderer: of the runs.
-        thread: runs render tasks.
-        views: names and views to choose from.
-        frustums: overlays of the same views.
-        start: index of the initial view.
-        max_size: initial limit of the longer side, pixels.
-    """
-
-    renderer: ProgressiveRenderer
-    thread: RenderThread
-    views: Sequence[tuple[str, View]]
-    frustums: CameraFrustums
-    start: int
-    max_size: int
 
 
 class Session:
