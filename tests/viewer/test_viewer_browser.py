@@ -227,6 +227,8 @@ def test_a_camera_path_is_recorded_played_saved_and_filmed(watch: Any, runs: dic
     _open_folder(watcher, "Camera path")
     page.get_by_role("button", name="Add keyframe").click()
     page.get_by_text("1 keyframe, 0.0 s").wait_for(timeout=PATIENCE)
+    page.wait_for_timeout(1000)
+    assert watcher.value("View") == "test 0: r_0", "adding one does not move the camera"
     watcher.turn()
     page.get_by_role("button", name="Add keyframe").click()
     page.get_by_text("2 keyframes, 2.0 s").wait_for(timeout=PATIENCE)

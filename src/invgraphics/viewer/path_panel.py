@@ -58,6 +58,7 @@ class PathPanel:
         self.path = CameraPath(())
         self._playing: asyncio.Task[None] | None = None
         self._exporting = False
+        self._listed = NONE
         self._line: Any = None
         with gui.add_folder("Camera path", expand_by_default=False):
             add = gui.add_button("Add keyframe", hint="The current view, after the keyframe that is selected below.")
@@ -113,10 +114,13 @@ class PathPanel:
     def _list(self, selected: int) -> None:
         names = [f"{index + 1} of {len(self.path.keyframes)}" for index in range(len(self.path.keyframes))]
         self.selected.options = tuple(names) or (NONE,)
-        self.selected.value = names[selected] if names else NONE
+        self._listed = self.selected.value = names[selected] if names else NONE
         self._changed()
 
     async def _go(self) -> None:
+        if self.selected.value == self._listed:
+            return  # the browser's echo of a selection that the program made
+        self._listed = self.selected.value
         if (index := self._index) is not None:
             self._callbacks.move(self.path.keyframes[index])
 
