@@ -8,11 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
 
 from invgraphics.runs import checkpoint
+from invgraphics.tools.camera_path import read_camera_path
 
 viser = pytest.importorskip("viser")
 
@@ -211,6 +213,79 @@ def test_the_picture_can_be_saved_on_another_background(watch: Any, runs: dict[s
     download.value.save_as(tmp_path / "saved.png")
     saved = np.asarray(Image.open(tmp_path / "saved.png")).astype(float)
     assert float(saved.min()) < 5 and saved.shape[2] == 3
+    assert watcher.complaints == []
+
+
+def _open_folder(watcher: Watcher, name: str) -> None:
+    watcher.page.get_by_text(name, exact=True).click()
+    watcher.page.wait_for_timeout(500)
+
+
+def test_a_camera_path_is_recorded_played_saved_and_filmed(watch: Any, runs: dict[str, Path], tmp_path: Path) -> None:
+    watcher = watch(runs["splatting/gaussians"])
+    page = watcher.page
+    _open_folder(watcher, "Camera path")
+    page.get_by_role("button", name="Add keyframe").click()
+    page.get_by_text("1 keyframe, 0.0 s").wait_for(timeout=PATIENCE)
+    page.wait_for_timeout(1000)
+    assert watcher.value("View") == "test 0: r_0", "adding one does not move the camera"
+    watcher.turn()
+    page.get_by_role("button", name="Add keyframe").click()
+    page.get_by_text("2 keyframes, 2.0 s").wait_for(timeout=PATIENCE)
+    second = watcher.canvas("path")
+    watcher.choose("Keyframe", "1 of 2")
+    assert _apart(watcher.canvas(), second) > 1, "selecting a keyframe goes there"
+
+    with page.expect_download(timeout=PATIENCE) as download:
+        page.get_by_role("button", name="Save path").click()
+    download.value.save_as(tmp_path / "path.json")
+    path = read_camera_path(tmp_path / "path.json")
+    scene = watcher.viewer._runs[0].scene
+    assert len(path.keyframes) == 2
+    first = path.keyframes[0].local_pose(scene)
+    assert float((first - scene.test[0].camera.cam_to_world).abs().max()) < 2e-3, "it was recorded at test view 0"
+
+    page.get_by_role("button", name="Play", exact=True).click()
+    page.get_by_role("button", name="Stop", exact=True).wait_for(timeout=PATIENCE)
+    page.get_by_role("button", name="Play", exact=True).wait_for(timeout=PATIENCE)
+    watcher.rest()
+    assert _apart(watcher.canvas("played"), second) < 2, "it ends at the second keyframe"
+
+    with page.expect_download(timeout=2 * PATIENCE) as download:
+        page.get_by_role("button", name="Export film").click()
+    download.value.save_as(tmp_path / "film.mp4")
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "film.mp4"))
+    assert next(reader)["size"] == (32, 32)
+    film = [np.frombuffer(frame, np.uint8).reshape(32, 32, 3).astype(float) for frame in reader]
+    assert len(film) == 49, "two seconds of 24, both ends included"
+    prediction = np.asarray(Image.open(runs["splatting/gaussians"] / "test" / "0000.png")).astype(float)
+    assert _apart(film[0], prediction) < 8 < _apart(film[-1], prediction), "from test view 0 to elsewhere"
+
+    page.get_by_role("button", name="Delete keyframe").click()
+    page.get_by_text("1 keyframe, 0.0 s").wait_for(timeout=PATIENCE)
+    assert watcher.complaints == []
+
+
+def test_a_crop_box_hides_what_is_outside(watch: Any, runs: dict[str, Path]) -> None:
+    watcher = watch(runs["volumetric/hash"])
+    watcher.turn()
+    whole = watcher.canvas()
+    _open_folder(watcher, "Crop box")
+    watcher.tick("Crop")
+    assert watcher.page.get_by_text("Cropped: rays are sampled inside the box only.").count() == 1
+    thumb = watcher.page.locator(
+        "xpath=//*[text()='x (world units)']/following::*[contains(@class, 'thumb')][1]"
+    ).bounding_box()
+    x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
+    watcher.page.mouse.move(x, y)
+    watcher.page.mouse.down()
+    watcher.page.mouse.move(x + 130, y, steps=8)
+    watcher.page.mouse.up()
+    watcher.page.wait_for_timeout(500)
+    watcher.rest()
+    assert _apart(watcher.canvas("cropped"), whole) > 2
+    watcher.tick("Crop")
+    assert _apart(watcher.canvas(), whole) < 1
     assert watcher.complaints == []
 
 

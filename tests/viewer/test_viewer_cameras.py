@@ -10,9 +10,16 @@ import torch
 from invgraphics.core import Camera
 from invgraphics.core.transforms import look_at, rigid
 from invgraphics.testing import toy_cameras, toy_scene
-from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera, fov_and_aspect, limit_size, rotation_quaternion, subregion
+from invgraphics.viewer.cameras import (
+    LetterboxedView,
+    ViewerCamera,
+    fov_and_aspect,
+    limit_size,
+    nearest_view,
+    rotation_quaternion,
+    subregion,
+)
 from invgraphics.viewer.server import upward
-from invgraphics.viewer.session import nearest_view
 
 POINTS = torch.rand(50, 3, generator=torch.Generator().manual_seed(3)) - 0.5
 

@@ -37,7 +37,7 @@ class FakeRun:
     def to_local(self, camera: Camera, scene: Scene) -> Camera:
         return camera
 
-    def render(self, camera: Camera, geometry: bool) -> Rendering:
+    def render(self, camera: Camera, geometry: bool, crop: None = None) -> Rendering:
         self.clock.now += self.fixed + self.per_pixel * camera.width * camera.height
         size = camera.height, camera.width
         return Rendering(torch.full((*size, 3), 0.5), torch.ones(size), torch.ones(size))
@@ -105,10 +105,10 @@ def test_refinement_over_empty_background_does_not_slow_the_next_movement() -> N
     clock = Clock()
 
     class HalfEmpty(FakeRun):
-        def render(self, camera: Camera, geometry: bool) -> Rendering:
+        def render(self, camera: Camera, geometry: bool, crop: None = None) -> Rendering:
             below_centre = float(camera.centre[1]) < camera.height / 2  # a strip of the lower half
             self.per_pixel = 1e-9 if below_centre else 1e-5
-            return super().render(camera, geometry)
+            return super().render(camera, geometry, crop)
 
     run = HalfEmpty(clock, 1e-5, 0.0, independent_pixels=True)
     renderer = ProgressiveRenderer((run,), clock)  # type: ignore[arg-type]

@@ -14,8 +14,8 @@ from PIL import Image
 
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.runs import checkpoint
+from invgraphics.tools.colorize import EMPTY, ERROR_LIMIT, resize_image
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera
-from invgraphics.viewer.colorize import EMPTY, ERROR_LIMIT, resize_image
 from invgraphics.viewer.loaded_run import LoadedRun, open_run
 from invgraphics.viewer.progressive import ProgressiveRenderer, RenderRequest
 from invgraphics.viewer.resolution import MIN_PIXELS
@@ -160,9 +160,9 @@ def test_side_by_side_shows_both_whole(loaded_runs: dict[str, LoadedRun]) -> Non
 class Slow(LoadedRun):
     """A run whose every piece takes long."""
 
-    def render(self, camera, geometry):
+    def render(self, camera, geometry, crop=None):
         time.sleep(0.05)
-        return super().render(camera, geometry)
+        return super().render(camera, geometry, crop)
 
 
 @pytest.mark.parametrize("layout", ["split", "side by side"])

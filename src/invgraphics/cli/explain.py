@@ -75,7 +75,7 @@ def show_contributions(explanation: Explanation) -> None:
     """Print the contributions that weigh most, in the order in which they are composited."""
     found = explanation.contributions
     heaviest = sorted(found.weight.argsort(descending=True)[:ROWS].tolist())
-    names = ["distance", "from", "to", "alpha", "T", "weight", "red", "green", "blue"]
+    names = ["distance (world)", "from", "to", "alpha", "T", "weight", "red", "green", "blue"]
     columns = [found.t, found.begin, found.end, found.alpha, found.transmittance, found.weight, *found.rgb.T]
     if found.density is not None:
         names.insert(3, "density")
@@ -102,7 +102,7 @@ def sentences(explanation: Explanation) -> list[str]:
         told.append(f"In the whole model, {sentence}")
     depths = {"mean": pixel["expected"], "median": pixel["median"], "true": pixel["true_depth"]}
     known = [f"{name} {value:.4g}" for name, value in depths.items() if value is not None]
-    return [*told, f"Depth: {', '.join(known)}."] if known else told
+    return [*told, f"Depth in world units: {', '.join(known)}."] if known else told
 
 
 def _colour(values: list[float]) -> str:

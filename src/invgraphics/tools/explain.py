@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -59,7 +59,7 @@ class Explanation:
 
     Attributes:
         folder: holds `TABLE`, `FACTS`, `PICTURE` and `TRUTH`.
-        contributions: in the order in which they are composited.
+        contributions: in the order in which they are composited, world units.
         rendered: colour of the pixel as `render` shows it, in front of the scene's background.
         composited: the same from the contributions.
         facts: what else there is to know, as in the file.
@@ -80,7 +80,7 @@ def explain(request: ExplainRequest) -> Explanation:
     """
     fitted = open_fitted(request.run, request.scene).in_its_frame()
     view = _view(fitted.scene, request)
-    found = fitted.model.contributions(view.camera, request.pixel)
+    found = in_world_units(fitted.model.contributions(view.camera, request.pixel), fitted.scene.scale)
     picture = fitted.model.render(view.camera, normals=False)
 
     column, row = request.pixel
@@ -92,6 +92,26 @@ def explain(request: ExplainRequest) -> Explanation:
     explanation = Explanation(request.folder, found, rendered, composited, facts)
     _write(explanation, view, picture, fitted.scene)
     return explanation
+
+
+def in_world_units(found: Contributions, scale: float) -> Contributions:
+    """Contributions with distances times ``scale``, the world length of one local unit, and densities divided by it."""
+
+    def profile(one: Profile | None) -> Profile | None:
+        if one is None:
+            return None
+        return replace(one, t=one.t * scale, density=None if one.density is None else one.density / scale)
+
+    return replace(
+        found,
+        t=found.t * scale,
+        begin=found.begin * scale,
+        end=found.end * scale,
+        density=None if found.density is None else found.density / scale,
+        profile=profile(found.profile),
+        marched=profile(found.marched),
+        passes=tuple(replace(one, t0=one.t0 * scale, t1=one.t1 * scale) for one in found.passes),
+    )
 
 
 def _view(scene: Scene, request: ExplainRequest) -> View:
@@ -128,19 +148,20 @@ def _facts(fitted: Fitted, request: ExplainRequest, view: View, found: Contribut
         "colour": scene.colour,
         "background": _row(scene.background),
         "kind": found.kind,
-        "near": _number(ray.near[0]),
-        "far": _number(ray.far[0]),
+        "length_unit": "world",
+        "near": _number(ray.near[0] * scene.scale),
+        "far": _number(ray.far[0] * scene.scale),
         "space": scene.bounds.space,
         "pixel": {
             "column": column,
             "row": row,
             "alpha": _number(found.opacity),
-            "depth": _number(picture.depth[row, column]),
+            "depth": _number(picture.depth[row, column] * scene.scale),
             "expected": _number(found.expected_depth),
             "median": _number(found.median_depth),
             "true": _row(view.over(scene.background)[row, column]),
             "true_alpha": None if view.alpha is None else _number(view.opacity()[row, column]),
-            "true_depth": None if view.depth is None else _number(view.depth[row, column]),
+            "true_depth": None if view.depth is None else _number(view.depth[row, column] * scene.scale),
         },
         "contributions": _columns(found),
         "dead": _dead(fitted),

@@ -7,13 +7,14 @@ has a vertical field of view, square pixels, and its optical axis in the middle 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core import Camera
+from invgraphics.core import Camera, View
 from invgraphics.core.transforms import quaternion_to_matrix, rigid
 
 SQUARE_TOLERANCE = 1e-3
@@ -129,3 +130,11 @@ def rescale(camera: Camera, scale: float) -> Camera:
     """Camera resized by ``scale``, rounded to whole pixels."""
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
+
+
+def nearest_view(views: Sequence[View], viewer_camera: ViewerCamera, extent: float) -> int:
+    """Index of the view nearest to a camera: distance in scene extents plus angle in radians."""
+    poses = torch.stack([view.camera.cam_to_world for view in views])
+    distance = (poses[:, :3, 3] - viewer_camera.pose[:3, 3]).norm(dim=1) / extent
+    angle = (poses[:, :3, 2] @ viewer_camera.pose[:3, 2]).clamp(-1, 1).acos()
+    return int((distance + angle).argmin())

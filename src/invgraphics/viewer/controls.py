@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from invgraphics.viewer.colorize import OUTPUTS
+from invgraphics.tools.colorize import OUTPUTS
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.progressive import LAYOUTS, Frame
 
@@ -78,15 +78,15 @@ class Controls:
         self._facts = gui.add_html("")
         self.update_summary()
         for handle in (self.output, self.layout, self.split, self.max_size, self.background):
-            _on_change(handle, callbacks.output)
+            on_change(handle, callbacks.output)
 
         async def saved(_: Any) -> None:
             await callbacks.save()
 
         save.on_click(saved)
-        _on_change(self.view, callbacks.view)
+        on_change(self.view, callbacks.view)
         for handle in (self.cameras, self.splats):
-            _on_change(handle, callbacks.overlays)
+            on_change(handle, callbacks.overlays)
 
     def update_summary(self) -> None:
         """Update name, training progress and scores of the runs."""
@@ -103,10 +103,10 @@ class Controls:
 
     def show_status(self, *lines: str) -> None:
         """Replace the status by lines of text."""
-        self._status.content = _block("".join(f"<div>{escape(line)}</div>" for line in lines if line))
+        self._status.content = status_block("".join(f"<div>{escape(line)}</div>" for line in lines if line))
 
 
-def _on_change(handle: Any, callback: Callback) -> None:
+def on_change(handle: Any, callback: Callback) -> None:
     """Register ``callback`` for changes by the user, not by the program."""
 
     async def changed(event: Any) -> None:
@@ -118,8 +118,14 @@ def _on_change(handle: Any, callback: Callback) -> None:
 
 def _facts_of(run: LoadedRun) -> str:
     rows = "".join(f"<div>{escape(name)}: {escape(value)}</div>" for name, value in run.summary().items())
-    return _block(f"<div><b>{escape(run.name)}</b></div>{rows}")
+    return status_block(f"<div><b>{escape(run.name)}</b></div>{rows}")
 
 
-def _block(content: str) -> str:
+def status_block(content: str) -> str:
+    """HTML of small text in the control panel."""
     return f'<div style="padding:0.2em 0.75em 0.5em;font-size:0.8rem;line-height:1.4">{content}</div>'
+
+
+def jump_notice(output: str, view: str) -> str:
+    """The reason why choosing an output has moved the camera."""
+    return f"Moved to the nearest photograph, {view}: the {output} is known at photographs only."

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from invgraphics.core import Camera, Quantity, RayRenderer, Rendering, Scene, View
 from invgraphics.core.transforms import apply_similarity
@@ -15,6 +17,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
+from invgraphics.viewer.crop import CropBox, crop_model, crop_obstacle
 
 Stamp = tuple[int, int, int]
 Stamps = tuple[Stamp | None, Stamp | None]
@@ -56,16 +59,36 @@ class LoadedRun:
         """Whether the field provides Gaussians, which the browser can draw."""
         return Quantity.GAUSSIANS in self.fitted.model.field.provides
 
-    def render(self, camera: Camera, geometry: bool) -> Rendering:
-        """Render one image as evaluation does; on the CPU, with normals if ``geometry``."""
-        return self.fitted.model.render(camera, normals=geometry)
+    @property
+    def crop_obstacle(self) -> str:
+        """Why `render` cannot crop this run; empty if it can."""
+        return crop_obstacle(self.fitted.model.renderer)
+
+    def render(self, camera: Camera, geometry: bool, crop: CropBox | None = None) -> Rendering:
+        """Render one image as evaluation does; on the CPU, with normals if ``geometry``.
+
+        Args:
+            camera: in this run's local frame.
+            geometry: whether normals are wanted.
+            crop: in this run's local frame; without effect where there is a `crop_obstacle`.
+        """
+        model = self.fitted.model
+        if crop is not None and not self.crop_obstacle:
+            model = crop_model(model, crop)
+        return model.render(camera, normals=geometry)
 
     def to_local(self, camera: Camera, scene: Scene) -> Camera:
         """Transform a camera from ``scene``'s local frame to this run's, through the world frame."""
         if scene is self.scene:
             return camera
-        similarity = torch.linalg.inv(self.scene.world_from_local.double()) @ scene.world_from_local.double()
-        return camera.moved(apply_similarity(similarity, camera.cam_to_world.double()).to(camera.cam_to_world))
+        return camera.moved(apply_similarity(self._from_local(scene), camera.cam_to_world.double()).to(camera.cam_to_world))
+
+    def crop_to_local(self, crop: CropBox, scene: Scene) -> CropBox:
+        """Transform a crop box from ``scene``'s local frame to this run's, as the axis-aligned box around it."""
+        return crop if scene is self.scene else crop.transformed(self._from_local(scene))
+
+    def _from_local(self, scene: Scene) -> Float[Tensor, "4 4"]:
+        return torch.linalg.inv(self.scene.world_from_local.double()) @ scene.world_from_local.double()
 
     def views(self) -> list[tuple[str, View]]:
         """Test and training views with unique names."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ from invgraphics.core import Gaussians, Quantity, Scene, View
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.harmonics import BAND_0
 from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.tools.colorize import Picture, true_image
 from invgraphics.viewer.cameras import fov_and_aspect, rotation_quaternion
-from invgraphics.viewer.colorize import Picture, true_image
 from invgraphics.viewer.loaded_run import LoadedRun
 
 THUMBNAIL = 96
@@ -74,6 +75,44 @@ class CameraFrustums:
             size = (max(1, round(width * scale)), max(1, round(height * scale)))
             self._thumbnails[index] = true_image(view, self._scene, size)
         return self._thumbnails[index]
+
+
+class Overlays:
+    """Frustums and splats in one browser, added when they are first shown.
+
+    Args:
+        viser_scene: of the browser.
+        run: whose splats are drawn.
+        frustums: of its views.
+        on_click: awaited with the index of a frustum that is clicked.
+    """
+
+    def __init__(
+        self, viser_scene: Any, run: LoadedRun, frustums: CameraFrustums, on_click: Callable[[int], Awaitable[None]]
+    ) -> None:
+        self._viser_scene, self._run, self._views, self._on_click = viser_scene, run, frustums, on_click
+        self._frustums: dict[int, Any] = {}
+        self._splats: Any = None
+
+    def update(self, splats: bool, frustums: bool, hidden: int | None) -> Iterator[float]:
+        """Show or hide splats and frustums, except the one of the view ``hidden``; a task of the render thread."""
+        if splats and self._splats is None:
+            self._splats = add_splats(self._run, self._viser_scene)
+        if self._splats is not None:
+            self._splats.visible = splats
+        for index in range(len(self._views)):
+            wanted = frustums and index != hidden
+            if index not in self._frustums and wanted:
+                self._frustums[index] = self._views.add(index, self._viser_scene, partial(self._on_click, index))
+                yield 0.0
+            elif index in self._frustums and self._frustums[index].visible != wanted:
+                self._frustums[index].visible = wanted
+
+    def remove_splats(self) -> None:
+        """Remove the splats, whose model has changed; `update` adds the new ones."""
+        if self._splats is not None:
+            self._splats.remove()
+            self._splats = None
 
 
 def add_splats(run: LoadedRun, viser_scene: Any) -> Any:

@@ -7,18 +7,17 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
 import torch
-from jaxtyping import UInt8
-from numpy import ndarray
 
 from invgraphics.core import Camera, Rendering, View
 from invgraphics.metrics.protocols import PROTOCOLS, score
+from invgraphics.tools.colorize import Picture, colorize, resize_image, true_image
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera, limit_size, rescale, subregion
-from invgraphics.viewer.colorize import EMPTY, Picture, colorize, pad_to_window, resize_image, true_image
+from invgraphics.viewer.crop import CropBox
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.render_thread import Task
 from invgraphics.viewer.resolution import SETTLE_SECONDS, AdaptiveResolution
+from invgraphics.viewer.window import crop_columns, letterboxed, side_by_side_image
 
 Layout = Literal["first", "second", "split", "side by side"]
 LAYOUTS: tuple[Layout, ...] = ("split", "side by side", "first", "second")
@@ -38,6 +37,7 @@ class RenderRequest:
         max_size: limit of the longer side, pixels.
         skip_coarse: start at full size, because an image from here is on screen already.
         background: behind predictions, in the scene's colour space; ``None`` for the scene's own.
+        crop: box in the first run's local frame outside which nothing is rendered.
     """
 
     camera: ViewerCamera
@@ -49,6 +49,7 @@ class RenderRequest:
     max_size: int = 800
     skip_coarse: bool = False
     background: tuple[float, float, float] | None = None
+    crop: CropBox | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +179,7 @@ class ProgressiveRenderer:
         """Render the next strip of a side's level; whether that has finished it."""
         panel, began, finished = side.panel.at(side.scales[0]), self._clock(), None
         if side.task is None:
-            side.task, side.began = self._render(panel, request.output == "normal", untiled), side.spent
+            side.task, side.began = self._render(panel, request, untiled), side.spent
         try:
             next(side.task)
         except StopIteration as stop:
@@ -205,13 +206,14 @@ class ProgressiveRenderer:
         panels = [_Panel(first, camera, (0, column)), _Panel(second, camera, (column, camera.width))]
         return [panel for panel in panels if panel.columns[0] < panel.columns[1]]
 
-    def _render(self, panel: _Panel, geometry: bool, untiled: bool) -> Generator[float, None, Rendering]:
-        run, columns = panel.run, panel.columns
+    def _render(self, panel: _Panel, request: RenderRequest, untiled: bool) -> Generator[float, None, Rendering]:
+        run, columns, geometry = panel.run, panel.columns, request.output == "normal"
+        crop = None if request.crop is None else run.crop_to_local(request.crop, self.runs[0].scene)
         camera = run.to_local(panel.camera, self.runs[0].scene)
         if not run.independent_pixels:
             # A splat's footprint depends on its distance to the image's border, so tiles would not match.
-            picture = run.render(camera, geometry)
-            return picture if panel.whole else _columns(picture, columns)
+            picture = run.render(camera, geometry, crop)
+            return picture if panel.whole else crop_columns(picture, columns)
         # Strips do not adapt the resolution: one of empty background is fast, and the next movement would be slow.
         rows = camera.height if untiled else self.resolutions[run].strip_rows(columns[1] - columns[0])
         parts = []
@@ -219,7 +221,7 @@ class ProgressiveRenderer:
             if parts:
                 yield 0.0
             strip = subregion(camera, columns, (top, min(top + rows, camera.height)))
-            parts.append(run.render(strip, geometry))
+            parts.append(run.render(strip, geometry, crop))
         return Rendering.cat(parts)
 
     def _compose(self, request: RenderRequest, sides: Sequence[_Side], letterbox: LetterboxedView | None) -> Frame:
@@ -243,9 +245,9 @@ class ProgressiveRenderer:
             for picture, (first, last) in zip(seen.pictures, columns, strict=True)
         ]
         if request.layout == "side by side":
-            picture = _beside([_letterboxed(picture, letterbox) for picture in pictures])
+            picture = side_by_side_image([letterboxed(picture, letterbox) for picture in pictures])
         else:
-            picture = _letterboxed(_beside(pictures), letterbox)
+            picture = letterboxed(side_by_side_image(pictures), letterbox)
         return Frame(
             picture,
             (finest.width, finest.height),
@@ -257,7 +259,12 @@ class ProgressiveRenderer:
 
     def _psnr(self, request: RenderRequest, panels: Sequence[_Panel], renderings: Sequence[Rendering]) -> tuple[float, ...]:
         view = request.view
-        if view is None or request.output not in ("prediction", "error") or not all(panel.whole for panel in panels):
+        if (
+            view is None
+            or request.crop is not None
+            or request.output not in ("prediction", "error")
+            or not all(panel.whole for panel in panels)
+        ):
             return ()
         if any(rendering.alpha.shape != view.image.shape[:2] for rendering in renderings):
             return ()
@@ -269,28 +276,4 @@ class ProgressiveRenderer:
             (view.camera.width, view.camera.height) if letterbox is None else (letterbox.camera.width, letterbox.camera.height)
         )
         picture = true_image(view, self.runs[0].scene, size)
-        return Frame(_letterboxed(picture, letterbox), size, 0.0, True, f"the photograph {view.name}")
-
-
-def _columns(picture: Rendering, columns: tuple[int, int]) -> Rendering:
-    cut = slice(*columns)
-    normal = None if picture.normal is None else picture.normal[:, cut]
-    return Rendering(picture.rgb[:, cut], picture.alpha[:, cut], picture.depth[:, cut], normal)
-
-
-def _letterboxed(picture: Picture, letterbox: LetterboxedView | None) -> Picture:
-    """Resize an image of a photograph's camera and pad it to the window."""
-    if letterbox is None:
-        return picture
-    full = resize_image(picture, (letterbox.camera.width, letterbox.camera.height))
-    return pad_to_window(full, (letterbox.width, letterbox.height), (letterbox.left, letterbox.top))
-
-
-def _beside(pictures: Sequence[UInt8[ndarray, "h _ 3"]]) -> Picture:
-    """Concatenate images from left to right, separated by a line."""
-    lined = []
-    for picture in pictures[:-1]:
-        ended = picture.copy()
-        ended[:, -1:] = EMPTY
-        lined.append(ended)
-    return np.concatenate([*lined, pictures[-1]], axis=1)
+        return Frame(letterboxed(picture, letterbox), size, 0.0, True, f"the photograph {view.name}")

@@ -21,7 +21,8 @@ from invgraphics.viewer.loaded_run import POLL, LoadedRun
 from invgraphics.viewer.overlays import CameraFrustums
 from invgraphics.viewer.progressive import ProgressiveRenderer
 from invgraphics.viewer.render_thread import RenderThread, Task
-from invgraphics.viewer.session import Session, SharedState
+from invgraphics.viewer.session import Session
+from invgraphics.viewer.shared_state import SharedState
 
 UP = (0.0, 0.0, 1.0)
 """Default up direction of the local frame."""

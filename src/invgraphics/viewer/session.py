@@ -4,22 +4,36 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
-from invgraphics.core import Scene, View
+from invgraphics.core import Scene
 from invgraphics.experiments.evaluate import display
-from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera, limit_size, rotation_quaternion
-from invgraphics.viewer.colorize import NEEDS_TRUTH
-from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Controls
-from invgraphics.viewer.overlays import CameraFrustums, add_splats
-from invgraphics.viewer.progressive import Frame, ProgressiveRenderer, RenderRequest
-from invgraphics.viewer.render_thread import RenderThread, Task
+from invgraphics.tools.camera_path import CameraPath, Keyframe
+from invgraphics.tools.colorize import NEEDS_TRUTH
+from invgraphics.viewer.cameras import (
+    LetterboxedView,
+    ViewerCamera,
+    fov_and_aspect,
+    limit_size,
+    nearest_view,
+    rotation_quaternion,
+)
+from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Controls, jump_notice, on_change
+from invgraphics.viewer.crop import crop_note
+from invgraphics.viewer.crop_panel import CropPanel
+from invgraphics.viewer.film_export import RATE, FilmLook, export_film, film_cameras
+from invgraphics.viewer.loaded_run import LoadedRun
+from invgraphics.viewer.overlays import Overlays
+from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
+from invgraphics.viewer.progressive import Frame, RenderRequest
+from invgraphics.viewer.render_thread import Task
+from invgraphics.viewer.shared_state import SharedState
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
@@ -33,27 +47,6 @@ RENDERING = "Rendering …"
 """Status until the first frame after a change."""
 
 
-@dataclass(frozen=True, eq=False)
-class SharedState:
-    """State shared by all sessions.
-
-    Attributes:
-        renderer: of the runs.
-        thread: runs render tasks.
-        views: names and views to choose from.
-        frustums: overlays of the same views.
-        start: index of the initial view.
-        max_size: initial limit of the longer side, pixels.
-    """
-
-    renderer: ProgressiveRenderer
-    thread: RenderThread
-    views: Sequence[tuple[str, View]]
-    frustums: CameraFrustums
-    start: int
-    max_size: int
-
-
 class Session:
     """Session of one browser. Methods run in viser's event loop, except where the render thread is named."""
 
@@ -62,11 +55,15 @@ class Session:
         names = [name for name, _ in shared.views]
         callbacks = Callbacks(self._output_changed, self._view_chosen, self._overlays_changed, self._save_image)
         self._controls = Controls(client.gui, shared.renderer.runs, names, shared.max_size, callbacks)
+        self._crop = CropPanel(client.gui, client.scene, self._scene)
+        for handle in (self._crop.enabled, *self._crop.axes):
+            on_change(handle, self._crop_changed)
+        path = PathCallbacks(self._keyframe, self._move_to, self._export, self._stop_export, self._download)
+        self._path = PathPanel(client.gui, client.scene, self._scene, path)
         self._view_index: int | None = None
         self._arrived, self._deadline = False, 0.0
         self._requested: tuple[int | None, float] | None = None
-        self._frustums: dict[int, Any] = {}
-        self._splats: Any = None
+        self._overlays = Overlays(client.scene, shared.renderer.runs[0], shared.frustums, self._frustum_clicked)
         self._closed = False
         self._notice = ""
         self._frame: Frame | None = None
@@ -76,7 +73,8 @@ class Session:
     def close(self) -> None:
         """Cancel the tasks of a browser that has disconnected."""
         self._closed = True
-        for what in ("frame", "overlays"):
+        self._path.close()
+        for what in ("frame", "overlays", "film"):
             self._shared.thread.cancel((what, self._client.client_id))
 
     def go_to_view(self, index: int) -> None:
@@ -84,25 +82,26 @@ class Session:
         name, view = self._shared.views[index]
         self._view_index, self._arrived, self._deadline = index, False, time.monotonic() + ARRIVAL
         self._controls.view.value = name
-        pose, camera = view.camera.cam_to_world, self._client.camera
-        position, forward = pose[:3, 3].double(), pose[:3, 2].double()
+        self._set_camera(view.camera.cam_to_world, self._letterbox().fov)
+        self._submit("overlays", self._update_overlays())
+        self._controls.show_status(RENDERING)
+        self._request_frame()
+
+    def _set_camera(self, pose: Float[Tensor, "4 4"], fov: float) -> None:
+        """Send the browser a camera; it turns around the point ahead that is nearest to the scene's centre."""
+        camera, position, forward = self._client.camera, pose[:3, 3].double(), pose[:3, 2].double()
         reach = float((self._scene.bounds.centre.double() - position) @ forward)
         turning = position + forward * (reach if reach > 0 else self._scene.bounds.radius)
         with self._client.atomic():
             camera.position = position.numpy()
             camera.wxyz = np.array(rotation_quaternion(pose))
             camera.look_at = turning.numpy()
-            camera.fov = self._letterbox().fov
-        self._submit("overlays", self._update_overlays())
-        self._controls.show_status(RENDERING)
-        self._request_frame()
+            camera.fov = fov
 
     def refresh(self) -> None:
         """Show a reloaded model; called by the render thread."""
         self._controls.update_summary()
-        if self._splats is not None:
-            self._splats.remove()
-            self._splats = None
+        self._overlays.remove_splats()
         self._submit("overlays", self._update_overlays())
         self._request_frame(skip_coarse=True)
 
@@ -112,8 +111,12 @@ class Session:
             self._client.add_notification("The picture could not be made", sentence, color="red")
 
     @property
+    def _runs(self) -> tuple[LoadedRun, ...]:
+        return self._shared.renderer.runs
+
+    @property
     def _scene(self) -> Scene:
-        return self._shared.renderer.runs[0].scene
+        return self._runs[0].scene
 
     @property
     def _camera(self) -> ViewerCamera:
@@ -180,9 +183,54 @@ class Session:
             return
         content = io.BytesIO()
         Image.fromarray(self._frame.image).save(content, format="PNG")
-        self._client.send_file_download(
-            f"{self._scene.name}-{self._controls.output.value}.png", content.getvalue(), save_immediately=True
+        self._download(f"{self._scene.name}-{self._controls.output.value}.png", content.getvalue())
+
+    def _download(self, name: str, content: bytes) -> None:
+        self._client.send_file_download(name, content, save_immediately=True)
+
+    async def _crop_changed(self) -> None:
+        self._crop.draw()
+        self._request_frame()
+
+    def _keyframe(self) -> Keyframe:
+        """The current camera; at a photograph with the photograph's field of view, not the window's."""
+        fov = self._camera.fov
+        if self._view_index is not None:
+            fov = fov_and_aspect(self._shared.views[self._view_index][1].camera)[0]
+        return Keyframe.from_local(self._camera.pose, fov, self._scene)
+
+    def _move_to(self, keyframe: Keyframe) -> None:
+        """Move the camera to a keyframe."""
+        self._view_index, self._notice = None, ""
+        self._controls.view.value = FREE_CAMERA
+        pose = keyframe.local_pose(self._scene)
+        self._set_camera(pose, keyframe.fov)
+
+    def _export(self, path: CameraPath) -> None:
+        """Render a film of the path in the render thread and send it to the browser."""
+        run = self._runs[-1 if self._controls.layout.value == "second" else 0]
+        output, box = self._controls.output.value, self._crop.box
+        look = FilmLook(
+            "prediction" if output in NEEDS_TRUTH else output,
+            BACKGROUNDS[self._controls.background.value],
+            None if box is None else run.crop_to_local(box, self._scene),
         )
+        cameras = film_cameras(path, run, int(self._controls.max_size.value))
+        count = len(cameras)
+
+        def on_progress(done: int) -> None:
+            if not self._closed and (done == 1 or done % RATE == 0):
+                self._path.show_status(f"Exporting: frame {done} of {count}")
+
+        def on_film(content: bytes) -> None:
+            if not self._closed:
+                self._download(f"{self._scene.name}-path.mp4", content)
+                self._path.show_status(f"Film of {count} frames, {RATE} a second, sent to the browser.", exporting=False)
+
+        self._submit("film", export_film(run, cameras, look, on_progress, on_film))
+
+    def _stop_export(self) -> None:
+        self._shared.thread.cancel(("film", self._client.client_id))
 
     def _submit(self, what: str, task: Task) -> None:
         self._shared.thread.submit((what, self._client.client_id), task)
@@ -205,10 +253,15 @@ class Session:
             max_size=int(controls.max_size.value),
             skip_coarse=skip_coarse,
             background=BACKGROUNDS[controls.background.value],
+            crop=self._crop.box,
         )
         note = (
             self._notice if request.output == output else f"This is the prediction: the {output} is known at photographs only."
         )
+
+        if request.crop is not None:
+            runs = {"first": self._runs[:1], "second": self._runs[-1:]}.get(request.layout, self._runs)
+            note = " ".join(filter(None, (note, *dict.fromkeys(crop_note(run.fitted.model.renderer) for run in runs))))
 
         def on_frame(frame: Frame) -> None:
             if self._closed:
@@ -228,35 +281,9 @@ class Session:
 
     def _update_overlays(self) -> Iterator[float]:
         """Bring the overlays in line with the controls; runs in the render thread."""
-        if self._controls.splats.value and self._splats is None:
-            self._splats = add_splats(self._shared.renderer.runs[0], self._client.scene)
-        if self._splats is not None:
-            self._splats.visible = self._controls.splats.value
-        for index in range(len(self._shared.frustums)):
-            wanted = (
-                self._controls.cameras.value and index != self._view_index and self._controls.layout.value != "side by side"
-            )
-            if index not in self._frustums and wanted:
-                self._frustums[index] = self._shared.frustums.add(index, self._client.scene, self._view_callback(index))
-                yield 0.0
-            elif index in self._frustums and self._frustums[index].visible != wanted:
-                self._frustums[index].visible = wanted
+        controls = self._controls
+        frustums = controls.cameras.value and controls.layout.value != "side by side"
+        yield from self._overlays.update(controls.splats.value, frustums, self._view_index)
 
-    def _view_callback(self, index: int) -> Any:
-        async def choose() -> None:
-            self.go_to_view(index)
-
-        return choose
-
-
-def jump_notice(output: str, view: str) -> str:
-    """The reason why choosing an output has moved the camera."""
-    return f"Moved to the nearest photograph, {view}: the {output} is known at photographs only."
-
-
-def nearest_view(views: Sequence[View], viewer_camera: ViewerCamera, extent: float) -> int:
-    """Index of the view nearest to a camera: distance in scene extents plus angle in radians."""
-    poses = torch.stack([view.camera.cam_to_world for view in views])
-    distance = (poses[:, :3, 3] - viewer_camera.pose[:3, 3]).norm(dim=1) / extent
-    angle = (poses[:, :3, 2] @ viewer_camera.pose[:3, 2]).clamp(-1, 1).acos()
-    return int((distance + angle).argmin())
+    async def _frustum_clicked(self, index: int) -> None:
+        self.go_to_view(index)

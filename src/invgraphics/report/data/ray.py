@@ -59,6 +59,11 @@ class Ray:
         known = {key: number(self.pixel.get(key), key, self.source) for key in DEPTHS}
         return {key: value for key, value in known.items() if value is not None}
 
+    @property
+    def length_unit(self) -> str:
+        """``world``, or ``local`` for files from before lengths were stored in the data set's units."""
+        return optional(self.facts, "length_unit", str, self.source, "local")
+
     def curve(self, name: str) -> dict[str, Float[ndarray, " p"]]:
         """``profile`` or ``marched``, empty where there is none; what it lacks is left out."""
         table = optional(self.facts, name, dict, self.source, {})

@@ -65,7 +65,7 @@ def draw_ray(folder: Path) -> Path:
         _depths((strip, main, below), ray)
         for axes in (strip, main, below):
             axes.tick_params(labelbottom=False, bottom=False)
-        total.set_xlabel("distance along the ray (local units)")
+        total.set_xlabel(f"distance along the ray ({ray.length_unit} units)")
         _pictures(figure, grid[:, 1].subgridspec(2, 1), ray, folder)
         figure.suptitle(_title(ray), x=0.01, ha="left", fontsize=14, fontweight="bold")
         png = folder / f"{NAME}.png"
@@ -213,7 +213,8 @@ def _densities(axes: Axes, ray: Ray) -> None:
         axes.set_ylim(0, 1.08 * max(float(curve["density"].max()), 1e-9))
     if ray.kind == "samples" and "density" in ray.columns:
         axes.plot(ray.columns["t"], ray.columns["density"], ".", color=DENSITY, markersize=4)
-    axes.set_ylabel("density" if ray.kind != "splats" else "density\nif marched")
+    unit = f"\nper {ray.length_unit} unit"
+    axes.set_ylabel(f"density{unit}" if ray.kind != "splats" else f"density{unit}\nif marched")
 
 
 def _depths(panels: tuple[Axes, ...], ray: Ray) -> None:

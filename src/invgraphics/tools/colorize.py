@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from invgraphics.core import Rendering, Scene, View
@@ -36,7 +36,11 @@ class ColorizedImages:
 
 
 def colorize(
-    output: str, renderings: Sequence[Rendering], scenes: Sequence[Scene], truths: Sequence[Picture | None]
+    output: str,
+    renderings: Sequence[Rendering],
+    scenes: Sequence[Scene],
+    truths: Sequence[Picture | None],
+    span: tuple[float, float] | None = None,
 ) -> ColorizedImages:
     """Map renderings to 8-bit images with one shared colour scale.
 
@@ -45,10 +49,11 @@ def colorize(
         renderings: on the CPU, with normals where these are displayed.
         scenes: whose background, colour space and unit of length count, one for each rendering.
         truths: photographs of the renderings' sizes, one for each.
+        span: nearest and farthest depth in world units; ``None`` for the renderings' own.
     """
     pairs = list(zip(renderings, scenes, strict=True))
     if output == "depth":
-        return _depths(pairs)
+        return _depths(renderings, scenes, span)
     if output == "normal":
         note = "x, y, z of the normal as red, green, blue"
         return ColorizedImages([_normal(rendering) for rendering in renderings], note)
@@ -95,22 +100,38 @@ def _error(picture: Picture, truth: Picture) -> Picture:
     return _mapped(difference / ERROR_LIMIT, ERROR_COLOURS)
 
 
-def _depths(pairs: Sequence[tuple[Rendering, Scene]]) -> ColorizedImages:
-    """Depth images in world units, one range for all: 1st to 99th percentile."""
-    depths = [rendering.depth.numpy() * scene.scale for rendering, scene in pairs]
-    solid = [
-        (rendering.alpha.numpy() >= OPAQUE) & np.isfinite(depth) for (rendering, _), depth in zip(pairs, depths, strict=True)
+def depth_range(renderings: Sequence[Rendering], scenes: Sequence[Scene]) -> tuple[float, float] | None:
+    """The 1st and 99th percentile of all depths in world units; ``None`` where no rendering shows a surface."""
+    maps = _surface_depths(renderings, scenes)
+    values = np.concatenate([depth[solid] for depth, solid in maps])
+    if not len(values):
+        return None
+    low, high = np.percentile(values, [1, 99]).tolist()
+    return low, high
+
+
+def _surface_depths(
+    renderings: Sequence[Rendering], scenes: Sequence[Scene]
+) -> list[tuple[Float[ndarray, "h w"], Bool[ndarray, "h w"]]]:
+    """Depth in world units, and where it shows a surface."""
+    depths = [rendering.depth.numpy() * scene.scale for rendering, scene in zip(renderings, scenes, strict=True)]
+    return [
+        (depth, (rendering.alpha.numpy() >= OPAQUE) & np.isfinite(depth))
+        for rendering, depth in zip(renderings, depths, strict=True)
     ]
-    values = np.concatenate([depth[mask] for depth, mask in zip(depths, solid, strict=True)])
-    low, high = np.percentile(values, [1, 99]).tolist() if len(values) else (0.0, 1.0)
-    span = max(high - low, 1e-9)
+
+
+def _depths(renderings: Sequence[Rendering], scenes: Sequence[Scene], span: tuple[float, float] | None) -> ColorizedImages:
+    """Depth images in one range."""
+    found = span or depth_range(renderings, scenes)
+    low, high = found or (0.0, 1.0)
     pictures = []
-    for depth, mask in zip(depths, solid, strict=True):
-        picture = _mapped((np.where(mask, depth, low) - low) / span, DEPTH_COLOURS)
-        picture[~mask] = EMPTY
+    for depth, solid in _surface_depths(renderings, scenes):
+        picture = _mapped((np.where(solid, depth, low) - low) / max(high - low, 1e-9), DEPTH_COLOURS)
+        picture[~solid] = EMPTY
         pictures.append(picture)
-    legend = f"distance from the camera, {low:.3g} (bright) to {high:.3g} (dark) units of the world"
-    return ColorizedImages(pictures, legend if len(values) else "no surface in sight")
+    legend = f"distance from the camera, {low:.3g} (bright) to {high:.3g} (dark) world units"
+    return ColorizedImages(pictures, legend if found else "no surface in sight")
 
 
 def _normal(rendering: Rendering) -> Picture:
