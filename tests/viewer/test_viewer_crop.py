@@ -58,7 +58,7 @@ def test_what_is_outside_is_not_rendered(runs: dict[str, Path], method: str) -> 
     assert float(nothing.alpha.max()) < 1e-6
     seen = run.render(camera, False, CropBox((0.0, -9, -9), (9, 9, 9)))
     assert 0 < float(seen.alpha.sum()) < 0.95 * float(whole.alpha.sum())
-    assert not run.crop_obstacle and "Cropped" in crop_note(run.fitted.renderer)
+    assert not run.crop_obstacle and "Cropped" in crop_note(run.fitted.model.renderer)
     surface = (seen.alpha > 0.5) & seen.depth.isfinite()
     if method != "splatting/gaussians" and bool(surface.any()):  # splats may extend beyond the box
         rays = camera.rays()
@@ -70,8 +70,8 @@ def test_gaussians_are_culled_by_their_centres(runs: dict[str, Path]) -> None:
     fitted = open_fitted(runs["splatting/gaussians"])
     ctx = Context(fitted.scene.bounds)
     box = CropBox((-0.2, -1, -1), (0.4, 1, 1))
-    whole = fitted.field.primitives(Quantity.GAUSSIANS, ctx)
-    kept = CroppedGaussians(fitted.field, box).primitives(Quantity.GAUSSIANS, ctx)
+    whole = fitted.model.field.primitives(Quantity.GAUSSIANS, ctx)
+    kept = CroppedGaussians(fitted.model.field, box).primitives(Quantity.GAUSSIANS, ctx)
     x = whole.means[:, 0]
     assert len(kept) == int(((x >= -0.2) & (x <= 0.4) & (whole.means[:, 1:].abs() <= 1).all(dim=1)).sum())
     assert 0 < len(kept) < len(whole) and len(kept.sh) == len(kept)
