@@ -129,8 +129,8 @@ def test_a_run_measures_both_implementations_and_their_limit() -> None:
 def test_without_numba_the_reference_is_measured_alone(monkeypatch) -> None:
     missing = lambda name: "ImportError: no numba" if name == "numba" else ""  # noqa: E731
     for module in (run, limits, splat_cases):
-        monkeypatch.setattr(module, "why_not", missing)
-    monkeypatch.setattr(run, "here", lambda: ("reference",))
+        monkeypatch.setattr(module, "unavailable_reason", missing)
+    monkeypatch.setattr(run, "cpu_implementations", lambda: ("reference",))
     results = bench(Request(("splats", "iterations", "peers"), quick=True))
     assert {m.implementation for m in results.measurements} == {"reference", "machine"}
     assert {skipped.what for skipped in results.skipped} == {"numba kernels", "cuda kernels", "iterations", "peers"}

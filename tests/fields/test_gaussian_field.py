@@ -4,11 +4,9 @@ import math
 
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from invgraphics.core import Context, Points, Quantity, Samples, harmonics
 from invgraphics.core.colour import srgb_to_linear
-from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.gaussian import PARAMETERS, GaussianField, GaussianFieldConfig
 
@@ -167,33 +165,6 @@ def test_a_checkpoint_of_another_size_loads(make_scene):
     assert small.means.grad.shape == (30, 3)
     with pytest.raises(RuntimeError, match="sh_rest"):
         GaussianFieldConfig(sh_degree=1).build(scene).load_state_dict(big.state_dict())
-
-
-def test_transformed_moves_covariances_and_colours_and_comes_back(make_scene):
-    scene = make_scene(points=_points())
-    field = _scrambled(scene)
-    field.active_degree = 2
-    rotation = torch.from_numpy(Rotation.random(random_state=1).as_matrix())
-    similarity = torch.eye(4, dtype=torch.float64)
-    similarity[:3, :3], similarity[:3, 3] = 2.5 * rotation, torch.tensor([1.0, -2.0, 0.5])
-    before, after = _gaussians(field, scene), _gaussians(field.transformed(similarity), scene)
-    torch.testing.assert_close(after.means, 2.5 * before.means @ rotation.T + similarity[:3, 3])
-
-    def covariance(gaussians):
-        axes = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
-        return axes @ axes.mT
-
-    torch.testing.assert_close(covariance(after), 2.5**2 * rotation @ covariance(before) @ rotation.T)
-    direction = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1)
-    seen = harmonics.evaluate(after.sh, direction @ rotation.T)
-    torch.testing.assert_close(seen, harmonics.evaluate(before.sh, direction))
-    back = _gaussians(field.transformed(similarity).transformed(torch.linalg.inv(similarity)), scene)
-    torch.testing.assert_close(back.means, before.means)
-    torch.testing.assert_close(covariance(back), covariance(before))
-    torch.testing.assert_close(back.sh, before.sh)
-    assert field.transformed(similarity).active_degree == 2
-    with pytest.raises(InputError, match="mirror"):
-        field.transformed(torch.diag(torch.tensor([1.0, 1, -1, 1])))
 
 
 def test_points_cannot_be_asked(make_scene):

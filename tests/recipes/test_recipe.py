@@ -7,7 +7,7 @@ import torch
 
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
-from invgraphics.recipes.recipe import load_method, methods, presets, resolve
+from invgraphics.recipes.recipe import load_method, methods, migrate, presets, resolve
 from invgraphics.testing import check_field, check_renderer, toy_scene
 
 CELLS = [(name, preset) for name in methods() for preset in (*presets(name), "")]
@@ -70,3 +70,15 @@ def test_a_users_own_file_is_a_method(tmp_path) -> None:
         load_method(str(own))
     with pytest.raises(tomllib.TOMLDecodeError):
         tomllib.loads(own.read_text())
+
+
+def test_recipes_of_older_runs_still_resolve() -> None:
+    now = load_method("splatting/gaussians-mip", None, ["renderer.max_grad_splats=10"])
+    renderer = {key: value for key, value in now.table["renderer"].items() if key not in ("antialiased", "max_grad_splats")}
+    older = now.table | {"renderer": renderer | {"compensate": True, "receivers": 10}}
+    with pytest.raises(InputError, match="compensate"):
+        resolve(now.name, now.preset, older)
+    assert resolve(now.name, now.preset, migrate(older)).digest == now.digest
+    hashed = load_method("volumetric/hash").table
+    sampler = {("wave" if key == "chunk" else key): value for key, value in hashed["renderer"]["sampler"].items()}
+    assert migrate(hashed | {"renderer": hashed["renderer"] | {"sampler": sampler}}) == hashed

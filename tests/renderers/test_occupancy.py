@@ -78,13 +78,13 @@ def test_samples_behind_opaque_surfaces_are_left_out(make_scene: Callable[..., S
     rays = scene.bounds.clip(scene.train[0].camera.rays())
     ctx = context(scene, training=False)
     density = ball.density_no_grad
-    for wave in (1, 7, 32):
-        sampler = learnt(replace(SMALL, wave=wave, transmittance=0.01), scene, ball)
+    for chunk in (1, 7, 32):
+        sampler = learnt(replace(SMALL, chunk=chunk, transmittance=0.01), scene, ball)
         samples, _ = sampler.sample(rays, ball, ctx)
         tau = density(samples) * samples.delta
         before = in_front_of(tau, samples.ray)
         assert bool((before <= -torch.log(torch.tensor(0.01)) + 1e-4).all())
-        # The same as marching everything and cutting afterwards, whatever the wave.
+        # The same as marching everything and cutting afterwards, whatever the chunk.
         whole, _ = learnt(replace(SMALL, stop="never"), scene, ball).sample(rays, ball, ctx)
         before = in_front_of(density(whole) * whole.delta, whole.ray)
         visible = before <= -torch.log(torch.tensor(0.01))

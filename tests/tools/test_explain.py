@@ -97,8 +97,8 @@ def test_two_splats_by_hand() -> None:
     "renderer",
     [
         Splatting(SplattingConfig(shape="disc", dilation=0.5)),
-        Splatting(SplattingConfig(dilation=0.1, compensate=True)),
-        Splatting(SplattingConfig(receivers=3)),
+        Splatting(SplattingConfig(dilation=0.1, antialiased=True)),
+        Splatting(SplattingConfig(max_grad_splats=3)),
         GaussianSorted(GaussianSortedConfig("splat", "centre")),
         GaussianSorted(GaussianSortedConfig("physical", "ray")),
         GaussianExact(GaussianExactConfig("physical")),

@@ -15,7 +15,7 @@ from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
 from invgraphics.training.limits import COLLAPSED, LimitsConfig, dead_gaussians, pixel_sizes
-from invgraphics.training.losses import PhotometricConfig
+from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
 
 
@@ -36,7 +36,7 @@ def _fit(colour: float, target: int, hooks: tuple = (LimitsConfig(),), **changes
     groups = OptimiserConfig({"field": GroupConfig("field", 0.05)}, eps=1e-15)
     built = [hook.build() for hook in hooks]
     field = GaussianField(tensors)
-    losses = [PhotometricConfig(distance="l1").build()]
+    losses = [PhotometricLoss(distance="l1")]
     model = Model(field, SplattingConfig().build(scene), scene.bounds)
     return Fit(Plan(model, scene, losses, built, groups, BatchConfig(), Budget(steps=100)))
 

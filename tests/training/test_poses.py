@@ -10,12 +10,12 @@ from torch import Tensor
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, Field, FieldValues, Model, Quantity, Samples, Scene, View
 from invgraphics.core.colour import quantise
+from invgraphics.core.ngp import HashGrid
 from invgraphics.core.transforms import se3_exp
 from invgraphics.experiments.build import build_model, build_plan
 from invgraphics.fields.encodings.frequency import FrequencyConfig
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.kernels import reference
-from invgraphics.kernels.types import HashGrid
 from invgraphics.metrics.poses import pose_errors
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
@@ -26,7 +26,7 @@ from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
 from invgraphics.training.localise import Descent, descend
-from invgraphics.training.losses import PhotometricConfig
+from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import OptimiserConfig
 from invgraphics.training.poses import Poses, PosesConfig, motion_about, windows
 
@@ -250,7 +250,7 @@ def test_poses_come_back(blobs: Scene) -> None:
     plan = Plan(
         model=Model(Blobs(), VolumetricConfig(StratifiedConfig(32)).build(shown), shown.bounds),
         scene=shown,
-        losses=[PhotometricConfig().build()],
+        losses=[PhotometricLoss()],
         hooks=[],
         optimiser=config.optimiser(OptimiserConfig(), seen=1.0),
         batches=BatchConfig(rays=1200, views=6),

@@ -41,9 +41,6 @@ def test_smoothed_gaussians_keep_their_integral() -> None:
     after = field.primitives(Quantity.GAUSSIANS, ctx)
     torch.testing.assert_close(after.scales.square(), before.scales.square() + 0.05**2)
     torch.testing.assert_close(after.opacities * after.scales.prod(dim=1), before.opacities * before.scales.prod(dim=1))
-    moved = field.transformed(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0]))).primitives(Quantity.GAUSSIANS, ctx)
-    torch.testing.assert_close(moved.scales, 2 * after.scales)
-    torch.testing.assert_close(moved.opacities, after.opacities)
 
 
 def test_filter_follows_the_number_of_gaussians() -> None:

@@ -16,9 +16,9 @@ from invgraphics.runs import checkpoint
 
 viser = pytest.importorskip("viser")
 
-from invgraphics.viewer.cameras import Mount  # noqa: E402
+from invgraphics.viewer.cameras import LetterboxedView  # noqa: E402
+from invgraphics.viewer.launch import ViewerConfig, open_viewer  # noqa: E402
 from invgraphics.viewer.server import Viewer  # noqa: E402
-from invgraphics.viewer.view import ViewRequest, open_viewer  # noqa: E402
 
 pytestmark = pytest.mark.browser
 
@@ -129,7 +129,7 @@ def watch(browser: Any, tmp_path: Path, request: pytest.FixtureRequest) -> Itera
     opened: list[Any] = []
 
     def start(*runs: Path) -> Watcher:
-        viewer = open_viewer(ViewRequest(runs, port=0, longest=160), print)
+        viewer = open_viewer(ViewerConfig(runs, port=0, max_size=160), print)
         opened.append(viewer.stop)
         context = browser.new_context(viewport=WINDOW)
         opened.append(context.close)
@@ -148,12 +148,12 @@ def _at_photograph(watcher: Watcher, picture: np.ndarray) -> float:
     """Mean difference, 0 to 255, between what the window shows of a photograph's camera and ``picture``."""
     seen = watcher.canvas()
     height, width = seen.shape[:2]
-    mount = Mount.of(watcher.viewer._subjects[0].scene.test[0].camera, width / height)
-    scale = height / mount.height
-    left, top = round(mount.left * scale), round(mount.top * scale)
-    side = round(mount.camera.width * scale)
+    letterbox = LetterboxedView.fit(watcher.viewer._runs[0].scene.test[0].camera, width / height)
+    scale = height / letterbox.height
+    left, top = round(letterbox.left * scale), round(letterbox.top * scale)
+    side = round(letterbox.camera.width * scale)
     part = Image.fromarray(seen[top : top + side, left : left + side].astype(np.uint8))
-    small = np.asarray(part.resize((mount.camera.width, mount.camera.height), Image.Resampling.BOX)).astype(float)
+    small = np.asarray(part.resize((letterbox.camera.width, letterbox.camera.height), Image.Resampling.BOX)).astype(float)
     return _apart(small[2:-2, 2:-2], picture[2:-2, 2:-2])
 
 
@@ -187,7 +187,7 @@ def test_turning_leaves_the_photograph_and_truth_comes_back_to_one(watch: Any, r
     watcher.choose("Show", "truth")
     truth = watcher.canvas()
     watcher.turn()
-    assert watcher.value("View") == "anywhere"
+    assert watcher.value("View") == "free camera"
     assert watcher.page.get_by_text("the truth is known at photographs only").count() == 1
     free = watcher.canvas("turned")
     assert _apart(free, truth) > 1
@@ -262,13 +262,13 @@ def test_a_fit_is_followed(watch: Any, runs: dict[str, Path], tmp_path: Path) ->
     state["field"]["means"][:, 2] += 0.4
     checkpoint.save(run / checkpoint.NAME, state)
     (run / "fit.json").write_text('{"steps": 12345, "seconds": 6.0}')
-    watcher.viewer.look_for_news()
+    watcher.viewer.reload_if_changed()
     watcher.page.get_by_text("step 12,345").wait_for(timeout=PATIENCE)
     watcher.page.wait_for_timeout(500)
     watcher.rest()
     assert _apart(watcher.canvas("followed"), before) > 2
     (run / checkpoint.NAME).write_bytes(b"broken")
-    watcher.viewer.look_for_news()
+    watcher.viewer.reload_if_changed()
     watcher.page.get_by_text("is not a readable checkpoint").wait_for(state="attached", timeout=PATIENCE)
     assert _apart(watcher.canvas()[120:], watcher.canvas()[120:]) < 1
     assert watcher.complaints == []

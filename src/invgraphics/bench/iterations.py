@@ -26,7 +26,7 @@ from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
 from invgraphics.training.hooks import FitState, Hook
-from invgraphics.training.losses import Loss, PhotometricConfig, SsimConfig
+from invgraphics.training.losses import Loss, PhotometricLoss, SsimLoss
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
 
 VIEWS = 4
@@ -69,7 +69,7 @@ def splat_fit(field: GaussianField, pictures: Scene) -> Fit:
     """A fit of Gaussians that show ``pictures`` already, their colours disturbed, or there would be no gradients."""
     with torch.no_grad():
         field.sh_dc += 0.1 * torch.randn(field.sh_dc.shape, generator=torch.Generator().manual_seed(1))
-    losses = [PhotometricConfig(0.8, "l1").build(), SsimConfig(0.2).build()]
+    losses = [PhotometricLoss(0.8, "l1"), SsimLoss(0.2)]
     return _fit(Model(field, SplattingConfig().build(pictures), pictures.bounds), pictures, losses, [], BatchConfig())
 
 
@@ -119,7 +119,7 @@ def nerf_fit(pictures: Scene, levels: int, log2_size: int, hidden: int, warm_ste
     torch.manual_seed(0)
     field, counter = config.build(pictures), _CountSamples()
     model = Model(field, VolumetricConfig(sampler).build(pictures), pictures.bounds)
-    losses: list[Loss] = [PhotometricConfig(distance="huber").build()]
+    losses: list[Loss] = [PhotometricLoss(distance="huber")]
     warming = _fit(model, pictures, losses, [], BatchConfig(rays=256, views=VIEWS, samples=WARM_SAMPLES), lr=1e-2)
     for _ in range(warm_steps):
         warming.step()

@@ -8,7 +8,7 @@ from functools import cache
 
 import torch
 
-from invgraphics.kernels.dispatch import why_not
+from invgraphics.kernels.dispatch import unavailable_reason
 
 MATRIX = 2048
 """Edge of the square matrices of `sgemm`."""
@@ -58,7 +58,7 @@ def triad() -> Limit:
 
 def gather(size: int) -> Limit | None:
     """Random reads of 8-byte entries in a table of ``size`` bytes; counts entries. ``None`` without Numba."""
-    if why_not("numba"):
+    if unavailable_reason("numba"):
         return None
     import numpy as np
 
@@ -74,7 +74,7 @@ def gather(size: int) -> Limit | None:
 
 def exp2() -> Limit | None:
     """The kernels' exp2 polynomial on arrays in the L1 cache; counts exponentials. ``None`` without Numba."""
-    if why_not("numba"):
+    if unavailable_reason("numba"):
         return None
     import numpy as np
 

@@ -22,7 +22,7 @@ from invgraphics.bench.splat_cases import GATE as SPLAT_GATE
 from invgraphics.bench.splat_cases import both_ways, splat_pipeline, without_gradient
 from invgraphics.bench.subject import activated, camera, gaussian_field
 from invgraphics.bench.timing import Effort, Timing, alternate
-from invgraphics.kernels.types import HashGrid
+from invgraphics.core.ngp import HashGrid
 
 GROWTH = (FINEST / BASE) ** (1 / (HASH_GATE["levels"] - 1))
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])

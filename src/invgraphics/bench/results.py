@@ -11,7 +11,7 @@ from invgraphics.bench.timing import Timing
 
 FORWARD, BOTH = "forward", "forward+backward"
 """Directions."""
-FORWARD_ONLY = ("ray_march", "hash_render")
+FORWARD_ONLY = ("ray_march", "ngp_render")
 """Operations without a gradient."""
 
 SIZE_KEYS = (

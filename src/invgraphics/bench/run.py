@@ -15,7 +15,7 @@ from invgraphics.bench.peers import peers
 from invgraphics.bench.results import BOTH, FORWARD_ONLY, MACHINE, THREADS, Measurement, Results, Skipped
 from invgraphics.bench.timing import Effort, alternate
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.dispatch import IMPLEMENTATIONS, here, why_not
+from invgraphics.kernels.dispatch import IMPLEMENTATIONS, cpu_implementations, unavailable_reason
 
 QUICK, FULL = Effort(0.4, 2, 9), Effort(0.6, 3, 15)
 """How long to look at each variant."""
@@ -28,7 +28,7 @@ _CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
     "grid": sample_cases.grid_sample,
     "march": sample_cases.ray_march,
     "composite": sample_cases.composite,
-    "picture": sample_cases.hash_render,
+    "picture": sample_cases.ngp_render,
     "ssim": splat_cases.ssim,
 }
 
@@ -52,7 +52,7 @@ class Request:
     @property
     def implementations(self) -> tuple[str, ...]:
         """Kernels to measure, in alternation."""
-        return (self.kernels,) if self.kernels else here()
+        return (self.kernels,) if self.kernels else cpu_implementations()
 
 
 def bench(request: Request) -> Results:
@@ -60,8 +60,10 @@ def bench(request: Request) -> Results:
     keep_freed_memory()
     results = Results()
     if not request.kernels:
-        missing = (name for name in IMPLEMENTATIONS if name not in here())
-        results.skipped += [Skipped(f"{name} kernels", why_not(name) or "measured on a CPU only") for name in missing]
+        missing = (name for name in IMPLEMENTATIONS if name not in cpu_implementations())
+        results.skipped += [
+            Skipped(f"{name} kernels", unavailable_reason(name) or "measured on a CPU only") for name in missing
+        ]
     request.say("compiling")
     with kernels.using(request.kernels):
         kernels.warm_up()

@@ -17,7 +17,8 @@ from invgraphics.bench.results import BOTH, FORWARD
 from invgraphics.bench.splat_cases import both_ways, without_gradient
 from invgraphics.bench.subject import bounds, camera, occupied
 from invgraphics.core import Rays
-from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
+from invgraphics.core.ngp import FusedNGP, HashGrid
+from invgraphics.kernels.types import MarchSteps
 
 GATE = {"levels": 16, "log2_size": 15, "points": 1 << 16}
 """The size that the project's promise about hash grids is made for."""
@@ -73,10 +74,10 @@ def ray_march(quick: bool) -> Iterator[Case]:
         yield Case("ray_march", {"resolution": OCCUPANCY, "rays": rays}, lambda rays=rays: _march(rays))
 
 
-def hash_render(quick: bool) -> Iterator[Case]:
+def ngp_render(quick: bool) -> Iterator[Case]:
     """Pictures of a hash grid in one pass over rays; nothing is opaque, so that every step is looked at."""
     for rays in QUICK_PICTURE_RAYS if quick else PICTURE_RAYS:
-        yield Case("hash_render", {"resolution": OCCUPANCY, "rays": rays}, lambda rays=rays: _picture(rays))
+        yield Case("ngp_render", {"resolution": OCCUPANCY, "rays": rays}, lambda rays=rays: _picture(rays))
 
 
 def composite(quick: bool) -> Iterator[Case]:
@@ -127,7 +128,7 @@ def _march(count: int) -> dict[str, Pass]:
     return {FORWARD: Pass(march, float(MARCH_BYTES * len(march().ray)), limits.triad(), "bytes")}
 
 
-def hash_field() -> HashField:
+def random_ngp() -> FusedNGP:
     """Random tables and networks: a half transparent fog."""
     generator = torch.Generator().manual_seed(0)
 
@@ -138,14 +139,14 @@ def hash_field() -> HashField:
     table = torch.randn(PICTURE_GRID.entries, 2, generator=generator)
     geometry = network(2 * PICTURE_GRID.levels, PICTURE_WIDTH, 1 + HANDED)
     colour = network(HANDED + BANDS**2, PICTURE_WIDTH, PICTURE_WIDTH, 3)
-    return HashField(table, PICTURE_GRID, geometry, colour, "exp", 0.0, BANDS, "srgb")
+    return FusedNGP(table, PICTURE_GRID, geometry, colour, "exp", 0.0, BANDS, "srgb")
 
 
 def _picture(count: int) -> dict[str, Pass]:
-    field, region, cells, rays = hash_field(), bounds(), occupied(OCCUPANCY), some_rays(count)
+    field, region, cells, rays = random_ngp(), bounds(), occupied(OCCUPANCY), some_rays(count)
     steps = MarchSteps(2 * region.radius / PICTURE_STEPS)
-    render = lambda: kernels.hash_render(rays, cells, region, steps, field)  # noqa: E731
-    products = sum(weight.numel() for weight, _ in field.geometry + field.colour)
+    render = lambda: kernels.ngp_render(rays, cells, region, steps, field)  # noqa: E731
+    products = sum(weight.numel() for weight, _ in field.density_net + field.colour_net)
     looks = len(kernels.ray_march(rays, cells, region, steps, rays.near).ray)
     return {FORWARD: Pass(render, 2.0 * products * looks, limits.sgemm(), "flop")}
 

@@ -14,7 +14,7 @@ from invgraphics.bench.case import SLOW, Case, Pass, Run
 from invgraphics.bench.results import BOTH, FORWARD
 from invgraphics.bench.subject import activated, camera, gaussian_field, leaves
 from invgraphics.core import Camera, Gaussians
-from invgraphics.kernels.dispatch import why_not
+from invgraphics.kernels.dispatch import unavailable_reason
 from invgraphics.kernels.types import Footprints
 
 GATE = {"gaussians": 50_000, "width": 400}
@@ -60,7 +60,7 @@ def alpha_evaluations(footprints: Footprints, rgb: Tensor, width: int, height: i
     It walks blocks of pixels and counts its visits. The backward pass visits the same blocks once more. The reference
     evaluates every pixel of every tile that a footprint's square touches, which is more; the useful work is what counts.
     """
-    if why_not("numba"):
+    if unavailable_reason("numba"):
         return 0.0
     from invgraphics.kernels.numba.runtime import LANES
 
@@ -110,7 +110,7 @@ def _rasterise(gaussians: int, width: int) -> dict[str, Pass]:
     means, conics, opacities, colours = (
         x.detach().requires_grad_() for x in (found.means2d, found.conics, found.opacities, rgb)
     )
-    footprints = Footprints(means, conics, opacities, found.depths, found.planes, found.radii)
+    footprints = Footprints(means, conics, opacities, found.depths, found.depth_planes, found.radii)
     amount = alpha_evaluations(footprints, colours, width, width)
     draw = lambda: kernels.splat_rasterise(footprints, colours, width, width)  # noqa: E731
     return _alpha_passes(draw, [means, conics, opacities, colours], amount)

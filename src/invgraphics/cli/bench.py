@@ -88,10 +88,10 @@ class Bench:
         from invgraphics import kernels
         from invgraphics.bench.run import Request
         from invgraphics.errors import InputError
-        from invgraphics.kernels.dispatch import here
+        from invgraphics.kernels.dispatch import cpu_implementations
 
         with kernels.using(self.kernels):  # refuses what cannot be used
-            if self.kernels not in (None, *here()):
+            if self.kernels not in (None, *cpu_implementations()):
                 raise InputError(f"The {self.kernels} kernels do not run on a CPU, and that is what `bench` measures.")
             return Request(parts, self.quick, self.kernels, lambda sentence: print(sentence, file=sys.stderr, flush=True))
 

@@ -10,6 +10,8 @@ from invgraphics.core.field import Field as Field
 from invgraphics.core.field import Gaussians as Gaussians
 from invgraphics.core.field import Quantity as Quantity
 from invgraphics.core.model import Model as Model
+from invgraphics.core.ngp import FusedNGP as FusedNGP
+from invgraphics.core.ngp import HashGrid as HashGrid
 from invgraphics.core.rays import Rays as Rays
 from invgraphics.core.renderer import RayRenderer as RayRenderer
 from invgraphics.core.renderer import Renderer as Renderer

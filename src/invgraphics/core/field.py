@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.rendering import Context
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.errors import NotComposableError
@@ -82,6 +84,10 @@ class Field(nn.Module, ABC):
         density = self.query_no_grad(samples, Quantity.DENSITY).density
         assert density is not None
         return density
+
+    def fused(self, bounds: Bounds) -> FusedNGP | None:
+        """Detached parameters over ``bounds`` for fused inference, where a kernel supports such fields; else ``None``."""
+        return None
 
     def primitives(self, want: Quantity, ctx: Context) -> Any:
         """The explicit primitives of this field: `Gaussians` for ``Quantity.GAUSSIANS``, and so on.

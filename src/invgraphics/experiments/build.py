@@ -60,7 +60,7 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
     return Plan(
         model=model,
         scene=scene,
-        losses=[loss.build() for loss in recipe.losses],
+        losses=recipe.losses,
         hooks=[hook.build() for hook in recipe.hooks],
         optimiser=recipe.optimiser
         if poses is None

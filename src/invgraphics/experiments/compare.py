@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +101,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> dict
         "command": request.shell(),
         "baselines": baseline_scores(scene, protocol),
         "noise_ceiling": scene.noise_ceiling,
-        "protocol": asdict(protocol) | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
+        "protocol": protocol.record() | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
         "scene_info": {
             "train": len(scene.train),
             "val": len(scene.val),

@@ -15,8 +15,8 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
 from invgraphics.experiments.posed import optimised, scene_of_fit
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.waiting import limit_spinning
-from invgraphics.recipes.recipe import Method, resolve
+from invgraphics.kernels.openmp import limit_spinning
+from invgraphics.recipes.recipe import Method, migrate, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -107,7 +107,7 @@ def _method(folder: RunFolder, provenance: Mapping[str, Any]) -> Method:
         InputError: it cannot be resolved here; where packages are missing that the run was made with, the sentence names them.
     """
     try:
-        return resolve(provenance["method"], provenance["preset"], folder.read_recipe())
+        return resolve(provenance["method"], provenance["preset"], migrate(folder.read_recipe()))
     except InputError as error:
         used: Mapping[str, str] = provenance.get("plugins", {})
         missing = sorted({package for package in used.values() if not plugins.installed(package)})

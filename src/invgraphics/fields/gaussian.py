@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics.core import harmonics
@@ -18,7 +17,6 @@ from invgraphics.core.scene import Points, Scene
 from invgraphics.errors import NotComposableError
 from invgraphics.fields.convert import visible_points
 from invgraphics.fields.starting import depth_points, random_points, scene_points, starting_scales
-from invgraphics.fields.transformed import move_gaussians
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 """Names of a `GaussianField`'s parameters; the first axis of each is the primitive."""
@@ -180,28 +178,6 @@ class GaussianField(Field):
                 raise ValueError(f"rows of {name} have shape {tuple(old.shape[1:])}, not {tuple(tensor.shape[1:])}.")
             setattr(self, name, nn.Parameter(tensor.detach(), requires_grad=old.requires_grad))
         self.smoothing = self.means.new_zeros(len(self.means))
-
-    @torch.no_grad()
-    def transformed(self, similarity: Float[Tensor, "4 4"]) -> GaussianField:
-        """A copy of this field moved by a similarity, colours included.
-
-        Raises:
-            InputError: the matrix is no similarity.
-        """
-        moved = move_gaussians(self._gaussians(harmonics.count(self.sh_degree)), similarity.to(self.means))
-        tensors = {
-            "means": moved.means,
-            "quaternions": moved.quaternions,
-            "log_scales": moved.scales.log(),
-            "opacity_logits": self.opacity_logits.clone(),
-            "sh_dc": moved.sh[:, :1].clone(),
-            "sh_rest": moved.sh[:, 1:].clone(),
-        }
-        field = GaussianField(tensors, self.isotropic)
-        field.active_degree = self.active_degree
-        # A length: it grows with the scale, which is the cube root of the volume's.
-        field.smoothing = self.smoothing * torch.linalg.det(similarity.to(self.means)[:3, :3]) ** (1 / 3)
-        return field
 
     def _gaussians(self, coefficients: int) -> Gaussians:
         """The Gaussians as stored, without smoothing."""

@@ -143,6 +143,19 @@ def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
     return Method(name, preset, recipe, to_table(recipe))
 
 
+RENAMED = {"compensate": "antialiased", "receivers": "max_grad_splats", "wave": "chunk"}
+"""Keys of ``[renderer]`` in recipes of older runs, and their names now."""
+
+
+def migrate(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's table with the keys of its renderer as they are named now."""
+
+    def renamed(part: Any) -> Any:
+        return {RENAMED.get(key, key): renamed(value) for key, value in part.items()} if isinstance(part, Mapping) else part
+
+    return {key: renamed(value) if key == "renderer" else value for key, value in table.items()}
+
+
 def source(name: str) -> dict[str, Any]:
     """The recipe's table as written, presets included; changes that the name itself makes are left out."""
     name = split_name(name)[0]

@@ -15,7 +15,7 @@ from typing_extensions import override
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.kernels.reference.march import step_lengths
-from invgraphics.kernels.types import March, MarchSteps, hash_field
+from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.samplers import uniform
 from invgraphics.renderers.termination import visible_samples
 from invgraphics.renderers.visibility import visible_cells
@@ -51,7 +51,7 @@ class OccupancyConfig:
         cells: cells that a refresh looks at after warm-up, half of them drawn from the occupied ones.
         stop: when to leave out samples behind opaque surfaces, at the price of a density look-up.
         transmittance: a ray stops when less than this is left of its light.
-        wave: samples per ray before the first look at the transmittance; each later wave is half as long again.
+        chunk: samples per ray before the transmittance is tested first; each later chunk is half as long again.
     """
 
     resolution: int = 128
@@ -69,7 +69,7 @@ class OccupancyConfig:
     cells: int = 1 << 17
     stop: Literal["always", "evaluation", "never"] = "always"
     transmittance: float = 1e-3
-    wave: int = 16
+    chunk: int = 16
 
     def __post_init__(self) -> None:
         for key in (
@@ -80,7 +80,7 @@ class OccupancyConfig:
             "late_steps",
             "every",
             "cells",
-            "wave",
+            "chunk",
         ):
             value = getattr(self, key)
             if value is not None and value < 1:
@@ -164,17 +164,17 @@ class Occupancy(Sampler):
             # Features are of use to the renderer only where it needs no gradients through them.
             want |= field.provides & Quantity.FEATURES
         query = partial(field.query_no_grad, want=want)
-        return visible_samples(rays, self._march(rays, ctx), query, self.config.transmittance, self.config.wave), ()
+        return visible_samples(rays, self._march(rays, ctx), query, self.config.transmittance, self.config.chunk), ()
 
     @torch.no_grad()
     def _march_fused(self, rays: Rays, field: Field, ctx: Context) -> March | None:
         """A march with early termination, where a fused kernel supports the field and these steps; else ``None``."""
-        parts, steps = hash_field(field, ctx.bounds), self.steps(ctx)
+        parts, steps = field.fused(ctx.bounds), self.steps(ctx)
         even = ctx.bounds.space == "box" or steps.contracted
-        if parts is None or not even or steps.cone > 0 or not kernels.compiled("hash_march", parts.table):
+        if parts is None or not even or steps.cone > 0 or not kernels.compiled("ngp_march", parts.table):
             return None
         start = self._start(rays, steps, ctx)
-        return kernels.hash_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
+        return kernels.ngp_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
 
     def steps(self, ctx: Context) -> MarchSteps:
         """How long steps are now."""

@@ -40,33 +40,33 @@ class SplattingConfig:
         shape: ``ellipsoid`` projects to an ellipse, to first order (EWA); ``disc`` drops the shortest axis and meets each
             pixel's ray exactly (2DGS).
         dilation: variance in square pixels added to every footprint (low-pass filter); of the smallest one, for discs.
-        compensate: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
+        antialiased: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
         depth: ``expected`` averages the distances of a pixel's splats by weight; ``median`` takes that of the splat at which
             half of the light is gone. For evaluation: gradients pass through the expected one only.
         normals: ``shortest`` averages the splats' shortest axes; ``depth`` takes the slope of the depth map.
         absolute_gradients: whether density control sees the sum of absolute gradients over pixels (AbsGS), in which opposite
             pulls do not cancel.
-        receivers: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
+        max_grad_splats: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
             limited bandwidth uses 10).
         tile: edge of a tile in pixels (Numba takes 32 at most); ``None`` leaves it to the kernel.
     """
 
     shape: Literal["ellipsoid", "disc"] = "ellipsoid"
     dilation: float = 0.3
-    compensate: bool = False
+    antialiased: bool = False
     depth: Literal["expected", "median"] = "expected"
     normals: Literal["shortest", "depth"] = "shortest"
     absolute_gradients: bool = False
-    receivers: int = 0
+    max_grad_splats: int = 0
     tile: int | None = None
 
     def __post_init__(self) -> None:
-        if self.dilation < 0 or self.receivers < 0:
-            raise ValueError("dilation and receivers must not be negative")
+        if self.dilation < 0 or self.max_grad_splats < 0:
+            raise ValueError("dilation and max_grad_splats must not be negative")
         if self.tile is not None and self.tile < 1:
             raise ValueError(f"tile must be at least 1, not {self.tile}")
-        if self.shape == "disc" and (self.compensate or self.absolute_gradients):
-            raise ValueError("discs know neither 'compensate' nor 'absolute_gradients'")
+        if self.shape == "disc" and (self.antialiased or self.absolute_gradients):
+            raise ValueError("discs know neither 'antialiased' nor 'absolute_gradients'")
 
     def build(self, scene: Scene) -> Splatting:
         """The renderer; it needs nothing from the scene."""
@@ -94,10 +94,10 @@ class Splatting(Renderer):
             features.append(_normals(gaussians, camera))
         size = camera.width, camera.height
         sums, alpha = kernels.splat_rasterise(
-            footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.receivers
+            footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.max_grad_splats
         )
         rendering = self._rendering(sums, alpha, camera, footprints)
-        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.pull, gaussians.opacities, gaussians.scales)
+        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.absgrad, gaussians.opacities, gaussians.scales)
         return rendering, Trace(screen=screen, rays=alpha.numel())
 
     def project(self, gaussians: Gaussians, camera: Camera) -> tuple[Footprints, Float[Tensor, "n 3"]]:
@@ -106,11 +106,11 @@ class Splatting(Renderer):
         if config.shape == "disc":
             footprints, rgb = kernels.splat_project_discs(gaussians, camera, config.dilation)
         else:
-            footprints, rgb = kernels.splat_project(gaussians, camera, config.dilation, config.compensate)
+            footprints, rgb = kernels.splat_project(gaussians, camera, config.dilation, config.antialiased)
         if footprints.means2d.requires_grad:
             footprints.means2d.retain_grad()
             if config.absolute_gradients:
-                footprints = replace(footprints, pull=torch.zeros_like(footprints.means2d, requires_grad=True))
+                footprints = replace(footprints, absgrad=torch.zeros_like(footprints.means2d, requires_grad=True))
         return footprints, rgb
 
     @override
@@ -132,7 +132,7 @@ class Splatting(Renderer):
         weight = blending_weights(alpha[None])[0]
         drawn = int((weight > 0).sum())  # compositing stops when next to no light is left
         order, alpha, weight = order[:drawn], alpha[:drawn], weight[:drawn]
-        planes = footprints.planes[order]
+        planes = footprints.depth_planes[order]
         t = planes[:, 0] + ((point - footprints.means2d[order]) * planes[:, 1:]).sum(dim=1)
         rays = camera.ray(pixel)
         sigma = torch.zeros_like(t) if self.config.shape == "disc" else _deviations(gaussians, order, rays)
@@ -176,8 +176,8 @@ def _deviations(gaussians: Gaussians, order: Int[Tensor, " k"], rays: Rays) -> F
 
 
 def _distance_coefficients(footprints: Footprints) -> Float[Tensor, "n 3"]:
-    """`Footprints.planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
-    at_mean, slopes = footprints.planes[:, :1], footprints.planes[:, 1:]
+    """`Footprints.depth_planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
+    at_mean, slopes = footprints.depth_planes[:, :1], footprints.depth_planes[:, 1:]
     return torch.cat([slopes, at_mean - (slopes * footprints.means2d).sum(dim=1, keepdim=True)], dim=1)
 
 

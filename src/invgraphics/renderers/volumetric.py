@@ -26,7 +26,6 @@ from invgraphics.core import (
     Scene,
     Trace,
 )
-from invgraphics.kernels.types import hash_field
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.occupancy import Occupancy
 from invgraphics.renderers.quadrature import integrate
@@ -99,12 +98,12 @@ class Volumetric(RayRenderer):
         sampler, normals = self.sampler, ctx.geometry and Quantity.NORMAL in field.provides
         if torch.is_grad_enabled() or ctx.training or normals or not isinstance(sampler, Occupancy):
             return None
-        parts = hash_field(field, ctx.bounds)
-        if parts is None or sampler.config.stop == "never" or not kernels.compiled("hash_render", parts.table):
+        parts = field.fused(ctx.bounds)
+        if parts is None or sampler.config.stop == "never" or not kernels.compiled("ngp_render", parts.table):
             return None
         rays, given = camera.rays(), (sampler.occupied, ctx.bounds, sampler.steps(ctx), parts)
         limits = sampler.config.transmittance, UNSEEN
-        sums, alpha = kernels.hash_render(ctx.bounds.clip(rays), *given, *limits, camera.width)
+        sums, alpha = kernels.ngp_render(ctx.bounds.clip(rays), *given, *limits, camera.width)
         flat = to_rendering(sums[:, :3], alpha, sums[:, 3], None, rays.far)
         return flat.reshape(camera.height, camera.width)
 

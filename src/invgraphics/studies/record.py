@@ -117,7 +117,7 @@ def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resourc
         **{key: getattr(study, key) for key in keys},
         "approximations": [asdict(pair) for pair in study.approximations],
         "known": [asdict(deviation) for deviation in study.known],
-        "protocol": asdict(job.protocol),
+        "protocol": job.protocol.record(),
         "command": request.shell(),
         "environment": machine,
     }

@@ -15,7 +15,7 @@ from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
-from invgraphics.fields.transformed import move_gaussians
+from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
 from invgraphics.runs.folder import make_parent
 from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_file
@@ -113,16 +113,16 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     axes = plugins.load("formats", request.to).axes
     with torch.no_grad():
         local = fitted.model.field.primitives(Quantity.GAUSSIANS, fitted.model.context())
-    placed = on_cpu(move_gaussians(on_cpu(local), file_from_local(scene, axes, request.world).float()))
+    placed = on_cpu(transform_gaussians(on_cpu(local), file_from_local(scene, axes, request.world).float()))
     expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
     placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
     shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
     note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
-    antialiased = getattr(fitted.method.recipe.renderer, "compensate", False)
+    antialiased = getattr(fitted.method.recipe.renderer, "antialiased", False)
     write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)))
 
     _, written = read_gaussians(request.out)
-    back = move_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
+    back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
     loss = agreement(local, on_device(back, fitted.model.device), fitted)
     degree = harmonics.degree_of(written.gaussians.sh.shape[1])
     had = harmonics.degree_of(local.sh.shape[1])

@@ -19,7 +19,7 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import describe
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
-from invgraphics.fields.transformed import move_gaussians
+from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import Splats, read_gaussians
 from invgraphics.formats.ply import OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
@@ -73,14 +73,14 @@ def import_run(request: ImportRequest) -> Path:
     if (folder.root / "provenance.json").is_file():
         raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
     scene = open_with_progress(job.request.scene, job.options)
-    gaussians = move_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
+    gaussians = transform_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()
     repeatable(job.device)
     use_kernels(job.request.kernels)
     origin = {"imported": _origin(request, name, splats, axes)}
-    if splats.antialiased and not getattr(job.method.recipe.renderer, "compensate", False):
+    if splats.antialiased and not getattr(job.method.recipe.renderer, "antialiased", False):
         print(
-            "The file says that it was fitted with anti-aliasing; --set renderer.compensate=true shows it so.", file=sys.stderr
+            "The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true shows it so.", file=sys.stderr
         )
     with folder.held():
         folder.clear()

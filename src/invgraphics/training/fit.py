@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from invgraphics.core import Batch, Context, Model, RayRenderer, Rendering, Scene, Trace
 from invgraphics.errors import NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.waiting import limit_spinning
+from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.clock import SchedulerTimes
@@ -113,7 +113,8 @@ class Fit:
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
-        loss = torch.stack([loss(rendering, trace, batch, ctx) for loss in plan.losses]).sum()
+        composited = replace(rendering, rgb=rendering.over(batch.background))
+        loss = torch.stack([loss(composited, trace, batch, ctx) for loss in plan.losses]).sum()
         value = loss.item()
         if not torch.isfinite(loss):
             raise NumericalError(self._blame(rendering))

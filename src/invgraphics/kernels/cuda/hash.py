@@ -16,10 +16,10 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
 from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of, once_differentiable
 from invgraphics.kernels.reference.hash import PRIMES
-from invgraphics.kernels.types import HashGrid
 
 BLOCK = 256
 """Points of one program."""

@@ -24,8 +24,8 @@ if nb.config.DISABLE_JIT:  # type: ignore[attr-defined]
     raise ImportError("NUMBA_DISABLE_JIT is set")
 
 PACKAGE = __name__.rpartition(".")[0]
-PARTS = ("splats", "samples")
-"""Functions of `warming` that together call every kernel; each takes about as long to compile."""
+WARMUP, PARTS = f"{PACKAGE}.warmup", ("splats", "samples")
+"""A module and those of its functions that together call every kernel; each takes about as long to compile."""
 
 FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """LLVM's fast-math without ``nnan`` and ``ninf``: comparisons must sort out NaN and infinity, not assume them away."""
@@ -68,14 +68,14 @@ class _Compiler(event.Listener):
                 print("compiling kernels, once, less than a minute", file=sys.stderr, flush=True)
                 with contextlib.suppress(OSError):
                     # The compiler knows one thread only: two processes share the work.
-                    for process in [_warming(part) for part in PARTS]:
+                    for process in [_start_warmup(part) for part in PARTS]:
                         process.wait()
                 self.here = True
 
 
-def _warming(part: str) -> subprocess.Popen[bytes]:
+def _start_warmup(part: str) -> subprocess.Popen[bytes]:
     """A process that runs, and so compiles, one of the `PARTS`."""
-    code = f"from {PACKAGE} import runtime, warming; runtime.compile_here(); warming.{part}()"
+    code = f"import {__name__} as runtime, {WARMUP} as warmup; runtime.compile_here(); warmup.{part}()"
     return subprocess.Popen([sys.executable, "-P", "-c", code], stderr=subprocess.DEVNULL)
 
 
@@ -101,7 +101,7 @@ def _cached(**options: Any) -> _Decorator:
                 _compiler.run()
                 return load(signature)
 
-        # Those of others, who borrow these decorators, are unknown to `warming`.
+        # Those of others, who borrow these decorators, are unknown to `warmup`.
         if function.__module__.startswith(PACKAGE):
             kernel.compile = compile_or_load
             _compiler.kernels.add(kernel)

@@ -10,18 +10,19 @@ import torch
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.hash.grid import grid_sample
-from invgraphics.kernels.numba.ngp.march import hash_march
-from invgraphics.kernels.numba.ngp.render import hash_render
+from invgraphics.kernels.numba.ngp.march import ngp_march
+from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.rays.composite import composite
 from invgraphics.kernels.numba.rays.march import ray_march
 from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
-from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 
 def warm_up() -> float:
@@ -45,9 +46,9 @@ def splats() -> None:
     splat_bin(footprints, 8, 8, 4)
     splat_median(footprints, 8, 8)
     # The backward walk is compiled anew for each setting of its two switches.
-    for pull in (None, torch.zeros(4, 2, requires_grad=True)):
-        for receivers in (0, 1):
-            image, alpha = splat_rasterise(replace(footprints, pull=pull), rgb, 8, 8, receivers=receivers)
+    for absgrad in (None, torch.zeros(4, 2, requires_grad=True)):
+        for max_grad_splats in (0, 1):
+            image, alpha = splat_rasterise(replace(footprints, absgrad=absgrad), rgb, 8, 8, max_grad_splats=max_grad_splats)
             (image.sum() + alpha.sum()).backward(retain_graph=True)
 
 
@@ -68,8 +69,8 @@ def samples() -> None:
     everywhere = torch.ones(2, 2, 2, dtype=torch.bool)
     ray_march(rays, everywhere, bounds, MarchSteps(0.1), rays.near)
     layer = torch.zeros(16, 4), torch.zeros(16)
-    field = HashField(
+    field = FusedNGP(
         torch.zeros(levels.entries, 2), levels, (layer,), ((torch.zeros(3, 16), torch.zeros(3)),), "exp", 0.0, 1, "srgb"
     )
-    hash_march(rays, everywhere, bounds, MarchSteps(0.1), field, rays.near, 0.5)
-    hash_render(rays, everywhere, bounds, MarchSteps(0.1), field)
+    ngp_march(rays, everywhere, bounds, MarchSteps(0.1), field, rays.near, 0.5)
+    ngp_render(rays, everywhere, bounds, MarchSteps(0.1), field)

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.hash.cells import BLOCK, CHUNK, ZERO, ask_for, at_vertices, blend, locate, rows_of, spread
 from invgraphics.kernels.numba.hash.jacobian import locate_back, rise, rise_back
 from invgraphics.kernels.numba.runtime import array, index, inlined, once_differentiable, parallel, prange, share, threads
 from invgraphics.kernels.numba.simd.instructions import blend_pair, spread_pair
-from invgraphics.kernels.types import HashGrid
 
 UNIT, TWO = index(1), index(2)
 

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.hash.cells import BLOCK
@@ -18,7 +19,7 @@ from invgraphics.kernels.numba.ngp.queue import EDGE, fill, no_rays, step_of, st
 from invgraphics.kernels.numba.rays.composite import absorb
 from invgraphics.kernels.numba.rays.march import ROOM, most_steps, packed, surroundings
 from invgraphics.kernels.numba.runtime import array, inlined, parallel, prange, scratch, threads
-from invgraphics.kernels.types import HashField, March, MarchSteps
+from invgraphics.kernels.types import March, MarchSteps
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
@@ -45,8 +46,8 @@ def _keep(s, said, scale, way, far, settings, rows, counts):
 def reach(rays, space, table, levels, geometry, settings, jobs, rows, counts):
     """Steps of every ray that light reaches, in ``rows``: begin and end; ``counts`` of them, which are 0 before.
 
-    Arguments as in `hash_render.render`; ``settings`` are activation, bias, least transmittance, and
-    `HashField.contracted_density`.
+    Arguments as in `ngp_render.render`; ``settings`` are activation, bias, least transmittance, and
+    `FusedNGP.contracted_density`.
     """
     sizes = geometry[1]
     for job in prange(jobs):
@@ -64,27 +65,27 @@ def reach(rays, space, table, levels, geometry, settings, jobs, rows, counts):
 
 
 @torch.no_grad()
-def hash_march(
+def ngp_march(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
     steps: MarchSteps,
-    field: HashField,
+    field: FusedNGP,
     start: Float[Tensor, " n"],
-    transmittance: float,
+    min_transmittance: float,
 ) -> March:
-    """See `invgraphics.kernels.hash_march`; steps that grow with a cone and other widths are left to the reference."""
+    """See `invgraphics.kernels.ngp_march`; steps that grow with a cone and other widths are left to the reference."""
     endless = bounds.space == "contracted" and not steps.contracted
     if field.table.shape[1] != 2 or steps.cone > 0 or endless:
-        return reference.hash_march(rays, occupied, bounds, steps, field, start, transmittance)
+        return reference.ngp_march(rays, occupied, bounds, steps, field, start, min_transmittance)
     space = surroundings(occupied, bounds, steps)
     # The first output alone: nobody asks for a colour.
-    *hidden, (weight, bias) = field.geometry
+    *hidden, (weight, bias) = field.density_net
     model = array(field.table).reshape(-1), levels_of(field.grid), packed_network((*hidden, (weight[:1], bias[:1])))
     settings = (
-        ACTIVATIONS.index(field.density),
-        np.float32(field.bias),
-        float(transmittance),
+        ACTIVATIONS.index(field.density_activation),
+        np.float32(field.density_bias),
+        float(min_transmittance),
         np.float32(field.contracted_density),
     )
     most = most_steps(rays, bounds, start, steps)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.hash.cells import BLOCK
@@ -31,7 +32,7 @@ from invgraphics.kernels.numba.ngp.queue import EDGE, fill, no_rays, step_of, st
 from invgraphics.kernels.numba.rays.composite import absorb
 from invgraphics.kernels.numba.rays.march import surroundings
 from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, parallel, prange, threads
-from invgraphics.kernels.types import HashField, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
@@ -92,7 +93,7 @@ def render(rays, space, table, levels, geometry, colour, widest, settings, width
         colour: the same of the radiance's.
         widest: most inputs or outputs of any layer.
         settings: activation, bias, whether radiance is linear, bands, least transmittance, most weight of a ray to leave out,
-            `HashField.contracted_density`.
+            `FusedNGP.contracted_density`.
         width: pixels of a row of the picture.
         jobs: number of jobs.
         sums: output (n, 4).
@@ -126,28 +127,28 @@ def render(rays, space, table, levels, geometry, colour, widest, settings, width
 
 
 @torch.no_grad()
-def hash_render(
+def ngp_render(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
     steps: MarchSteps,
-    field: HashField,
-    transmittance: float = 0.0,
-    unseen: float = 0.0,
+    field: FusedNGP,
+    min_transmittance: float = 0.0,
+    max_error: float = 0.0,
     width: int = 0,
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-    """See `invgraphics.kernels.hash_render`; what has other than two features per entry is left to the reference."""
+    """See `invgraphics.kernels.ngp_render`; what has other than two features per entry is left to the reference."""
     if field.table.shape[1] != 2:
-        return reference.hash_render(rays, occupied, bounds, steps, field, transmittance, unseen, width)
+        return reference.ngp_render(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
     lines = tuple(array(part) for part in (rays.origins, rays.directions, rays.near, rays.far))
-    geometry, colour = packed_network(field.geometry), packed_network(field.colour)
+    geometry, colour = packed_network(field.density_net), packed_network(field.colour_net)
     settings = (
-        ACTIVATIONS.index(field.density),
-        np.float32(field.bias),
+        ACTIVATIONS.index(field.density_activation),
+        np.float32(field.density_bias),
         field.colour_space == "linear",
-        field.bands,
-        float(transmittance),
-        np.float32(unseen),
+        field.sh_bands,
+        float(min_transmittance),
+        np.float32(max_error),
         np.float32(field.contracted_density),
     )
     widest = int(max(geometry[1].max(), colour[1].max()))

@@ -12,7 +12,7 @@ from invgraphics.kernels.numba.harmonics import harmonics
 from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined, log2, parallel, prange, share
 from invgraphics.kernels.numba.simd.layouts import read_1, read_3, read_4, write_1, write_2, write_3
 from invgraphics.kernels.reference.splat_project import ILL_CONDITIONED, MARGIN, NEAR
-from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN
+from invgraphics.kernels.types import ALPHA_MIN, COMPENSATION_MIN
 
 # A camera as a flat tuple: rotation to the world row by row, position, focal lengths, principal point, width, height.
 ROTATION, POSITION, FOCAL, CENTRE, SIZE, VIEW = 0, 9, 12, 14, 16, 18
@@ -26,7 +26,7 @@ _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 _NEAR, _MARGIN, _THIN = np.float32(NEAR), np.float32(MARGIN), np.float32(ILL_CONDITIONED)
 _TINY, _EPSILON = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
 _TWO_LN_2, _PER_ALPHA_MIN = np.float32(2 * np.log(2)), np.float32(1 / ALPHA_MIN)
-_NORM_MIN, _FADE_MIN = np.float32(1e-12), np.float32(FADE_MIN)
+_NORM_MIN, _COMPENSATION_MIN = np.float32(1e-12), np.float32(COMPENSATION_MIN)
 
 
 @inlined
@@ -162,7 +162,7 @@ def fade_of(x, y, dilation):
     """Factor that gives a filtered footprint the integral it had unfiltered, and the unfiltered covariance."""
     xx, xy, yy, area = covariance(x, y, _ZERO)
     _, _, _, det = covariance(x, y, dilation)
-    return max(np.sqrt(area / det), _FADE_MIN), xx, xy, yy, area
+    return max(np.sqrt(area / det), _COMPENSATION_MIN), xx, xy, yy, area
 
 
 @inlined
@@ -200,7 +200,7 @@ def _radius(view, u, v, xx, xy, yy, opacity):
 
 
 @inlined
-def _project_lane(view, dilation, compensate, lanes, lane):
+def _project_lane(view, dilation, antialiased, lanes, lane):
     """Footprint of one primitive, and the harmonics in its direction."""
     offset, mean = camera_point(view, three(lanes, MEAN + lane))
     in_front = mean[2] > _NEAR
@@ -213,7 +213,7 @@ def _project_lane(view, dilation, compensate, lanes, lane):
     u = view[CENTRE] + view[FOCAL] * mean[0] / mean[2]
     v = view[CENTRE + 1] + view[FOCAL + 1] * mean[1] / mean[2]
     fade = _ONE
-    if compensate:
+    if antialiased:
         fade, _, _, _, _ = fade_of(x, y, dilation)
     radius = _radius(view, u, v, xx, xy, yy, lanes[_OPACITY + lane] * fade)
     seen = in_front and radius > _ZERO
@@ -243,8 +243,8 @@ def _colour(lanes, lane, sh, i):
 
 @parallel
 def project(
-    view, dilation, compensate, means, quaternions, scales, opacities, sh, jobs,
-    means2d, conics, depths, planes, radii, rgb, fades,
+    view, dilation, antialiased, means, quaternions, scales, opacities, sh, jobs,
+    means2d, conics, depths, depth_planes, radii, rgb, fades,
 ):  # fmt: skip
     """Footprints and colours; those of culled primitives are set to something harmless."""
     n = len(means)
@@ -257,13 +257,13 @@ def project(
             read_primitives(means, quaternions, scales, i, count, lanes)
             read_1(opacities, i, count, lanes, _OPACITY)
             for lane in range(LANES):
-                _project_lane(view, dilation, compensate, lanes, lane)
+                _project_lane(view, dilation, antialiased, lanes, lane)
             write_1(depths, i, count, lanes, _DEPTH)
             write_1(radii, i, count, lanes, _RADIUS)
             write_1(fades, i, count, lanes, _FADE)
             write_2(means2d, i, count, lanes, _SCREEN)
             write_3(conics, i, count, lanes, _CONIC)
-            write_3(planes, i, count, lanes, _PLANE)
+            write_3(depth_planes, i, count, lanes, _PLANE)
             for lane in range(count):
                 i, at = index(begin + lane), index(lane)
                 rgb[i, 0], rgb[i, 1], rgb[i, 2] = _colour(lanes, at, sh, i)

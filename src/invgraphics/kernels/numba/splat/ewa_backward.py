@@ -27,7 +27,7 @@ from invgraphics.kernels.numba.splat.ewa import (
     screen_axes,
     three,
 )
-from invgraphics.kernels.types import FADE_MIN
+from invgraphics.kernels.types import COMPENSATION_MIN
 
 # Slots of a group of primitives behind what the forward pass reads: its results, their gradients, ...
 _CONIC, _SEEN, _TO_SCREEN, _TO_CONIC, _TO_DEPTH, _TO_FADE = (index(slot) * LANES for slot in (10, 13, 14, 16, 19, 20))
@@ -36,7 +36,7 @@ _TO_MEAN, _TO_QUATERNION, _TO_SCALE, _HARMONICS, _POSE = (index(slot) * LANES fo
 _ROOM = index(47 + 12) * LANES
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
-_FADE_MIN = np.float32(FADE_MIN)
+_COMPENSATION_MIN = np.float32(COMPENSATION_MIN)
 
 
 @inlined
@@ -53,7 +53,7 @@ def _through_inverse(conic, g):
 def _through_fade(x, y, dilation, conic, to_fade):
     """Gradients along the screen axes: d ln fade = (d area / area - d det / det) / 2, both quadratic in the axes."""
     fade, xx, xy, yy, area = fade_of(x, y, dilation)
-    g = to_fade * fade if fade > _FADE_MIN else _ZERO
+    g = to_fade * fade if fade > _COMPENSATION_MIN else _ZERO
     a, b, c = g * (yy / area - conic[0]), -g * (xy / area + conic[1]), g * (xx / area - conic[2])
     return (
         (a * x[0] + b * y[0], a * x[1] + b * y[1], a * x[2] + b * y[2]),
@@ -62,13 +62,13 @@ def _through_fade(x, y, dilation, conic, to_fade):
 
 
 @inlined
-def _through_screen(view, dilation, compensate, mean, root, conic, to_conic, to_mean2d, to_fade):
+def _through_screen(view, dilation, antialiased, mean, root, conic, to_conic, to_mean2d, to_fade):
     """Gradients along the mean in camera axes and along the covariance's root."""
     x, y, sx, sy = screen_axes(view, mean, root)
     gxx, gxy, gyy = _through_inverse(conic, to_conic)
     gx = (_TWO * gxx * x[0] + gxy * y[0], _TWO * gxx * x[1] + gxy * y[1], _TWO * gxx * x[2] + gxy * y[2])
     gy = (_TWO * gyy * y[0] + gxy * x[0], _TWO * gyy * y[1] + gxy * x[1], _TWO * gyy * y[2] + gxy * x[2])
-    if compensate:
+    if antialiased:
         hx, hy = _through_fade(x, y, dilation, conic, to_fade)
         gx = (gx[0] + hx[0], gx[1] + hx[1], gx[2] + hx[2])
         gy = (gy[0] + hy[0], gy[1] + hy[1], gy[2] + hy[2])
@@ -176,7 +176,7 @@ def _kept(seen, values):
 
 
 @inlined
-def _back_lane(view, dilation, compensate, lanes, lane):
+def _back_lane(view, dilation, antialiased, lanes, lane):
     """Gradients along one primitive, and its share of those along the camera's pose."""
     rotation = rotation_of(view)
     seen = lanes[_SEEN + lane] > _ZERO
@@ -186,7 +186,7 @@ def _back_lane(view, dilation, compensate, lanes, lane):
     turn, root = scaled_axes(view, q, s)
     to_mean2d = lanes[_TO_SCREEN + lane], lanes[_TO_SCREEN + LANES + lane]
     conic, to_conic, to_fade = three(lanes, _CONIC + lane), three(lanes, _TO_CONIC + lane), lanes[_TO_FADE + lane]
-    to_mean, to_root = _through_screen(view, dilation, compensate, mean, root, conic, to_conic, to_mean2d, to_fade)
+    to_mean, to_root = _through_screen(view, dilation, antialiased, mean, root, conic, to_conic, to_mean2d, to_fade)
     to_mean = (to_mean[0], to_mean[1], to_mean[2] + lanes[_TO_DEPTH + lane])
     to_turn = scaled_columns(to_root, s)
     w, x, y, z = _to_quaternion(q, norm, _product(rotation, to_turn))
@@ -207,7 +207,7 @@ def _back_lane(view, dilation, compensate, lanes, lane):
 
 @parallel
 def project_back(
-    view, dilation, compensate, means, quaternions, scales, sh, radii, conics, rgb,
+    view, dilation, antialiased, means, quaternions, scales, sh, radii, conics, rgb,
     to_means2d, to_conics, to_depths, to_rgb, to_fades,
     to_means, to_quaternions, to_scales, to_sh, pose,
 ):  # fmt: skip
@@ -231,7 +231,7 @@ def project_back(
             for lane in range(count):
                 _through_colour(lanes, index(lane), index(begin + lane), sh, rgb, to_rgb, to_sh)
             for lane in range(LANES):
-                _back_lane(view, dilation, compensate, lanes, lane)
+                _back_lane(view, dilation, antialiased, lanes, lane)
             for k in range(12 * GROUP):
                 shares[k] += lanes[_POSE + index(k)]
             write_3(to_means, i, count, lanes, _TO_MEAN)

@@ -60,7 +60,7 @@ def _walk(rows, entries, first, last, x0, y0, transmittance, distance, is_open, 
 
 @parallel
 def median(rows, entries, starts, bounds, edge, columns, touched, depth):
-    """Write where each pixel's transmittance falls to 1/2 (arguments as in `rasterise`; features are the planes).
+    """Write where each pixel's transmittance falls to 1/2 (arguments as in `rasterise`; features are the depth planes).
 
     ``depth`` (h, w) holds inf and keeps it where the transmittance stays above.
     """

@@ -26,18 +26,18 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, pose: Tensor, *constants: Any
     ) -> tuple[Tensor, ...]:
-        opacities, camera, dilation, compensate = constants
+        opacities, camera, dilation, antialiased = constants
         n = len(means)
         view = _flat(camera)
         means2d, conics, rgb = means.new_empty(n, 2), means.new_empty(n, 3), means.new_empty(n, 3)
-        depths, planes, radii, fades = means.new_empty(n), means.new_empty(n, 3), means.new_empty(n), means.new_empty(n)
-        outputs = (means2d, conics, depths, planes, radii, rgb, fades)
+        depths, depth_planes, radii, fades = means.new_empty(n), means.new_empty(n, 3), means.new_empty(n), means.new_empty(n)
+        outputs = (means2d, conics, depths, depth_planes, radii, rgb, fades)
         inputs = (array(x) for x in (means, quaternions, scales, opacities, sh))
-        project(view, np.float32(dilation), compensate, *inputs, threads(), *(output.numpy() for output in outputs))
+        project(view, np.float32(dilation), antialiased, *inputs, threads(), *(output.numpy() for output in outputs))
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(means, quaternions, scales, sh, opacities, conics, radii, rgb, pose)
-        ctx.view, ctx.camera, ctx.dilation, ctx.compensate = view, camera, dilation, compensate
+        ctx.view, ctx.camera, ctx.dilation, ctx.antialiased = view, camera, dilation, antialiased
         return outputs
 
     @staticmethod
@@ -53,7 +53,7 @@ class _Project(torch.autograd.Function):
         poses = np.empty((threads(), 12))
         inputs = (array(x) for x in (means, quaternions, scales, sh, radii, conics, rgb))
         outputs = (result.numpy() for result in results)
-        project_back(ctx.view, np.float32(ctx.dilation), ctx.compensate, *inputs, *map(array, received), *outputs, poses)
+        project_back(ctx.view, np.float32(ctx.dilation), ctx.antialiased, *inputs, *map(array, received), *outputs, poses)
         along_pose = _pose_gradient(poses, pose) if ctx.needs_input_grad[4] else None
         if to_planes is not None:
             gaussians = Gaussians(means, quaternions, scales, opacities, sh)
@@ -85,7 +85,7 @@ def _pose_gradient(jobs: np.ndarray, pose: Tensor) -> Tensor:
 def _through_planes(
     gaussians: Gaussians, camera: Camera, dilation: float, to_planes: Tensor, radii: Tensor
 ) -> tuple[Tensor | None, ...]:
-    """Gradients that arrive by the planes, which only depth losses use: left to the reference."""
+    """Gradients through the depth planes, which only depth losses use: left to the reference."""
     with torch.enable_grad():
         leaves = [x.detach().requires_grad_() for x in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.sh)]
         means, quaternions, scales, sh = leaves
@@ -93,19 +93,19 @@ def _through_planes(
         again = Gaussians(means, quaternions, scales, gaussians.opacities.detach(), sh)
         footprints, _ = reference.splat_project(again, camera.moved(pose), dilation)
         visible = torch.where(radii[:, None] > 0, to_planes, 0.0)
-        return torch.autograd.grad(footprints.planes, [*leaves, pose], visible, allow_unused=True)
+        return torch.autograd.grad(footprints.depth_planes, [*leaves, pose], visible, allow_unused=True)
 
 
 def splat_project(
-    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, compensate: bool = False
+    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, antialiased: bool = False
 ) -> tuple[Footprints, Float[Tensor, "n 3"]]:
     """See `invgraphics.kernels.splat_project`; a camera whose lens is being optimised is left to the reference."""
     if camera.focal.requires_grad or camera.centre.requires_grad:
-        return reference.splat_project(gaussians, camera, dilation, compensate)
+        return reference.splat_project(gaussians, camera, dilation, antialiased)
     g = gaussians
-    constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation, compensate)
-    means2d, conics, depths, planes, radii, rgb, fades = _Project.apply(
+    constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation, antialiased)
+    means2d, conics, depths, depth_planes, radii, rgb, fades = _Project.apply(
         g.means, g.quaternions, g.scales, g.sh, camera.cam_to_world, *constants
     )
-    opacities = g.opacities * fades if compensate else g.opacities
-    return Footprints(means2d, conics, opacities, depths, planes, radii), rgb
+    opacities = g.opacities * fades if antialiased else g.opacities
+    return Footprints(means2d, conics, opacities, depths, depth_planes, radii), rgb

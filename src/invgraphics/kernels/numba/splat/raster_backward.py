@@ -87,11 +87,11 @@ def _open_tile(state, blocks, x0, y0, stride, image, alpha, image_gradient, alph
 
 
 @inlined
-def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, ends, past, absolute, receivers):
+def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, ends, past, absolute, grad_limit):
     """Repeat one footprint's blending onto blocks of a tile, and add what it receives from them to its row of ``sums``.
 
     Returns the blocks that it finished: those that end at ``past``.
-    With ``receivers`` on, a block counts at its end the footprints that each of its pixels has seen.
+    With ``grad_limit`` on, a block counts at its end the footprints that each of its pixels has seen.
     """
     shape, opacity = shape_of(rows, r)
     xx, xy, yy = conic(rows, r)
@@ -115,11 +115,11 @@ def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, ends, past,
         # alpha raises its own contribution and hides what is behind; where it is clamped or skipped it does not change.
         v = response * (transmittance * along - behind / (_ONE - alpha))
         v = where(goes_on & (response < _ALPHA_MAX), v, _ZERO)
-        if len(receivers) == ON:
+        if len(grad_limit) == ON:
             rank = base + stride - LANES
             seen = load(state, rank) + where(alpha > _ZERO, _ONE, _ZERO)
             store(state, rank, seen)
-            v, weight = where(seen <= receivers[0], v, _ZERO), where(seen <= receivers[0], weight, _ZERO)
+            v, weight = where(seen <= grad_limit[0], v, _ZERO), where(seen <= grad_limit[0], weight, _ZERO)
         vx, vy = v * dx, v * dy
         sum_1, sum_x, sum_y = sum_1 + v, sum_x + vx, sum_y + vy
         sum_xx, sum_xy, sum_yy = sum_xx + vx * dx, sum_xy + vx * dy, sum_yy + vy * dy
@@ -136,7 +136,7 @@ def _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, ends, past,
 
 
 @inlined
-def _walk_tile(rows, entries, first, last, x0, y0, channels, state, stride, alive, touched, ends, sums, absolute, receivers):
+def _walk_tile(rows, entries, first, last, x0, y0, channels, state, stride, alive, touched, ends, sums, absolute, grad_limit):
     """Walk a tile's footprints front to back and add what each of them receives to ``sums``."""
     for entry in range(first, last):
         if not alive:
@@ -146,22 +146,22 @@ def _walk_tile(rows, entries, first, last, x0, y0, channels, state, stride, aliv
         prefetch(sums, ahead)
         r, blocks = index(entries[index(entry)]), touched[index(entry)] & alive
         if blocks:
-            alive ^= _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, ends, entry + 1, absolute, receivers)
+            alive ^= _receive(state, stride, rows, r, blocks, x0, y0, channels, sums, ends, entry + 1, absolute, grad_limit)
 
 
 @parallel
 def walk_back(
     rows, entries, starts, bounds, edge, columns, touched, ends, image, alpha, image_gradient, alpha_gradient, sums, absolute,
-    receivers,
+    grad_limit,
 ):  # fmt: skip
     """Per job and packed footprint, the sums from which `gather` makes gradients (other arguments as in `rasterise`).
 
-    Two switches: ``absolute`` adds `PULLS` sums of absolute gradients; ``receivers`` lets only so many footprints of a pixel,
+    Two switches: ``absolute`` adds `PULLS` sums of absolute gradients; ``grad_limit`` lets only so many footprints of a pixel,
     from the front, receive its gradient.
     """
     height, width = alpha.shape
     channels = rows.shape[1] - FEATURES
-    stride = _PICTURE + LANES * index(channels + (1 if len(receivers) == ON else 0))
+    stride = _PICTURE + LANES * index(channels + (1 if len(grad_limit) == ON else 0))
     for job in prange(len(bounds) - 1):
         state = np.empty(BLOCKS * stride, np.float32)
         own = sums[job]
@@ -173,7 +173,7 @@ def walk_back(
                 _open_tile(state, blocks, x0, y0, stride, image, alpha, image_gradient, alpha_gradient)
                 _walk_tile(
                     rows, entries, starts[tile], starts[tile + 1], x0, y0, channels, state, stride,
-                    blocks, touched, ends[tile], own, absolute, receivers,
+                    blocks, touched, ends[tile], own, absolute, grad_limit,
                 )  # fmt: skip
 
 

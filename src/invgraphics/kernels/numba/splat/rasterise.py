@@ -33,13 +33,13 @@ class _Walk(NamedTuple):
 
 
 class _Rasterise(torch.autograd.Function):
-    """Differentiable in means2d, conics, opacities and features; `Footprints.pull` gets the absolute gradients."""
+    """Differentiable in means2d, conics, opacities and features; `Footprints.absgrad` gets the absolute gradients."""
 
     @staticmethod
     def forward(
-        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, pull: Tensor | None, *constants: Any
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, absgrad: Tensor | None, *constants: Any
     ) -> tuple[Tensor, Tensor]:
-        footprints, (width, height), tile, ctx.receivers = constants
+        footprints, (width, height), tile, ctx.max_grad_splats = constants
         edge, columns, lines = _tiles(width, height, tile)
         packed = pack(footprints, features, columns, lines, edge * BLOCK)
         image, alpha = means2d.new_empty(height, width, features.shape[1]), means2d.new_empty(height, width)
@@ -81,7 +81,7 @@ class _Rasterise(torch.autograd.Function):
             to_alpha,
             sums,
             (np.float32(0),) * (ON if absolute else OFF),
-            (np.float32(ctx.receivers),) * (ON if ctx.receivers else OFF),
+            (np.float32(ctx.max_grad_splats),) * (ON if ctx.max_grad_splats else OFF),
         )
         gradients = tuple(
             torch.zeros_like(x, memory_format=torch.contiguous_format) for x in (means2d, conics, opacities, features)
@@ -111,14 +111,14 @@ def splat_rasterise(
     width: int,
     height: int,
     tile: int | None = None,
-    receivers: int = 0,
+    max_grad_splats: int = 0,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """See `invgraphics.kernels.splat_rasterise`; discs are left to the reference."""
     if footprints.homography is not None:
-        return reference.splat_rasterise(footprints, features, width, height, tile, receivers)
+        return reference.splat_rasterise(footprints, features, width, height, tile, max_grad_splats)
     f = footprints
-    constants = (footprints, (width, height), tile, receivers)
-    return _Rasterise.apply(f.means2d, f.conics, f.opacities, features, f.pull, *constants)
+    constants = (footprints, (width, height), tile, max_grad_splats)
+    return _Rasterise.apply(f.means2d, f.conics, f.opacities, features, f.absgrad, *constants)
 
 
 @torch.no_grad()
@@ -127,7 +127,7 @@ def splat_median(footprints: Footprints, width: int, height: int, tile: int | No
     if footprints.homography is not None:
         return reference.splat_median(footprints, width, height, tile)
     edge, columns, lines = _tiles(width, height, tile)
-    packed = pack(footprints, footprints.planes, columns, lines, edge * BLOCK)
+    packed = pack(footprints, footprints.depth_planes, columns, lines, edge * BLOCK)
     depth = torch.full((height, width), torch.inf)
     bounds, touched = _bounds(np.diff(packed.starts)), np.empty(len(packed.entries), np.uintp)
     median(packed.rows, packed.entries, packed.starts, bounds, edge, columns, touched, depth.numpy())

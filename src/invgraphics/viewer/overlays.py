@@ -1,4 +1,4 @@
-"""What the browser draws itself, over the picture: the photographs' cameras, and Gaussians."""
+"""Overlays drawn by the browser: camera frustums and Gaussian splats."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from invgraphics.core import Gaussians, Quantity, Scene, View
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.harmonics import BAND_0
 from invgraphics.core.transforms import quaternion_to_matrix
-from invgraphics.viewer.cameras import frustum, quaternion
-from invgraphics.viewer.colouring import Picture, photograph
-from invgraphics.viewer.subject import Subject
+from invgraphics.viewer.cameras import fov_and_aspect, rotation_quaternion
+from invgraphics.viewer.colorize import Picture, true_image
+from invgraphics.viewer.loaded_run import LoadedRun
 
 THUMBNAIL = 96
-"""Pixels along the longest side of a photograph in its camera."""
+"""Pixels along the longer side of a frustum's photograph."""
 FRUSTUM_SIZE = 0.04
-"""Size of a camera's pyramid, of the scene's extent; viser takes a third of its sides' product as the size cubed."""
+"""Size of a frustum, of the scene's extent; viser takes a third of its sides' product as the size cubed."""
 TEST_COLOUR, TRAIN_COLOUR = (213, 94, 0), (0, 114, 178)
 LARGEST_HALF = 3e4
-"""Largest variance that is sent; half precision, in which the browser keeps them, ends at 65504."""
+"""Largest variance that is sent; the browser keeps half floats, at most 65504."""
 
 
-class Photographs:
-    """The photographs of a scene as cameras with small pictures, which are made when they are first wanted.
+class CameraFrustums:
+    """Camera frustums of a scene's photographs, with thumbnails that are made on first use.
 
     Args:
         views: names and views.
@@ -43,11 +43,11 @@ class Photographs:
     def __len__(self) -> int:
         return len(self._views)
 
-    def draw(self, index: int, into: Any, chosen: Callable[[], Any]) -> Any:
-        """Add one camera to a browser's scene; returns its handle. ``chosen`` is called, and awaited, when it is clicked."""
+    def add(self, index: int, viser_scene: Any, on_click: Callable[[], Any]) -> Any:
+        """Add one frustum to a viser scene; returns its handle. ``on_click`` is awaited when it is clicked."""
         name, view = self._views[index]
-        fov, aspect = frustum(view.camera)
-        handle = into.add_camera_frustum(
+        fov, aspect = fov_and_aspect(view.camera)
+        handle = viser_scene.add_camera_frustum(
             f"/cameras/{index}",
             fov,
             aspect,
@@ -56,12 +56,12 @@ class Photographs:
             thickness_units="screen",
             color=TEST_COLOUR if name.startswith("test") else TRAIN_COLOUR,
             image=self._thumbnail(index),
-            wxyz=quaternion(view.camera.cam_to_world),
+            wxyz=rotation_quaternion(view.camera.cam_to_world),
             position=tuple(view.camera.position.tolist()),
         )
 
         async def clicked(_: Any) -> None:
-            await chosen()
+            await on_click()
 
         handle.on_click(clicked)
         return handle
@@ -72,20 +72,20 @@ class Photographs:
             height, width = view.image.shape[:2]
             scale = min(1.0, THUMBNAIL / max(width, height))
             size = (max(1, round(width * scale)), max(1, round(height * scale)))
-            self._thumbnails[index] = photograph(view, self._scene, size)
+            self._thumbnails[index] = true_image(view, self._scene, size)
         return self._thumbnails[index]
 
 
-def draw_splats(subject: Subject, into: Any) -> Any:
-    """Add a run's Gaussians to a browser's scene; returns their handle. Colours are those of band 0."""
-    ctx = subject.fitted.model.context()
+def add_splats(run: LoadedRun, viser_scene: Any) -> Any:
+    """Add a run's Gaussians to a viser scene, coloured by spherical-harmonics band 0; returns their handle."""
+    ctx = run.fitted.model.context()
     with torch.no_grad():
-        gaussians: Gaussians = subject.fitted.model.field.primitives(Quantity.GAUSSIANS, ctx)
+        gaussians: Gaussians = run.fitted.model.field.primitives(Quantity.GAUSSIANS, ctx)
         rgb = (0.5 + BAND_0 * gaussians.sh[:, 0]).clamp(0, 1)
-        rgb = linear_to_srgb(rgb) if subject.scene.colour == "linear" else rgb
-        unit = enlargement(gaussians)
+        rgb = linear_to_srgb(rgb) if run.scene.colour == "linear" else rgb
+        unit = half_precision_scale(gaussians)
         centres, covariances = _moments(gaussians)
-    return into.add_gaussian_splats(
+    return viser_scene.add_gaussian_splats(
         "/splats",
         centers=(centres * unit).astype(np.float32),
         covariances=(covariances * unit**2).astype(np.float32),
@@ -95,12 +95,12 @@ def draw_splats(subject: Subject, into: Any) -> Any:
     )
 
 
-def enlargement(gaussians: Gaussians) -> float:
-    """The factor that makes the best of half precision: the largest Gaussian's variance is the largest number."""
+def half_precision_scale(gaussians: Gaussians) -> float:
+    """Scale factor that maps the largest variance to `LARGEST_HALF`."""
     return math.sqrt(LARGEST_HALF) / max(float(gaussians.scales.max()), 1e-12)
 
 
 def _moments(gaussians: Gaussians) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 3"]]:
-    """Means and covariances, in double precision."""
+    """Means and covariances in double precision."""
     axes = quaternion_to_matrix(gaussians.quaternions.double()) * gaussians.scales.double()[:, None, :]
     return gaussians.means.double().cpu().numpy(), (axes @ axes.transpose(1, 2)).cpu().numpy()

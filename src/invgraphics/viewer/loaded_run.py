@@ -1,4 +1,4 @@
-"""A run that is looked at: its model as of its newest checkpoint, and what is known about it."""
+"""A run opened in the viewer: its newest checkpoint, and its training progress and scores."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from invgraphics.runs.folder import RunFolder
 
 Stamp = tuple[int, int, int]
 Stamps = tuple[Stamp | None, Stamp | None]
-"""Of a run's checkpoint and scores."""
+"""File stamps of a run's checkpoint and scores."""
 POLL = 0.5
-"""Seconds between two looks at a checkpoint file."""
+"""Seconds between two checks of a checkpoint file."""
 
 
-class Subject:
-    """A run, its model and how far its fit is. Only the thread that renders may use the model.
+class LoadedRun:
+    """A run with its model; only the render thread may use the model.
 
     Args:
         fitted: the opened run.
-        stamps: of its files, taken before they were read; ``None`` for those of now.
+        stamps: of its files, taken before they were read; ``None`` for current ones.
     """
 
     def __init__(self, fitted: Fitted, stamps: Stamps | None = None) -> None:
         self.fitted = fitted
-        self._stamps = stamps or stamps_of(fitted.folder, fitted.source)
+        self._stamps = stamps or file_stamps(fitted.folder, fitted.source)
         self.steps, self.seconds = self._progress()
 
     @property
@@ -43,32 +43,32 @@ class Subject:
 
     @property
     def name(self) -> str:
-        """What the run is called on the page."""
+        """The method's name."""
         return self.fitted.method.name
 
     @property
-    def by_rays(self) -> bool:
-        """Whether the pixels are independent, so that a picture can be rendered in parts."""
+    def independent_pixels(self) -> bool:
+        """Whether pixels are independent, so that an image can be rendered in strips."""
         return isinstance(self.fitted.model.renderer, RayRenderer)
 
     @property
     def has_gaussians(self) -> bool:
-        """Whether the browser can draw the model."""
+        """Whether the field provides Gaussians, which the browser can draw."""
         return Quantity.GAUSSIANS in self.fitted.model.field.provides
 
     def render(self, camera: Camera, geometry: bool) -> Rendering:
-        """One picture on the CPU, as an evaluation makes it; with normals if ``geometry``."""
+        """Render one image as evaluation does; on the CPU, with normals if ``geometry``."""
         return self.fitted.model.render(camera, normals=geometry)
 
-    def placed(self, camera: Camera, scene: Scene) -> Camera:
-        """A camera of ``scene``'s local frame in this run's own: both stand for the same one in the data set's world."""
+    def to_local(self, camera: Camera, scene: Scene) -> Camera:
+        """Transform a camera from ``scene``'s local frame to this run's, through the world frame."""
         if scene is self.scene:
             return camera
         similarity = torch.linalg.inv(self.scene.world_from_local.double()) @ scene.world_from_local.double()
         return camera.moved(apply_similarity(similarity, camera.cam_to_world.double()).to(camera.cam_to_world))
 
     def views(self) -> list[tuple[str, View]]:
-        """All views with names that are unlike each other, test views first."""
+        """Test and training views with unique names."""
         splits = (("test", self.scene.test), ("train", self.scene.train))
         return [
             (f"{split} {index}: {view.name.removeprefix(f'{split}/')}", view)
@@ -76,19 +76,19 @@ class Subject:
             for index, view in enumerate(views)
         ]
 
-    def changed(self) -> bool:
-        """Whether the fit has written a checkpoint or scores that are not shown; any thread may ask."""
-        stamps = stamps_of(self.fitted.folder, self.fitted.source)
+    def has_update(self) -> bool:
+        """Whether the checkpoint or scores on disk are newer than those loaded; thread-safe."""
+        stamps = file_stamps(self.fitted.folder, self.fitted.source)
         return stamps[0] is not None and stamps != self._stamps
 
-    def refresh(self) -> None:
+    def reload(self) -> None:
         """Load the newest checkpoint.
 
         Raises:
             InputError: it is not readable, or does not fit the recipe that this run had when it was opened.
         """
         fitted = self.fitted
-        self._stamps = stamps_of(fitted.folder, fitted.source)  # first: a file that comes meanwhile is news again
+        self._stamps = file_stamps(fitted.folder, fitted.source)  # first: a file written meanwhile is newer
         state = checkpoint.load(fitted.source.checkpoint, fitted.model.device)
         try:
             fitted.load(state)
@@ -96,8 +96,8 @@ class Subject:
             raise InputError(f"{fitted.source.root} has become another run.", "Start the viewer again.") from error
         self.steps, self.seconds = self._progress()
 
-    def facts(self) -> dict[str, str]:
-        """What there is to say about the run, name -> value in words."""
+    def summary(self) -> dict[str, str]:
+        """Scene, training progress, primitive count and test scores as text, by name."""
         primitives = self.fitted.model.field.primitive_count()
         facts = {"scene": self.scene.name, "fit": f"step {self.steps:,}, {self.seconds:.1f} s"}
         if primitives is not None:
@@ -106,7 +106,7 @@ class Subject:
         return facts
 
     def _progress(self) -> tuple[int, float]:
-        """Steps and seconds of the fit, as its folder says."""
+        """Steps and seconds of the fit, from its folder."""
         try:
             fit = self.fitted.source.read_json("fit.json")
             return int(fit["steps"]), float(fit["seconds"])
@@ -123,8 +123,8 @@ def _scores(folder: RunFolder) -> str:
     return ", ".join(words.format(quality[name]["mean"]) for name, words in said.items() if name in quality)
 
 
-def stamps_of(folder: RunFolder, source: RunFolder) -> Stamps:
-    """What tells two states of a run apart: its checkpoint, in ``source``, and its scores; ``None`` for what is not there."""
+def file_stamps(folder: RunFolder, source: RunFolder) -> Stamps:
+    """Stamps of a run's checkpoint, in ``source``, and scores; ``None`` for missing files."""
     return _stamp(source.checkpoint), _stamp(folder.root / "scores.json")
 
 
@@ -136,31 +136,31 @@ def _stamp(path: Path) -> Stamp | None:
     return found.st_mtime_ns, found.st_size, found.st_ino
 
 
-def open_subject(run: Path, scene: str | None, live: bool, say: Callable[[str], None]) -> Subject:
+def open_run(run: Path, scene: str | None, live: bool, say: Callable[[str], None]) -> LoadedRun:
     """Open a run, in ``live`` as soon as its fit has written a checkpoint.
 
     Args:
         run: its folder.
         scene: another copy of its scene.
-        live: wait for what a fit in progress has not written yet.
-        say: told why there is a wait.
+        live: wait for files that a fit in progress has not written yet.
+        say: called with the reason of a wait.
 
     Raises:
-        InputError: this is no run, or it has no checkpoint and nobody said to wait.
+        InputError: this is no run, or it has no checkpoint and ``live`` is false.
     """
-    missing = missing_part(run)
+    missing = missing_file(run)
     if missing and not live:
         raise InputError(*missing)
     if missing:
         say(f"Waiting for a fit to write its first checkpoint to {run} (`fit --checkpoint-every 5s` does so sooner).")
-    while missing_part(run):
+    while missing_file(run):
         time.sleep(POLL)
-    stamps = stamps_of(RunFolder(run), _source(run))
-    return Subject(open_fitted(run, scene).in_its_frame(), stamps)
+    stamps = file_stamps(RunFolder(run), _source(run))
+    return LoadedRun(open_fitted(run, scene).in_its_frame(), stamps)
 
 
-def missing_part(run: Path) -> tuple[str, str] | None:
-    """What a folder lacks to be looked at, and what to do about it; ``None`` if it is complete."""
+def missing_file(run: Path) -> tuple[str, str] | None:
+    """Sentence and remedy for a folder that cannot be viewed; ``None`` if it can."""
     if not (run / "recipe.toml").is_file() or not (run / "provenance.json").is_file():
         return f"{run} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
     if not _source(run).checkpoint.is_file():
@@ -169,9 +169,9 @@ def missing_part(run: Path) -> tuple[str, str] | None:
 
 
 def _source(run: Path) -> RunFolder:
-    """The folder whose model a run shows: its own, or that of the fit it is a rendering of."""
+    """Folder of a run's checkpoint: its own, or that of the fit it is a rendering of."""
     try:
-        shown = json.loads((run / "provenance.json").read_text()).get("fitted_run")
+        fitted = json.loads((run / "provenance.json").read_text()).get("fitted_run")
     except (OSError, ValueError, AttributeError):
-        shown = None  # opening it will say what is wrong
-    return RunFolder(run if shown is None else run / shown)
+        fitted = None  # opening the run reports the error
+    return RunFolder(run if fitted is None else run / fitted)

@@ -1,4 +1,4 @@
-"""Opens runs, and a viewer for them."""
+"""Opening runs and starting a viewer for them."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from invgraphics.errors import InputError
-from invgraphics.viewer.subject import open_subject
+from invgraphics.viewer.loaded_run import open_run
 
 if TYPE_CHECKING:
     from invgraphics.viewer.server import Viewer
 
 
 @dataclass(frozen=True)
-class ViewRequest:
-    """What to look at, and where.
+class ViewerConfig:
+    """Runs, address and initial view of a viewer.
 
     Attributes:
         runs: folders of one run or two; cameras are the first one's.
-        live: wait for a first checkpoint.
+        live: wait for the first checkpoint.
         view: test view at which browsers start.
         host: address to listen at.
         port: port to listen at, 0 for any that is free.
-        longest: most pixels along a picture's longest side.
+        max_size: limit of the longer side, pixels.
         scene: another copy of the runs' scene.
     """
 
@@ -37,34 +37,34 @@ class ViewRequest:
     view: int = 0
     host: str = "127.0.0.1"
     port: int = 8080
-    longest: int = 800
+    max_size: int = 800
     scene: str | None = None
 
 
-def open_viewer(request: ViewRequest, say: Callable[[str], None]) -> Viewer:
+def open_viewer(config: ViewerConfig, say: Callable[[str], None]) -> Viewer:
     """Open the runs and start the viewer.
 
     Args:
-        request: what to look at.
-        say: told what takes long, in sentences.
+        config: runs and address.
+        say: called with a sentence before each long wait.
 
     Raises:
-        InputError: viser is missing, a run cannot be looked at, the runs do not fit together, or nobody can listen there.
+        InputError: viser is missing, a run cannot be looked at, the runs do not fit together, or the address cannot be bound.
     """
     if importlib.util.find_spec("viser") is None:
         raise InputError("The viewer needs viser, which is not installed.", "`pip install 'invgraphics[viewer]'`")
-    check_place(request.host, request.port)
-    subjects = [open_subject(run, request.scene, request.live, say) for run in request.runs]
-    names = [subject.scene.name for subject in subjects]
+    check_address(config.host, config.port)
+    runs = [open_run(run, config.scene, config.live, say) for run in config.runs]
+    names = [run.scene.name for run in runs]
     if len(set(names)) > 1:
         raise InputError(f"The runs show different scenes: {' and '.join(names)}.", "Two runs are compared on one scene.")
-    count = len(subjects[0].scene.test)
-    if not 0 <= request.view < count:
-        raise InputError(f"--view cannot be {request.view}.", f"Expected a test view, 0 to {count - 1}.")
+    count = len(runs[0].scene.test)
+    if not 0 <= config.view < count:
+        raise InputError(f"--view cannot be {config.view}.", f"Expected a test view, 0 to {count - 1}.")
 
-    from invgraphics.viewer.server import Place, Viewer
+    from invgraphics.viewer.server import Address, Viewer
 
-    return Viewer(subjects, Place(request.host, request.port), request.view, request.longest)
+    return Viewer(runs, Address(config.host, config.port), config.view, config.max_size)
 
 
 def is_loopback(host: str) -> bool:
@@ -75,8 +75,8 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def check_place(host: str, port: int) -> None:
-    """See that somebody can listen at an address and port, before anything is loaded.
+def check_address(host: str, port: int) -> None:
+    """Check that an address and port can be bound, before anything is loaded.
 
     Raises:
         InputError: it is in use, not allowed, or no address of this machine.

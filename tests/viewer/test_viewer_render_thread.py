@@ -6,51 +6,51 @@ import time
 
 import pytest
 
-from invgraphics.viewer.pace import GROWTH, LEAST, TARGET, Pace
-from invgraphics.viewer.worker import Worker
+from invgraphics.viewer.render_thread import RenderThread
+from invgraphics.viewer.resolution import MIN_PIXELS, PYRAMID_FACTOR, TARGET_SECONDS, AdaptiveResolution
 
 
 @pytest.mark.parametrize(("per_pixel", "fixed"), [(1e-6, 0.0), (1e-5, 0.02), (1e-4, 0.0), (3e-5, 0.05)])
 def test_the_pace_settles_at_what_the_renderer_manages(per_pixel: float, fixed: float) -> None:
-    pace = Pace()
+    pace = AdaptiveResolution()
     for _ in range(20):
         pixels = round(pace.pixels)
-        pace.learn(pixels, fixed + per_pixel * pixels)
-    assert fixed + per_pixel * pace.pixels == pytest.approx(TARGET, rel=0.05)
+        pace.update(pixels, fixed + per_pixel * pixels)
+    assert fixed + per_pixel * pace.pixels == pytest.approx(TARGET_SECONDS, rel=0.05)
 
 
 def test_one_measurement_changes_little() -> None:
-    pace = Pace(pixels=10_000)
-    pace.learn(10_000, 60.0)
+    pace = AdaptiveResolution(pixels=10_000)
+    pace.update(10_000, 60.0)
     assert pace.pixels == 5_000
-    pace.learn(5_000, 1e-9)
+    pace.update(5_000, 1e-9)
     assert pace.pixels == 10_000
     for _ in range(30):
-        pace.learn(10_000, 1e3)
-    assert pace.pixels == LEAST
+        pace.update(10_000, 1e3)
+    assert pace.pixels == MIN_PIXELS
 
 
 @pytest.mark.parametrize("pixels", [600, 5_000, 40_000, 250_000, 479_000, 480_000, 10**6])
 def test_pictures_grow_from_what_is_fast_to_the_whole(pixels: float) -> None:
-    scales = Pace(pixels=pixels).scales(800, 600)
+    scales = AdaptiveResolution(pixels=pixels).pyramid_scales(800, 600)
     assert scales[-1] == 1.0 and scales == sorted(set(scales))
     if pixels < 480_000:
         assert (scales[0] ** 2 * 480_000) == pytest.approx(pixels)
         work = sum(scale**2 for scale in scales[:-1])
         assert work < 0.35 or len(scales) == 2, "what leads to the whole picture costs little of it"
-        assert all(finer / coarser <= GROWTH**1.5 for coarser, finer in itertools.pairwise(scales))
-    assert Pace(pixels=pixels).scales(800, 600, resting=True) == [1.0]
+        assert all(finer / coarser <= PYRAMID_FACTOR**1.5 for coarser, finer in itertools.pairwise(scales))
+    assert AdaptiveResolution(pixels=pixels).pyramid_scales(800, 600, skip_coarse=True) == [1.0]
 
 
 def test_strips_are_as_long_as_a_coarse_picture() -> None:
-    assert Pace(pixels=1000).rows(100) == 10
-    assert Pace(pixels=1000).rows(5000) == 1
+    assert AdaptiveResolution(pixels=1000).strip_rows(100) == 10
+    assert AdaptiveResolution(pixels=1000).strip_rows(5000) == 1
 
 
 @pytest.fixture
 def worker():
     complaints = []
-    one = Worker(lambda key, error: complaints.append((key, error)))
+    one = RenderThread(lambda key, error: complaints.append((key, error)))
     one.complaints = complaints
     one.start()
     yield one
@@ -156,7 +156,7 @@ def test_what_is_forgotten_is_not_done(worker) -> None:
     worker.submit("gate", gate())
     started.wait(5)
     worker.submit("a", job())
-    worker.forget("a")
+    worker.cancel("a")
     go.set()
     worker.stop()
     assert done == []

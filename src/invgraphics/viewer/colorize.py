@@ -1,4 +1,4 @@
-"""Renderings as colours: what a person can choose to see."""
+"""8-bit images of renderings: colour, error, depth and normals, for display."""
 
 from __future__ import annotations
 
@@ -15,73 +15,74 @@ from invgraphics.metrics.base import OPAQUE
 
 Picture = UInt8[ndarray, "h w 3"]
 
-SHOWN = ("prediction", "truth", "error", "depth", "normal")
-"""What can be shown; truth and error at the data set's cameras only."""
-OF_VIEWS = ("truth", "error")
+OUTPUTS = ("prediction", "truth", "error", "depth", "normal")
+"""Outputs that can be displayed."""
+NEEDS_TRUTH = ("truth", "error")
+"""Outputs that exist at the data set's cameras only."""
 
 ERROR_COLOURS, DEPTH_COLOURS = "magma", "viridis_r"
 ERROR_LIMIT = 0.25
-"""Absolute error, of 1, from which on it is drawn as the brightest colour."""
+"""Absolute error, of 1, at the end of the colour map."""
 EMPTY = (64, 66, 70)
-"""Around a photograph, and where there is no surface that could have a depth or a normal."""
+"""Letterbox bars, and pixels without depth or normal."""
 
 
 @dataclass(frozen=True)
-class Coloured:
-    """Pictures, one for each rendering, and what their colours mean."""
+class ColorizedImages:
+    """One image per rendering, and the legend of their colours."""
 
     pictures: list[Picture]
     legend: str
 
 
-def coloured(
-    shown: str, renderings: Sequence[Rendering], scenes: Sequence[Scene], truths: Sequence[Picture | None]
-) -> Coloured:
-    """Colour renderings alike.
+def colorize(
+    output: str, renderings: Sequence[Rendering], scenes: Sequence[Scene], truths: Sequence[Picture | None]
+) -> ColorizedImages:
+    """Map renderings to 8-bit images with one shared colour scale.
 
     Args:
-        shown: one of `SHOWN`; without a truth, its error is shown as the prediction.
-        renderings: on the CPU, with normals where these are shown.
+        output: one of `OUTPUTS`; without a truth, the prediction replaces the error.
+        renderings: on the CPU, with normals where these are displayed.
         scenes: whose background, colour space and unit of length count, one for each rendering.
         truths: photographs of the renderings' sizes, one for each.
     """
     pairs = list(zip(renderings, scenes, strict=True))
-    if shown == "depth":
+    if output == "depth":
         return _depths(pairs)
-    if shown == "normal":
+    if output == "normal":
         note = "x, y, z of the normal as red, green, blue"
-        return Coloured([_normal(rendering) for rendering in renderings], note)
-    pictures = [photographed(rendering, scene) for rendering, scene in pairs]
+        return ColorizedImages([_normal(rendering) for rendering in renderings], note)
+    pictures = [to_display(rendering, scene) for rendering, scene in pairs]
     known = [truth for truth in truths if truth is not None]
-    if shown == "error" and len(known) == len(pictures):
+    if output == "error" and len(known) == len(pictures):
         errors = [_error(picture, truth) for picture, truth in zip(pictures, known, strict=True)]
-        return Coloured(errors, f"absolute error, mean of the channels: black is 0, white {ERROR_LIMIT:g} of 1 and more")
-    return Coloured(pictures, "")
+        return ColorizedImages(errors, f"absolute error, mean of the channels: black is 0, white {ERROR_LIMIT:g} of 1 and more")
+    return ColorizedImages(pictures, "")
 
 
-def photographed(rendering: Rendering, scene: Scene) -> Picture:
-    """The colours that evaluations score: over the scene's background, for a display, in 8 bits."""
+def to_display(rendering: Rendering, scene: Scene) -> Picture:
+    """Composite over the scene's background and encode as 8-bit display colours, as evaluation does."""
     return display(rendering.over(scene.background), scene).numpy()
 
 
-def photograph(view: View, scene: Scene, size: tuple[int, int] | None = None) -> Picture:
-    """A view's photograph over the scene's background, for a display, in 8 bits, resized to (width, height)."""
-    return resized(display(view.over(scene.background), scene).numpy(), size)
+def true_image(view: View, scene: Scene, size: tuple[int, int] | None = None) -> Picture:
+    """A view's ground truth over the scene's background in 8-bit display colours, resized to (width, height)."""
+    return resize_image(display(view.over(scene.background), scene).numpy(), size)
 
 
-def resized(picture: Picture, size: tuple[int, int] | None) -> Picture:
-    """A picture at another size (width, height): averaged if that is smaller, smooth if it is larger."""
+def resize_image(picture: Picture, size: tuple[int, int] | None) -> Picture:
+    """Resample to (width, height): box filter when shrinking, bilinear when enlarging."""
     from PIL import Image
 
     if size is None or size == (picture.shape[1], picture.shape[0]):
         return picture
     smaller = size[0] < picture.shape[1]
-    way = Image.Resampling.BOX if smaller else Image.Resampling.BILINEAR
-    return np.asarray(Image.fromarray(picture).resize(size, way))
+    resample = Image.Resampling.BOX if smaller else Image.Resampling.BILINEAR
+    return np.asarray(Image.fromarray(picture).resize(size, resample))
 
 
-def framed(picture: Picture, window: tuple[int, int], corner: tuple[int, int]) -> Picture:
-    """A picture in a window of (width, height) pixels, its corner at (column, row)."""
+def pad_to_window(picture: Picture, window: tuple[int, int], corner: tuple[int, int]) -> Picture:
+    """Pad an image to a window of (width, height) pixels, its corner at (column, row)."""
     height, width = picture.shape[:2]
     canvas = np.empty((window[1], window[0], 3), np.uint8)
     canvas[:] = EMPTY
@@ -94,8 +95,8 @@ def _error(picture: Picture, truth: Picture) -> Picture:
     return _mapped(difference / ERROR_LIMIT, ERROR_COLOURS)
 
 
-def _depths(pairs: Sequence[tuple[Rendering, Scene]]) -> Coloured:
-    """World units, one range for all, from the first to the last percent."""
+def _depths(pairs: Sequence[tuple[Rendering, Scene]]) -> ColorizedImages:
+    """Depth images in world units, one range for all: 1st to 99th percentile."""
     depths = [rendering.depth.numpy() * scene.scale for rendering, scene in pairs]
     solid = [
         (rendering.alpha.numpy() >= OPAQUE) & np.isfinite(depth) for (rendering, _), depth in zip(pairs, depths, strict=True)
@@ -109,7 +110,7 @@ def _depths(pairs: Sequence[tuple[Rendering, Scene]]) -> Coloured:
         picture[~mask] = EMPTY
         pictures.append(picture)
     legend = f"distance from the camera, {low:.3g} (bright) to {high:.3g} (dark) units of the world"
-    return Coloured(pictures, legend if len(values) else "no surface in sight")
+    return ColorizedImages(pictures, legend if len(values) else "no surface in sight")
 
 
 def _normal(rendering: Rendering) -> Picture:

@@ -9,9 +9,10 @@ import torch
 from torch.nn.functional import normalize
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
-from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 GRID = HashGrid(levels=6, log2_size=12, base=8, finest=128)
 
@@ -20,16 +21,16 @@ def network(*widths: int):
     return tuple((torch.randn(o, i) / i**0.5, 0.1 * torch.randn(o)) for i, o in pairwise(widths))
 
 
-def hash_field(hidden=(20,), handed=13, bands=4, density="exp", space="srgb", features=2) -> HashField:
+def random_ngp(hidden=(20,), handed=13, bands=4, density="exp", space="srgb", features=2) -> FusedNGP:
     """Random tables and networks, about half transparent over a few units."""
     grid = replace(GRID, features=features)
     geometry, colour = network(grid.levels * features, *hidden, 1 + handed), network(handed + bands**2, 24, 24, 3)
-    return HashField(torch.randn(grid.entries, features), grid, geometry, colour, density, 1.0, bands, space)
+    return FusedNGP(torch.randn(grid.entries, features), grid, geometry, colour, density, 1.0, bands, space)
 
 
-def doubled(field: HashField) -> HashField:
-    geometry, colour = (tuple((w.double(), b.double()) for w, b in net) for net in (field.geometry, field.colour))
-    return replace(field, table=field.table.double(), geometry=geometry, colour=colour)
+def doubled(field: FusedNGP) -> FusedNGP:
+    geometry, colour = (tuple((w.double(), b.double()) for w, b in net) for net in (field.density_net, field.colour_net))
+    return replace(field, table=field.table.double(), density_net=geometry, colour_net=colour)
 
 
 def setting(space="box", rays=500):
@@ -57,9 +58,9 @@ def in_float64(rays, occupied, bounds, steps, field):
 )
 def test_equals_its_parts(parts, space, cone) -> None:
     bounds, rays, occupied = setting(space)
-    field, steps = hash_field(**parts), MarchSteps(0.03, cone)
-    (sums, alpha), again = (numba.hash_render(rays, occupied, bounds, steps, field) for _ in range(2))
-    exact_sums, exact_alpha = reference.hash_render(*in_float64(rays, occupied, bounds, steps, field))
+    field, steps = random_ngp(**parts), MarchSteps(0.03, cone)
+    (sums, alpha), again = (numba.ngp_render(rays, occupied, bounds, steps, field) for _ in range(2))
+    exact_sums, exact_alpha = reference.ngp_render(*in_float64(rays, occupied, bounds, steps, field))
     assert 0.2 < float(exact_alpha.mean()) < 0.99
     # A step on a cell's wall may be kept by one of the two only.
     off = ((alpha - exact_alpha).abs() > 1e-5) | ((sums - exact_sums).abs() > 1e-5 * exact_sums.abs().max()).any(dim=1)
@@ -71,15 +72,15 @@ def test_equals_its_parts(parts, space, cone) -> None:
 def test_leaves_out_no_more_than_it_may() -> None:
     """A share of the light, and a share of the colours, which are in [0, 1]; and it does leave something out."""
     bounds, rays, occupied = setting()
-    field = replace(hash_field(), bias=4.0)
-    _, alpha = numba.hash_render(rays, occupied, bounds, MarchSteps(0.03), field)
-    _, less = numba.hash_render(rays, occupied, bounds, MarchSteps(0.03), field, transmittance=0.2)
+    field = replace(random_ngp(), density_bias=4.0)
+    _, alpha = numba.ngp_render(rays, occupied, bounds, MarchSteps(0.03), field)
+    _, less = numba.ngp_render(rays, occupied, bounds, MarchSteps(0.03), field, min_transmittance=0.2)
     assert 0.05 < float((alpha - less).max()) <= 0.2 + 1e-5
     assert bool((less >= torch.minimum(alpha, torch.tensor(0.8)) - 1e-5).all())
     # Each step of thinner fog weighs less than that; all of them together weigh more.
-    field = replace(field, bias=0.0)
-    whole, alpha = numba.hash_render(rays, occupied, bounds, MarchSteps(0.03), field)
-    coarse, same = numba.hash_render(rays, occupied, bounds, MarchSteps(0.03), field, unseen=0.1)
+    field = replace(field, density_bias=0.0)
+    whole, alpha = numba.ngp_render(rays, occupied, bounds, MarchSteps(0.03), field)
+    coarse, same = numba.ngp_render(rays, occupied, bounds, MarchSteps(0.03), field, max_error=0.1)
     assert torch.equal(same, alpha)
     assert torch.equal(coarse[:, 3], whole[:, 3])
     missing = (whole - coarse)[:, :3]
@@ -89,17 +90,17 @@ def test_leaves_out_no_more_than_it_may() -> None:
 
 def test_rays_do_not_depend_on_each_other_nor_on_the_threads() -> None:
     bounds, rays, occupied = setting()
-    field, steps = hash_field(), MarchSteps(0.03)
+    field, steps = random_ngp(), MarchSteps(0.03)
     before = torch.get_num_threads()
     results = []
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
-            results.append(numba.hash_render(rays, occupied, bounds, steps, field, 1e-3))
+            results.append(numba.ngp_render(rays, occupied, bounds, steps, field, 1e-3))
     finally:
         torch.set_num_threads(before)
     some = torch.tensor([3, 77, 78, 400])
-    results.append(numba.hash_render(rays[some], occupied, bounds, steps, field, 1e-3))
+    results.append(numba.ngp_render(rays[some], occupied, bounds, steps, field, 1e-3))
     assert torch.equal(results[0][1], results[1][1])
     assert torch.equal(results[0][1][some], results[2][1])
     # Colours are added up as they come.
@@ -110,23 +111,23 @@ def test_rays_do_not_depend_on_each_other_nor_on_the_threads() -> None:
 @pytest.mark.parametrize("width", [1, 7, 8, 20, 33, 10_000])
 def test_pictures_of_any_width_have_every_ray_once(width: int) -> None:
     bounds, rays, occupied = setting()
-    call = rays, occupied, bounds, MarchSteps(0.03), hash_field(), 1e-3, 0.0
-    in_order, by_blocks = numba.hash_render(*call), numba.hash_render(*call, width)
+    call = rays, occupied, bounds, MarchSteps(0.03), random_ngp(), 1e-3, 0.0
+    in_order, by_blocks = numba.ngp_render(*call), numba.ngp_render(*call, width)
     assert torch.equal(by_blocks[1], in_order[1])
     torch.testing.assert_close(by_blocks[0], in_order[0], rtol=0, atol=1e-5)
 
 
 def test_nothing_to_see_and_bad_numbers() -> None:
     bounds, rays, occupied = setting(rays=9)
-    field, steps = hash_field(), MarchSteps(0.03)
-    sums, alpha = numba.hash_render(rays[:0], occupied, bounds, steps, field)
+    field, steps = random_ngp(), MarchSteps(0.03)
+    sums, alpha = numba.ngp_render(rays[:0], occupied, bounds, steps, field)
     assert sums.shape == (0, 4) and alpha.shape == (0,)
-    sums, alpha = numba.hash_render(rays, torch.zeros_like(occupied), bounds, steps, field)
+    sums, alpha = numba.ngp_render(rays, torch.zeros_like(occupied), bounds, steps, field)
     assert float(sums.abs().sum() + alpha.sum()) == 0
-    whole = numba.hash_render(rays, occupied, bounds, steps, field)
+    whole = numba.ngp_render(rays, occupied, bounds, steps, field)
     for tensor in (rays.origins, rays.directions, rays.near, rays.far):
         tensor[::3] = torch.nan
-    sums, alpha = numba.hash_render(rays, occupied, bounds, steps, field)
+    sums, alpha = numba.ngp_render(rays, occupied, bounds, steps, field)
     good = torch.arange(9) % 3 > 0
     torch.testing.assert_close(sums[good], whole[0][good], rtol=0, atol=1e-5)
     assert torch.equal(alpha[good], whole[1][good])
@@ -135,11 +136,11 @@ def test_nothing_to_see_and_bad_numbers() -> None:
 @pytest.mark.parametrize("transmittance", [0.0, 0.1])
 def test_march_keeps_what_light_reaches(transmittance: float) -> None:
     bounds, rays, occupied = setting()
-    field, steps = replace(hash_field(), bias=2.0), MarchSteps(0.03)
+    field, steps = replace(random_ngp(), density_bias=2.0), MarchSteps(0.03)
     start = rays.near + 0.03 * torch.rand(len(rays))
-    ours = numba.hash_march(rays, occupied, bounds, steps, field, start, transmittance)
+    ours = numba.ngp_march(rays, occupied, bounds, steps, field, start, transmittance)
     exact = in_float64(rays, occupied, bounds, steps, field)
-    theirs = reference.hash_march(*exact, start.double(), transmittance)
+    theirs = reference.ngp_march(*exact, start.double(), transmittance)
     everything = reference.ray_march(rays, occupied, bounds, steps, start)
     counts = [torch.bincount(march.ray, minlength=len(rays)) for march in (ours, theirs, everything)]
     same = counts[0] == counts[1]
@@ -156,28 +157,28 @@ def test_march_keeps_what_light_reaches(transmittance: float) -> None:
 
 def test_march_of_many_long_rays_is_done_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     bounds, rays, occupied = setting(rays=50)
-    field, steps = hash_field(), MarchSteps(0.03)
-    whole = numba.hash_march(rays, occupied, bounds, steps, field, rays.near, 0.1)
+    field, steps = random_ngp(), MarchSteps(0.03)
+    whole = numba.ngp_march(rays, occupied, bounds, steps, field, rays.near, 0.1)
     # By path: the package's attribute of this name is the operation.
     monkeypatch.setattr(import_module("invgraphics.kernels.numba.ngp.march"), "ROOM", 700)
-    parts = numba.hash_march(rays, occupied, bounds, steps, field, rays.near, 0.1)
+    parts = numba.ngp_march(rays, occupied, bounds, steps, field, rays.near, 0.1)
     assert all(torch.equal(getattr(whole, name), getattr(parts, name)) for name in ("ray", "t0", "t1", "resume"))
-    none = numba.hash_march(rays[:0], occupied, bounds, steps, field, rays.near[:0], 0.1)
+    none = numba.ngp_march(rays[:0], occupied, bounds, steps, field, rays.near[:0], 0.1)
     assert len(none.ray) == len(none.resume) == 0
 
 
 def test_other_widths_of_an_entry_go_to_the_reference() -> None:
     bounds, rays, occupied = setting(rays=40)
-    field, steps = hash_field(features=3), MarchSteps(0.03)
-    ours, theirs = (kernels.hash_render(rays, occupied, bounds, steps, field) for kernels in (numba, reference))
+    field, steps = random_ngp(features=3), MarchSteps(0.03)
+    ours, theirs = (kernels.ngp_render(rays, occupied, bounds, steps, field) for kernels in (numba, reference))
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
-    ours, theirs = (k.hash_march(rays, occupied, bounds, steps, field, rays.near, 0.1) for k in (numba, reference))
+    ours, theirs = (k.ngp_march(rays, occupied, bounds, steps, field, rays.near, 0.1) for k in (numba, reference))
     assert torch.equal(ours.t1, theirs.t1)
 
 
 def test_the_reference_goes_on_where_a_march_has_kept_all_it_may() -> None:
     bounds, rays, occupied = setting(rays=40)
-    field = hash_field()
-    whole, parts = (reference.hash_render(rays, occupied, bounds, MarchSteps(0.03, limit=n), field) for n in (1024, 5))
+    field = random_ngp()
+    whole, parts = (reference.ngp_render(rays, occupied, bounds, MarchSteps(0.03, limit=n), field) for n in (1024, 5))
     for a, b in zip(whole, parts, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-5)
