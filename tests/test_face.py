@@ -5,6 +5,7 @@ import importlib
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -28,7 +29,8 @@ from invgraphics.scenes.open import SceneOptions, source_of
 from invgraphics.testing import toy_scene
 
 SPLATS = ig.load_method("splatting/gaussians", set={"field.count": 60, "field.max_init": 60, "field.sh_degree": 0})
-EXAMPLES = ("load_scene", "load_method", "fit", "evaluate", "load_run", "compare", "Model")
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ("load_scene", "load_method", "fit", "evaluate", "load_run", "compare", "ablate", "Model")
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +47,20 @@ def test_the_examples_hold(thing: object) -> None:
     said = io.StringIO()
     failed, _ = doctest.DocTestRunner().run(test, out=said.write)
     assert not failed, said.getvalue()
+
+
+def test_the_readme_holds() -> None:
+    """Its blocks of Python, one after the other, on the toy and with few steps."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.S | re.M)
+    assert len(blocks) == 3
+    code = "\n".join(blocks).replace('"bricks", size=256', '"toy.npz"')
+    code, budgets = re.subn(r'"(?:30s|60s|500steps)"', '"4steps"', code)
+    assert budgets == 3
+    code = code.replace('"1000steps"', '"6steps"').replace('{"field.width": 64}', '{"field.width": 16, "batches.rays": 64}')
+    names: dict = {}
+    exec(code, names)
+    assert names["fit"].fit.steps == 6 and len(names["frames"]) == 1
+    assert names["splatted"].rgb.shape == names["integrated"].rgb.shape == (128, 128, 3)
 
 
 def test_names_are_lazy_and_typed() -> None:
