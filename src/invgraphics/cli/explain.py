@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 ROWS = 24
 """Contributions that are printed, those that weigh most; the file has all."""
-NOUNS = {"samples": "samples", "splats": "splats", "gaussians": "Gaussians"}
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def show_contributions(explanation: Explanation) -> None:
     facts = explanation.facts
     what = f"pixel {facts['pixel']['column']},{facts['pixel']['row']} of {facts['split']} view {facts['view']}"
     shown = "" if len(rows) == len(found) else f", the {len(rows)} heaviest"
-    show_table(f"{facts['method']}, {what}: {len(found)} {NOUNS[found.kind]}{shown}", ["", *names], rows)
+    show_table(f"{facts['method']}, {what}: {len(found)} {found.kind}{shown}", ["", *names], rows)
 
 
 def sentences(explanation: Explanation) -> list[str]:

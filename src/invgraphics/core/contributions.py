@@ -51,7 +51,8 @@ class Contributions:
     """k contributions to one pixel, in the order in which the renderer composites them; colour = Σ weight rgb.
 
     Attributes:
-        kind: what they are, a word: ``samples`` (intervals of a field), ``splats``, ``gaussians`` (integrated along the ray).
+        kind: what they are, in the plural, for titles: ``samples`` are intervals of a field; others (``splats``, ``Gaussians``)
+            are drawn as points of the ray.
         t: distance along the ray: the interval's middle, or the largest response of a Gaussian.
         begin: where the interval begins; for Gaussians, one standard deviation nearer.
         end: where it ends; for Gaussians, one standard deviation farther.

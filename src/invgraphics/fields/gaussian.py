@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -37,6 +37,8 @@ class GaussianFieldConfig:
         scale_factor: multiplies the starting scales.
         isotropic: whether all three axes of a Gaussian stay equal.
     """
+
+    title: ClassVar[str] = "anisotropic 3D Gaussians"
 
     sh_degree: int = 3
     count: int = 10_000

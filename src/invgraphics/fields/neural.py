@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -63,6 +63,8 @@ class NeuralFieldConfig:
         density_per: unit of length of the network's density. ``contracted``: in a contracted space, the box's half-extent after
             contraction along the radius, so that a new field is as thin a fog all the way to infinity as in a box.
     """
+
+    title: ClassVar[str] = "network"
 
     encoding: Annotated[Any, Slot("encodings")] = field(default_factory=FrequencyConfig)
     geometry: Literal["density", "sdf"] = "density"

@@ -46,6 +46,8 @@ class GaussianExactConfig:
         smallest: optical depth below which a Gaussian is left out of a ray.
     """
 
+    title: ClassVar[str] = "exact line integrals"
+
     opacity: Literal["peak", "physical"] = "peak"
     steps: int = 32
     smallest: float = ALPHA_MIN / 4
@@ -70,6 +72,8 @@ class GaussianSortedConfig:
             the optical axis, one order for all pixels as splatters have it (along the ray itself where there is no camera).
         smallest: optical depth below which a Gaussian is left out of a ray; ``splat`` leaves out alphas below 1/255.
     """
+
+    title: ClassVar[str] = "line integrals in ray order"
 
     opacity: Opacity = "peak"
     order: Literal["ray", "centre"] = "ray"
@@ -174,7 +178,7 @@ class GaussianExact(GaussianRays):
         order = order[intersections.depth[order] > 0]
         t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
         return Contributions(
-            kind="gaussians",
+            kind="Gaussians",
             t=t,
             begin=t - sigma,
             end=t + sigma,
@@ -218,7 +222,7 @@ class GaussianSorted(GaussianRays):
         t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
         alpha, reached = opacities(weight)
         return Contributions(
-            kind="gaussians",
+            kind="Gaussians",
             t=t,
             begin=t - sigma,
             end=t + sigma,

@@ -51,6 +51,8 @@ class SplattingConfig:
         tile: edge of a tile in pixels (Numba takes 32 at most); ``None`` leaves it to the kernel.
     """
 
+    title: ClassVar[str] = "splatting"
+
     shape: Literal["ellipsoid", "disc"] = "ellipsoid"
     dilation: float = 0.3
     antialiased: bool = False

@@ -48,6 +48,8 @@ class VolumetricConfig:
             (Philip and Deschaintre 2023, Floaters no more).
     """
 
+    title: ClassVar[str] = "volume rendering"
+
     sampler: Annotated[Any, Slot("samplers")] = field(default_factory=StratifiedConfig)
     gradient_reach: float = 0.0
 

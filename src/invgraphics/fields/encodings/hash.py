@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -22,6 +23,8 @@ COARSE_LEVELS = 2
 @dataclass(frozen=True)
 class HashConfig(HashGrid):
     """A hash grid as a recipe's encoding: `HashGrid` with its limits."""
+
+    title: ClassVar[str] = "multi-resolution hash grid"
 
     def __post_init__(self) -> None:
         if self.levels < 1 or self.features < 1:

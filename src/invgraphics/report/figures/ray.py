@@ -34,7 +34,6 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Of sRGB's primaries; tells dark swatches from light ones."""
 CELLS = 900
 """Cells of a colour strip."""
-NOUNS = {"samples": "samples", "splats": "splats", "gaussians": "Gaussians"}
 
 
 def draw_ray(folder: Path) -> Path:
@@ -78,7 +77,7 @@ def draw_ray(folder: Path) -> Path:
 def _title(ray: Ray) -> str:
     facts, pixel = ray.facts, ray.pixel
     where = f"{facts['scene']}, {facts['split']} view {facts['view']}, pixel ({pixel['column']}, {pixel['row']})"
-    return f"{facts['method']} on {where}: {len(ray.rgb)} {NOUNS[ray.kind]}"
+    return f"{facts['method']} on {where}: {len(ray.rgb)} {ray.kind}"
 
 
 def _set_span(axes: Axes, low: float, high: float) -> None:
