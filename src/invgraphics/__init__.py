@@ -1,7 +1,7 @@
 """Compare and teach differentiable rendering: NeRF volume rendering versus splatting, on one ruler.
 
 >>> import invgraphics as ig
->>> scene = ig.load_scene("bricks", size=256)                          # doctest: +SKIP
+>>> scene = ig.load_scene("bricks")                                    # doctest: +SKIP
 >>> fit = ig.fit("splatting/gaussians", scene, budget="30s")           # doctest: +SKIP
 >>> fit.model.render(scene.test[0].camera)                             # doctest: +SKIP
 
