@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -213,7 +214,7 @@ def test_objects_show_themselves() -> None:
     picture = fit.model.render(view.camera)
     for shown in (view, picture):
         colours = shown.over(white)
-        pixels = torch.tensor(list(Image.open(io.BytesIO(shown._repr_png_())).getdata())).reshape(24, 24, 3) / 255
+        pixels = torch.from_numpy(np.array(Image.open(io.BytesIO(shown._repr_png_())))) / 255
         assert torch.allclose(pixels, colours.clamp(0, 1), atol=0.5 / 255 + 1e-6)
     assert picture.reshape(24 * 24)._repr_png_() is None
     assert "8 to fit, 0 to watch" in scene._repr_html_() and "data:image/png;base64," in scene._repr_html_()
