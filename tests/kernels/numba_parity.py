@@ -56,7 +56,12 @@ def samples() -> list[str]:
     for number, true in zip(numba.ngp_render(*call), reference.ngp_render(*call), strict=True):
         assert true.abs().max() > 0.1
         assert (number - true).abs().max() <= 1e-4 * true.abs().max()
-    parts = ("hash.encode.encode", "hash.encode.encode_back", "rays.composite.accumulate", "rays.composite.accumulate_back")
+    parts = (
+        "hash.encode.encode",
+        "hash.encode.encode_backward",
+        "rays.composite.accumulate",
+        "rays.composite.accumulate_backward",
+    )
     return assembly(*parts, "ngp.render.render")
 
 
@@ -89,7 +94,7 @@ def pictures() -> list[str]:
     ours, theirs = (k.ray_march(rays, occupied, bounds, MarchSteps(0.01), rays.near) for k in (numba, reference))
     assert len(ours.ray) > 0
     assert all(torch.equal(getattr(ours, name), getattr(theirs, name)) for name in ("ray", "t0", "t1", "resume"))
-    return assembly("splat.raster.rasterise", "splat.raster_backward.walk_back", "rays.march.walk")
+    return assembly("splat.raster.rasterise", "splat.raster_backward.rasterise_backward", "rays.march.traverse")
 
 
 def assembly(*names: str) -> list[str]:

@@ -8,7 +8,7 @@ from invgraphics.core.bounds import Bounds, contract
 from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
-from invgraphics.kernels.numba.rays.march import most_steps
+from invgraphics.kernels.numba.rays.march import max_steps
 from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import March, MarchSteps
 
@@ -54,7 +54,7 @@ def test_every_ray_ends_within_the_steps_there_is_room_for() -> None:
     everywhere = torch.ones(8, 8, 8, dtype=torch.bool)
     march = numba.ray_march(rays, everywhere, bounds, STEPS, rays.near)
     counts = torch.bincount(march.ray, minlength=len(rays))
-    assert int(counts.max()) < most_steps(rays, bounds, rays.near, STEPS) < 100
+    assert int(counts.max()) < max_steps(rays, bounds, rays.near, STEPS) < 100
     assert torch.equal(march.resume, rays.far)
 
 

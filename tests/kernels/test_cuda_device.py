@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from invgraphics import kernels
-from invgraphics.bench.subject import activated, camera, gaussian_field
+from invgraphics.bench.workload import activated, camera, gaussian_field
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
 

@@ -160,7 +160,7 @@ def test_march_of_many_long_rays_is_done_in_parts(monkeypatch: pytest.MonkeyPatc
     field, steps = random_ngp(), MarchSteps(0.03)
     whole = numba.ngp_march(rays, occupied, bounds, steps, field, rays.near, 0.1)
     # By path: the package's attribute of this name is the operation.
-    monkeypatch.setattr(import_module("invgraphics.kernels.numba.ngp.march"), "ROOM", 700)
+    monkeypatch.setattr(import_module("invgraphics.kernels.numba.ngp.march"), "MAX_INTERVALS", 700)
     parts = numba.ngp_march(rays, occupied, bounds, steps, field, rays.near, 0.1)
     assert all(torch.equal(getattr(whole, name), getattr(parts, name)) for name in ("ray", "t0", "t1", "resume"))
     none = numba.ngp_march(rays[:0], occupied, bounds, steps, field, rays.near[:0], 0.1)

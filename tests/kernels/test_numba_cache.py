@@ -15,7 +15,7 @@ import hashlib, torch
 from dataclasses import replace
 from invgraphics import kernels
 from invgraphics.bench.sample_cases import random_ngp, some_rays
-from invgraphics.bench.subject import activated, bounds, camera, gaussian_field, leaves, occupied
+from invgraphics.bench.workload import activated, bounds, camera, gaussian_field, leaves, occupied
 from invgraphics.kernels.types import MarchSteps
 
 def bits(*tensors):
@@ -29,8 +29,8 @@ rays = some_rays(500)
 call = rays, occupied(64), bounds(), MarchSteps(0.02), random_ngp()
 march = kernels.ngp_march(*call, rays.near, 0.01)
 print(bits(*kernels.ngp_render(*call)), bits(march.t0, march.t1))
-gaussians, seen_by = activated(gaussian_field(3000)), camera(100)
-footprints, rgb = kernels.splat_project(gaussians, seen_by)
+gaussians, viewpoint = activated(gaussian_field(3000)), camera(100)
+footprints, rgb = kernels.splat_project(gaussians, viewpoint)
 print(bits(kernels.splat_median(footprints, 100, 100)))
 for absgrad in (None, torch.zeros(3000, 2, requires_grad=True)):
     for max_grad_splats in (0, 5):

@@ -1,4 +1,4 @@
-"""How long OpenMP's threads spin while they wait, where the environment variable comes too late."""
+"""OpenMP spin-wait limit of an already loaded runtime, where the environment variable comes too late."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from pathlib import Path
 from invgraphics.thread_pools import SPIN_SETTING_IS_LATE
 
 MAPS = Path("/proc/self/maps")
-"""Linux: what this process has loaded."""
+"""Linux: memory mappings of this process, which name its shared libraries."""
 
 LIBRARY = "libgomp"
-"""GNU's OpenMP runtime, which torch brings on Linux and Numba uses as well."""
+"""GNU's OpenMP runtime, bundled with torch on Linux and used by Numba as well."""
 
 
 @cache
 def limit_spinning() -> int:
     """Make idle OpenMP threads sleep at once where libgomp was loaded before `invgraphics` could set ``GOMP_SPINCOUNT``.
 
-    libgomp reads that variable once, as it is loaded: whoever imports torch first gets threads that wait by spinning for
-    milliseconds, and steps that take ten times as long beside one busy process. It documents, however, that threads spin a
-    hundred times only while it manages more of them than there are processors. So one more thread of ours asks it for a team
-    of that size, once, and then sleeps: the team stays, asleep too, and everyone's waiting is short from then on.
+    libgomp reads that variable once, as it is loaded: if torch was imported first, idle threads spin for milliseconds, and
+    steps take ten times as long beside one busy process. Its documentation limits spinning to a hundred iterations while it
+    manages more threads than there are processors. So a helper thread starts one team of that size and then sleeps: the team
+    stays alive, asleep too, and spinning is short from then on.
 
     Returns:
-        How many runtimes were told; 0 where the variable was in force from the start.
+        Number of runtimes limited this way; 0 where the variable was in force from the start.
     """
     if not SPIN_SETTING_IS_LATE or not sys.platform.startswith("linux"):
         return 0
@@ -44,10 +44,10 @@ def _loaded() -> list[str]:
 
 
 def _hold_team(path: str) -> bool:
-    """Keep a team of more threads than processors asleep in the runtime at ``path``; whether that could be done."""
+    """Keep a sleeping team of more threads than processors alive in the runtime at ``path``; returns success."""
     try:
         runtime = ctypes.CDLL(path)
-        parallel, nothing = runtime.GOMP_parallel, ctypes.cast(ctypes.CDLL(None).labs, ctypes.c_void_p)
+        parallel, no_op = runtime.GOMP_parallel, ctypes.cast(ctypes.CDLL(None).labs, ctypes.c_void_p)
         size = int(runtime.omp_get_num_procs()) + 1
     except (AttributeError, OSError):
         return False
@@ -55,9 +55,9 @@ def _hold_team(path: str) -> bool:
     ready = threading.Event()
 
     def hold() -> None:
-        parallel(nothing, None, size, 0)  # every thread computes the absolute value of a null pointer
+        parallel(no_op, None, size, 0)  # every thread computes the absolute value of a null pointer
         ready.set()
-        threading.Event().wait()  # a team ends with the thread that made it
+        threading.Event().wait()  # a team ends with the thread that started it
 
     threading.Thread(target=hold, name="openmp-team", daemon=True).start()
     return ready.wait(timeout=10)

@@ -1,4 +1,4 @@
-"""Compile everything ahead of its first use."""
+"""Ahead-of-time compilation: calls that compile every kernel."""
 
 from __future__ import annotations
 
@@ -26,10 +26,7 @@ from invgraphics.kernels.types import MarchSteps
 
 
 def warm_up() -> float:
-    """Run every kernel forward and backward on tiny input, which has it compiled; returns the seconds it took.
-
-    Next to none when everything was cached.
-    """
+    """Run every kernel forward and backward on tiny input, which compiles it; returns seconds, about 0 when all is cached."""
     began = perf_counter()
     samples()
     splats()
@@ -37,7 +34,7 @@ def warm_up() -> float:
 
 
 def splats() -> None:
-    """The kernels of the splatter."""
+    """Compile the kernels of Gaussian splatting."""
     pose = torch.eye(4).requires_grad_()
     camera = Camera(pose, torch.full((2,), 8.0), torch.full((2,), 4.0), 8, 8)
     shapes = ((4, 3), (4, 4), (4, 3), (4,), (4, 1, 3))
@@ -45,7 +42,7 @@ def splats() -> None:
     footprints, rgb = splat_project(gaussians, camera)
     splat_bin(footprints, 8, 8, 4)
     splat_median(footprints, 8, 8)
-    # The backward walk is compiled anew for each setting of its two switches.
+    # The backward pass is specialised for each setting of its two switches.
     for absgrad in (None, torch.zeros(4, 2, requires_grad=True)):
         for max_grad_splats in (0, 1):
             image, alpha = splat_rasterise(replace(footprints, absgrad=absgrad), rgb, 8, 8, max_grad_splats=max_grad_splats)
@@ -53,17 +50,17 @@ def splats() -> None:
 
 
 def samples() -> None:
-    """The kernels of ray renderers, and SSIM."""
+    """Compile the kernels of volume rendering, and SSIM."""
     image = torch.zeros(8, 8, 3).requires_grad_()
     ssim(image, torch.zeros_like(image)).backward()
     unit = torch.full((2, 3), 0.4).requires_grad_()
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)
-    (slope,) = torch.autograd.grad(features.sum(), unit, create_graph=True)
+    (gradient,) = torch.autograd.grad(features.sum(), unit, create_graph=True)
     values = grid_sample(unit, torch.zeros(2, 2, 2, 1).requires_grad_())
     ray = torch.zeros(2, dtype=torch.int64)
     _, sums, alpha = composite(values[:, 0], features, ray, 1)
-    (sums.sum() + alpha.sum() + slope.sum()).backward()
+    (sums.sum() + alpha.sum() + gradient.sum()).backward()
     bounds = Bounds(torch.zeros(3), torch.ones(3))
     rays = bounds.clip(Rays.make(torch.full((2, 3), 0.1), torch.full((2, 3), 3**-0.5)))
     everywhere = torch.ones(2, 2, 2, dtype=torch.bool)

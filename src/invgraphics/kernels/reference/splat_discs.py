@@ -82,7 +82,7 @@ def half_width(
         matrix: M, the axes and the centre in homogeneous pixels.
         weights: squared reach along each axis, and -1 for the centre.
         means2d: the centre's image, in pixels.
-        camera: whose picture it is.
+        camera: camera that projects them.
     """
     dual = (matrix * weights[:, None, :]) @ matrix.transpose(1, 2)
     bounded = dual[:, 2, 2] < 0

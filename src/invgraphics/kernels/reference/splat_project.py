@@ -33,7 +33,7 @@ def splat_project(
     a = jacobian(mean, camera) @ factor
 
     xx, xy, yy, det = _covariance(a, dilation)
-    opacities = gaussians.opacities * _fades(a, det) if antialiased else gaussians.opacities
+    opacities = gaussians.opacities * _compensations(a, det) if antialiased else gaussians.opacities
     conics = torch.stack([yy / det, -xy / det, xx / det], dim=1)
     means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]
     with torch.no_grad():
@@ -99,8 +99,8 @@ def _covariance(a: Float[Tensor, "n 3 3"], dilation: float) -> tuple[Tensor, Ten
     return xx + dilation, xy, yy + dilation, det.clamp_min(torch.finfo(det.dtype).tiny)
 
 
-def _fades(a: Float[Tensor, "n 3 3"], det: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Factor that gives a filtered footprint, of covariance determinant ``det``, the integral it had unfiltered."""
+def _compensations(a: Float[Tensor, "n 3 3"], det: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Opacity compensation that keeps the integral of a filtered footprint of covariance determinant ``det``."""
     *_, area = _covariance(a, 0.0)
     return (area / det).clamp_min(COMPENSATION_MIN**2).sqrt()
 

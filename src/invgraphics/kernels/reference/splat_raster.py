@@ -83,10 +83,10 @@ def splat_median(footprints: Footprints, width: int, height: int, tile: int | No
 def over_tiles(
     footprints: Footprints, size: tuple[int, int], tile: int, paint: Callable[[Tensor, Tensor], Tensor]
 ) -> Float[Tensor, "h w c"]:
-    """Ask ``paint`` for every tile of a ``size = (width, height)`` picture.
+    """Assemble a ``size = (width, height)`` image from ``paint``, called for every tile.
 
     Args:
-        footprints: what is drawn.
+        footprints: projected primitives.
         size: width and height in pixels.
         tile: edge of a tile in pixels.
         paint: gets the tile's splats (k,), front to back, and its pixel centres (p, 2); gives (p, c).
@@ -109,7 +109,7 @@ def over_tiles(
 
 
 class _GatherAbsolute(torch.autograd.Function):
-    """Passes offsets (p, k, 2) on, and gives each footprint's probe (k, 2) the sum over pixels of their absolute gradients."""
+    """Identity on offsets (p, k, 2) whose backward gives ``probe`` (k, 2) their absolute gradients, summed over pixels."""
 
     @staticmethod
     def forward(ctx: Any, offset: Tensor, probe: Tensor) -> Tensor:
@@ -141,7 +141,7 @@ def responses_at(footprints: Footprints, splats: Int[Tensor, " k"], pixels: Floa
 
 
 def visible_alphas(responses: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-    """Responses below the visible are skipped, those near 1 clamped."""
+    """Alpha of each response: 0 below `ALPHA_MIN`, clamped at `ALPHA_MAX`."""
     return torch.where(responses < ALPHA_MIN, 0.0, responses.clamp_max(ALPHA_MAX))
 
 
@@ -156,7 +156,7 @@ def _composite(responses: Float[Tensor, "p k"], features: Float[Tensor, "k c"], 
 
 
 def blending_weights(alpha: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-    """T_i alpha_i. The transmittance never grows again, so once it would fall too low all later splats are left out as well."""
+    """Compositing weights T_i alpha_i; 0 from the splat on that would lower transmittance below `TRANSMITTANCE_MIN`."""
     after = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     return torch.where(after < TRANSMITTANCE_MIN, 0.0, alpha * before)

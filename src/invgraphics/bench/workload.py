@@ -1,4 +1,4 @@
-"""What is measured on: Gaussians on a sphere, a box and a plane, looking like a fitted object without being one."""
+"""Synthetic workload of the benchmarks: Gaussians on a sphere, a box and a plane, similar to a fitted scene."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SCALE = 0.7
 """Standard deviations relative to the distance of neighbours."""
 SH_DEGREE = 3
 DISTANCE, FOCAL = 3.0, 1.6
-"""Of the cameras from what they look at, and their focal length relative to the picture's edge: the object fills it."""
+"""Distance of the cameras from their target, and focal length relative to the image's edge: the object fills it."""
 MIDDLE = (0.0, 0.0, -0.3)
-"""What the cameras look at."""
+"""Look-at target of the cameras."""
 
 
 def bounds() -> Bounds:
-    """The cube that holds the object."""
+    """Bounding cube of the object."""
     return Bounds(-torch.ones(3), torch.ones(3))
 
 
@@ -60,7 +60,7 @@ def _surface(n: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
 
 
 def activated(field: GaussianField) -> Gaussians:
-    """The field's Gaussians as leaves that take gradients, for kernels measured alone."""
+    """Activated parameters of the field as differentiable leaf tensors."""
     with torch.no_grad():
         stored = torch.cat([field.sh_dc, field.sh_rest], dim=1)
         tensors = (field.means, field.quaternions, field.log_scales.exp(), field.opacity_logits.sigmoid(), stored)
@@ -68,7 +68,7 @@ def activated(field: GaussianField) -> Gaussians:
 
 
 def leaves(gaussians: Gaussians) -> list[Tensor]:
-    """All tensors of a set of Gaussians."""
+    """Parameter tensors of a set of Gaussians."""
     return [gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.sh]
 
 
@@ -83,20 +83,20 @@ def camera(width: int, turn: float = 0.1) -> Camera:
 
 @torch.no_grad()
 def scene(field: GaussianField, views: int, width: int) -> Scene:
-    """Pictures of the Gaussians from all around, with alpha, to be fitted again."""
+    """Training scene: renderings of the Gaussians with alpha, from cameras all around."""
     gaussians = activated(field)
     train = []
     for i in range(views):
-        seen_by = camera(width, i / views)
-        footprints, rgb = kernels.splat_project(gaussians, seen_by)
+        viewpoint = camera(width, i / views)
+        footprints, rgb = kernels.splat_project(gaussians, viewpoint)
         image, alpha = kernels.splat_rasterise(footprints, rgb, width, width)
-        train.append(View(seen_by, quantise(image / alpha[..., None].clamp_min(1e-3)), f"{i}", alpha=quantise(alpha)))
+        train.append(View(viewpoint, quantise(image / alpha[..., None].clamp_min(1e-3)), f"{i}", alpha=quantise(alpha)))
     points = Points(field.means.detach(), (0.5 + BAND_0 * field.sh_dc[:, 0].detach()).clamp(0, 1))
     return Scene("benchmark", tuple(train), (), torch.ones(3), bounds(), points=points)
 
 
 def occupied(resolution: int, points: int = 200_000) -> Bool[Tensor, "r r r"]:
-    """Cells of the unit cube that the object's surface passes through, and those beside them."""
+    """Occupancy grid: cells that the object's surface passes through, dilated by one."""
     unit = bounds().to_unit(_surface(points, torch.Generator().manual_seed(0)))
     x, y, z = (unit * resolution).long().clamp(0, resolution - 1).unbind(1)
     cells = torch.zeros(resolution, resolution, resolution)
