@@ -90,9 +90,9 @@ def test_a_name_may_carry_changes() -> None:
     """Its own changes come last, and its own preset first; the name stays whole, so that it makes the method again."""
     name = "volumetric/nerf:preset=paper:field.width=96:batches.rays=77"
     assert split_name(name) == ("volumetric/nerf", "paper", ("field.width=96", "batches.rays=77"))
-    method = load_method(name, "laptop", ["field.width=8", "field.layers=3"])
+    method = load_method(name, "laptop", ["field.width=8", "field.layers=7"])
     assert (method.name, method.preset) == (name, "paper")
-    assert (method.recipe.field.width, method.recipe.field.layers, method.recipe.batches.rays) == (96, 3, 77)
+    assert (method.recipe.field.width, method.recipe.field.layers, method.recipe.batches.rays) == (96, 7, 77)
     assert split_name("C:/mine.toml") == ("C:/mine.toml", None, ())
     assert slug(name) == "volumetric-nerf-preset=paper-field.width=96-batches.rays=77"
     listed = "splatting/gaussians:batches.resolution=[0.5,1.0],volumetric/hash"
