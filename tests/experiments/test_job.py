@@ -12,7 +12,7 @@ from invgraphics.experiments.identity import define
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import CompareRequest, FitRequest
 from invgraphics.recipes import recipe
-from invgraphics.scenes.corrupt import TrainingData
+from invgraphics.scenes.degrade import TrainingData
 from invgraphics.scenes.open import SceneOptions
 from invgraphics.training.budget import Budget, Cadence
 

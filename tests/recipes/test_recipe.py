@@ -1,5 +1,8 @@
 """Recipes: every built-in method builds under every preset; overrides and errors."""
 
+import copy
+import hashlib
+import json
 import tomllib
 
 import pytest
@@ -9,7 +12,7 @@ from invgraphics.cli.arguments import parse_list
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.request import slug
-from invgraphics.recipes.recipe import load_method, methods, migrate, presets, resolve, split_name
+from invgraphics.recipes.recipe import load_method, methods, presets, resolve, split_name
 from invgraphics.testing import check_field, check_renderer, toy_scene
 
 CELLS = [(name, preset) for name in methods() for preset in (*presets(name), "")]
@@ -74,16 +77,54 @@ def test_a_users_own_file_is_a_method(tmp_path) -> None:
         tomllib.loads(own.read_text())
 
 
-def test_recipes_of_older_runs_still_resolve() -> None:
+@pytest.mark.parametrize(
+    ("hook", "words"),
+    [
+        ("density_control", "Gaussians"),
+        ("relocation", "Gaussians"),
+        ("smoothing", "Gaussians"),
+        ("limits", "Gaussians"),
+        ("sh_degree", "spherical harmonics"),
+    ],
+)
+def test_hooks_that_the_field_cannot_serve_are_refused_before_anything_is_built(hook: str, words: str) -> None:
+    table = load_method("volumetric/hash").table
+    with pytest.raises(InputError, match=f"hook '{hook}' needs {words}, which NeuralField does not have"):
+        resolve("mine", "", table | {"hooks": [{"type": hook}]})
+
+
+def test_a_cap_reaches_the_field_and_the_hooks_that_make_primitives() -> None:
+    recipe = load_method("splatting/gaussians", overrides=["max_primitives=123"]).recipe
+    assert recipe.field.max_init == recipe.field.count == 123
+    assert [hook.max_primitives for hook in recipe.hooks if hasattr(hook, "max_primitives")] == [123]
+    assert load_method("volumetric/hash", overrides=["max_primitives=123"]).recipe.field.layers == 1
+
+
+def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
+    """With the keys as they were first called; the digest, by which runs are found again, is over those names."""
+    method = load_method("splatting/gaussians", "long")
+    table = copy.deepcopy(method.table)
+    (hook,) = [hook for hook in table["hooks"] if hook["type"] == "density_control"]
+    for new, old in {"revised_opacity": "share_opacity", "cap_ramp": "pace", "latest_start_step": "start_steps"}.items():
+        hook[old] = hook.pop(new)
+    for new, old in {"antialiased": "compensate", "max_grad_splats": "receivers"}.items():
+        table["renderer"][old] = table["renderer"].pop(new)
+    assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
+    again = resolve(method.name, "long", table)
+    assert again.recipe == method.recipe and again.table == method.table
+    assert again.digest == method.digest == hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
+    with pytest.raises(InputError, match=r"Unknown key 'hooks\.1\.pace'"):
+        resolve(method.name, "", table | {"hooks": [table["hooks"][0], {"type": "density_control", "pace": 1, "cap_ramp": 1}]})
+
+
+def test_renderers_of_older_runs_still_resolve() -> None:
     now = load_method("splatting/gaussians-mip", None, ["renderer.max_grad_splats=10"])
     renderer = {key: value for key, value in now.table["renderer"].items() if key not in ("antialiased", "max_grad_splats")}
     older = now.table | {"renderer": renderer | {"compensate": True, "receivers": 10}}
-    with pytest.raises(InputError, match="compensate"):
-        resolve(now.name, now.preset, older)
-    assert resolve(now.name, now.preset, migrate(older)).digest == now.digest
+    assert resolve(now.name, now.preset, older).table == now.table
     hashed = load_method("volumetric/hash").table
     sampler = {("wave" if key == "chunk" else key): value for key, value in hashed["renderer"]["sampler"].items()}
-    assert migrate(hashed | {"renderer": hashed["renderer"] | {"sampler": sampler}}) == hashed
+    assert resolve("mine", "", hashed | {"renderer": hashed["renderer"] | {"sampler": sampler}}).table == hashed
 
 
 def test_a_name_may_carry_changes() -> None:

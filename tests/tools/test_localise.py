@@ -12,7 +12,6 @@ from invgraphics.cli.main import run as command
 from invgraphics.core.transforms import apply_similarity, look_at
 from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import open_fitted
-from invgraphics.experiments.posed import inverse
 from invgraphics.metrics.poses import Similarity, rotation_angle
 from invgraphics.training.poses import motion_about
 
@@ -136,4 +135,4 @@ def test_the_way_back_undoes_a_similarity() -> None:
     turn = look_at(*(torch.randn(3, dtype=torch.float64) for _ in range(3)))[:3, :3]
     similarity = Similarity(1.7, turn, torch.tensor([0.3, -2.0, 0.7]).double())
     points = torch.randn(5, 3, dtype=torch.float64)
-    torch.testing.assert_close(inverse(similarity).points(similarity.points(points)), points)
+    torch.testing.assert_close(similarity.inverse().points(similarity.points(points)), points)

@@ -122,7 +122,7 @@ def test_processor_time_is_counted_beside_the_clock(scene, make_fit) -> None:
     resumed = make_fit("volumetric/nerf", scene, 9)
     resumed.load(fit.state(), clocks["seconds"])
     resumed.resume_clocks(clocks)
-    resumed.rehearse()  # on no clock
+    resumed.warmup_step()  # on no clock
     assert (resumed.clocks()["seconds"], resumed.clocks()["cpu_seconds"]) == (clocks["seconds"], clocks["cpu_seconds"])
     if clocks["ran_seconds"] is not None:
         assert resumed.clocks()["ran_seconds"] >= clocks["ran_seconds"] > 0

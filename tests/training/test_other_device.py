@@ -16,7 +16,7 @@ METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
 def test_fit_and_evaluate_elsewhere(name: str, scene, small) -> None:
     with other_device() as device:
         fit = Fit(build_plan(small(name), scene, Budget(steps=12), 0, device))
-        fit.rehearse()
+        fit.warmup_step()
         fit.run(lambda loss: False)
         assert fit.steps == 12
         assert all(isinstance(parameter, Elsewhere) for parameter in fit.plan.model.field.parameters())

@@ -32,7 +32,7 @@ class View:
         depth: true distance along the unit ray, local units, inf where nothing is hit; one ray per pixel centre.
         normal: true unit normal, local frame, facing the camera; zero where nothing is hit.
         mask: True where the pixel counts; ``None`` means everywhere.
-        undisturbed: the camera's pose before it was disturbed on purpose; ``None`` where it was not. For scores only.
+        ground_truth_pose: the camera's pose before it was degraded on purpose; ``None`` where it was not. For scores only.
     """
 
     camera: Camera
@@ -42,12 +42,12 @@ class View:
     depth: Float[Tensor, "h w"] | None = None
     normal: Float[Tensor, "h w 3"] | None = None
     mask: Tensor | None = None
-    undisturbed: Float[Tensor, "4 4"] | None = None
+    ground_truth_pose: Float[Tensor, "4 4"] | None = None
 
     @property
     def true_pose(self) -> Float[Tensor, "4 4"]:
         """The best that is known of the camera's pose; fits see ``camera`` only."""
-        return self.camera.cam_to_world if self.undisturbed is None else self.undisturbed
+        return self.camera.cam_to_world if self.ground_truth_pose is None else self.ground_truth_pose
 
     def colour(self, index: Tensor | None = None) -> Float[Tensor, "*p 3"]:
         """Straight colour as floats: the whole image, or the pixels with flat indices ``index`` only."""
@@ -84,6 +84,10 @@ class Points:
 
     def __len__(self) -> int:
         return len(self.position)
+
+    def joined(self, others: Points) -> Points:
+        """These points, then the others."""
+        return Points(torch.cat([self.position, others.position]), torch.cat([self.rgb, others.rgb]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from invgraphics.recipes.schema import Recipe
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Plan
-from invgraphics.training.poses import make_poses, windows
+from invgraphics.training.poses import coarse_to_fine_encodings, make_poses
 
 
 def device_of(name: str | None) -> torch.device:
@@ -47,7 +47,7 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -
     model = Model(method.recipe.field.build(scene), method.recipe.renderer.build(scene), scene.bounds)
     training = method.recipe.training
     if training is not None and training.poses is not None and training.poses.optimise:
-        for encoding in windows(model):
+        for encoding in coarse_to_fine_encodings(model):
             encoding.add_window()
     return model.to(device)
 
@@ -64,7 +64,7 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
         hooks=[hook.build() for hook in recipe.hooks],
         optimiser=recipe.optimiser
         if poses is None
-        else poses.config.optimiser(recipe.optimiser, _seen(recipe, model.renderer, scene)),
+        else poses.config.optimiser(recipe.optimiser, _view_share(recipe, model.renderer, scene)),
         batches=recipe.batches if poses is None else poses.config.batches(recipe.batches),
         budget=budget,
         seed=seed,
@@ -73,8 +73,8 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
     )
 
 
-def _seen(recipe: Recipe, renderer: Renderer, scene: Scene) -> float:
-    """Share of the training views that one step sees."""
+def _view_share(recipe: Recipe, renderer: Renderer, scene: Scene) -> float:
+    """Share of the training views in one step's batch."""
     views = len(scene.train)
     return min(recipe.batches.views, views) / views if isinstance(renderer, RayRenderer) else 1 / views
 

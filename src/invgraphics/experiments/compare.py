@@ -21,7 +21,7 @@ from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 
 
 def compare(request: CompareRequest) -> tuple[Path, int]:
@@ -77,7 +77,7 @@ def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
     RunFolder(Path(request.out)).create()
     scene = open_with_progress(request.scene, jobs[0].options)
     check_variants(jobs[0].variants, [job.method for job in jobs], scene)
-    return jobs, corrupt(scene, jobs[0].data, request.seeds[0])
+    return jobs, degrade(scene, jobs[0].data, request.seeds[0])
 
 
 def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> dict[str, Any]:

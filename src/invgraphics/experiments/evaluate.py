@@ -15,11 +15,11 @@ from PIL import Image
 
 from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
-from invgraphics.experiments.shortfall import observe, shortfall
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
@@ -92,14 +92,14 @@ def score_model(
 
     Args:
         model: what is scored.
-        scene: undisturbed.
+        scene: as loaded.
         protocol: name of the rules.
         title: what the model is called, on the progress bar and in sentences.
         poses: of the training views, where the fit has refined them: test poses are then aligned and refined first.
         keep: is given each picture with the number of its view.
     """
     rules = protocol_named(protocol)
-    scores, seconds, observed = [], [], []
+    scores, seconds, statistics_of_views = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
     with Reporter(f"{title} evaluation") as reporter:
         model.render(scene.test[0].camera.resized(16, 16))  # first use pays for allocation
@@ -108,10 +108,10 @@ def score_model(
             timed = index % ceil(len(scene.test) / TIMED) == 0
             picture, took = _picture(model, camera, normals=view.normal is not None, timed=timed)
             seconds += took
-            picture = picture if posed is None else posed.as_seen(picture, camera, view)
+            picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
             keep(index, picture)
             scores.append(score(picture, view, scene, rules))
-            observed.append(observe(picture, view.camera, scene))
+            statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
     return {
@@ -121,7 +121,7 @@ def score_model(
         "cost": _model_costs(model, scene, statistics.median(seconds)),
         "quality": quality if posed is None else quality | posed.quality(),
         "skipped": skipped,
-        **shortfall(title, quality, observed, scene, rules),
+        **below_baseline(title, quality, statistics_of_views, scene, rules),
     }
 
 

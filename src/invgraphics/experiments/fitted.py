@@ -13,10 +13,10 @@ from invgraphics import plugins
 from invgraphics.core import Model, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
-from invgraphics.experiments.posed import optimised, scene_of_fit
+from invgraphics.experiments.posed import refined_poses, scene_in_fit_frame
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.openmp import limit_spinning
-from invgraphics.recipes.recipe import Method, migrate, resolve
+from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -30,7 +30,7 @@ class Fitted:
     Attributes:
         folder: of the run.
         method: its recipe.
-        scene: undisturbed, at the run's size and with its test views.
+        scene: as loaded, at the run's size and with its test views.
         model: fitted, on the run's device.
         source: the folder that holds the checkpoint: the run itself, or the run that a rendering shows.
         poses: of the training views as the fit saw them, where it refined them.
@@ -56,7 +56,7 @@ class Fitted:
 
     def in_its_frame(self) -> Fitted:
         """The same with the scene where the fit has it: a fit that refines poses may drift from those that it was given."""
-        return self if self.poses is None else replace(self, scene=scene_of_fit(self.poses, self.scene))
+        return self if self.poses is None else replace(self, scene=scene_in_fit_frame(self.poses, self.scene))
 
 
 def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
@@ -90,7 +90,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
         model = replace(model, renderer=model.renderer.untrained())
     source = folder if shown is None else RunFolder(folder.root / shown)
     state = checkpoint.load(source.checkpoint, device)
-    config = optimised(method)
+    config = refined_poses(method)
     fitted = Fitted(folder, method, scene, model, source)
     try:
         poses = Poses.restored(config, state["poses"]).to(device) if config is not None and "poses" in state else None
@@ -107,7 +107,7 @@ def _method(folder: RunFolder, provenance: Mapping[str, Any]) -> Method:
         InputError: it cannot be resolved here; where packages are missing that the run was made with, the sentence names them.
     """
     try:
-        return resolve(provenance["method"], provenance["preset"], migrate(folder.read_recipe()))
+        return resolve(provenance["method"], provenance["preset"], folder.read_recipe())
     except InputError as error:
         used: Mapping[str, str] = provenance.get("plugins", {})
         missing = sorted({package for package in used.values() if not plugins.installed(package)})

@@ -36,9 +36,9 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
     """The identity of a run: equal for equal bits, on one machine.
 
     Args:
-        job: of the run; its disturbances of training data follow from the undisturbed truth, the settings and the seed, so that
+        job: of the run; its degradations of training data follow from the truth as loaded, the settings and the seed, so that
             nothing needs to be disturbed to know them.
-        truth: of the undisturbed scene.
+        truth: of the scene as loaded.
         threads: of the process that fits, which decide the order of sums.
     """
     method = job.method

@@ -15,7 +15,7 @@ from invgraphics.experiments.variants import RendererVariant, variant_named
 from invgraphics.metrics.protocols import Protocol, protocol_named
 from invgraphics.recipes.recipe import Method, assign, load_method
 from invgraphics.runs.folder import RunFolder
-from invgraphics.scenes.corrupt import TrainingData
+from invgraphics.scenes.degrade import TrainingData
 from invgraphics.scenes.open import SceneOptions
 from invgraphics.training.budget import Budget, Cadence
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
-from invgraphics.experiments.posed import carried, into_fit
+from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
@@ -52,9 +52,9 @@ class Monitor:
         background = self._scene.background.to(self._device)
         errors = []
         poses = fit.plan.poses
-        drift = None if poses is None else into_fit(poses, self._scene)
+        drift = None if poses is None else world_to_fit(poses, self._scene)
         for view, flat in zip(self._views, self._pixels, strict=True):
-            camera = view.camera if drift is None else carried(view.camera, drift)
+            camera = view.camera if drift is None else transform_camera(view.camera, drift)
             prediction = self._predict(fit, camera, flat, ctx, background)
             errors.append((prediction.clamp(0, 1).cpu() - view.over(self._scene.background, flat)).square().mean())
         return -10 * math.log10(max(float(torch.stack(errors).mean()), 1e-10))

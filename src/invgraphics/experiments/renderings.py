@@ -68,7 +68,7 @@ def render_missing(job: Job, scene: Scene) -> None:
 
     Args:
         job: of the fit.
-        scene: the undisturbed scene.
+        scene: the scene as loaded.
     """
     if rendered(job):
         return

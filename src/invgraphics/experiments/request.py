@@ -10,7 +10,7 @@ from typing import Any, Literal
 Existing = Literal["refuse", "resume", "reuse"]
 
 DATA = "data."
-"""How the keys begin that change the training data rather than the recipe (`invgraphics.scenes.corrupt.TrainingData`)."""
+"""How the keys begin that change the training data rather than the recipe (`invgraphics.scenes.degrade.TrainingData`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,7 +39,7 @@ from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder, write_json
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import choices
 from invgraphics.training.fit import Fit
 
@@ -74,7 +74,7 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
     with folder.held():
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
-        shown = corrupt(scene, job.data, request.seed)
+        shown = degrade(scene, job.data, request.seed)
         identity = identify(job, TruthDigest.of(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
@@ -96,7 +96,7 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
             else:
                 folder.clear()
             describe(job, (scene, shown), identity)
-            forecast = _rehearse(job, fit, memory)
+            forecast = _warm_up(job, fit, memory)
             if "suspicion" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
             for sentence in (*announcements([method.choice]), _prediction(job, fit, forecast)):
@@ -128,13 +128,13 @@ def _check_existing(folder: RunFolder, request: FitRequest) -> None:
     folder.create()
 
 
-def _rehearse(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
+def _warm_up(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
     """Take a step and a look of the monitor that count for nothing; the memory that they needed tells what the fit will need.
 
     Raises:
         InputError: the primitives would need more memory than the machine has.
     """
-    fit.rehearse()
+    fit.warmup_step()
     Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
     folder = job.folder
     forecast = memory_forecast(fit.plan, job.method, memory.peak_bytes)
@@ -160,7 +160,7 @@ def _declare_clocks(folder: RunFolder, spent: Mapping[str, Any]) -> None:
 
 
 def _evaluate(job: Job, scene: Scene, fit: Fit, spent: dict[str, Any]) -> None:
-    """Score the fit on the undisturbed scene. ``scores.json`` comes last, because a run that has it is finished."""
+    """Score the fit on the scene as loaded. ``scores.json`` comes last, because a run that has it is finished."""
     job.folder.write_json("fit.json", spent)
     for protocol in job.protocols:
         evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
@@ -171,7 +171,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str, origin: Mappi
 
     Args:
         job: of the run.
-        scenes: undisturbed, and as the fit sees it.
+        scenes: as loaded, and as the fit sees it.
         identity: of the run.
         origin: provenance that takes precedence, of a model that was not fitted here.
     """

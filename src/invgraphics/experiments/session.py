@@ -24,7 +24,7 @@ from invgraphics.experiments.start import memory_forecast
 from invgraphics.experiments.variants import variant_named, with_renderer
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 from invgraphics.training.poses import Poses
@@ -89,7 +89,7 @@ class FittedRun(ABC):
 
     Attributes:
         method: what was fitted.
-        scene: undisturbed, with the views that score it.
+        scene: as loaded, with the views that score it.
     """
 
     method: Method
@@ -162,7 +162,7 @@ class MemoryRun(FittedRun):
 
     Args:
         job: what to fit, and how.
-        scene: undisturbed.
+        scene: as loaded.
         on_step: is given the fit before its first step and after each one.
 
     Raises:
@@ -178,8 +178,8 @@ class MemoryRun(FittedRun):
         repeatable(job.device)
         use_kernels(job.request.kernels)
         with PeakMemory(job.device) as memory:
-            self.fit = prepare(job, corrupt(scene, job.data, job.request.seed))
-            self.fit.rehearse()
+            self.fit = prepare(job, degrade(scene, job.data, job.request.seed))
+            self.fit.warmup_step()
             Monitor(self.fit.plan.scene, job.device).psnr(self.fit)
             memory_forecast(self.fit.plan, job.method, memory.peak_bytes)
         self._run()

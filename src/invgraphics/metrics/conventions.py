@@ -39,7 +39,7 @@ class Ssim:
         edges: ``valid``: windows wholly inside the picture only; or everywhere, and the picture goes on as ``zero``, as
             ``mirror`` (the edge pixel occurs once: dcb|abcd) or as ``reflect`` (twice: cba|abcd).
         data_range: the range L of the values; ``None`` measures it in each pair: the larger max - min of the two pictures.
-        grey: whether the window looks at Rec. 709 luma, instead of at each channel in turn.
+        grey: whether SSIM is computed on Rec. 709 luma, instead of on each channel.
     """
 
     kernel: tuple[float, ...] = ()
@@ -66,7 +66,7 @@ Measure = Psnr | Ssim | Lpips
 
 @dataclass(frozen=True)
 class Protocol:
-    """How pictures are scored: what is fixed before a metric looks at them, and which metrics those are.
+    """Settings of scoring: background, rounding, masks and crop of both pictures, and the metrics that compare them.
 
     No protocol below crops a picture; SSIM's own border is part of its `Ssim`. Pictures are composited in the scene's colour
     space and measured in display sRGB.
@@ -82,7 +82,7 @@ class Protocol:
         truth: rounding of the truth.
         truth_double: whether the truth is composited in double precision. It decides on which side of a whole byte truncation
             falls at the edges of things.
-        masks: what becomes of pixels that do not count: ``excluded`` from every mean, and equal in both pictures, so that
+        masks: treatment of pixels outside a view's mask: ``excluded`` from every mean, and equal in both pictures, so that
             windows see no error there; multiplied by ``zero`` in both pictures; or ``unknown`` to the tool.
         crop: pixels left out along each border.
         widest: the tool's loader scales wider pictures down to this width in pixels; ``None``: it does not.
@@ -110,7 +110,7 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 BLACK: Colour = (0.0, 0.0, 0.0)
 
 VISER_GREY: Colour = (0.1490, 0.1647, 0.2157)
-"""What splatfacto shows behind a scene when it does not train, unless told another colour."""
+"""Background of splatfacto in evaluation, unless it is configured."""
 
 NGP_KERNEL = (0.120078, 0.233881, 0.292082, 0.233881, 0.120078)
 """The window of instant-ngp's SSIM along one axis."""

@@ -51,7 +51,7 @@ def flip(pair: Pair) -> float:
 
 
 def lpips_weights(net: str = "alex") -> Path:
-    """Where a backbone of LPIPS is looked for: torch's own model cache."""
+    """Path of a backbone's weights in torch's model cache."""
     return Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[net][1]
 
 

@@ -16,6 +16,7 @@ from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.presets import select_preset
+from invgraphics.recipes.renamed import with_current_names, with_first_names
 from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
@@ -58,8 +59,8 @@ class Method:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the resolved table."""
-        return hashlib.sha256(json.dumps(self.table, sort_keys=True).encode()).hexdigest()
+        """SHA-256 of the resolved table, the same whatever its keys are called by now."""
+        return hashlib.sha256(json.dumps(with_first_names(self.table), sort_keys=True).encode()).hexdigest()
 
 
 def methods() -> dict[str, str]:
@@ -136,24 +137,16 @@ def assign(table: dict[str, Any], items: Sequence[str]) -> None:
 
 
 def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
-    """A method from a complete table, for instance from a run's ``recipe.toml``."""
+    """A method from a complete table, for instance from a run's ``recipe.toml``; keys may have names of earlier versions.
+
+    Raises:
+        InputError: unknown key, a value of the wrong type, or a hook that the field cannot serve.
+    """
     from invgraphics.recipes.schema import Recipe
 
-    recipe = fill(Recipe, table).capped()
+    recipe = fill(Recipe, with_current_names(table)).capped()
+    recipe.check_hooks()
     return Method(name, preset, recipe, to_table(recipe))
-
-
-RENAMED = {"compensate": "antialiased", "receivers": "max_grad_splats", "wave": "chunk"}
-"""Keys of ``[renderer]`` in recipes of older runs, and their names now."""
-
-
-def migrate(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A run's table with the keys of its renderer as they are named now."""
-
-    def renamed(part: Any) -> Any:
-        return {RENAMED.get(key, key): renamed(value) for key, value in part.items()} if isinstance(part, Mapping) else part
-
-    return {key: renamed(value) if key == "renderer" else value for key, value in table.items()}
 
 
 def source(name: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A scene in one ``.npz``: the simplest thing a person can write with ``numpy.savez``.
+"""Scenes in one ``.npz`` file, as ``numpy.savez`` writes it.
 
 ============== ============================== =====================================================================
 key            shape                          meaning
@@ -239,6 +239,6 @@ def _beyond(scene: Scene) -> str:
         f"{' and '.join(mixed)} for some views only": bool(mixed),
         "pictures of several sizes": len({(camera.width, camera.height) for camera in cameras}) > 1,
         "a background other than the default": scene.background.tolist() != [float(scene.has_alpha)] * 3,
-        "poses that are disturbed on purpose": any(view.undisturbed is not None for view in views),
+        "poses that are degraded on purpose": any(view.ground_truth_pose is not None for view in views),
     }
     return next((what for what, present in found.items() if present), "")

@@ -165,11 +165,11 @@ def _description(spec: str) -> str | None:
 
 def _render(description: str, options: SceneOptions, progress: Callable[[int, int, str], None] | None) -> Path:
     from invgraphics.scenes.mitsuba import make
-    from invgraphics.scenes.mitsuba.spec import locate, read
+    from invgraphics.scenes.mitsuba.spec import description_path, read
 
     size = options.size
     if isinstance(size, int):
-        width, height = read(locate(description)).size
+        width, height = read(description_path(description)).size
         size = (round(size * width / max(width, height)), round(size * height / max(width, height)))
     return make(
         description,

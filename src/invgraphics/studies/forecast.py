@@ -14,7 +14,7 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.start import CHECKPOINT_COPIES
 from invgraphics.experiments.variants import with_renderer
 from invgraphics.metrics.cost import model_bytes
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 
@@ -88,7 +88,7 @@ def try_method(job: Job, scene: Scene) -> Cost:
     seed, device = job.request.seed, job.device
     use_kernels(job.request.kernels)
     pixels = sum(view.camera.width * view.camera.height for view in scene.test)
-    shown = corrupt(scene, job.data, seed)
+    shown = degrade(scene, job.data, seed)
     try:
         fit = Fit(build_plan(job.method, shown, job.budget, seed, device))
         fit.step()  # the first compiles and allocates

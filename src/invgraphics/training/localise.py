@@ -1,4 +1,4 @@
-"""One photograph's pose, by gradient descent through a scene that is fitted already (iNeRF, Yen-Chen et al. 2021)."""
+"""Pose of one photograph in a fitted scene, by gradient descent on its photometric error (iNeRF, Yen-Chen et al. 2021)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from invgraphics.training.poses import motion_about, pivot_depth
 
 
 @dataclass(frozen=True)
-class Descent:
-    """How a pose is searched for.
+class PoseDescent:
+    """Settings of a descent on a pose.
 
     Attributes:
         steps: of Adam.
@@ -37,14 +37,14 @@ class Descent:
         return self.lr * (self.final / self.lr) ** (step / max(self.steps - 1, 1))
 
 
-def descend(model: Model, view: View, scene: Scene, descent: Descent) -> Camera:
-    """The camera that, starting from the view's, shows what its photograph shows; a rigid motion in its own frame away.
+def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) -> Camera:
+    """Refine a view's camera to its photograph: a rigid motion in the camera's frame that lowers the photometric error.
 
     Args:
         model: fitted; not changed.
-        view: photograph, and where the search starts.
+        view: photograph, and the camera to start from.
         scene: for its bounds, extent and background.
-        descent: how far and how fast. The pixels of all steps are drawn from one fixed seed.
+        descent: steps and learning rates. The pixels of all steps are drawn from one fixed seed.
     """
     device = model.device
     small = _at_scale(view, descent.scale)
@@ -55,11 +55,11 @@ def descend(model: Model, view: View, scene: Scene, descent: Descent) -> Camera:
     ctx = model.context()
     start = small.camera.to(device)
     pivot = pivot_depth(start, scene)
-    with _fixed(*model.parts.values()):
+    with _frozen(*model.parts.values()):
         for step in range(descent.steps):
             adam.param_groups[0]["lr"] = descent.rate(step)
             camera = start.moved(start.cam_to_world @ motion_about(twist * reach, pivot))
-            colour, target = _compared(model, camera, (small, scene), ctx, (descent.rays, generator))
+            colour, target = _predicted_and_true(model, camera, (small, scene), ctx, (descent.rays, generator))
             loss = (colour - target).square().mean()
             adam.zero_grad()
             loss.backward()
@@ -69,8 +69,8 @@ def descend(model: Model, view: View, scene: Scene, descent: Descent) -> Camera:
         return view.camera.moved(pose.to(view.camera.cam_to_world))
 
 
-def difference(model: Model, view: View, scene: Scene, scale: float = 1.0) -> float:
-    """Mean squared difference between a photograph and what its camera shows, colours in front of the scene's background."""
+def photometric_error(model: Model, view: View, scene: Scene, scale: float = 1.0) -> float:
+    """Mean squared error between a view's photograph and its camera's rendering, both over the scene's background."""
     small = _at_scale(view, scale)
     picture = model.render(small.camera, normals=False)
     counted = torch.ones_like(small.opacity(), dtype=torch.bool) if small.mask is None else small.mask
@@ -83,10 +83,10 @@ def _at_scale(view: View, scale: float) -> View:
     return view if (width, height) == (view.camera.width, view.camera.height) else scaled_view(view, width, height)
 
 
-def _compared(
+def _predicted_and_true(
     model: Model, camera: Camera, truth: tuple[View, Scene], ctx: Context, draw: tuple[int, torch.Generator]
 ) -> tuple[Tensor, Tensor]:
-    """Colours seen and photographed at the pixels of one step."""
+    """Rendered and true colours at the pixels of one step."""
     view, scene = truth
     background = scene.background.to(camera.focal.device)
     batch = Batch(view.over(scene.background), view.opacity(), background)
@@ -102,8 +102,8 @@ def _compared(
 
 
 @contextmanager
-def _fixed(*modules: nn.Module) -> Iterator[None]:
-    """Without gradients towards the modules' parameters, which saves computing them."""
+def _frozen(*modules: nn.Module) -> Iterator[None]:
+    """Within the block, no gradients of the modules' parameters are computed."""
     learning = [parameter for module in modules for parameter in module.parameters() if parameter.requires_grad]
     for parameter in learning:
         parameter.requires_grad_(False)

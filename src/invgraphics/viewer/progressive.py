@@ -123,10 +123,12 @@ class ProgressiveRenderer:
 
     Args:
         runs: one or two; cameras are in the first one's local frame.
+        clock: seconds; render times are differences of it.
     """
 
-    def __init__(self, runs: Sequence[LoadedRun]) -> None:
+    def __init__(self, runs: Sequence[LoadedRun], clock: Callable[[], float] = time.perf_counter) -> None:
         self.runs = tuple(runs)
+        self._clock = clock
         self.resolutions = {run: AdaptiveResolution() for run in self.runs}
 
     def render(self, request: RenderRequest, on_frame: Callable[[Frame], None]) -> Task:
@@ -150,11 +152,13 @@ class ProgressiveRenderer:
             _Side(each, self.resolutions[each.run].pyramid_scales(*each.pixels, request.skip_coarse, len(panels)))
             for each in panels
         ]
-        moving = not request.skip_coarse
+        moving, began = not request.skip_coarse, self._clock()
         for side in sides:
             while not self._advance(side, request, untiled=moving):
                 yield 0.0
         on_frame(self._compose(request, sides, letterbox))
+        if moving:
+            self._learn(sides, self._clock() - began)
         yield SETTLE_SECONDS if moving else 0.0
         while waiting := [side for side in sides if side.scales]:
             # The side with the least time so far: a fast run is fine long before a slow one.
@@ -162,21 +166,27 @@ class ProgressiveRenderer:
                 on_frame(self._compose(request, sides, letterbox))
             yield 0.0
 
+    def _learn(self, sides: Sequence[_Side], seconds: float) -> None:
+        """Adapt the resolution of each side to a frame that took ``seconds``; composing and encoding are shared equally."""
+        shared = (seconds - sum(side.spent for side in sides)) / len(sides)
+        for side in sides:
+            assert side.latest is not None
+            _, rendering, took = side.latest
+            self.resolutions[side.panel.run].update(rendering.alpha.numel(), took + shared)
+
     def _advance(self, side: _Side, request: RenderRequest, untiled: bool) -> bool:
         """Render the next strip of a side's level; whether that has finished it."""
-        panel, began, finished = side.panel.at(side.scales[0]), time.perf_counter(), None
+        panel, began, finished = side.panel.at(side.scales[0]), self._clock(), None
         if side.task is None:
             side.task, side.began = self._render(panel, request.output == "normal", untiled), side.spent
         try:
             next(side.task)
         except StopIteration as stop:
             finished = stop.value
-        side.spent += time.perf_counter() - began
+        side.spent += self._clock() - began
         if finished is None:
             return False
         took = side.spent - side.began
-        if untiled:
-            self.resolutions[panel.run].update(finished.alpha.numel(), took)
         side.latest, side.task = (panel, finished, took), None
         side.scales.pop(0)
         return True
@@ -202,17 +212,14 @@ class ProgressiveRenderer:
             # A splat's footprint depends on its distance to the image's border, so tiles would not match.
             picture = run.render(camera, geometry)
             return picture if panel.whole else _columns(picture, columns)
-        resolution = self.resolutions[run]
-        rows = camera.height if untiled else resolution.strip_rows(columns[1] - columns[0])
+        # Strips do not adapt the resolution: one of empty background is fast, and the next movement would be slow.
+        rows = camera.height if untiled else self.resolutions[run].strip_rows(columns[1] - columns[0])
         parts = []
         for top in range(0, camera.height, rows):
             if parts:
                 yield 0.0
             strip = subregion(camera, columns, (top, min(top + rows, camera.height)))
-            began = time.perf_counter()
             parts.append(run.render(strip, geometry))
-            if not untiled and strip.height == rows:
-                resolution.update(strip.width * rows, time.perf_counter() - began)
         return Rendering.cat(parts)
 
     def _compose(self, request: RenderRequest, sides: Sequence[_Side], letterbox: LetterboxedView | None) -> Frame:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-TARGET_SECONDS = 0.08
-"""Render time per frame while the camera moves, seconds; with sending, ten frames a second. Also of one strip of a still."""
+TARGET_SECONDS = 0.085
+"""Time from request to frame while the camera moves, encoding included: ten frames a second, with a margin for noise. Also of
+one strip of a still."""
 SETTLE_SECONDS = 0.2
 """Seconds without input after which the camera counts as at rest."""
 INITIAL_PIXELS, MIN_PIXELS, MAX_PIXELS = 40 * 40, 12 * 12, 1 << 22
 """Pixel budget: initial value and range."""
-MAX_CHANGE = 2.0
-"""Largest factor by which one measurement changes the budget: single measurements are noisy."""
+MAX_RISE, MAX_DROP = 2.0, 8.0
+"""Largest factors by which one measurement raises or lowers the budget: a slow frame is worse than a coarse one."""
 PYRAMID_FACTOR = 2.5
 """Approximate ratio of sides between levels: all coarser levels cost a fifth of the last."""
 
@@ -30,7 +31,7 @@ class AdaptiveResolution:
     def update(self, pixels: int, seconds: float) -> None:
         """Update the budget from one measurement: ``pixels`` rendered in ``seconds``."""
         wanted = pixels * TARGET_SECONDS / max(seconds, 1e-6)
-        self.pixels = min(max(wanted, self.pixels / MAX_CHANGE, MIN_PIXELS), self.pixels * MAX_CHANGE, float(MAX_PIXELS))
+        self.pixels = min(max(wanted, self.pixels / MAX_DROP, MIN_PIXELS), self.pixels * MAX_RISE, float(MAX_PIXELS))
 
     def pyramid_scales(self, width: int, height: int, skip_coarse: bool = False, renderers: int = 1) -> list[float]:
         """Scales of the levels that lead to ``width`` x ``height``, from coarse to 1.

@@ -1,4 +1,4 @@
-"""What the parent process asks the rendering process for, and the hash under which the answer is kept."""
+"""Rendering jobs, and the hash that is their key in the cache."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.config import fill, to_table
-from invgraphics.scenes.mitsuba.spec import Counts, Samples, SceneSpec
+from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel, SceneSpec
 
 # The sources that decide pixels, relative to the package; the rest (caching, messages) does not.
 _SOURCES = (
@@ -31,7 +31,7 @@ class Source:
 
     size: tuple[int, int]
     views: Counts
-    samples: Samples
+    samples: SamplesPerPixel
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Job:
     spec: SceneSpec
     size: tuple[int, int]
     views: Counts
-    samples: Samples
+    samples: SamplesPerPixel
     seed: int
     variant: str
     source: Source | None = None

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from invgraphics.core import Bounds, Camera, Rendering, Scene, View
-from invgraphics.experiments.shortfall import observe, shortfall
+from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 
 
@@ -37,7 +37,7 @@ def test_says_why_and_what_to_try(method: str, colour: float, alpha: float, dept
     shown, rules = scene(), protocol_named("default")
     prediction, view = picture(colour, alpha, depth), scene().test[0]
     quality, _ = summarise([score(prediction, view, shown, rules, only=("psnr",))], rules)
-    found = shortfall(method, quality, [observe(prediction, view.camera, shown)], shown, rules)
+    found = below_baseline(method, quality, [coverage_and_depth(prediction, view.camera, shown)], shown, rules)
     if words:
         sentence = found["shortfall"]
         assert words in sentence
@@ -50,6 +50,6 @@ def test_says_why_and_what_to_try(method: str, colour: float, alpha: float, dept
 
 def test_says_nothing_where_there_is_nothing_to_compare_with() -> None:
     shown = scene()
-    assert shortfall("volumetric/hash", {}, [], shown, protocol_named("default")) == {}
+    assert below_baseline("volumetric/hash", {}, [], shown, protocol_named("default")) == {}
     alone = shown.with_views(train=())
-    assert shortfall("volumetric/hash", {"psnr": {"mean": 1.0}}, [], alone, protocol_named("default")) == {}
+    assert below_baseline("volumetric/hash", {"psnr": {"mean": 1.0}}, [], alone, protocol_named("default")) == {}

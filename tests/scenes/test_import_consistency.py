@@ -7,10 +7,10 @@ import pycolmap
 import pytest
 from dots import ring
 
-from invgraphics.scenes.photos.pairs import Evidence, Pair
+from invgraphics.scenes.photos.consistency import MATCHES, check_consistency, explained, parallax, sampson
+from invgraphics.scenes.photos.pairs import MatchedPair, VerifiedMatches
 from invgraphics.scenes.photos.plausible import folds, implausible
 from invgraphics.scenes.photos.prepare import Prepared
-from invgraphics.scenes.photos.suspicion import MATCHES, examine, explained, parallax, sampson
 
 EYES = ring(8, distortion=None)
 NAMES = [f"{index}.png" for index in range(len(EYES))]
@@ -28,11 +28,11 @@ def model_of(eyes, focal_factor: float = 1.0) -> pycolmap.Reconstruction:
     return model
 
 
-def matches(first: int, second: int, count: int = 60, seen_as: int | None = None) -> Pair:
+def matches(first: int, second: int, count: int = 60, seen_as: int | None = None) -> MatchedPair:
     """Random points in both photographs; the second may show them as another camera would (the scene looks alike there)."""
     points = np.random.default_rng(first * 100 + second).uniform(-1, 1, (count, 3))
     other = EYES[second if seen_as is None else seen_as]
-    return Pair(first, second, (EYES[first].pixels(points), other.pixels(points)))
+    return MatchedPair(first, second, (EYES[first].pixels(points), other.pixels(points)))
 
 
 def test_true_matches_are_explained_and_others_are_not() -> None:
@@ -45,13 +45,13 @@ def test_true_matches_are_explained_and_others_are_not() -> None:
 def test_a_folded_reconstruction_is_suspicious() -> None:
     """Every fifth pair saw a part that looks like another one."""
     honest = [matches(i, j) for i in range(8) for j in range(i + 1, 8)]
-    found = examine(model_of(EYES), PHOTOS, Evidence((100,) * 8, tuple(honest)))
+    found = check_consistency(model_of(EYES), PHOTOS, VerifiedMatches((100,) * 8, tuple(honest)))
     assert (found["contradicting"], found["doubtful"], found["support"], found["suspicious"]) == (0, [], 1.0, False)
     assert found["pairs"] >= 8
     mixed = [
         matches(pair.first, pair.second, seen_as=(pair.second + 3) % 8) if n % 5 == 0 else pair for n, pair in enumerate(honest)
     ]
-    found = examine(model_of(EYES), PHOTOS, Evidence((100,) * 8, tuple(mixed)))
+    found = check_consistency(model_of(EYES), PHOTOS, VerifiedMatches((100,) * 8, tuple(mixed)))
     assert found["suspicious"]
     assert found["contradicting"] >= found["broken"] >= 1
     assert found["support"] == pytest.approx(22 / 28, abs=0.05)
@@ -68,10 +68,10 @@ def test_one_broken_link_of_a_walk_is_suspicious() -> None:
     pairs = []
     for i, j in [(i, i + step) for step in (1, 2) for i in range(13 - step)]:
         seen = points[: 300 if j - i == 1 else 100]
-        pairs.append(Pair(i, j, (walk[i].pixels(seen), walk[j].pixels(seen))))
-    evidence = Evidence((100,) * 13, tuple(pairs))
-    assert not examine(model_of(walk), photos, evidence)["suspicious"]
-    found = examine(model_of(folded), photos, evidence)
+        pairs.append(MatchedPair(i, j, (walk[i].pixels(seen), walk[j].pixels(seen))))
+    evidence = VerifiedMatches((100,) * 13, tuple(pairs))
+    assert not check_consistency(model_of(walk), photos, evidence)["suspicious"]
+    found = check_consistency(model_of(folded), photos, evidence)
     assert (found["broken"], found["suspicious"]) == (1, True)
     assert found["worst"][0]["photos"] == ["6.png", "7.png"]
 
@@ -83,7 +83,7 @@ def test_a_few_mistakes_in_a_scene_that_holds_something_twice_are_not_heard() ->
         matches(pair.first, pair.second, 60, seen_as=(pair.second + 3) % 8) if n % 5 == 0 else pair
         for n, pair in enumerate(honest)
     ]
-    found = examine(model_of(EYES), PHOTOS, Evidence((100,) * 8, tuple(mixed)))
+    found = check_consistency(model_of(EYES), PHOTOS, VerifiedMatches((100,) * 8, tuple(mixed)))
     assert (found["contradicting"], found["suspicious"]) == (0, False)
 
 
@@ -95,7 +95,7 @@ def test_a_rich_mistake_between_photographs_from_far_apart_is_not_heard() -> Non
         matches(pair.first, pair.second, 200, seen_as=(pair.second + 3) % 8) if pair.second - pair.first == 4 else pair
         for pair in pairs
     ]
-    found = examine(model_of(EYES), PHOTOS, Evidence((100,) * 8, tuple(pairs)))
+    found = check_consistency(model_of(EYES), PHOTOS, VerifiedMatches((100,) * 8, tuple(pairs)))
     assert found["support"] < 0.95
     assert not found["suspicious"]
 
@@ -109,7 +109,7 @@ def test_an_inverted_reconstruction_is_suspicious() -> None:
         rotation = second.R @ first.R.T
         planes = [(points - eye.centre) / eye.focal for eye, points in zip((first, second), pair.points, strict=True)]
         assert sampson(rotation, second.t - rotation @ first.t, *planes).max() < 1e-9
-    found = examine(model_of(inverted), PHOTOS, Evidence((100,) * 8, pairs))
+    found = check_consistency(model_of(inverted), PHOTOS, VerifiedMatches((100,) * 8, pairs))
     assert found["suspicious"]
     assert len(found["doubtful"]) == 8
 
@@ -143,8 +143,8 @@ def test_impossible_cameras_are_named() -> None:
 
 
 def test_weak_pairs_and_photographs_without_a_pose_are_no_witnesses() -> None:
-    evidence = Evidence((100,) * 8, (matches(0, 4, MATCHES - 1, seen_as=1), matches(0, 7, seen_as=2)))
-    found = examine(model_of(EYES[:7]), PHOTOS, evidence)
+    evidence = VerifiedMatches((100,) * 8, (matches(0, 4, MATCHES - 1, seen_as=1), matches(0, 7, seen_as=2)))
+    found = check_consistency(model_of(EYES[:7]), PHOTOS, evidence)
     assert (found["pairs"], found["suspicious"]) == (0, False)
 
 

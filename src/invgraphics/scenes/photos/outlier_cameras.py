@@ -1,4 +1,4 @@
-"""Photographs that a reconstruction places where nothing holds them: named, and left out."""
+"""Outlier cameras of a reconstruction: few observations, or far from all others. They are deregistered and reported."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from jaxtyping import Float
 from invgraphics.scenes.photos.prepare import Prepared
 
 FEW_POINTS = 15
-"""A pose with fewer observations rests on chance: COLMAP accepts no pair of photographs with fewer verified matches."""
+"""Fewest observations of a camera that is kept: COLMAP accepts no pair of photographs with fewer verified matches."""
 
 FAR = 10.0
-"""A camera is far off if its nearest neighbour is as many times farther than those of nine in ten cameras."""
+"""Distance to the nearest neighbour, in units of the 90 % quantile of these distances, from which a camera is an outlier."""
 
 MOST = 1 / 3
-"""Share of a reconstruction's photographs of which more are no strays: then the whole is weak, and stays as it is."""
+"""Largest share of the cameras that may be outliers: beyond, the whole reconstruction is weak, and stays as it is."""
 
 _QUANTILE = 0.9
 
 
-def remove_strays(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
-    """Deregister the stray photographs of a ``pycolmap.Reconstruction``.
+def remove_outlier_cameras(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
+    """Deregister the outlier cameras of a ``pycolmap.Reconstruction``.
 
     Returns:
-        Why each was left out, by its own name.
+        Photograph -> why its camera was removed.
     """
     source = {photo.name: photo.source for photo in photos}
     images = [image for image in model.images.values() if image.has_pose]
@@ -36,9 +36,9 @@ def remove_strays(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
     frames = []
     for image, times in zip(images, far, strict=True):
         if image.num_points3D < FEW_POINTS:
-            reasons[source[image.name]] = f"a stray: it shows only {image.num_points3D} of the points"
+            reasons[source[image.name]] = f"an outlier: it observes only {image.num_points3D} of the points"
         elif times > FAR:
-            reasons[source[image.name]] = f"a stray: {times:.0f} times as far from the other cameras as they are apart"
+            reasons[source[image.name]] = f"an outlier: {times:.0f} times as far from the other cameras as they are apart"
         else:
             continue
         frames.append(image.frame_id)

@@ -1,6 +1,6 @@
-"""What can be done to training data on purpose: fewer, smaller, noisier or differently lit photographs, wrong poses.
+"""Degraded training data for studies: fewer, smaller, noisier or differently exposed photographs, poses with errors.
 
-Test views are never touched. Every disturbance is drawn per view from the run's seed, by a generator of its own, and grows
+Test views are never changed. Every degradation is drawn per view from the run's seed, by a generator of its own, and grows
 in proportion to its setting: two levels of one study share their random numbers, and leaving views out changes none that stay.
 """
 
@@ -24,12 +24,12 @@ COLOURS = {"black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "white": (1.0, 1.0
 """Backgrounds that have a name."""
 
 KEEP = "random"
-"""The background of an undisturbed scene: its photographs keep their alpha, and each step draws a colour."""
+"""The background of a scene as loaded: its photographs keep their alpha, and each step draws a colour."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """How training data differs from what the data set holds; the defaults change nothing.
+    """Degradations of the training data; the defaults change nothing.
 
     Attributes:
         train_views: number of training views, those farthest from each other first; a smaller choice is part of a larger one.
@@ -69,7 +69,7 @@ class TrainingData:
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def check(self, scene: Scene) -> None:
-        """See whether ``scene`` can be changed like this.
+        """Refuse settings that ``scene`` cannot have.
 
         Raises:
             InputError: it has fewer views, smaller photographs, or no transparency to put a background behind.
@@ -88,13 +88,13 @@ class TrainingData:
             raise InputError(f"data.background has no effect on '{scene.name}': its photographs are opaque everywhere.")
 
 
-def corrupt(scene: Scene, data: TrainingData, seed: int) -> Scene:
-    """The scene that a fit gets to see; the same object where ``data`` changes nothing.
+def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
+    """The scene with degraded training views; the same object where ``data`` changes nothing.
 
     Args:
         scene: as loaded.
         data: what to change.
-        seed: of all disturbances.
+        seed: of all degradations.
 
     Raises:
         InputError: the scene cannot be changed like this (see `TrainingData.check`).
@@ -104,7 +104,7 @@ def corrupt(scene: Scene, data: TrainingData, seed: int) -> Scene:
         return scene
     data.check(scene)
     views = [(index, scene.train[index]) for index in chosen_views(scene, data.train_views)]
-    train = [_disturbed(view, index, scene, data, seed) for index, view in views]
+    train = [_degraded(view, index, scene, data, seed) for index, view in views]
     notes = scene.notes | {"training_data": ", ".join(f"{name} = {value}" for name, value in changes.items())}
     if data.background != KEEP:
         colour = torch.tensor(COLOURS[data.background] if isinstance(data.background, str) else data.background)
@@ -131,8 +131,8 @@ def chosen_views(scene: Scene, count: int | None) -> list[int]:
     return sorted(order)
 
 
-def _disturbed(view: View, index: int, scene: Scene, data: TrainingData, seed: int) -> View:
-    """One training view, smaller and noisier; the camera's errors come first, the sensor's noise last."""
+def _degraded(view: View, index: int, scene: Scene, data: TrainingData, seed: int) -> View:
+    """One training view with pose errors, resized, then exposure and noise."""
     if data.pose_noise:
         generator = _generator(seed, "pose", index)
         # Three equal axes share the mean square.
@@ -142,7 +142,7 @@ def _disturbed(view: View, index: int, scene: Scene, data: TrainingData, seed: i
         pose[:3, :3] = pose[:3, :3] @ turn
         pose[:3, 3] += shift * scene.extent * data.pose_noise / 100
         wrong = view.camera.moved(pose.float())
-        view = replace(view, camera=wrong, depth=None, normal=None, undisturbed=view.true_pose)
+        view = replace(view, camera=wrong, depth=None, normal=None, ground_truth_pose=view.true_pose)
     if data.size is not None:
         view = _resized(view, data.size)
     if data.exposure:
@@ -154,9 +154,9 @@ def _disturbed(view: View, index: int, scene: Scene, data: TrainingData, seed: i
     return view
 
 
-def _generator(seed: int, disturbance: str, index: int) -> torch.Generator:
-    """Randomness of one disturbance of one view."""
-    digest = hashlib.sha256(f"{disturbance} {seed} {index}".encode()).digest()
+def _generator(seed: int, degradation: str, index: int) -> torch.Generator:
+    """Randomness of one degradation of one view."""
+    digest = hashlib.sha256(f"{degradation} {seed} {index}".encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
 
 

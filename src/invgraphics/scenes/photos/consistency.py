@@ -1,16 +1,15 @@
-"""A check on reconstructions that are complete, precise and wrong: do photographs agree with those they overlap most with?
+"""Consistency of a reconstruction with the two-view geometries: the check that finds folded and inverted ones.
 
-Where a scene looks alike in different places, or a first pair misleads, structure from motion can fold or invert it: every
-photograph is placed, the reprojection error is small (what contradicts is dropped as an outlier), and cameras stand on the
-wrong side. But each pair of photographs is matched and verified on its own, before any reconstruction: pairs whose verified
-matches lie off the epipolar lines of the reconstructed poses, or meet behind a camera, are witnesses against it.
+Repeated structure or a misleading first pair can make structure from motion fold or invert a scene: every photograph is
+registered, the reprojection error is small (contradicting matches are dropped as outliers), and cameras stand on the wrong
+side. But each pair of photographs is matched and verified on its own, before any reconstruction. So a pair contradicts the
+reconstruction if its verified matches lie off the epipolar lines of the reconstructed poses, or triangulate behind a camera.
 
-Not all pairs are heard. Real scenes hold things twice, and pairs of photographs from far apart that mistake one for the other
-are verified, with many matches where the texture is rich. Each photograph is asked about its two strongest partners, which on
-a walk were taken before and after it: there the same thing is seen from nearly the same side, and hardly anything is mistaken.
-One link broken between two photographs that are each other's strongest partners is enough: a fold needs no more. Comparing
-rotations of two-view geometries with the reconstruction, or going around triplets of them, tells less: small planar overlaps
-leave the rotation of honest pairs ambiguous.
+Not all pairs count. Where a scene repeats itself, distant pairs that show different copies are verified too, with many matches
+where the texture is rich. Of each photograph, the two pairs with most matches count, which on a walk are those with the
+photographs before and after it: baselines are short there, and copies are hardly ever confused. One contradicting pair that is
+among the strongest of both its photographs is enough: a fold needs no more. Comparing rotations of two-view geometries with
+the reconstruction, or around triplets, tells less: small planar overlaps leave the rotation of correct pairs ambiguous.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from invgraphics.scenes.photos.pairs import Evidence, Pair
+from invgraphics.scenes.photos.pairs import MatchedPair, VerifiedMatches
 from invgraphics.scenes.photos.plausible import implausible, spread
 from invgraphics.scenes.photos.prepare import Prepared
 
 MATCHES = 30
-"""Pairs with fewer verified matches are no witnesses: chance can bring so many onto one geometry."""
+"""Fewest verified matches of a pair that counts: chance can fit fewer to one geometry."""
 
 PARTNERS = 2
-"""Strongest partners that a photograph is asked about: one on either side of it on a walk.
+"""Pairs that count for each photograph, those with most matches: one on either side of it on a walk.
 
 Measured: no pair contradicts in four right reconstructions (bonsai by the global mapper, 84 pairs; fox by the incremental one,
 33, 0.6° from the known poses; the box with unique pictures by both, 38). Of pairs that are each other's strongest, 1 to 6 of
@@ -38,7 +37,7 @@ can, whose two mappers and given poses differ by 50° and more; the box with the
 partners, bonsai's right poses have 4 of 158 against them; with the best matched quarter of all pairs, 15 of 169."""
 
 NEAR = 4.0
-"""Pixels from its epipolar line at which a match still counts as explained: the tolerance of COLMAP's verification."""
+"""Largest epipolar distance in pixels of a match that the poses explain: the tolerance of COLMAP's verification."""
 
 EXPLAINED = 0.5
 """A pair of which the poses explain a smaller share of the matches contradicts them."""
@@ -51,8 +50,8 @@ SUSPICIOUS = 0.1
 the wrong ones."""
 
 
-def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[str, Any]:
-    """Count the placed photographs that contradict their strongest partners, and check cameras for plausibility.
+def check_consistency(model: Any, photos: Sequence[Prepared], evidence: VerifiedMatches) -> dict[str, Any]:
+    """Count registered photographs whose strongest pairs contradict the poses, and check cameras for plausibility.
 
     Args:
         model: a ``pycolmap.Reconstruction``, its lenses not removed yet.
@@ -60,7 +59,7 @@ def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[
         evidence: verified matches.
 
     Returns:
-        ``pairs`` that were heard, ``contradicting`` ones, their ``share``, how many of them are ``broken`` links between
+        ``pairs`` that count, ``contradicting`` ones, their ``share``, how many of them are ``broken`` links between
         photographs that are each other's strongest partners; ``doubtful`` photographs of the ``asked`` ones, by name;
         ``support``, the share of all verified matches that the poses explain; ``spread`` of the cameras; ``implausible``
         properties; ``suspicious``, a ``sentence`` for a person, and the ``worst`` pairs.
@@ -73,15 +72,15 @@ def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[
             shares[index] = explained(first, second, pair)
     matches = sum(len(pair) for pair in evidence.pairs)
     partners = strongest(evidence.pairs, [index for index in shares if len(evidence.pairs[index]) >= MATCHES])
-    heard = sorted({index for indices in partners.values() for index in indices})
-    against = sorted((index for index in heard if shares[index] < EXPLAINED), key=lambda index: -len(evidence.pairs[index]))
+    counted = sorted({index for indices in partners.values() for index in indices})
+    against = sorted((index for index in counted if shares[index] < EXPLAINED), key=lambda index: -len(evidence.pairs[index]))
     broken = [index for index in against if all(index in partners[photo] for photo in _ends(evidence.pairs[index]))]
     doubtful = [photo for photo, indices in sorted(partners.items()) if _agreement(indices, shares, evidence.pairs) < AGREEING]
-    told = [*broken, *(index for index in against if index not in broken)][:5]
+    shown = [*broken, *(index for index in against if index not in broken)][:5]
     found = {
-        "pairs": len(heard),
+        "pairs": len(counted),
         "contradicting": len(against),
-        "share": len(against) / len(heard) if heard else 0.0,
+        "share": len(against) / len(counted) if counted else 0.0,
         "broken": len(broken),
         "asked": len(partners),
         "doubtful": [photos[photo].source for photo in doubtful],
@@ -89,32 +88,32 @@ def examine(model: Any, photos: Sequence[Prepared], evidence: Evidence) -> dict[
         "support": sum(share * len(evidence.pairs[index]) for index, share in shares.items()) / max(matches, 1),
         "spread": spread(model),
         "implausible": implausible(model),
-        "worst": [_row(evidence.pairs[index], shares[index], photos) for index in told],
+        "worst": [_row(evidence.pairs[index], shares[index], photos) for index in shown],
     }
     suspicious = bool(broken or found["implausible"]) or 0 < len(doubtful) >= SUSPICIOUS * len(partners)
     return found | {"suspicious": suspicious, "sentence": _sentence(found, suspicious)}
 
 
-def strongest(pairs: Sequence[Pair], heard: Sequence[int]) -> dict[int, list[int]]:
-    """Indices of the pairs with most matches for each photograph among the ``heard`` ones, at most `PARTNERS` of them."""
+def strongest(pairs: Sequence[MatchedPair], counted: Sequence[int]) -> dict[int, list[int]]:
+    """Indices of the pairs with most matches for each photograph among the ``counted`` ones, at most `PARTNERS` of them."""
     of: dict[int, list[int]] = {}
-    for index in sorted(heard, key=lambda index: (-len(pairs[index]), index)):
+    for index in sorted(counted, key=lambda index: (-len(pairs[index]), index)):
         for photo in (pairs[index].first, pairs[index].second):
             if len(of.setdefault(photo, [])) < PARTNERS:
                 of[photo].append(index)
     return of
 
 
-def _ends(pair: Pair) -> tuple[int, int]:
+def _ends(pair: MatchedPair) -> tuple[int, int]:
     return pair.first, pair.second
 
 
-def _agreement(indices: Sequence[int], shares: dict[int, float], pairs: Sequence[Pair]) -> float:
+def _agreement(indices: Sequence[int], shares: dict[int, float], pairs: Sequence[MatchedPair]) -> float:
     """Share of a photograph's matches with its partners that the poses explain."""
     return float(np.average([shares[index] for index in indices], weights=[len(pairs[index]) for index in indices]))
 
 
-def _row(pair: Pair, share: float, photos: Sequence[Prepared]) -> dict[str, Any]:
+def _row(pair: MatchedPair, share: float, photos: Sequence[Prepared]) -> dict[str, Any]:
     return {"photos": [photos[pair.first].source, photos[pair.second].source], "matches": len(pair), "explained": share}
 
 
@@ -122,15 +121,15 @@ def _sentence(found: dict[str, Any], suspicious: bool) -> str:
     pairs = f"{found['contradicting']} of the {found['pairs']} best matched pairs of photographs contradict the poses"
     if not suspicious:
         return pairs
-    shown = f" (such as {' and '.join(found['worst'][0]['photos'])})" if found["worst"] else ""
+    example = f" (such as {' and '.join(found['worst'][0]['photos'])})" if found["worst"] else ""
     doubt = f"{len(found['doubtful'])} of {found['asked']} photographs do not agree with their neighbours"
     return (
-        f"{'; '.join([pairs + shown, doubt, *found['implausible']])}. Parts that look alike may have been taken for one, or "
+        f"{'; '.join([pairs + example, doubt, *found['implausible']])}. Parts that look alike may have been taken for one, or "
         "the focal length be wrong: look at top-view.png. More photographs between those that disagree help most."
     )
 
 
-def explained(first: Any, second: Any, pair: Pair) -> float:
+def explained(first: Any, second: Any, pair: MatchedPair) -> float:
     """Share of a pair's matches that two posed ``pycolmap.Image`` explain.
 
     A match is explained if it lies within `NEAR` pixels (Sampson's distance, pixels of the first photograph) of the epipolar
