@@ -1,7 +1,7 @@
 """Compare and teach differentiable rendering: NeRF volume rendering versus splatting, on one ruler.
 
 >>> import invgraphics as ig
->>> scene = ig.load_scene("bricks", size=256)                          # doctest: +SKIP
+>>> scene = ig.load_scene("bricks")                                    # doctest: +SKIP
 >>> fit = ig.fit("splatting/gaussians", scene, budget="30s")           # doctest: +SKIP
 >>> fit.model.render(scene.test[0].camera)                             # doctest: +SKIP
 
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from invgraphics import thread_pools as thread_pools  # sets what torch reads when it is imported
 
 if TYPE_CHECKING:
+    from invgraphics.api import ablate as ablate
     from invgraphics.api import compare as compare
     from invgraphics.api import evaluate as evaluate
     from invgraphics.api import fit as fit
@@ -34,6 +35,7 @@ __all__ = [
     "Rendering",
     "Scene",
     "View",
+    "ablate",
     "compare",
     "evaluate",
     "fit",
@@ -49,6 +51,7 @@ _HOMES = {
     "Rendering": "invgraphics.core",
     "Scene": "invgraphics.core",
     "View": "invgraphics.core",
+    "ablate": "invgraphics.api",
     "compare": "invgraphics.api",
     "evaluate": "invgraphics.api",
     "fit": "invgraphics.api",

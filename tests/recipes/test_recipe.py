@@ -8,9 +8,11 @@ import tomllib
 import pytest
 import torch
 
+from invgraphics.cli.arguments import parse_list
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
-from invgraphics.recipes.recipe import load_method, methods, presets, resolve
+from invgraphics.experiments.request import slug
+from invgraphics.recipes.recipe import load_method, methods, presets, resolve, split_name
 from invgraphics.testing import check_field, check_renderer, toy_scene
 
 CELLS = [(name, preset) for name in methods() for preset in (*presets(name), "")]
@@ -123,3 +125,16 @@ def test_renderers_of_older_runs_still_resolve() -> None:
     hashed = load_method("volumetric/hash").table
     sampler = {("wave" if key == "chunk" else key): value for key, value in hashed["renderer"]["sampler"].items()}
     assert resolve("mine", "", hashed | {"renderer": hashed["renderer"] | {"sampler": sampler}}).table == hashed
+
+
+def test_a_name_may_carry_changes() -> None:
+    """Its own changes come last, and its own preset first; the name stays whole, so that it makes the method again."""
+    name = "volumetric/nerf:preset=paper:field.width=96:batches.rays=77"
+    assert split_name(name) == ("volumetric/nerf", "paper", ("field.width=96", "batches.rays=77"))
+    method = load_method(name, "laptop", ["field.width=8", "field.layers=7"])
+    assert (method.name, method.preset) == (name, "paper")
+    assert (method.recipe.field.width, method.recipe.field.layers, method.recipe.batches.rays) == (96, 7, 77)
+    assert split_name("C:/mine.toml") == ("C:/mine.toml", None, ())
+    assert slug(name) == "volumetric-nerf-preset=paper-field.width=96-batches.rays=77"
+    listed = "splatting/gaussians:batches.resolution=[0.5,1.0],volumetric/hash"
+    assert parse_list(listed, "--methods") == tuple(listed.replace("],", "]|").split("|"))
