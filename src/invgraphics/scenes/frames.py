@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.images import SUFFIXES, Photo, image_size
 from invgraphics.scenes.layout import pose
 from invgraphics.scenes.lens import Lens
+from invgraphics.tables import read_json
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -43,14 +43,7 @@ class Frames:
         Raises:
             InputError: it is missing, no JSON (line and column are given), or has no frames.
         """
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(f"{path} does not exist.") from None
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path} is not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.") from error
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{path} cannot be read: {error}.") from error
+        table = read_json(path)
         frames = table.get("frames") if isinstance(table, dict) else None
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise InputError(

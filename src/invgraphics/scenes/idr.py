@@ -15,7 +15,7 @@ from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files, image_size
 from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth, pose
-from invgraphics.scenes.npz import DAMAGED
+from invgraphics.tables import read_arrays
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 
@@ -62,11 +62,7 @@ def _source(path: Path) -> Path | None:
 
 
 def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], list[Camera]]:
-    try:
-        with np.load(source, allow_pickle=False) as table:
-            arrays = {key: np.asarray(table[key], dtype=np.float64) for key in table.files if "_mat_" in key}
-    except DAMAGED as error:
-        raise InputError(f"{source} cannot be read: {error}.") from error
+    arrays = read_arrays(source)
     sphere = _matrix(arrays, "scale_mat_0", source)
     world_from_local = torch.from_numpy(sphere)
     # The sphere's matrix is a similarity exactly if its linear part without the scale is rigid.
@@ -84,9 +80,9 @@ def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], lis
 def _matrix(arrays: Mapping[str, np.ndarray], key: str, source: Path) -> Float[np.ndarray, "4 4"]:
     if key not in arrays:
         raise InputError(f"{source} has no '{key}'.", "One world_mat and one scale_mat per picture are expected.")
-    if arrays[key].shape != (4, 4) or not np.isfinite(arrays[key]).all():
+    if arrays[key].shape != (4, 4) or arrays[key].dtype.kind not in "fiu" or not np.isfinite(arrays[key]).all():
         raise InputError(f"'{key}' of {source} is not a finite 4x4 matrix.")
-    return arrays[key]
+    return arrays[key].astype(np.float64)
 
 
 def decompose(projection: Float[np.ndarray, "3 4"], size: tuple[int, int], where: str) -> Camera:

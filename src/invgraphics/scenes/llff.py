@@ -13,7 +13,7 @@ from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files
 from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, scene_name
-from invgraphics.scenes.npz import DAMAGED
+from invgraphics.tables import read_array
 
 
 class Llff:
@@ -51,12 +51,7 @@ class Llff:
 
 
 def _read(source: Path) -> Float[np.ndarray, "n 17"]:
-    try:
-        table = np.load(source, allow_pickle=False)
-    except DAMAGED as error:
-        raise InputError(f"{source} cannot be read: {error}.") from error
-    if not isinstance(table, np.ndarray):
-        raise InputError(f"{source} is an archive, not one array.")
+    table = read_array(source)
     if table.ndim != 2 or table.shape[1] != 17 or len(table) == 0 or table.dtype.kind != "f":
         raise InputError(f"{source} has shape {table.shape}, expected n rows of 17 numbers.")
     return table.astype(np.float64)
@@ -64,7 +59,7 @@ def _read(source: Path) -> Float[np.ndarray, "n 17"]:
 
 def _pictures(path: Path) -> list[Path]:
     """The photographs at the highest resolution there is: ``images``, or else ``images_4`` and the like."""
-    scaled = sorted((int(f.name[7:]), f) for f in path.glob("images_*") if f.is_dir() and f.name[7:].isdigit())
+    scaled = sorted((int(f.name[7:]), f) for f in path.glob("images_*") if f.is_dir() and f.name[7:].isdecimal())
     for folder in (path / "images", *(folder for _, folder in scaled)):
         if files := image_files(folder):
             return files

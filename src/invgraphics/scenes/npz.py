@@ -19,8 +19,6 @@ bounds         (2, 3), optional               lowest and highest corner of a box
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -35,11 +33,9 @@ from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
 from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
+from invgraphics.tables import read_arrays
 
 Arrays = Mapping[str, np.ndarray]
-
-DAMAGED = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""What `numpy.load` raises about a file that is damaged or holds pickled objects."""
 
 _REQUIRED = ("images", "cam_to_world", "focal")
 
@@ -90,11 +86,7 @@ class Npz:
 
 def _read(path: Path) -> Arrays:
     """All arrays, with the shapes that the convention asks for."""
-    try:
-        with np.load(path, allow_pickle=False) as table:
-            arrays = {key: table[key] for key in table.files}
-    except DAMAGED as error:
-        raise InputError(f"{path} cannot be read: {error}.", "Write or copy the file again.") from error
+    arrays = read_arrays(path)
     missing = [key for key in _REQUIRED if key not in arrays]
     if missing:
         raise InputError(f"{path} has no {' and no '.join(map(repr, missing))}.", f"It has: {', '.join(arrays) or 'nothing'}.")
