@@ -63,7 +63,7 @@ _DAMAGED = (
     zlib.error,
 )
 """What zipfile and NumPy raise about damaged archives and headers."""
-_KEY_PARTS = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{LIMITS.depth},}}")
+_KEY_PARTS = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{LIMITS.depth}}}")
 """A dotted key of too many parts, for which tomllib takes quadratic time and memory."""
 _HEADERS = {1: ("<H", np.lib.format.read_array_header_1_0), 2: ("<I", np.lib.format.read_array_header_2_0)}
 """Version of NumPy's format -> how the header's length is stored, and how the header is parsed."""
