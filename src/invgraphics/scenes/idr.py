@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -67,6 +68,8 @@ def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], lis
     world_from_local = torch.from_numpy(sphere)
     # The sphere's matrix is a similarity exactly if its linear part without the scale is rigid.
     scale = torch.linalg.det(world_from_local[:3, :3]).abs() ** (1 / 3)
+    if not 0 < float(scale) < math.inf or not np.array_equal(sphere[3], [0, 0, 0, 1]):
+        raise InputError(f"The scale_mat_0 of {source} is no similarity: its determinant is {float(scale) ** 3:g}.")
     pose(torch.cat([world_from_local[:3, :3] / scale, world_from_local[:3, 3:]], dim=1), f"{source}, scale_mat_0")
     cameras = []
     for index, file in enumerate(files):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from jaxtyping import Float
 
 from invgraphics.core import Camera, Scene
+from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files
@@ -42,7 +44,7 @@ class Llff:
             _photo(row, file, f"{source}, row {index}") for index, (row, file) in enumerate(zip(table, files, strict=True))
         ]
         near, far = float(table[:, 15].min()), float(table[:, 16].max())
-        if not 0 < near < far:
+        if not 0 < near < far < math.inf:
             raise InputError(f"The depth bounds of {source} are {near:g} and {far:g}, not positive and increasing.")
         poses = torch.stack([photo.camera.cam_to_world for photo in photos])
         # LLFF's own numbers: 10% in front of the nearest bound; focus between that and five times the farthest.
@@ -69,7 +71,7 @@ def _pictures(path: Path) -> list[Path]:
 def _photo(row: Float[np.ndarray, 17], file: Path, where: str) -> Photo:
     values = torch.from_numpy(row[:15].reshape(3, 5))
     height, width, focal = values[:, 4].tolist()
-    if not (height >= 1 and width >= 1 and focal > 0):
+    if not (1 <= height <= LONGEST_SIDE and 1 <= width <= LONGEST_SIDE and 0 < focal < math.inf):
         raise InputError(f"Height, width and focal length of {where} are {height:g}, {width:g} and {focal:g}.")
     cam_to_world = pose(llff_to_opencv(values[:, :4]), where)
     centre = torch.tensor([width / 2, height / 2], dtype=torch.float64)
