@@ -1,6 +1,6 @@
 """A process that reads inputs, one line of JSON each way, so that the fuzzer can watch and end it.
 
-What is accepted is checked here by numpy alone: rays of every camera, pixels, points and Gaussians are finite and of sensible size.
+What is accepted is checked here by numpy alone: rays of every camera, pixels, points and Gaussians are finite and sensible.
 """
 
 from __future__ import annotations

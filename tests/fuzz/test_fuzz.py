@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,14 +63,15 @@ def good(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     reader.close()
 
 
-def expect_fine(reader: Reader, path: Path, what: str, unchanged: bool) -> None:
-    """Refused in one sentence (and at most a line of remedy), or accepted and right."""
+def expect_fine(reader: Reader, path: Path, what: str, unchanged: bool) -> str:
+    """Refused in one sentence (and at most a line of remedy), or accepted and right; returns which."""
     outcome, answer = reader.read(path)
     if outcome == "refused":
         assert len(answer.splitlines()) <= 2 and len(answer) < 2000, f"{what}: not one sentence: {answer}"
     else:
         assert outcome == "accepted", f"{what}: {outcome}: {answer}"
         assert not unchanged or answer == reader.digest, f"{what}: accepted, and read as something else"
+    return outcome
 
 
 @pytest.mark.timeout(3600)
@@ -79,6 +81,7 @@ def test_damaged_inputs_are_refused_or_right(good: tuple[str, Path, str, Reader]
     bad = root.with_name("bad")
     shutil.copytree(root, bad)
     files = sorted(bad.glob(pattern))
+    outcomes: Counter[str] = Counter()
 
     @seed(SEED)
     @settings(
@@ -95,11 +98,12 @@ def test_damaged_inputs_are_refused_or_right(good: tuple[str, Path, str, Reader]
         before = path.read_bytes()
         try:
             change = mutations.mutate(path, choose)
-            expect_fine(reader, spec_of(bad, pattern, name), f"{path.name}, {change}", path.suffix in CHECKED)
+            outcomes[expect_fine(reader, spec_of(bad, pattern, name), f"{path.name}, {change}", path.suffix in CHECKED)] += 1
         finally:
             path.write_bytes(before)
 
     search()
+    print(f"{name}: {outcomes['refused']} refused, {outcomes['accepted']} accepted")
 
 
 def test_harmless_changes_are_accepted_as_the_same(good: tuple[str, Path, str, Reader]) -> None:

@@ -124,14 +124,15 @@ def _frame(arrays: Arrays, poses: Float[Tensor, "n 4 4"], path: Path) -> Frame:
         rgb = arrays.get("points_rgb", np.full(position.shape, 0.5))
         if position.ndim != 2 or position.shape[1] != 3 or rgb.shape != position.shape:
             raise InputError(f"'points' of {path} has shape {position.shape}, its colours {rgb.shape}; expected (m, 3) twice.")
-        if not np.isfinite(position).all():
-            raise InputError(f"'points' of {path} has entries that are not finite.")
+        if position.dtype.kind not in "fiu" or not np.isfinite(position).all():
+            raise InputError(f"'points' of {path} has entries that are not finite numbers.")
         points = Points(
             torch.from_numpy(position.astype(np.float64)), torch.from_numpy(_bytes(rgb, "points_rgb", path)).float() / 255
         )
     if "bounds" not in arrays:
         return contracted_frame(poses, points)
-    lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32))
+    with np.errstate(over="ignore"):  # infinite bounds are refused with the scene
+        lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32))
     if not bool((lo < hi).all()):
         raise InputError(f"'bounds' of {path} is {arrays['bounds'].tolist()}: the first corner must be below the second.")
     return Frame(Bounds(lo, hi), points=points)
