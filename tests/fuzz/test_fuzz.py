@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 
-hypothesis = pytest.importorskip("hypothesis")
+pytest.importorskip("hypothesis")
 pytest.importorskip("resource", reason="limits of memory are POSIX's")
 
-import mutations  # noqa: E402
-import seeds  # noqa: E402
-from hypothesis import HealthCheck, Phase, given, seed, settings  # noqa: E402
-from hypothesis import strategies as st  # noqa: E402
-from watched import Reader  # noqa: E402
+import mutations
+import seeds
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from watched import Reader
 
 COUNT = int(os.environ.get("INVGRAPHICS_FUZZ", "200"))
 SEED = int(os.environ.get("INVGRAPHICS_FUZZ_SEED", f"{datetime.datetime.now(datetime.UTC):%Y%m%d}"))
