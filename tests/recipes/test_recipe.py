@@ -54,7 +54,7 @@ def test_overrides_take_toml_values() -> None:
         ("volumetric/nerf", None, ["field.width"], "not of the form key=value"),
         ("volumetric/nerf", None, ["field.width=wide"], "'field.width' cannot be 'wide'"),
         ("volumetric/nerf", None, ["losses.7.weight=1"], "Unknown key 'losses.7.weight'"),
-        ("missing.toml", None, [], "missing.toml cannot be read"),
+        ("missing.toml", None, [], "missing.toml does not exist"),
     ],
 )
 def test_bad_requests_get_a_sentence(name: str, preset: str | None, override: list[str], sentence: str) -> None:

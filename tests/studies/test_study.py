@@ -107,7 +107,7 @@ def test_folders_are_named_by_what_defines_the_run(study, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("question = ", "cannot be read"),
+        ("question = ", "is not valid TOML"),
         (HEAD + "desing = 3\n", r"trial\.toml: Unknown key 'desing'"),
         (HEAD.replace('["a", "b"]', "[]"), "'scenes' has no entries"),
         (HEAD.replace('"b"', '"a"'), "'scenes' has 'a' twice"),

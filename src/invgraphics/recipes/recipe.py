@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.presets import select_preset
 from invgraphics.recipes.renamed import with_current_names, with_first_names
+from invgraphics.tables import LIMITS, parse_toml, read_text
 from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
@@ -161,10 +161,7 @@ def source(name: str) -> dict[str, Any]:
         if not path.is_file():
             sentence = f"There is no method '{name}'.{did_you_mean(name, methods())}"
             raise InputError(sentence, f"Known methods: {', '.join(methods())}; or the path of a .toml.")
-    try:
-        return _parse(path.read_text(), str(path))
-    except OSError as error:
-        raise InputError(f"The recipe {path} cannot be read: {error.strerror}.") from error
+    return _parse(read_text(path, LIMITS.toml_bytes), str(path))
 
 
 def _foreign_text(name: str) -> str:
@@ -172,14 +169,15 @@ def _foreign_text(name: str) -> str:
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"The recipe {where} is not valid TOML: {error}.") from error
+    table = parse_toml(text, f"The recipe {where}")
+    known = table.get("presets", {})
+    if not isinstance(known, dict) or not all(isinstance(preset, dict) for preset in known.values()):
+        raise InputError(f"The 'presets' of {where} are no tables.", "Expected: [presets.NAME], and settings below it.")
+    return table
 
 
 def _value(text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return parse_toml(f"value = {text}", "--set")["value"]
+    except InputError:
         return text

@@ -15,6 +15,9 @@ from invgraphics.training.budget import Budget
 if TYPE_CHECKING:
     from invgraphics.studies.study import Study
 
+MOST_CELLS = 10_000
+"""Runs of a study: as many take a week at a minute each."""
+
 
 def completed(study: Study, where: str) -> Study:
     """The study with flat names, the factors of a list, and a base level for every factor."""
@@ -52,6 +55,7 @@ def checked(study: Study, where: str) -> Study:
     for what in NARROWING:
         _check_list(getattr(study, what), f"{where}: '{what}'")
     _check_narrowing(study, where)
+    _check_count(study, where)
     for name, levels in study.factors.items():
         _check_list(levels, f"{where}: the factor '{name}'")
         if study.base[name] not in levels:
@@ -79,6 +83,18 @@ def checked(study: Study, where: str) -> Study:
     if any(seed < 0 for seed in study.seeds) or (views != "all" and views < 1):
         raise InputError(f"{where}: seeds must be 0 or more, and 'test_views' 1 or more or 'all'.")
     return study
+
+
+def _check_count(study: Study, where: str) -> None:
+    """Refuse a study that is too large to be expanded, whatever its runs would take."""
+    levels = [len(levels) for levels in study.factors.values()]
+    points = {"factorial": math.prod(levels), "one-at-a-time": 1 + sum(levels), "list": len(study.cells)}[study.design]
+    count = points * len(study.scenes) * len(study.methods) * len(study.seeds)
+    if count > MOST_CELLS:
+        raise InputError(
+            f"{where} asks for {count:,} cells; a study has at most {MOST_CELLS:,}.",
+            "Give fewer levels in [factors], or the design 'one-at-a-time'.",
+        )
 
 
 def _check_narrowing(study: Study, where: str) -> None:

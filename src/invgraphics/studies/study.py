@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import tomllib
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
@@ -33,6 +32,7 @@ from invgraphics.studies.factors import (
     override,
     path_of,
 )
+from invgraphics.tables import read_toml
 
 FILE = "study.toml"
 
@@ -230,10 +230,7 @@ def read_study(path: Path) -> Study:
         InputError: not TOML; a key is unknown, missing or of the wrong type; a factor is empty or repeats a level; a design
             lacks what it needs. The sentence names the file.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}.") from error
+    table = read_toml(path)
     try:
         study = fill(Study, table)
     except InputError as error:
