@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -53,6 +52,7 @@ class ImportFile:
         if not self.file.is_file():
             raise InputError(f"There is no file '{self.file}'.")
 
+        from invgraphics.runs.folder import RunFolder
         from invgraphics.tools.import_gaussians import ImportRequest, import_run
 
         out = self.out or Path("runs") / f"{Path(self.scene).resolve().name}-{self.file.name}"
@@ -72,6 +72,6 @@ class ImportFile:
                 protocol=self.protocol,
             )
         )
-        show_scores(json.loads((folder / "scores.json").read_text()))
+        show_scores(RunFolder(folder).read_scores())
         print(folder)
         return 0

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from invgraphics.cli.arguments import parse_size
-from invgraphics.errors import InputError
+from invgraphics.runs.folder import check_run
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,7 @@ class Render:
     def run(self) -> int:
         """Film; print the file."""
         size = None if self.size is None else parse_size(self.size)
-        if not (self.folder / "recipe.toml").is_file():
-            raise InputError(
-                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
-            )
+        check_run(self.folder)
 
         from invgraphics.tools.film import FilmRequest, film
 

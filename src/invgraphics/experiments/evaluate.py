@@ -22,7 +22,11 @@ from invgraphics.experiments.shortfall import observe, shortfall
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
+from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.run import truth_arrays, truth_picture
+from invgraphics.runs.scores import Score, Scores
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
 
@@ -57,18 +61,18 @@ def evaluate(
     scene: Scene,
     model: tuple[Field, Renderer],
     protocol: str,
-    costs: dict[str, Any],
+    costs: dict[str, float | None],
     method: Method,
     poses: Poses | None = None,
-) -> dict[str, Any]:
-    """Render, keep and score all test views of ``scene``; writes ``test/`` and the scores file, returns the scores.
+) -> Scores:
+    """Render, keep and score all test views of ``scene``; writes the pictures and the scores, returns the scores.
 
     Where the fit has refined its training poses, test poses are aligned and refined first (see `experiments.posed`).
     """
     rules = protocol_named(protocol)
     field, renderer = model
     device = next(field.parameters()).device
-    (folder.root / "test").mkdir(exist_ok=True)
+    folder.arrays(0).parent.mkdir(exist_ok=True)
     scores, seconds, observed = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
     with Reporter(f"{method.name} evaluation") as reporter:
@@ -79,34 +83,32 @@ def evaluate(
             picture, took = _picture(model, camera, scene, normals=view.normal is not None, timed=timed)
             seconds += took
             picture = picture if posed is None else posed.as_seen(picture, camera, view)
-            _save_view(folder.root / "test" / f"{index:04d}", picture, scene)
+            _save_view(folder, index, picture, scene)
             scores.append(score(picture, view, scene, rules))
             observed.append(observe(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
-    result = {
-        "schema": 1,
-        "method": method.name,
-        "preset": method.preset,
-        "preset_choice": method.preset_choice,
-        "scene": scene.name,
-        "seed": folder.read_json("provenance.json")["seed"],
-        "protocol": protocol,
-        "views": [view.name for view in scene.test],
-        "cost": costs | _model_costs(model, scene, statistics.median(seconds)),
-        "quality": quality if posed is None else quality | posed.quality(),
-        "skipped": skipped,
-    }
-    if disturbed := disturbance(costs.get("fit_processor_share")):
-        result["disturbed"] = disturbed
-    result |= shortfall(method.name, quality, observed, scene, rules)
-    if posed is not None:
-        result["test_poses"] = protocol_note(method)
-    folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)
+    joined = {name: Score(**score) for name, score in quality.items()}
+    result = Scores(
+        method=method.name,
+        preset=method.preset,
+        preset_choice=method.preset_choice,
+        scene=scene.name,
+        seed=folder.read(Provenance).seed,
+        protocol=protocol,
+        views=tuple(view.name for view in scene.test),
+        cost=costs | _model_costs(model, scene, statistics.median(seconds)),
+        quality=joined if posed is None else joined | posed.quality(),
+        skipped=skipped,
+        disturbed=disturbance(costs.get("fit_processor_share")),
+        shortfall=shortfall(method.name, quality, observed, scene, rules),
+        test_poses="" if posed is None else protocol_note(method),
+    )
+    folder.write(result)
     return result
 
 
-def _model_costs(model: tuple[Field, Renderer], scene: Scene, seconds: float) -> dict[str, Any]:
+def _model_costs(model: tuple[Field, Renderer], scene: Scene, seconds: float) -> dict[str, float | None]:
     """What a fitted model costs, and warns of primitives that no gradient could change; ``seconds`` are those of one view."""
     field = model[0]
     dead = dead_gaussians(field, [view.camera for view in scene.train])
@@ -136,7 +138,7 @@ def _picture(
     return (render_view(field, renderer, camera, scene, device) if normals else picture), seconds
 
 
-def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> dict[str, Any]:
+def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> Scores:
     """Score a finished run or rendering again from its checkpoint, on its own scene or on another copy of it.
 
     Raises:
@@ -145,7 +147,7 @@ def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "defa
     return _evaluate_fitted(open_fitted(run, scene_spec), protocol)
 
 
-def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> dict[str, Any]:
+def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> Scores:
     """Score the model of a run from its checkpoint; a rendering's is that of the run it shows (see `experiments.renderings`).
 
     Raises:
@@ -154,13 +156,12 @@ def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> dict[str, 
     return _evaluate_fitted(load_fitted(folder, scene), protocol)
 
 
-def _evaluate_fitted(fitted: Fitted, protocol: str) -> dict[str, Any]:
-    fit = fitted.source.read_json("fit.json")
-    model = fitted.field, fitted.renderer
-    return evaluate(fitted.folder, fitted.scene, model, protocol, fit_costs(fit), fitted.method, fitted.poses)
+def _evaluate_fitted(fitted: Fitted, protocol: str) -> Scores:
+    costs, model = fit_costs(fitted.source.read(FitRecord)), (fitted.field, fitted.renderer)
+    return evaluate(fitted.folder, fitted.scene, model, protocol, costs, fitted.method, fitted.poses)
 
 
-def _save_view(stem: Path, picture: Rendering, scene: Scene) -> None:
+def _save_view(folder: RunFolder, index: int, picture: Rendering, scene: Scene) -> None:
     """Keep a prediction: float16 premultiplied with geometry, and an 8-bit picture over the declared background."""
     arrays: dict[str, Any] = {
         "rgb": picture.rgb.numpy().astype(np.float16),
@@ -169,8 +170,8 @@ def _save_view(stem: Path, picture: Rendering, scene: Scene) -> None:
     }
     if picture.normal is not None:
         arrays["normal"] = picture.normal.numpy().astype(np.float16)
-    np.savez_compressed(stem.with_suffix(".npz"), **arrays)
-    Image.fromarray(display(picture.over(scene.background), scene).numpy()).save(stem.with_suffix(".png"))
+    np.savez_compressed(folder.arrays(index), **arrays)
+    Image.fromarray(display(picture.over(scene.background), scene).numpy()).save(folder.picture(index))
 
 
 def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
@@ -179,16 +180,15 @@ def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
 
 
 def save_truth(scene: Scene, root: Path) -> Path:
-    """Keep the test views' truth once per content: ``root/<sha>/0000.png`` and, for what it cannot hold, ``0000.npz``."""
+    """Keep the test views' truth once per content, in ``root/<sha>``: pictures and, for what they cannot hold, arrays."""
     folder = root / scene.digest("test")[:16]
     folder.mkdir(parents=True, exist_ok=True)
     for index, view in enumerate(scene.test):
-        stem = folder / f"{index:04d}"
-        if not stem.with_suffix(".png").is_file():
-            Image.fromarray(display(view.over(scene.background), scene).numpy()).save(stem.with_suffix(".png"))
+        if not truth_picture(folder, index).is_file():
+            Image.fromarray(display(view.over(scene.background), scene).numpy()).save(truth_picture(folder, index))
         arrays = _truth_arrays(view, scene)
-        if arrays and not stem.with_suffix(".npz").is_file():
-            np.savez_compressed(stem.with_suffix(".npz"), **arrays)
+        if arrays and not truth_arrays(folder, index).is_file():
+            np.savez_compressed(truth_arrays(folder, index), **arrays)
     return folder
 
 

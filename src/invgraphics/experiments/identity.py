@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.request import FitRequest
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder
+from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
 
@@ -47,7 +46,7 @@ def identify(request: FitRequest, method: Method, truth: TruthDigest, threads: i
     """
     source = getattr(method.recipe.field, "source", "")
     started_from = {"source": RunFolder(Path(source)).identity} if source else {}
-    return _sha256(
+    return sha256_of(
         started_from
         | {
             "method": method.name,
@@ -67,14 +66,10 @@ def define(request: FitRequest, method: Method) -> str:
     scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}
     scene |= {} if request.spp is None else {"spp": request.spp}  # so that studies without keep their folders' names
     parts = {"method": method.name, "recipe": method.digest, "data": training_data(request).changes()}
-    return _sha256(_asked(request) | scene | parts)
+    return sha256_of(_asked(request) | scene | parts)
 
 
 def _asked(request: FitRequest) -> dict[str, Any]:
     """Settings that decide a result; a budget counts, not its spelling."""
     settings = {key: getattr(request, key) for key in ("seed", "device", "kernels", "protocol")}
     return settings | {"budget": str(Budget.parse(request.budget))}
-
-
-def _sha256(parts: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

@@ -14,10 +14,12 @@ from torch import Tensor
 
 from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
 from invgraphics.errors import InputError
+from invgraphics.experiments.clocks import fit_record
 from invgraphics.experiments.posed import carried, into_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.history import Moment
 from invgraphics.training.fit import Fit
 from invgraphics.training.limits import dead_gaussians
 
@@ -151,7 +153,7 @@ class Recorder:
 
     def _save(self) -> None:
         checkpoint.save(self._folder.checkpoint, self._fit.state())
-        self._folder.write_json("fit.json", {"steps": self._fit.steps, **self._fit.clocks()})
+        self._folder.write(fit_record(self._fit.steps, self._fit.clocks()))
         self._saved_at = (self._fit.steps, time.monotonic())
 
     def _keep_snapshot(self, progress: float) -> None:
@@ -165,15 +167,15 @@ class Recorder:
     def _record(self) -> float:
         fit = self._fit
         psnr = self._monitor.psnr(fit)
-        line: dict[str, object] = {"step": fit.steps, "seconds": round(fit.seconds, 4), "progress": round(fit.progress, 6)}
-        line["psnr"] = psnr
-        if math.isfinite(self._loss):
-            line["loss"] = self._loss
-        count = fit.plan.field.primitive_count()
-        if count is not None:
-            line["primitives"] = count
         dead = dead_gaussians(fit.plan.field, [view.camera for view in fit.plan.scene.train])
-        if dead is not None:
-            line["dead"] = round(dead.share, 6)
-        self._folder.append_history(line)
+        moment = Moment(
+            step=fit.steps,
+            seconds=round(fit.seconds, 4),
+            progress=round(fit.progress, 6),
+            psnr=psnr,
+            loss=self._loss if math.isfinite(self._loss) else None,
+            primitives=fit.plan.field.primitive_count(),
+            dead=None if dead is None else round(dead.share, 6),
+        )
+        self._folder.append_history(moment)
         return psnr

@@ -1,16 +1,14 @@
 """The same fitted field through other renderers: what of a picture is the representation, and what is the renderer.
 
-A rendering is a run folder without a fit, ``RUN/rendered/NAME``; it knows the run whose checkpoint it shows. What the pictures
-of one fit differ in is in ``RUN/renderings.json``.
+A rendering is a run folder without a fit, ``RUN/rendered/NAME``; it knows the run whose checkpoint it shows. The run holds what
+the pictures of one fit differ in (`invgraphics.runs.renderings`).
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -24,12 +22,14 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.evaluate import evaluate_saved
-from invgraphics.experiments.request import FitRequest, slug
+from invgraphics.experiments.request import FitRequest
 from invgraphics.recipes.recipe import Method, load_method, resolve
+from invgraphics.runs.environment import Environment
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.renderings import OWN, Difference, Rendering, Renderings
+from invgraphics.text import sha256_of, slug
 
-RECORD = "renderings.json"
-"""What a fit's folder holds about its renderings."""
 FOLDER = "rendered"
 
 
@@ -48,7 +48,7 @@ class Eye:
     @property
     def digest(self) -> str:
         """SHA-256 of the settings."""
-        return hashlib.sha256(json.dumps(self.table, sort_keys=True).encode()).hexdigest()
+        return sha256_of(self.table)
 
     @property
     def folder(self) -> str:
@@ -98,10 +98,10 @@ def rendered(folder: RunFolder, request: FitRequest, method: Method) -> bool:
     if not request.render_with:
         return True
     try:
-        record = folder.read_json(RECORD)
+        record = folder.read(Renderings)
     except InputError:
         return False
-    return record.get("identity") == _identity(folder, [eye_named(name) for name in request.render_with], method)
+    return record.identity == _identity(folder, [eye_named(name) for name in request.render_with], method)
 
 
 def render_missing(folder: RunFolder, request: FitRequest, method: Method, scene: Scene) -> None:
@@ -115,57 +115,51 @@ def render_missing(folder: RunFolder, request: FitRequest, method: Method, scene
     """
     if rendered(folder, request, method):
         return
-    (folder.root / RECORD).unlink(missing_ok=True)
+    folder.remove(Renderings)
     eyes = [eye_named(name) for name in request.render_with]
     shown = {}
     for eye in _with_own(eyes, method):
         if eye.table == method.table["renderer"]:
-            shown[eye.name] = "."
+            shown[eye.name] = OWN
         else:
             shown[eye.name] = f"{FOLDER}/{eye.folder}"
             _render(RunFolder(folder.root / FOLDER / eye.folder), folder, (method, eye), scene, request.protocol)
     pictures = {name: _pictures(folder.root / place, scene) for name, place in shown.items()}
-    folder.write_json(
-        RECORD,
-        {
-            "schema": 1,
-            "identity": _identity(folder, eyes, method),
-            "fitted_by": method.name,
-            "views": [view.name for view in scene.test],
-            "renderings": [{"renderer": name, "run": place} for name, place in shown.items()],
-            "differences": [
-                {"renderers": [one, other], **_difference(pictures[one], pictures[other])}
-                for one, other in combinations(shown, 2)
-            ],
-        },
+    record = Renderings(
+        identity=_identity(folder, eyes, method),
+        fitted_by=method.name,
+        views=tuple(view.name for view in scene.test),
+        renderings=tuple(Rendering(renderer=name, run=place) for name, place in shown.items()),
+        differences=tuple(_difference(pair, *(pictures[name] for name in pair)) for pair in combinations(shown, 2)),
     )
+    folder.write(record)
 
 
 def _render(folder: RunFolder, fit: RunFolder, model: tuple[Method, Eye], scene: Scene, protocol: str) -> None:
     """Make one rendering, unless it is there."""
     method, eye = model
     seen = through(method, eye)
-    identity = _sha256([fit.identity, eye.digest])
+    identity = sha256_of([fit.identity, eye.digest])
     if folder.finished and folder.identity == identity:
         return
     folder.create()
     folder.clear()
-    (folder.root / "test").mkdir(exist_ok=True)
     folder.write_recipe(seen.table)
-    folder.write_json("environment.json", fit.read_json("environment.json"))
+    folder.write(fit.read(Environment))
     folder.history.write_text("")
-    provenance = fit.read_json("provenance.json")
+    provenance = fit.read(Provenance)
     up = Path(*[".."] * len(folder.root.relative_to(fit.root).parts))
-    changed = {
-        "cell_sha256": identity,
-        "method": seen.name,
-        "recipe_sha256": seen.digest,
-        "truth": (up / provenance["truth"]).as_posix(),
-        "fitted_run": up.as_posix(),
-        "fitted_by": method.name,
-        "rendered_by": eye.name,
-    }
-    folder.write_json("provenance.json", provenance | changed)
+    changed = replace(
+        provenance,
+        cell_sha256=identity,
+        method=seen.name,
+        recipe_sha256=seen.digest,
+        truth=(up / provenance.truth).as_posix(),
+        fitted_run=up.as_posix(),
+        fitted_by=method.name,
+        rendered_by=eye.name,
+    )
+    folder.write(changed)
     for rules in dict.fromkeys([protocol, "default"]):
         evaluate_saved(folder, scene, rules)
 
@@ -186,11 +180,7 @@ def _with_own(eyes: Sequence[Eye], method: Method) -> list[Eye]:
 
 
 def _identity(folder: RunFolder, eyes: Sequence[Eye], method: Method) -> str:
-    return _sha256([folder.identity, *([eye.name, eye.digest] for eye in _with_own(eyes, method))])
-
-
-def _sha256(parts: Any) -> str:
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return sha256_of([folder.identity, *([eye.name, eye.digest] for eye in _with_own(eyes, method))])
 
 
 def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:
@@ -198,13 +188,16 @@ def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:
     background = scene.background.numpy()
     pictures = []
     for index in range(len(scene.test)):
-        with np.load(run / "test" / f"{index:04d}.npz", allow_pickle=False) as arrays:
+        with np.load(RunFolder(run).arrays(index), allow_pickle=False) as arrays:
             clear = 1 - arrays["alpha"].astype(np.float64)[..., None]
             pictures.append((arrays["rgb"].astype(np.float64) + clear * background).clip(0, 1))
     return pictures
 
 
-def _difference(one: Sequence[Float[ndarray, "h w 3"]], other: Sequence[Float[ndarray, "h w 3"]]) -> dict[str, list[float]]:
-    """Per view, between pictures of one fit by two renderers: root of the mean square and the largest, colours in [0, 1]."""
+def _difference(
+    renderers: tuple[str, str], one: Sequence[Float[ndarray, "h w 3"]], other: Sequence[Float[ndarray, "h w 3"]]
+) -> Difference:
+    """Per view, between pictures of one fit by two renderers."""
     gaps = [a - b for a, b in zip(one, other, strict=True)]
-    return {"rmse": [float(np.sqrt((gap**2).mean())) for gap in gaps], "largest": [float(np.abs(gap).max()) for gap in gaps]}
+    rmse, largest = [float(np.sqrt((gap**2).mean())) for gap in gaps], [float(np.abs(gap).max()) for gap in gaps]
+    return Difference(renderers=renderers, rmse=tuple(rmse), largest=tuple(largest))

@@ -8,9 +8,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -26,7 +25,7 @@ from invgraphics.experiments.build import (
     training_data,
     use_kernels,
 )
-from invgraphics.experiments.clocks import disturbance, fit_costs, load_average, processor_share
+from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average, processor_share
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import WITH_PARENT, cores
@@ -42,7 +41,10 @@ from invgraphics.metrics.protocols import protocol_named
 from invgraphics.recipes.presets import announcements
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs import checkpoint
-from invgraphics.runs.folder import RunFolder, write_json
+from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.folder import TRUTH, RunFolder
+from invgraphics.runs.provenance import ImportedFile, LoadAverage, Options, Provenance
+from invgraphics.runs.schema import write_json
 from invgraphics.scenes.corrupt import corrupt
 from invgraphics.scenes.open import choices
 from invgraphics.training.budget import Budget
@@ -83,21 +85,23 @@ def fit_run(request: FitRequest) -> Path:
         with PeakMemory(device) as memory:
             fit = Fit(started(build_plan(method, shown, budget, request.seed, device), method, request.scene))
             if same and folder.resumable:
-                clocks = folder.read_json("fit.json")
-                fit.load(checkpoint.load(folder.checkpoint, device), float(clocks["seconds"]))
-                fit.resume_clocks(clocks)
+                earlier = folder.read(FitRecord)
+                fit.load(checkpoint.load(folder.checkpoint, device), earlier.seconds or 0.0)
+                fit.resume_clocks(asdict(earlier))
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            describe(folder, request, method, (scene, shown), identity, device)
+            folder.write(describe(folder, request, method, (scene, shown), identity, device))
             forecast = _rehearse(folder, fit, method, memory)
             if "suspicion" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
             for sentence in (*announcements([method.choice]), _prediction(request, fit, forecast)):
                 print(sentence, file=sys.stderr)
             Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}", request.snapshots).run()
-        spent = {"steps": fit.steps, **fit.clocks(), "peak_memory_bytes": memory.peak_bytes, "cores": cores()}
-        spent |= {"load_average": {"start": began_at, "end": load_average()}}
+        load = LoadAverage(start=began_at, end=load_average())
+        spent = replace(
+            fit_record(fit.steps, fit.clocks()), peak_memory_bytes=memory.peak_bytes, cores=cores(), load_average=load
+        )
         _declare_clocks(folder, spent)
         _evaluate(folder, scene, fit, request, method, spent)
         render_missing(folder, request, method, scene)
@@ -105,7 +109,7 @@ def fit_run(request: FitRequest) -> Path:
 
 
 def _check_existing(folder: RunFolder, request: FitRequest) -> None:
-    present = (folder.root / "provenance.json").is_file()
+    present = folder.has(Provenance)
     if request.existing == "refuse" and present:
         raise InputError(f"{folder.root} already holds a run.", "Add --resume to go on with it, or choose another --out.")
     if request.existing == "resume" and not present:
@@ -122,7 +126,7 @@ def _rehearse(folder: RunFolder, fit: Fit, method: Method, memory: PeakMemory) -
     fit.rehearse()
     Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
     forecast = memory_forecast(fit.plan, method, memory.peak_bytes)
-    folder.write_json("provenance.json", folder.read_json("provenance.json") | {"memory_forecast_bytes": forecast.bytes})
+    folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
     return forecast
 
 
@@ -135,17 +139,16 @@ def _prediction(request: FitRequest, fit: Fit, memory: MemoryForecast) -> str:
     return f"{request.method} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
 
 
-def _declare_clocks(folder: RunFolder, spent: Mapping[str, Any]) -> None:
+def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
     """Write how busy the machine was beside the run's provenance, and warn where others had the fit's cores."""
-    machine = {"threads": torch.get_num_threads(), "load_average": spent["load_average"]}
-    folder.write_json("provenance.json", folder.read_json("provenance.json") | machine)
+    folder.write(replace(folder.read(Provenance), threads=torch.get_num_threads(), load_average=spent.load_average))
     if disturbed := disturbance(processor_share(spent)):
         warn(f"The fit {disturbed}. Its times are not to be compared.")
 
 
-def _evaluate(folder: RunFolder, scene: Scene, fit: Fit, request: FitRequest, method: Method, spent: dict[str, Any]) -> None:
-    """Score the fit on the undisturbed scene. ``scores.json`` comes last, because a run that has it is finished."""
-    folder.write_json("fit.json", spent)
+def _evaluate(folder: RunFolder, scene: Scene, fit: Fit, request: FitRequest, method: Method, spent: FitRecord) -> None:
+    """Score the fit on the undisturbed scene. The default protocol's scores come last: a run that has them is finished."""
+    folder.write(spent)
     costs = fit_costs(spent)
     model = (fit.plan.field, fit.plan.renderer)
     if request.protocol != "default":
@@ -160,9 +163,9 @@ def describe(
     scenes: tuple[Scene, Scene],
     identity: str,
     device: torch.device,
-    origin: Mapping[str, Any] | None = None,
-) -> None:
-    """Write what can be known before the fit, of the scene as it was loaded and as the fit sees it.
+    imported: ImportedFile | None = None,
+) -> Provenance:
+    """Write recipe, machine and truth, and return what can be known before the fit of where the run comes from.
 
     Args:
         folder: of the run.
@@ -171,40 +174,39 @@ def describe(
         scenes: undisturbed, and as the fit sees it.
         identity: of the run.
         device: where it computes.
-        origin: further provenance, of a model that was not fitted here.
+        imported: the file, of a model that was not fitted here.
     """
     scene, shown = scenes
     folder.write_recipe(method.table)
-    folder.write_json("environment.json", environment(device))
-    truth_root = Path(request.truth) if request.truth else folder.root / "truth"
-    truth = save_truth(scene, truth_root)
-    provenance = {
-        "schema": 1,
-        "cell_sha256": identity,
-        "method": method.name,
-        "preset": method.preset,
-        "preset_choice": method.preset_choice,
-        "preset_chosen_on": list(method.chosen_on),
-        "recipe_sha256": method.digest,
-        "scene": request.scene,
-        "seed": request.seed,
-        "budget": request.budget,
-        "truth_sha256": scene.digest("test"),
-        "train_sha256": shown.digest("train"),
-        "cameras_sha256": scene.camera_digest(),
-        "truth": Path(*_relative(truth, folder.root)).as_posix(),
-        "background": scene.background.tolist(),
-        "colour": scene.colour,
-        "data": training_data(request).changes(),
-        "notes": shown.notes,
-        "code_version": code_version(),
-        "plugins": plugins.brought(method.table, method.name),
-        "command": request.shell(),
-        "options": {"size": request.size, "test_views": request.test_views, "spp": request.spp},
-        "device": str(device),
-    }
-    note = protocol_note(method)
-    folder.write_json("provenance.json", provenance | ({"test_poses": note} if note else {}) | dict(origin or {}))
+    folder.write(environment(device))
+    truth = save_truth(scene, Path(request.truth) if request.truth else folder.root / TRUTH)
+    red, green, blue = scene.background.tolist()
+    return Provenance(
+        cell_sha256=identity,
+        method=method.name,
+        preset=method.preset,
+        preset_choice=method.preset_choice,
+        preset_chosen_on=method.chosen_on,
+        recipe_sha256=method.digest,
+        scene=request.scene,
+        seed=request.seed,
+        budget=request.budget,
+        truth_sha256=scene.digest("test"),
+        train_sha256=shown.digest("train"),
+        cameras_sha256=scene.camera_digest(),
+        truth=Path(*_relative(truth, folder.root)).as_posix(),
+        background=(red, green, blue),
+        colour=scene.colour,
+        data=training_data(request).changes(),
+        notes=shown.notes,
+        code_version=code_version(),
+        plugins=plugins.brought(method.table, method.name),
+        command=request.shell(),
+        options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
+        device=str(device),
+        test_poses=protocol_note(method),
+        imported=imported,
+    )
 
 
 def _relative(target: Path, start: Path) -> tuple[str, ...]:

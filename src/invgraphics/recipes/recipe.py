@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +13,7 @@ from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.presets import select_preset
+from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
@@ -42,11 +41,6 @@ class Method:
     chosen_on: tuple[str, ...] = ()
 
     @property
-    def slug(self) -> str:
-        """The name as one folder name."""
-        return self.name.removesuffix(".toml").strip("/").replace("/", "-")
-
-    @property
     def choice(self) -> tuple[str, str, str]:
         """Name, preset and what chose the preset, for `recipes.presets.announcements`."""
         return self.name, self.preset, self.preset_choice
@@ -54,7 +48,7 @@ class Method:
     @property
     def digest(self) -> str:
         """SHA-256 of the resolved table."""
-        return hashlib.sha256(json.dumps(self.table, sort_keys=True).encode()).hexdigest()
+        return sha256_of(self.table)
 
 
 def methods() -> dict[str, str]:

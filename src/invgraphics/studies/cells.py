@@ -12,12 +12,13 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import device_of, requested_method, training_data
 from invgraphics.experiments.identity import define
 from invgraphics.experiments.recorder import Cadence
-from invgraphics.experiments.request import AblateRequest, FitRequest, slug
+from invgraphics.experiments.request import AblateRequest, FitRequest
 from invgraphics.metrics.protocols import protocol_named
 from invgraphics.recipes.recipe import Method
 from invgraphics.scenes.open import is_rendered
 from invgraphics.studies.factors import BUDGET, SIZE, in_scope, path_of
 from invgraphics.studies.study import Cell, Study
+from invgraphics.text import slug
 from invgraphics.training.budget import Budget
 
 LONGEST_NAME = 100

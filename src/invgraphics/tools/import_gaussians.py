@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shlex
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from invgraphics.core import Gaussians, Scene, harmonics
 from invgraphics.errors import InputError
@@ -24,7 +22,11 @@ from invgraphics.formats.ply import OPACITY_EPS
 from invgraphics.metrics.protocols import protocol_named
 from invgraphics.recipes.recipe import Method, load_method
 from invgraphics.runs import checkpoint
+from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.history import Moment
+from invgraphics.runs.provenance import ImportedFile, Provenance
+from invgraphics.text import sha256_of
 from invgraphics.tools.file_frames import WORLD, local_from_file
 
 IMPORTED = "imported"
@@ -72,14 +74,14 @@ def import_run(request: ImportRequest) -> Path:
     method = method_for(request, splats.gaussians)
     axes = request.frame or splats.axes
     folder = RunFolder(Path(request.out))
-    if (folder.root / "provenance.json").is_file():
+    if folder.has(Provenance):
         raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
     scene = open_requested(request)
     gaussians = move_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()
     repeatable(device)
     use_kernels(request.kernels)
-    origin = {"imported": _origin(request, name, splats, axes)}
+    origin = _origin(request, name, splats, axes)
     if splats.antialiased and not getattr(method.recipe.renderer, "compensate", False):
         print(
             "The file says that it was fitted with anti-aliasing; --set renderer.compensate=true shows it so.", file=sys.stderr
@@ -87,14 +89,14 @@ def import_run(request: ImportRequest) -> Path:
     with folder.held():
         folder.clear()
         identity = _identity(method, scene, origin)
-        describe(folder, request, method, (scene, scene), identity, device, origin)
+        folder.write(describe(folder, request, method, (scene, scene), identity, device, origin))
         field, renderer = build_model(method, scene, request.seed, device)
         assert isinstance(field, GaussianField)
         fill(field, gaussians)
         checkpoint.save(folder.checkpoint, {"field": field.state_dict(), "renderer": renderer.state_dict()})
-        folder.append_history({"step": 0, "seconds": 0.0, "progress": 1.0, "primitives": len(gaussians)})
-        costs = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}
-        folder.write_json("fit.json", {"steps": None, "seconds": None})
+        folder.append_history(Moment(step=0, seconds=0.0, progress=1.0, primitives=len(gaussians)))
+        costs: dict[str, float | None] = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}
+        folder.write(FitRecord())
         for rules in dict.fromkeys([request.protocol, "default"]):
             evaluate(folder, scene, (field, renderer), rules, costs, method)
     return folder.root
@@ -137,22 +139,29 @@ def fill(field: GaussianField, gaussians: Gaussians) -> None:
     field.active_degree = field.sh_degree
 
 
-def _origin(request: ImportRequest, name: str, splats: Splats, axes: str | None) -> dict[str, Any]:
+def _origin(request: ImportRequest, name: str, splats: Splats, axes: str | None) -> ImportedFile:
     path = Path(request.file)
-    return {
-        "file": request.file,
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-        "bytes": path.stat().st_size,
-        "format": name,
-        "axes": axes or "those of the data set's world",
-        "world": request.world,
-        "gaussians": len(splats.gaussians),
-        "sh_degree": harmonics.degree_of(splats.gaussians.sh.shape[1]),
-        "antialiased": splats.antialiased,
-        "notes": list(splats.notes),
-    }
+    return ImportedFile(
+        file=request.file,
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        bytes=path.stat().st_size,
+        format=name,
+        axes=axes or "those of the data set's world",
+        world=request.world,
+        gaussians=len(splats.gaussians),
+        sh_degree=harmonics.degree_of(splats.gaussians.sh.shape[1]),
+        antialiased=splats.antialiased,
+        notes=splats.notes,
+    )
 
 
-def _identity(method: Method, scene: Scene, origin: dict[str, Any]) -> str:
-    parts = [method.name, method.digest, scene.digest("test"), scene.camera_digest(), origin, code_version()]
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+def _identity(method: Method, scene: Scene, origin: ImportedFile) -> str:
+    parts = [
+        method.name,
+        method.digest,
+        scene.digest("test"),
+        scene.camera_digest(),
+        {"imported": asdict(origin)},
+        code_version(),
+    ]
+    return sha256_of(parts)

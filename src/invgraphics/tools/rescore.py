@@ -13,6 +13,7 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.conventions import Convention, Protocol
 from invgraphics.metrics.measures import score_under, summarise_under
 from invgraphics.metrics.protocols import ViewScore, score, summarise
+from invgraphics.runs.scores import DEFAULT, Score, ScoredTruth, Scores
 from invgraphics.tools.predictions import PictureSet
 from invgraphics.tools.rescoring import KNOWN, Rescored, Rules, background_name, evaluated, labels, scores_of
 
@@ -109,7 +110,7 @@ def rescore(sets: Sequence[PictureSet], rules: Sequence[Rules], allow_8bit: bool
                         views.append(score(rendering, truth, pictures.scene, rules_here, only[name]))
                 done += 1
                 reporter.show(done / total, f"{label}, view {index + 1} of {len(pictures.names)}")
-            tables = {one.name: _table(pictures, one, scores.get(one.name), lacking[one.name]) for one in rules}
+            tables = {one.name: _scores(pictures, one, scores.get(one.name), lacking[one.name]) for one in rules}
             result.append(Rescored(pictures, label, tables))
     return result
 
@@ -138,8 +139,8 @@ def _checked(pictures: PictureSet, index: int, exact: bool) -> Rendering:
     return rendering
 
 
-def _table(pictures: PictureSet, rules: Rules, views: Sequence[ViewScore] | None, lacking: str) -> dict[str, Any]:
-    """The content of a scores file."""
+def _scores(pictures: PictureSet, rules: Rules, views: Sequence[ViewScore] | None, lacking: str) -> Scores:
+    """Scores of a set of pictures, from those of its views."""
     if views is None:
         names = SHARED if isinstance(rules, Protocol) else tuple(rules.measures)
         quality, skipped = {}, dict.fromkeys(names, lacking)
@@ -147,29 +148,25 @@ def _table(pictures: PictureSet, rules: Rules, views: Sequence[ViewScore] | None
         quality, skipped = summarise(views, rules)
     else:
         quality, skipped = summarise_under(views, rules)
-    run = pictures.provenance
-    own = scores_of(pictures, "default") or {}
+    run, own = pictures.provenance, scores_of(pictures, DEFAULT)
     stated = asdict(rules)
     eight_bit = pictures.eight_bit and (stated.get("prediction") == "none" or stated.get("quantise") is False)
     caution = ("Unrounded predictions are wanted; 8-bit pictures stand in for them.",) if eight_bit and not lacking else ()
-    return {
-        "schema": 1,
-        "method": run.get("method", pictures.folder.name),
-        "preset": run.get("preset", ""),
-        "scene": own.get("scene", run.get("scene", "")),
-        "seed": run.get("seed"),
-        "protocol": rules.name,
-        "views": list(pictures.names),
-        "cost": own.get("cost", {}),
-        "quality": quality,
-        "skipped": skipped,
-        "rescored": True,
-        "conventions": stated,
-        "truth": {
-            "sha256": pictures.sha256,
-            "size": list(pictures.size),
-            "background": pictures.background,
-            "transparency": pictures.transparency,
-        },
-        "notes": [*pictures.notes, *caution],
-    }
+    truth = ScoredTruth(
+        sha256=pictures.sha256, size=pictures.size, background=pictures.background, transparency=pictures.transparency
+    )
+    return Scores(
+        method=pictures.folder.name if run is None else run.method,
+        preset="" if run is None else run.preset,
+        scene=own.scene if own is not None else "" if run is None else run.scene,
+        seed=None if run is None else run.seed,
+        protocol=rules.name,
+        views=pictures.names,
+        cost={} if own is None else own.cost,
+        quality={name: Score(**score) for name, score in quality.items()},
+        skipped=skipped,
+        rescored=True,
+        conventions=stated,
+        truth=truth,
+        notes=(*pictures.notes, *caution),
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +14,9 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs import checkpoint
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.folder import RunFolder, check_run
+from invgraphics.runs.provenance import Provenance
 
 Stamp = tuple[int, int, int]
 Stamps = tuple[Stamp | None, Stamp | None]
@@ -111,24 +112,24 @@ class Subject:
     def _progress(self) -> tuple[int, float]:
         """Steps and seconds of the fit, as its folder says."""
         try:
-            fit = self.fitted.source.read_json("fit.json")
-            return int(fit["steps"]), float(fit["seconds"])
-        except (InputError, KeyError):
+            fit = self.fitted.source.read(FitRecord)
+        except InputError:
             return 0, 0.0
+        return fit.steps or 0, fit.seconds or 0.0
 
 
 def _scores(folder: RunFolder) -> str:
     try:
-        quality = folder.read_json("scores.json")["quality"]
+        quality = folder.read_scores().quality
     except InputError:
         return ""
     said = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}"}
-    return ", ".join(words.format(quality[name]["mean"]) for name, words in said.items() if name in quality)
+    return ", ".join(words.format(quality[name].mean) for name, words in said.items() if name in quality)
 
 
 def stamps_of(folder: RunFolder, source: RunFolder) -> Stamps:
     """What tells two states of a run apart: its checkpoint, in ``source``, and its scores; ``None`` for what is not there."""
-    return _stamp(source.checkpoint), _stamp(folder.root / "scores.json")
+    return _stamp(source.checkpoint), _stamp(folder.scores_path())
 
 
 def _stamp(path: Path) -> Stamp | None:
@@ -164,8 +165,10 @@ def open_subject(run: Path, scene: str | None, live: bool, say: Callable[[str], 
 
 def missing_part(run: Path) -> tuple[str, str] | None:
     """What a folder lacks to be looked at, and what to do about it; ``None`` if it is complete."""
-    if not (run / "recipe.toml").is_file() or not (run / "provenance.json").is_file():
-        return f"{run} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
+    try:
+        check_run(run)
+    except InputError as error:
+        return error.sentence, error.remedy
     if not _source(run).checkpoint.is_file():
         return f"{run} has no checkpoint yet.", "`invgraphics view --live` waits for the first one."
     return None
@@ -174,7 +177,7 @@ def missing_part(run: Path) -> tuple[str, str] | None:
 def _source(run: Path) -> RunFolder:
     """The folder whose model a run shows: its own, or that of the fit it is a rendering of."""
     try:
-        shown = json.loads((run / "provenance.json").read_text()).get("fitted_run")
-    except (OSError, ValueError, AttributeError):
+        shown = RunFolder(run).read(Provenance).fitted_run
+    except InputError:
         shown = None  # opening it will say what is wrong
     return RunFolder(run if shown is None else run / shown)
