@@ -18,12 +18,13 @@ def file_name(key: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A length of time: ``12 s``, ``6 min 52 s``, ``2 h 1 min``."""
+    """A length of time: ``12 s``, ``6 min 52 s``, ``10 min``, ``2 h 1 min``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+    parts = ((hours, "h"), (minutes, "min")) if hours else ((minutes, "min"), (rest, "s"))
+    return " ".join(f"{amount} {unit}" for amount, unit in parts if amount)
 
 
 def sha256_of(value: Any) -> str:

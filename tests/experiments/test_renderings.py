@@ -23,10 +23,11 @@ from invgraphics.experiments.run import fit_run
 from invgraphics.recipes.recipe import load_method
 from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
 from invgraphics.runs import checkpoint
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import CHECKPOINT, RunFolder
+from invgraphics.runs.schema import plain
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.studies.cells import make_plan
-from invgraphics.studies.study import read_study
+from invgraphics.studies.reading import read_study
 from invgraphics.testing import toy_scene
 
 METHOD = "splatting/gaussians"
@@ -78,7 +79,7 @@ def test_differences_are_those_of_the_pictures(run: Path) -> None:
 def test_a_rendering_is_the_fitted_field_through_that_renderer(run: Path, toy_folder: Path) -> None:
     scene = open_scene(str(toy_folder), SceneOptions(test_views=16))
     field, _ = build_model(load_method(METHOD, None, SMALL[METHOD]), scene, 0, torch.device("cpu"))
-    field.load_state_dict(checkpoint.load(run / checkpoint.NAME)["field"])
+    field.load_state_dict(checkpoint.load(run / CHECKPOINT)["field"])
     with torch.no_grad():
         renderer = GaussianSorted(GaussianSortedConfig("splat"))
         picture, _ = renderer.render_image(field, scene.test[1].camera, Context(scene.bounds))
@@ -93,8 +94,8 @@ def test_a_rendering_is_a_run_that_knows_what_it_shows(run: Path) -> None:
     assert scores["method"] == f"{METHOD} rendered with {OTHERS[2]}"
     assert (folder / provenance["truth"] / "0000.png").is_file()
     assert (folder / provenance["fitted_run"]).resolve() == run.resolve()
-    assert not (folder / checkpoint.NAME).exists()
-    assert evaluate_run(folder)["quality"] == scores["quality"]
+    assert not (folder / CHECKPOINT).exists()
+    assert plain(evaluate_run(folder))["quality"] == scores["quality"]
 
 
 def _stamps(run: Path) -> dict[str, int]:

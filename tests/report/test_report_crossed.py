@@ -11,12 +11,13 @@ from report_folders import METHODS, SEEDS, VIEWS, truth_frame, write_run
 from invgraphics.errors import InputError
 from invgraphics.report.build import build_report
 from invgraphics.report.data.assets import Folder
-from invgraphics.report.data.reading import read_comparison
+from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.statistics.cross_render import cross
 from invgraphics.report.study import build_study_report
+from invgraphics.runs.study import Approximation
 
 OWN, OTHER = METHODS[2], "gaussian-volume/exact:opacity=physical"
-PAIR = {"name": "all that is approximate", "exact": OTHER, "approximate": OWN}
+PAIR = Approximation("all that is approximate", OTHER, OWN)
 
 
 def add_renderings(run: Path, method: str, rmse: float) -> None:

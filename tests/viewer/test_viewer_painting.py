@@ -14,6 +14,7 @@ from PIL import Image
 
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.viewer.cameras import Gaze, Mount
 from invgraphics.viewer.colouring import EMPTY, ERROR_LIMIT, resized
 from invgraphics.viewer.pace import LEAST
@@ -207,11 +208,11 @@ def test_a_newer_checkpoint_is_noticed_and_shown(runs: dict[str, Path], tmp_path
     subject = open_subject(run, None, live=True, say=print)
     assert not subject.changed() and subject.steps == 60 and "PSNR" in subject.facts()["test views"]
     before = _composited(subject, subject.scene.test[0].camera)
-    state = checkpoint.load(run / checkpoint.NAME)
+    state = checkpoint.load(run / CHECKPOINT)
     keep = len(state["field"]["means"]) // 2  # density control changes the number
     for name, values in state["field"].items():
         state["field"][name] = values[:keep] if values.ndim else values
-    checkpoint.save(run / checkpoint.NAME, state)
+    checkpoint.save(run / CHECKPOINT, state)
     (run / "fit.json").write_text('{"steps": 120, "seconds": 9.5}')
     assert subject.changed()
     subject.refresh()
@@ -222,5 +223,5 @@ def test_a_newer_checkpoint_is_noticed_and_shown(runs: dict[str, Path], tmp_path
     assert subject.changed()
     subject.refresh()
     assert subject.facts()["test views"] == "not scored yet" and not subject.changed()
-    (run / checkpoint.NAME).unlink()
+    (run / CHECKPOINT).unlink()
     assert not subject.changed(), "a fit that starts again removes the file first"

@@ -1,8 +1,8 @@
 """Records: frozen dataclasses that are JSON files of a public format, read with care and written whole.
 
-A field without a default is a key that every file has. A key whose value is the field's default is left out, and null stands
-for the default. Keys that a reader does not know are ignored, so that keys can be added; what readers must not overlook raises
-the record's ``SCHEMA``, and `Record.migrate` brings older tables up to date.
+A field without a default is a key that every file has. For another, absence and null stand for the default, and a default that
+says nothing (null, empty, false) is left out. Keys that a reader does not know are ignored, so that keys can be added; what
+readers must not overlook raises the record's ``SCHEMA``, and `Record.migrate` brings older tables up to date.
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ def stored_fields(kind: type) -> dict[str, bool]:
 
 
 def plain(value: Any) -> Any:
-    """Plain values as JSON has them: records as tables, with defaults left out; tuples as lists."""
+    """Plain values as JSON has them: records as tables, without defaults that say nothing; tuples as lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         table = {"schema": value.SCHEMA} if isinstance(value, Record) else {}
         for field in dataclasses.fields(value):
             item = getattr(value, field.name)
-            if field.metadata.get("stored", True) and not (_has_default(field) and item == _default(field)):
+            if field.metadata.get("stored", True) and not _says_nothing(field, item):
                 table[field.name] = plain(item)
         return table
     if isinstance(value, Mapping):
@@ -247,5 +247,9 @@ def _has_default(field: dataclasses.Field[Any]) -> bool:
     return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
-def _default(field: dataclasses.Field[Any]) -> Any:
-    return field.default if field.default is not dataclasses.MISSING else field.default_factory()  # type: ignore[misc]
+def _says_nothing(field: dataclasses.Field[Any], value: Any) -> bool:
+    """Whether a value is the field's default, and null, empty or false."""
+    if not _has_default(field):
+        return False
+    default = field.default if field.default is not dataclasses.MISSING else field.default_factory()  # type: ignore[misc]
+    return value == default and (not value or dataclasses.is_dataclass(value))

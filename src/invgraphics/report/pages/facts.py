@@ -132,18 +132,17 @@ def plain_facts(table: Mapping[str, Any]) -> Facts:
 
 def _run_facts(run: Run) -> dict[str, str]:
     """Hashes, versions and machine of one run, under the names that people read."""
-    names = {
-        "truth_sha256": "truth SHA-256",
-        "train_sha256": "training images SHA-256",
-        "cameras_sha256": "cameras SHA-256",
-        "recipe_sha256": "recipe SHA-256",
-        "code_version": "code version",
-        "budget": "budget",
-        "test_poses": "test poses",
-        "load_average": "load average",
+    known = run.provenance
+    facts = {
+        "truth SHA-256": known.truth_sha256,
+        "training images SHA-256": known.train_sha256,
+        "cameras SHA-256": known.cameras_sha256,
+        "recipe SHA-256": known.recipe_sha256,
+        "code version": known.code_version,
+        "budget": known.budget,
+        "test poses": known.test_poses,
+        "load average": _text(plain(known.load_average)),
     }
-    provenance = plain(run.provenance)
-    facts = {label: _text(provenance[key]) for key, label in names.items() if provenance.get(key)}
     for key, value in run.environment.facts().items():
         facts.setdefault(_words(str(key)), _text(value))
     return {key: value for key, value in facts.items() if value}
