@@ -7,6 +7,7 @@ import json
 import random
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -145,8 +146,6 @@ def _with_shortfall(run: Run) -> Run:
 
 
 def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
-    from dataclasses import replace
-
     from invgraphics.report.statistics.summary import summarise
 
     comparison = read_comparison(built_report)
@@ -191,8 +190,6 @@ def test_report_never_imports_torch() -> None:
 
 
 def test_verdict_says_on_which_side_of_a_line_the_winner_is(built_report: Path) -> None:
-    from dataclasses import replace
-
     from invgraphics.report.statistics.summary import summarise
 
     comparison = read_comparison(built_report)
