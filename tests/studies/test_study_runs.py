@@ -213,7 +213,7 @@ def test_the_forecast_adds_up() -> None:
     forecast = total(costs, runs=7, jobs=2)
     assert forecast.seconds == (3600 + 10 + 50 + 10 + 60 + 5) / 2
     assert (forecast.runs, forecast.missing, forecast.size) == (7, 3, 9 * 10**9)
-    assert str(forecast) == "7 runs, 4 of them finished; the rest takes about 31 min and 9 GB."
+    assert str(forecast) == "7 runs, 4 of them finished; the rest takes about 31 min 8 s and 9 GB."
 
 
 def test_training_data_has_the_same_door_in_fit_and_compare(toy_folder: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named
 from invgraphics.runs.comparison import ComparisonRecord, Failure, SceneFacts
 from invgraphics.runs.folder import RunFolder
-from invgraphics.runs.scores import Score
+from invgraphics.runs.scores import quality_of
 from invgraphics.scenes.corrupt import corrupt
 from invgraphics.training.budget import Budget
 
@@ -107,7 +107,7 @@ def _summary(request: CompareRequest, scene: Scene) -> ComparisonRecord:
         preset_chosen_on={method.name: method.chosen_on for method in methods if method.chosen_on},
         render_with=request.render_with,
         command=request.shell(),
-        baselines={name: {key: Score(**score) for key, score in scores.items()} for name, scores in baselines.items()},
+        baselines={name: quality_of(quality) for name, quality in baselines.items()},
         noise_ceiling=scene.noise_ceiling,
         protocol=asdict(protocol) | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
         scene_info=_scene_facts(scene),

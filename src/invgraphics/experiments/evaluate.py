@@ -26,7 +26,7 @@ from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.run import truth_arrays, truth_picture
-from invgraphics.runs.scores import Score, Scores
+from invgraphics.runs.scores import Scores, quality_of
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
 
@@ -88,7 +88,7 @@ def evaluate(
             observed.append(observe(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
-    joined = {name: Score(**score) for name, score in quality.items()}
+    joined = quality_of(quality)
     result = Scores(
         method=method.name,
         preset=method.preset,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -117,6 +118,11 @@ class Scores(Record):
     def file(self) -> str:
         """Name of the file that holds this record."""
         return scores_file(self.protocol)
+
+
+def quality_of(joined: Mapping[str, Mapping[str, Any]]) -> dict[str, Score]:
+    """Metric -> score, from the tables that `invgraphics.metrics.protocols.summarise` joins over the views."""
+    return {name: Score(**{**table, "per_view": tuple(table.get("per_view", ()))}) for name, table in joined.items()}
 
 
 def scores_file(protocol: str = DEFAULT) -> str:

@@ -13,7 +13,7 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.conventions import Convention, Protocol
 from invgraphics.metrics.measures import score_under, summarise_under
 from invgraphics.metrics.protocols import ViewScore, score, summarise
-from invgraphics.runs.scores import DEFAULT, Score, ScoredTruth, Scores
+from invgraphics.runs.scores import DEFAULT, ScoredTruth, Scores, quality_of
 from invgraphics.tools.predictions import PictureSet
 from invgraphics.tools.rescoring import KNOWN, Rescored, Rules, background_name, evaluated, labels, scores_of
 
@@ -163,7 +163,7 @@ def _scores(pictures: PictureSet, rules: Rules, views: Sequence[ViewScore] | Non
         protocol=rules.name,
         views=pictures.names,
         cost={} if own is None else own.cost,
-        quality={name: Score(**score) for name, score in quality.items()},
+        quality=quality_of(quality),
         skipped=skipped,
         rescored=True,
         conventions=stated,
