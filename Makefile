@@ -15,8 +15,9 @@ env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 compare: env  ## the main job: three families on one scene under one budget, and a report
 	$(BIN)/invgraphics compare bricks --methods $(METHODS) --budget 60s --out reports/compare-bricks
 
-picture: compare  ## renew the README's picture
+picture: compare  ## renew the README's pictures
 	$(BIN)/python docs/picture.py reports/compare-bricks docs/compare-bricks.png
+	$(BIN)/python docs/example.py docs/example.png
 
 bench: env  ## every kernel against the reference and the machine's limits: reports/bench
 	$(BIN)/invgraphics bench

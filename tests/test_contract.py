@@ -14,7 +14,6 @@ from invgraphics import kernels
 from invgraphics.core import (
     Bounds,
     Camera,
-    Conditional,
     Context,
     Encoding,
     Field,
@@ -73,7 +72,7 @@ class ProposalSampler(Sampler):
         self.coarse, self.fine = coarse, fine
         self.net = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1))
 
-    def sample(self, rays: Rays, density: Any, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         hit = hitting(rays)
         spacing = strata(rays[hit], self.coarse, ctx)
         coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds))
@@ -194,7 +193,7 @@ class NeuS(RayRenderer):
         self.log_sharpness = nn.Parameter(torch.tensor(sharpness).log())
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
-        samples, _ = self.sampler.sample(ctx.bounds.clip(rays), lambda s: s.t0, ctx)
+        samples, _ = self.sampler.sample(ctx.bounds.clip(rays), field, ctx)
         values = field.query(samples, self.requires)
         assert values.sdf is not None
         assert values.normal is not None
@@ -248,7 +247,7 @@ def test_sdf_renderer_with_learnable_sharpness() -> None:
 # (d) A field conditioned on a latent code, over two scenes.
 
 
-class BlobFamily(Conditional):
+class BlobFamily(nn.Module):
     """A hypernetwork: a code becomes the parameters of a coloured Gaussian blob."""
 
     def __init__(self, width: int = 4) -> None:

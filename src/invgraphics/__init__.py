@@ -1,11 +1,73 @@
-"""Compare and teach differentiable rendering: NeRF volume rendering versus splatting, on one ruler."""
+"""Compare and teach differentiable rendering: NeRF volume rendering versus splatting, on one ruler.
 
-import os
-import sys
+>>> import invgraphics as ig
+>>> scene = ig.load_scene("bricks")                                    # doctest: +SKIP
+>>> fit = ig.fit("splatting/gaussians", scene, budget="30s")           # doctest: +SKIP
+>>> fit.model.render(scene.test[0].camera)                             # doctest: +SKIP
 
-SPIN_SETTING_IS_LATE = "torch" in sys.modules and not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & os.environ.keys()
-"""Whether torch has read the environment without the setting below; `invgraphics.kernels.waiting` then finds another way."""
+All names below are imported when they are first used: importing the package imports no torch.
+"""
 
-# torch and Numba bring a thread pool each. A thread that waits by spinning takes the core that the other pool's thread needs;
-# with one more busy process on two cores, steps then took ten times as long. Read by libgomp when torch is imported.
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from invgraphics import thread_pools as thread_pools  # sets what torch reads when it is imported
+
+if TYPE_CHECKING:
+    from invgraphics.api import ablate as ablate
+    from invgraphics.api import compare as compare
+    from invgraphics.api import evaluate as evaluate
+    from invgraphics.api import fit as fit
+    from invgraphics.api import load_method as load_method
+    from invgraphics.api import load_run as load_run
+    from invgraphics.api import load_scene as load_scene
+    from invgraphics.core import Camera as Camera
+    from invgraphics.core import Gaussians as Gaussians
+    from invgraphics.core import Model as Model
+    from invgraphics.core import Rendering as Rendering
+    from invgraphics.core import Scene as Scene
+    from invgraphics.core import View as View
+
+__all__ = [
+    "Camera",
+    "Gaussians",
+    "Model",
+    "Rendering",
+    "Scene",
+    "View",
+    "ablate",
+    "compare",
+    "evaluate",
+    "fit",
+    "load_method",
+    "load_run",
+    "load_scene",
+]
+
+_HOMES = {
+    "Camera": "invgraphics.core",
+    "Gaussians": "invgraphics.core",
+    "Model": "invgraphics.core",
+    "Rendering": "invgraphics.core",
+    "Scene": "invgraphics.core",
+    "View": "invgraphics.core",
+    "ablate": "invgraphics.api",
+    "compare": "invgraphics.api",
+    "evaluate": "invgraphics.api",
+    "fit": "invgraphics.api",
+    "load_method": "invgraphics.api",
+    "load_run": "invgraphics.api",
+    "load_scene": "invgraphics.api",
+}
+"""Public name -> the module that has it."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'invgraphics' has no attribute '{name}'")
+    globals()[name] = value = getattr(importlib.import_module(_HOMES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

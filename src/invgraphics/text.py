@@ -9,7 +9,7 @@ from typing import Any
 
 def slug(method: str) -> str:
     """A method's name, ``renderer/recipe`` or the path of a recipe, as one folder name."""
-    return method.removesuffix(".toml").strip("/").replace("/", "-")
+    return method.removesuffix(".toml").strip("/").replace("/", "-").replace(":", "-")
 
 
 def file_name(key: str) -> str:

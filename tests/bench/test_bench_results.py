@@ -8,7 +8,7 @@ from bench_made_up import measured
 from invgraphics.bench import iterations, sample_cases, splat_cases
 from invgraphics.bench.gates import gates
 from invgraphics.bench.growth import growths
-from invgraphics.bench.results import BOTH, COLUMNS, FORWARD, SIZE_KEYS, Footprint, Results, write_tables
+from invgraphics.bench.results import BOTH, COLUMNS, FORWARD, SIZE_KEYS, PeakMemory, Results, write_tables
 from invgraphics.bench.run import thread_counts
 from invgraphics.bench.tables import number, quantity
 
@@ -22,7 +22,7 @@ def test_share_is_the_rate_over_the_limit() -> None:
 def test_tables_on_disk(tmp_path) -> None:
     results = Results(
         [measured("ssim", "numba", BOTH, {"width": 400, "channels": 3}, 0.002, amount=10.0, unit="flop")],
-        [Footprint("ssim", "numba", 1000, "pixel", 64_000)],
+        [PeakMemory("ssim", "numba", 1000, "pixel", 64_000)],
     )
     write_tables(results, tmp_path)
     (row,) = csv.DictReader((tmp_path / "results.csv").open())

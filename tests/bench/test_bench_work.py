@@ -6,9 +6,9 @@ import torch
 from scipy.spatial import KDTree
 
 from invgraphics import kernels
-from invgraphics.bench import iterations, limits, memory, peers, run, sample_cases, splat_cases, subject
+from invgraphics.bench import iterations, limits, memory, peers, run, sample_cases, splat_cases, workload
 from invgraphics.bench.results import BOTH, FORWARD, Results
-from invgraphics.bench.run import Request, bench, measure_case
+from invgraphics.bench.run import BenchRequest, bench, measure_case
 from invgraphics.bench.timing import Effort
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.neural import CPU_CHUNK, NeuralFieldConfig
@@ -38,20 +38,20 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_object_is_repeatable_and_its_gaussians_overlap_their_neighbours() -> None:
-    field = subject.gaussian_field(3000)
-    assert torch.equal(field.means, subject.gaussian_field(3000).means)
+    field = workload.gaussian_field(3000)
+    assert torch.equal(field.means, workload.gaussian_field(3000).means)
     means = field.means.detach()
     ball = (means[:1000] - torch.tensor([-0.4, 0.1, -0.2])).norm(dim=1)
     assert torch.allclose(ball, torch.full_like(ball, 0.4), atol=1e-5)
     nearest = KDTree(means.numpy()).query(means.numpy(), k=4)[0][:, 1:].mean(axis=1)
     ratio = np.median(field.log_scales.detach().exp().numpy() / nearest[:, None])
-    assert ratio == pytest.approx(subject.SCALE, rel=0.05)
+    assert ratio == pytest.approx(workload.SCALE, rel=0.05)
     assert float(field.opacity_logits.detach().std()) == pytest.approx(2, rel=0.1)
 
 
 def test_occupied_cells_hold_the_object_and_little_else() -> None:
-    cells = subject.occupied(64)
-    unit = subject.bounds().to_unit(subject.gaussian_field(500, seed=7).means.detach())
+    cells = workload.occupied(64)
+    unit = workload.bounds().to_unit(workload.gaussian_field(500, seed=7).means.detach())
     x, y, z = (unit * 64).long().unbind(1)
     assert bool(cells[x, y, z].all())
     assert 0.01 < float(cells.float().mean()) < 0.2
@@ -90,7 +90,7 @@ def test_networks_alone_are_the_fields_networks() -> None:
         encoding=HashConfig(levels=2, log2_size=4), layers=1, width=8, skip=-1, geometry_features=3,
         colour_width=8, direction="sh", density_activation="exp",
     )  # fmt: skip
-    field = config.build(subject.scene(subject.gaussian_field(50), 1, 8))
+    field = config.build(workload.scene(workload.gaussian_field(50), 1, 8))
     gradients = iterations.networks_alone(field, CPU_CHUNK + 5)()
     parameters = sum(1 for _ in (*field.geometry_net.parameters(), *field.colour_net.parameters()))
     assert [part[0].shape for part in gradients] == [(CPU_CHUNK, 4), (5, 4)]
@@ -101,7 +101,7 @@ def test_whole_steps_are_measured_beside_their_part(monkeypatch) -> None:
     monkeypatch.setattr(iterations, "WARM_STEPS", 2)
     monkeypatch.setattr(iterations, "WARM_SAMPLES", 256)
     monkeypatch.setattr(iterations, "SAMPLES", 512)
-    monkeypatch.setattr(iterations, "nerf_scene", lambda: subject.scene(subject.gaussian_field(200), 2, 16))
+    monkeypatch.setattr(iterations, "nerf_scene", lambda: workload.scene(workload.gaussian_field(200), 2, 16))
     once = Effort(0.0, 1, 1)
     found = iterations.splat_step(100, 16, once) + iterations.nerf_step({"levels": 2, "log2_size": 5, "hidden": 8}, once)
     assert [m.operation for m in found] == [
@@ -113,7 +113,7 @@ def test_whole_steps_are_measured_beside_their_part(monkeypatch) -> None:
 @pytest.mark.usefixtures("tiny")
 def test_a_run_measures_both_implementations_and_their_limit() -> None:
     said: list[str] = []
-    results = bench(Request(("splats", "hash"), quick=True, say=said.append))
+    results = bench(BenchRequest(("splats", "hash"), quick=True, progress=said.append))
     for operation in ("splats", "splat_project", "hash_encode"):
         for name in ("reference", "numba"):
             for direction in (FORWARD, BOTH):
@@ -129,9 +129,9 @@ def test_a_run_measures_both_implementations_and_their_limit() -> None:
 def test_without_numba_the_reference_is_measured_alone(monkeypatch) -> None:
     missing = lambda name: "ImportError: no numba" if name == "numba" else ""  # noqa: E731
     for module in (run, limits, splat_cases):
-        monkeypatch.setattr(module, "why_not", missing)
-    monkeypatch.setattr(run, "here", lambda: ("reference",))
-    results = bench(Request(("splats", "iterations", "peers"), quick=True))
+        monkeypatch.setattr(module, "unavailable_reason", missing)
+    monkeypatch.setattr(run, "cpu_implementations", lambda: ("reference",))
+    results = bench(BenchRequest(("splats", "iterations", "peers"), quick=True))
     assert {m.implementation for m in results.measurements} == {"reference", "machine"}
     assert {skipped.what for skipped in results.skipped} == {"numba kernels", "cuda kernels", "iterations", "peers"}
     assert results.find("splats", "reference", BOTH).share is None
@@ -141,7 +141,7 @@ def test_without_numba_the_reference_is_measured_alone(monkeypatch) -> None:
 def test_sizes_too_slow_for_the_reference_say_so() -> None:
     results = Results()
     (case,) = [case for case in splat_cases.splats(True) if case.operation == "splat_rasterise"]
-    found = measure_case(case, Request(quick=True), results.skipped)
+    found = measure_case(case, BenchRequest(quick=True), results.skipped)
     assert {m.implementation for m in found} == {"numba"}
     assert "splat_rasterise gaussians=100" in results.skipped[0].what
 
@@ -150,12 +150,15 @@ def test_memory_of_compositing_holds_at_least_its_outputs() -> None:
     if not memory.CLEAR.exists():
         pytest.skip("no /proc")
     results = Results()
-    memory.SUBJECTS, everything = {"composite": memory.Subject("sample", memory.SAMPLES, ("numba",))}, memory.SUBJECTS
+    memory.MEMORY_CASES, everything = (
+        {"composite": memory.MemoryCase("sample", memory.SAMPLES, ("numba",))},
+        memory.MEMORY_CASES,
+    )
     try:
-        memory.footprints(("numba",), results)
+        memory.measure_memory(("numba",), results)
     finally:
-        memory.SUBJECTS = everything
-    (found,) = results.footprints
+        memory.MEMORY_CASES = everything
+    (found,) = results.memory
     # Weights, transmittance behind, and gradients of the depth and of four channels.
     assert 4 * (1 + 1 + 1 + 4) < found.each < 200
 

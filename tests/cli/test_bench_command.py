@@ -9,7 +9,7 @@ from bench_made_up import measured
 
 from invgraphics.bench import PARTS, QUICK, iterations, sample_cases, splat_cases
 from invgraphics.bench import run as bench_run
-from invgraphics.bench.results import BOTH, FORWARD, PEERS, THREADS, Footprint, Results, Skipped
+from invgraphics.bench.results import BOTH, FORWARD, PEERS, THREADS, PeakMemory, Results, Skipped
 from invgraphics.cli import main
 from invgraphics.cli.bench import Bench
 from invgraphics.errors import InputError
@@ -18,7 +18,7 @@ from invgraphics.errors import InputError
 def made_up_run(request) -> Results:
     """A run with something in every table, in which all promises but the iteration's are kept."""
     limit = {"amount": 1.0, "unit": "look-ups", "limit": "gather 1 KB", "limit_rate": 20.0}
-    results = Results(footprints=[Footprint("splats", "numba", 10, "Gaussian", 10_000)])
+    results = Results(memory=[PeakMemory("splats", "numba", 10, "Gaussian", 10_000)])
     for n in (10_000, splat_cases.GATE["gaussians"], 200_000):
         for direction in (FORWARD, BOTH):
             sizes = {**splat_cases.GATE, "gaussians": n}

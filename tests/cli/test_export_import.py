@@ -93,11 +93,13 @@ def test_an_imported_run_is_a_run(run: Path, toy_folder: Path, tmp_path: Path, c
     assert _quality(tmp_path / "again") == _quality(back)
 
 
+def _import(file: Path, scene: Path, out: Path, **placed: str) -> ImportRequest:
+    return ImportRequest(file=str(file), run=FitRequest(scene=str(scene), method=METHOD, out=str(out)), **placed)
+
+
 def test_reports_show_it_beside_fits(run: Path, toy_folder: Path, tmp_path: Path) -> None:
     export_run(ExportRequest(run, "spz", tmp_path / "model.spz"))
-    back = import_run(
-        ImportRequest(file=str(tmp_path / "model.spz"), scene=str(toy_folder), method=METHOD, out=str(tmp_path / "b"))
-    )
+    back = import_run(_import(tmp_path / "model.spz", toy_folder, tmp_path / "b"))
     assert main.run(["report", str(run), str(back), "--out", str(tmp_path / "page")]) == main.DONE
     text = (tmp_path / "page" / "index.md").read_text()
     assert "splatting/gaussians (laptop)" in text and "splatting/gaussians (imported)" in text
@@ -119,9 +121,7 @@ def test_exports_are_in_the_world(run: Path, toy_folder: Path, tmp_path: Path, m
     expected = 2 * local.means @ turn.T + similarity[:3, 3]
     assert torch.allclose(world.means, expected, atol=1e-5)
     assert torch.allclose(world.scales, 2 * local.scales, rtol=1e-5)
-    back = import_run(
-        ImportRequest(file=str(tmp_path / "world.ply"), scene=str(toy_folder), method=METHOD, out=str(tmp_path / "b"))
-    )
+    back = import_run(_import(tmp_path / "world.ply", toy_folder, tmp_path / "b"))
     assert _quality(back)["psnr"] == pytest.approx(_quality(run)["psnr"], abs=1e-3)
 
 
@@ -135,13 +135,13 @@ def test_axes(run: Path, toy_folder: Path, tmp_path: Path) -> None:
     for world, expected in (("z-up", [x, z, -y]), ("opencv", [x, -y, -z]), ("opengl", [x, y, z])):
         file = _exported(run, tmp_path / "a.spz", "spz", world=world)
         assert torch.allclose(read_gaussians(file)[1].gaussians.means, torch.stack(expected, dim=1), atol=1e-4)
-        request = ImportRequest(file=str(file), scene=str(toy_folder), method=METHOD, out=str(tmp_path / world), world=world)
+        request = _import(file, toy_folder, tmp_path / world, world=world)
         assert abs(_quality(import_run(request))["psnr"] - _quality(run)["psnr"]) < 0.3
     splats = read_gaussians(tmp_path / "a.spz")[1]
     write_gaussians(tmp_path / "b.ply", "ply", splats)  # a file that does not say that it is right, up, back
-    request = ImportRequest(file=str(tmp_path / "b.ply"), scene=str(toy_folder), method=METHOD, out=str(tmp_path / "b"))
+    request = _import(tmp_path / "b.ply", toy_folder, tmp_path / "b")
     assert _quality(import_run(replace(request, frame="opencv")))["psnr"] == pytest.approx(_quality(run)["psnr"], abs=0.3)
-    turned = import_run(replace(request, frame="opengl", out=str(tmp_path / "c")))
+    turned = import_run(_import(tmp_path / "b.ply", toy_folder, tmp_path / "c", frame="opengl"))
     assert _quality(turned)["psnr"] < _quality(run)["psnr"] - 0.5
 
 

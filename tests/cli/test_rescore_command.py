@@ -11,7 +11,7 @@ from PIL import Image
 from invgraphics.cli.main import run
 from invgraphics.cli.rescore import parse_colour
 from invgraphics.errors import InputError
-from invgraphics.metrics.conventions import CONVENTIONS
+from invgraphics.metrics.conventions import PROTOCOLS
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_a_folder_of_pictures_is_scored_and_written_elsewhere(pictures: Path, tm
     assert sorted(pictures.rglob("*")) == before
     scores = json.loads((out / "model" / "scores.nerf-pytorch.json").read_text())
     assert scores["protocol"] == "nerf-pytorch" and len(scores["quality"]["psnr"]["per_view"]) == 3
-    assert scores["conventions"]["source"] == CONVENTIONS["nerf-pytorch"].source
+    assert scores["conventions"]["source"] == PROTOCOLS["nerf-pytorch"].source
     assert (out / "rescore.md").is_file() and (out / "rescore.csv").is_file()
 
 
@@ -97,7 +97,7 @@ def test_an_unfinished_run_is_refused(tmp_path: Path, capsys) -> None:
 def test_protocols_are_listed_with_their_sources(capsys) -> None:
     assert run(["list", "protocols"]) == 0
     text = capsys.readouterr().out
-    assert all(f" {name} " in text for name in ("default", "float", *CONVENTIONS))
+    assert all(f" {name} " in text for name in PROTOCOLS)
     assert "metrics.py" in text
 
 

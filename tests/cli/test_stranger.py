@@ -1,4 +1,4 @@
-"""A field from a stranger's package, found by its entry point: listed, compared, reported, without an edit to ours."""
+"""A field and a renderer from a stranger's package, found by entry points: they take part without an edit to ours."""
 
 import json
 import os
@@ -7,13 +7,21 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
+
 MODULE = '''
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
 import torch
 from torch import nn
-from invgraphics.core import Field, FieldValues, Quantity
+from invgraphics.config import Slot
+from invgraphics.core import Field, FieldValues, Quantity, RayRenderer
+from invgraphics.renderers.quadrature import integrate
+from invgraphics.renderers.samplers import StratifiedConfig
 
 @dataclass(frozen=True)
 class FogConfig:
@@ -31,6 +39,28 @@ class Fog(Field):
     def query(self, samples, want):
         m = len(samples)
         return FieldValues(density=self.log_density.exp().expand(m), radiance=self.logits.sigmoid().expand(m, 3))
+
+@dataclass(frozen=True)
+class ExposedConfig:
+    """Volume rendering with an exposure that is learnt."""
+    title = "exposed volume rendering"
+    sampler: Annotated[Any, Slot("samplers")] = field(default_factory=StratifiedConfig)
+    def build(self, scene):
+        return Exposed(self.sampler.build(scene))
+
+class Exposed(RayRenderer):
+    requires = Quantity.DENSITY | Quantity.RADIANCE
+    def __init__(self, sampler):
+        super().__init__()
+        self.sampler = sampler
+        self.log_exposure = nn.Parameter(torch.zeros(()))
+    def render_rays(self, field, rays, ctx):
+        samples, levels = self.sampler.sample(ctx.bounds.clip(rays), field, ctx)
+        values = field.query(samples, self.requires)
+        values = replace(values, radiance=values.radiance * self.log_exposure.exp())
+        return integrate(rays, samples, values, values.density * samples.delta, levels)
+    def untrained(self):
+        return Exposed(self.sampler.untrained())
 
 RECIPE = """
 summary = "Even fog from a stranger"
@@ -50,9 +80,16 @@ rays = 64
 match = "field"
 lr = 0.05
 """
+
+EXPOSED = RECIPE.replace("volumetric", "exposed").replace("Even fog", "Exposed fog") + """
+[optimiser.groups.exposure]
+match = "renderer"
+lr = 0.05
+"""
 '''
 ENTRY_POINTS = (
-    "[invgraphics.fields]\nfog = stranger_fog:FogConfig\n\n[invgraphics.recipes]\nvolumetric/fog = stranger_fog:RECIPE\n"
+    "[invgraphics.fields]\nfog = stranger_fog:FogConfig\n\n[invgraphics.renderers]\nexposed = stranger_fog:ExposedConfig\n\n"
+    "[invgraphics.recipes]\nvolumetric/fog = stranger_fog:RECIPE\nexposed/fog = stranger_fog:EXPOSED\n"
 )
 
 
@@ -86,6 +123,40 @@ def test_a_strangers_field_takes_part(environment: dict[str, str], toy_folder: P
     assert scores["cost"]["parameters"] == 4
     page = (out / "index.html").read_text()
     assert "volumetric/fog" in page and "Even fog from a stranger" in page
+
+
+def test_a_strangers_renderer_with_state_takes_part(environment: dict[str, str], toy_folder: Path, tmp_path: Path) -> None:
+    """Listed, fitted, compared with ours, shown beside it for a field that ours fitted, reported and explained."""
+    matrix, listed = _invgraphics(environment, "list", "matrix"), _invgraphics(environment, "list", "renderers")
+    assert "| exposed volume rendering |" in matrix
+    assert "stranger_fog:ExposedConfig" in listed
+    out = tmp_path / "report"
+    words = [
+        "--budget",
+        "20steps",
+        "--out",
+        str(out),
+        "--methods",
+        "volumetric/fog,exposed/fog",
+        "--render-with",
+        "exposed/fog",
+    ]
+    assert "exposed/fog" in _invgraphics(environment, "compare", str(toy_folder), *words)
+    assert "Exposed fog from a stranger" in (out / "index.html").read_text()
+    ours, theirs = (out / "runs" / name / "seed-0" for name in ("volumetric-fog", "exposed-fog"))
+    assert json.loads((theirs / "scores.json").read_text())["cost"]["parameters"] == 5
+    state = checkpoint.load(theirs / CHECKPOINT)
+    assert abs(float(state["renderer"]["log_exposure"])) > 0.01, "the renderer has learnt nothing"
+    # An exposure of 1 stands in, under which our renderer's field looks as it did.
+    shown = ours / "rendered" / "exposed-fog"
+    assert json.loads((shown / "scores.json").read_text())["method"] == "volumetric/fog rendered with exposed/fog"
+    with np.load(ours / "test" / "0000.npz") as own, np.load(shown / "test" / "0000.npz") as other:
+        np.testing.assert_allclose(own["rgb"], other["rgb"], atol=1e-3)
+    for run in (theirs, shown):
+        told = _invgraphics(environment, "explain", str(run), "--view", "0", "--pixel", "12,12")
+        assert "8 samples" in told
+        pixel = json.loads((run / "explained" / "test-0000-12-12" / "ray.json").read_text())["pixel"]
+        assert pixel["composited"] == pytest.approx(pixel["rendered"], abs=1e-5)
 
 
 def test_a_run_whose_package_is_gone_names_it(environment: dict[str, str], toy_folder: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import torch
 
 from invgraphics.core import Scene
 from invgraphics.core.transforms import apply_similarity, se3_exp
-from invgraphics.experiments.posed import scene_of_fit
+from invgraphics.experiments.posed import scene_in_fit_frame
 from invgraphics.metrics.poses import Similarity
 from invgraphics.training.poses import Poses, PosesConfig
 
@@ -20,7 +20,7 @@ def test_a_scene_follows_its_fit(scene: Scene) -> None:
     scene = replace(scene, test=(replace(first, depth=depth, normal=normal), *scene.test[1:]))
     poses = Poses.of(PosesConfig(), scene)
     poses.given.copy_(drift.poses(poses.reference))
-    seen = scene_of_fit(poses, scene)
+    seen = scene_in_fit_frame(poses, scene)
     for split in ("train", "test"):
         for before, after in zip(getattr(scene, split), getattr(seen, split), strict=True):
             expected = drift.poses(before.camera.cam_to_world).float()

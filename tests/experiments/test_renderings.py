@@ -17,13 +17,18 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.compare import compare
 from invgraphics.experiments.evaluate import evaluate_run
-from invgraphics.experiments.renderings import check_eyes, eye_named, rendered
+from invgraphics.experiments.fitted import open_fitted
+from invgraphics.experiments.job import Job
+from invgraphics.experiments.renderings import check_variants, rendered
 from invgraphics.experiments.request import AblateRequest, CompareRequest, FitRequest
 from invgraphics.experiments.run import fit_run
+from invgraphics.experiments.variants import variant_named
 from invgraphics.recipes.recipe import load_method
+from invgraphics.recipes.schema import Recipe
 from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
+from invgraphics.renderers.volumetric import Volumetric
 from invgraphics.runs import checkpoint
-from invgraphics.runs.folder import CHECKPOINT, RunFolder
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.runs.schema import plain
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.studies.cells import make_plan
@@ -78,7 +83,7 @@ def test_differences_are_those_of_the_pictures(run: Path) -> None:
 
 def test_a_rendering_is_the_fitted_field_through_that_renderer(run: Path, toy_folder: Path) -> None:
     scene = open_scene(str(toy_folder), SceneOptions(test_views=16))
-    field, _ = build_model(load_method(METHOD, None, SMALL[METHOD]), scene, 0, torch.device("cpu"))
+    field = build_model(load_method(METHOD, None, SMALL[METHOD]), scene, 0, torch.device("cpu")).field
     field.load_state_dict(checkpoint.load(run / CHECKPOINT)["field"])
     with torch.no_grad():
         renderer = GaussianSorted(GaussianSortedConfig("splat"))
@@ -103,21 +108,20 @@ def _stamps(run: Path) -> dict[str, int]:
 
 
 def test_what_is_there_is_kept(run: Path, request_one: FitRequest) -> None:
-    method = load_method(METHOD, None, SMALL[METHOD])
     before = _stamps(run)
-    assert rendered(RunFolder(run), request_one, method)
+    assert rendered(Job.of(request_one))
     fit_run(request_one)
     assert _stamps(run) == before
     # One rendering is lost: it alone is made again, and the fit is not.
     (run / "rendered" / "gaussian-volume-exact-steps=8" / "scores.json").unlink()
     (run / "renderings.json").unlink()
-    assert not rendered(RunFolder(run), request_one, method)
+    assert not rendered(Job.of(request_one))
     fit_run(request_one)
     changed = {name for name, stamp in _stamps(run).items() if before[name] != stamp}
     assert changed == {"rendered/gaussian-volume-exact-steps=8/scores.json"}
     # One more is asked for.
     more = replace(request_one, render_with=(*OTHERS, "gaussian-volume/sorted"))
-    assert not rendered(RunFolder(run), more, method)
+    assert not rendered(Job.of(more))
     fit_run(more)
     assert len(_record(run)["renderings"]) == 4 and len(_record(run)["differences"]) == 6
     fit_run(request_one)
@@ -129,6 +133,29 @@ def test_a_changed_renderer_is_another_one_than_the_fits_own(run: Path, request_
     other = replace(request_one, overrides=items, out=str(tmp_path / "b"), render_with=(METHOD, f"{METHOD}:dilation=0.1"))
     names = [(entry["renderer"], entry["run"]) for entry in _record(fit_run(other))["renderings"]]
     assert names == [(f"{METHOD}:dilation=0.1", "."), (METHOD, "rendered/splatting-gaussians")]
+
+
+def test_constants_stand_in_for_what_another_fit_would_have_learnt(toy_folder: Path, tmp_path: Path) -> None:
+    """A field fitted without an occupancy grid, marched through a full one."""
+    variant = "volumetric/hash:sampler.resolution=8:sampler.steps_per_diagonal=64"
+    shared = {"method": "volumetric/nerf", "scene": str(toy_folder), "budget": "4steps", "test_views": 1}
+    out = str(tmp_path / "run")
+    run = fit_run(FitRequest(**shared, overrides=tuple(SMALL["volumetric/nerf"]), out=out, render_with=(variant,)))
+    record = _record(run)
+    assert [entry["renderer"] for entry in record["renderings"]] == ["volumetric/nerf", variant]
+    fitted = open_fitted(run)
+    config = variant_recipe(variant).renderer.sampler
+    marched = replace(fitted.model, renderer=Volumetric(config.build(fitted.scene)))
+    with np.load(run / record["renderings"][1]["run"] / "test" / "0000.npz") as kept:
+        picture = marched.render(fitted.scene.test[0].camera)
+        np.testing.assert_allclose(kept["rgb"], picture.rgb.numpy(), atol=1e-3)
+    opened = open_fitted(run / record["renderings"][1]["run"])
+    opened.load(checkpoint.load(run / CHECKPOINT))  # as the viewer does, of a fit that goes on
+
+
+def variant_recipe(name: str) -> Recipe:
+    method, *settings = name.split(":")
+    return load_method(method, None, [f"renderer.{item}" for item in settings]).recipe
 
 
 @pytest.mark.parametrize(
@@ -143,7 +170,7 @@ def test_a_changed_renderer_is_another_one_than_the_fits_own(run: Path, request_
 )
 def test_what_makes_no_sense_is_refused(methods: tuple[str, ...], names: tuple[str, ...], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        check_eyes(names, [load_method(name) for name in methods], toy_scene(views=2, size=8))
+        check_variants(list(map(variant_named, names)), list(map(load_method, methods)), toy_scene(views=2, size=8))
 
 
 def test_compare_refuses_before_the_first_fit(toy_folder: Path, tmp_path: Path) -> None:
@@ -157,10 +184,9 @@ def test_compare_refuses_before_the_first_fit(toy_folder: Path, tmp_path: Path) 
 
 
 def test_names_are_read() -> None:
-    assert eye_named(RAY).table == {"type": "gaussian_sorted", "opacity": "splat", "order": "ray", "smallest": 1 / 1020}
-    assert (
-        eye_named("gaussian-volume/exact:opacity=physical:steps=7").folder == "gaussian-volume-exact-opacity=physical-steps=7"
-    )
+    assert variant_named(RAY).table == {"type": "gaussian_sorted", "opacity": "splat", "order": "ray", "smallest": 1 / 1020}
+    changed = variant_named("gaussian-volume/exact:opacity=physical:steps=7")
+    assert changed.folder == "gaussian-volume-exact-opacity=physical-steps=7"
 
 
 def test_the_command_line_has_it() -> None:

@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 from training_fixtures import SMALL
 
+from invgraphics.core import Model
 from invgraphics.errors import InputError
 from invgraphics.experiments import evaluate
 from invgraphics.experiments import run as module
@@ -81,7 +82,7 @@ def test_what_an_import_suspects_is_repeated_before_the_fit(
 ) -> None:
     suspect = {"suspicion": "3 of 9 contradict"}
     scene = open_scene(str(toy_folder), SceneOptions())
-    monkeypatch.setattr(module, "open_requested", lambda _: replace(scene, notes=scene.notes | suspect))
+    monkeypatch.setattr(module, "open_with_progress", lambda *_: replace(scene, notes=scene.notes | suspect))
     out = fit_run(_request(toy_folder, tmp_path / "run", budget="2steps"))
     assert "SUSPICIOUS poses: 3 of 9 contradict" in capsys.readouterr().err
     assert json.loads((out / "provenance.json").read_text())["notes"]["suspicion"] == "3 of 9 contradict"
@@ -106,20 +107,18 @@ def test_timing_costs_few_pictures_more_where_normals_are_scored(
     run: Path, monkeypatch: pytest.MonkeyPatch, normals: bool, colour_only: int, whole: int
 ) -> None:
     """Normals make a picture dearer than a viewer's, so a picture without them is timed beside it, for some views."""
-    fitted, asked, plain = open_fitted(run), [], evaluate.render_view
+    fitted, asked, plain = open_fitted(run), [], Model.render
 
-    def counted(field, renderer, camera, scene, device, geometry=True):
+    def counted(model, camera, *, normals=True):
         if camera.width == fitted.scene.test[0].camera.width:
-            asked.append(geometry)
-        return plain(field, renderer, camera, scene, device, geometry)
+            asked.append(normals)
+        return plain(model, camera, normals=normals)
 
-    monkeypatch.setattr(evaluate, "render_view", counted)
+    monkeypatch.setattr(Model, "render", counted)
     monkeypatch.setattr(evaluate, "TIMED", 2)
     up = torch.tensor([0.0, 0.0, 1.0])
     views = tuple(replace(view, normal=up.expand(*view.image.shape) if normals else None) for view in fitted.scene.test)
-    scores = evaluate.evaluate(
-        fitted.folder, replace(fitted.scene, test=views), (fitted.field, fitted.renderer), "float", {}, fitted.method
-    )
+    scores = evaluate.evaluate(fitted.folder, replace(fitted.scene, test=views), fitted.model, "float", {}, fitted.method)
     assert (asked.count(False), asked.count(True)) == (colour_only, whole)
     assert scores.cost["render_fps"] > 0
 

@@ -1,14 +1,13 @@
 """Gaussian fields: where they start, resizing, checkpoints of another size, and motion."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
-from invgraphics.core import Context, Points, Quantity, Samples, harmonics
+from invgraphics.core import Camera, Context, Points, Quantity, Samples, View, harmonics
 from invgraphics.core.colour import srgb_to_linear
-from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.gaussian import PARAMETERS, GaussianField, GaussianFieldConfig
 
@@ -92,6 +91,67 @@ def test_random_start_in_contracted_space_reaches_far(make_scene):
     assert float(distance.max()) <= 30.001
 
 
+def _photographs(scene, alpha: bool = False):
+    """Two views from either side of the scene's middle: the left half of each is red, the right half blue."""
+    centre, distance = scene.bounds.centre, 2.0
+    views = []
+    for facing in (1.0, -1.0):
+        pose = torch.diag(torch.tensor([facing, 1.0, facing, 1.0]))
+        pose[:3, 3] = centre - distance * pose[:3, 2]
+        camera = Camera(pose, torch.tensor([60.0, 60.0]), torch.tensor([20.0, 10.0]), 40, 20)
+        image = torch.zeros(20, 40, 3)
+        image[:, :20, 0] = image[:, 20:, 2] = 1.0
+        views.append(View(camera, image, f"facing {facing}", alpha=torch.ones(20, 40) if alpha else None))
+    return scene.with_views(train=tuple(views))
+
+
+def test_a_backdrop_lies_behind_the_subject_in_the_colours_of_the_photographs(make_scene):
+    scene = _photographs(make_scene("contracted", points=_points(30), half=0.3))
+    field = GaussianFieldConfig(backdrop=101).build(scene)
+    means, colour = field.means.detach()[30:], field.sh_dc.detach()[30:, 0] * harmonics.BAND_0 + 0.5
+    assert field.primitive_count() == 131
+    torch.testing.assert_close(field.means.detach()[:30], scene.points.position)
+    for index, (view, facing) in enumerate(zip(scene.train, (1.0, -1.0), strict=True)):
+        own = slice(0, 51) if index == 0 else slice(51, 101)  # evenly over the views
+        offset = means[own] - view.camera.position
+        x, y, z = offset[:, 0] * facing, offset[:, 1], offset[:, 2] * facing
+        assert (z > 0).all()
+        assert ((60 * x / z).abs() <= 20).all() and ((60 * y / z).abs() <= 10).all(), "outside the picture"
+        reach = offset.norm(dim=1) / 2.0
+        assert (reach >= 1.5).all() and (reach <= 10.0001).all(), "not behind the subject"
+        left = x < 0
+        torch.testing.assert_close(colour[own][left], torch.tensor([1.0, 0.0, 0.0]).expand(int(left.sum()), 3))
+        torch.testing.assert_close(colour[own][~left], torch.tensor([0.0, 0.0, 1.0]).expand(int((~left).sum()), 3))
+
+
+@pytest.mark.parametrize(("space", "alpha"), [("box", False), ("contracted", True)])
+def test_no_backdrop_where_there_is_nothing_behind(make_scene, space, alpha):
+    scene = _photographs(make_scene(space, points=_points(30)), alpha)
+    assert GaussianFieldConfig(backdrop=100).build(scene).primitive_count() == 30
+
+
+def test_a_backdrop_leaves_out_masked_pixels_and_stays_at_a_distance_around_cameras(make_scene):
+    scene = _photographs(make_scene("contracted", points=_points(30), half=0.3))
+    here = torch.eye(4)
+    here[:3, 3] = scene.bounds.centre  # a camera in the middle looks outwards
+    mask = torch.zeros(20, 40, dtype=torch.bool)
+    mask[:, 30:] = True
+    view = scene.train[0]
+    view = replace(view, camera=view.camera.moved(here), mask=mask)
+    field = GaussianFieldConfig(backdrop=50).build(scene.with_views(train=(view,)))
+    offset = field.means.detach()[30:] - scene.bounds.centre
+    assert len(offset) == 50
+    assert (60 * offset[:, 0] / offset[:, 2] >= 10).all(), "a pixel that does not count"
+    assert (offset.norm(dim=1) >= 1.49 * scene.bounds.radius).all()
+
+
+def test_the_backdrop_gives_way_to_a_limit_on_primitives():
+    config = GaussianFieldConfig(count=500, max_init=400, backdrop=300)
+    assert config.capped(10_000) == config
+    assert (config.capped(600).count, config.capped(600).backdrop) == (500, 100)
+    assert (config.capped(300).count, config.capped(300).max_init, config.capped(300).backdrop) == (300, 300, 0)
+
+
 def test_too_many_points_are_thinned_by_the_seed(make_scene):
     scene = make_scene(points=_points(100))
     starts = []
@@ -113,7 +173,7 @@ def test_bad_point_clouds_are_refused_in_a_sentence(make_scene, points, says):
     assert GaussianFieldConfig(init="random", count=5).build(make_scene(points=points)).primitive_count() == 5
 
 
-@pytest.mark.parametrize("bad", [{"sh_degree": 4}, {"opacity": 1.0}, {"count": 0}, {"scale_factor": 0.0}])
+@pytest.mark.parametrize("bad", [{"sh_degree": 4}, {"opacity": 1.0}, {"count": 0}, {"backdrop": -1}, {"scale_factor": 0.0}])
 def test_nonsense_is_refused(bad):
     with pytest.raises(ValueError, match="must"):
         GaussianFieldConfig(**bad)
@@ -167,33 +227,6 @@ def test_a_checkpoint_of_another_size_loads(make_scene):
     assert small.means.grad.shape == (30, 3)
     with pytest.raises(RuntimeError, match="sh_rest"):
         GaussianFieldConfig(sh_degree=1).build(scene).load_state_dict(big.state_dict())
-
-
-def test_transformed_moves_covariances_and_colours_and_comes_back(make_scene):
-    scene = make_scene(points=_points())
-    field = _scrambled(scene)
-    field.active_degree = 2
-    rotation = torch.from_numpy(Rotation.random(random_state=1).as_matrix())
-    similarity = torch.eye(4, dtype=torch.float64)
-    similarity[:3, :3], similarity[:3, 3] = 2.5 * rotation, torch.tensor([1.0, -2.0, 0.5])
-    before, after = _gaussians(field, scene), _gaussians(field.transformed(similarity), scene)
-    torch.testing.assert_close(after.means, 2.5 * before.means @ rotation.T + similarity[:3, 3])
-
-    def covariance(gaussians):
-        axes = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
-        return axes @ axes.mT
-
-    torch.testing.assert_close(covariance(after), 2.5**2 * rotation @ covariance(before) @ rotation.T)
-    direction = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1)
-    seen = harmonics.evaluate(after.sh, direction @ rotation.T)
-    torch.testing.assert_close(seen, harmonics.evaluate(before.sh, direction))
-    back = _gaussians(field.transformed(similarity).transformed(torch.linalg.inv(similarity)), scene)
-    torch.testing.assert_close(back.means, before.means)
-    torch.testing.assert_close(covariance(back), covariance(before))
-    torch.testing.assert_close(back.sh, before.sh)
-    assert field.transformed(similarity).active_degree == 2
-    with pytest.raises(InputError, match="mirror"):
-        field.transformed(torch.diag(torch.tensor([1.0, 1, -1, 1])))
 
 
 def test_points_cannot_be_asked(make_scene):

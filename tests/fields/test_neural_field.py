@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from invgraphics.config import fill, to_table
-from invgraphics.core import Bounds, Quantity, Samples, no_grad_density
+from invgraphics.core import Bounds, Quantity, Samples
 from invgraphics.errors import InputError
 from invgraphics.fields import neural
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies
@@ -294,7 +294,7 @@ def test_a_new_field_is_as_thin_in_endless_space_as_in_a_box(make_scene) -> None
         torch.nn.init.zeros_(field.geometry_net.output.bias)
         r = torch.cat([torch.linspace(0, 1, 2001), torch.logspace(0, 2, 4001)[1:]]).double()
         position = scene.bounds.centre + (half * (r[1:] + r[:-1]) / 2).float()[:, None] * torch.tensor([[0.6, 0.0, 0.8]])
-        density = no_grad_density(field)(Samples.at(position)).double()
+        density = field.density_no_grad(Samples.at(position)).double()
         depth = (density * half * r.diff()).sum()
         start = math.log1p(math.exp(0.5))  # softplus
         assert float(depth) == pytest.approx(start * (2 - 1 / 100), rel=1e-3)

@@ -8,7 +8,7 @@ from gaussian_files import camera_at, picture_of, psnr
 
 from invgraphics.core import Gaussians
 from invgraphics.core.transforms import axes_to_opencv
-from invgraphics.fields.transformed import move_gaussians
+from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import read_gaussians
 
 FILES = ("biker.compressed.ply", "biker.spz", "biker_derived_standard.ply")
@@ -18,7 +18,7 @@ EYES = ([0.0, -0.5, -3.0], [2.5, -1.0, 1.0])
 def _opencv(path: Path) -> Gaussians:
     """The file in axes right, down, forward; those of PLY files, which do not say, are so."""
     splats = read_gaussians(path)[1]
-    return move_gaussians(splats.gaussians, axes_to_opencv(splats.axes or "opencv").float())
+    return transform_gaussians(splats.gaussians, axes_to_opencv(splats.axes or "opencv").float())
 
 
 def test_the_three_files_agree(data: Callable[[str], Path]) -> None:

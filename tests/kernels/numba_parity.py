@@ -12,10 +12,11 @@ from torch import Tensor
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
 from invgraphics.kernels.numba.runtime import compile_here
-from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 WIDER = {"xmm": ("ymm", "zmm"), "ymm": ("zmm",), "zmm": ()}
 
@@ -49,14 +50,19 @@ def samples() -> list[str]:
     assert_equal(lambda d, c: numba.composite(d, c, ray, 30), lambda d, c: reference.composite(d, c, ray, 30), inputs)
     networks = [((torch.randn(16, 8), torch.randn(16)), (torch.randn(4, 16), torch.randn(4)))]
     networks += [((torch.randn(5, 7), torch.randn(5)), (torch.randn(3, 5), torch.randn(3)))]
-    field = HashField(torch.randn(grid.entries, 2), grid, *networks, "exp", -2.0, 2, "srgb")
+    field = FusedNGP(torch.randn(grid.entries, 2), grid, *networks, "exp", -2.0, 2, "srgb")
     bounds, rays = box_of_rays()
     call = rays, torch.rand(8, 8, 8) < 0.5, bounds, MarchSteps(0.05), field
-    for number, true in zip(numba.hash_render(*call), reference.hash_render(*call), strict=True):
+    for number, true in zip(numba.ngp_render(*call), reference.ngp_render(*call), strict=True):
         assert true.abs().max() > 0.1
         assert (number - true).abs().max() <= 1e-4 * true.abs().max()
-    parts = ("hash.encode", "hash.encode_back", "composite.accumulate", "composite.accumulate_back", "hash_render.render")
-    return assembly(*parts)
+    parts = (
+        "hash.encode.encode",
+        "hash.encode.encode_backward",
+        "rays.composite.accumulate",
+        "rays.composite.accumulate_backward",
+    )
+    return assembly(*parts, "ngp.render.render")
 
 
 def box_of_rays() -> tuple[Bounds, Rays]:
@@ -88,14 +94,14 @@ def pictures() -> list[str]:
     ours, theirs = (k.ray_march(rays, occupied, bounds, MarchSteps(0.01), rays.near) for k in (numba, reference))
     assert len(ours.ray) > 0
     assert all(torch.equal(getattr(ours, name), getattr(theirs, name)) for name in ("ray", "t0", "t1", "resume"))
-    return assembly("raster.rasterise", "raster_backward.walk_back", "march.walk")
+    return assembly("splat.raster.rasterise", "splat.raster_backward.rasterise_backward", "rays.march.traverse")
 
 
 def assembly(*names: str) -> list[str]:
     """Machine code of everything that kernels, named ``module.function``, were compiled to."""
     code = []
     for name in names:
-        module, _, function = name.partition(".")
+        module, _, function = name.rpartition(".")
         # By path: the package's attributes of these names are its operations.
         kernel = getattr(import_module(f"invgraphics.kernels.numba.{module}"), function)
         code += kernel.inspect_asm().values()

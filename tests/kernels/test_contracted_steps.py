@@ -5,11 +5,12 @@ from dataclasses import replace
 import torch
 
 from invgraphics.core.bounds import Bounds, contract
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
-from invgraphics.kernels.numba.rays.march import most_steps
+from invgraphics.kernels.numba.rays.march import max_steps
 from invgraphics.kernels.reference.march import step_lengths
-from invgraphics.kernels.types import HashField, HashGrid, March, MarchSteps
+from invgraphics.kernels.types import March, MarchSteps
 
 F64 = torch.float64
 STEPS = MarchSteps(0.03, limit=10_000, contracted=True)
@@ -53,7 +54,7 @@ def test_every_ray_ends_within_the_steps_there_is_room_for() -> None:
     everywhere = torch.ones(8, 8, 8, dtype=torch.bool)
     march = numba.ray_march(rays, everywhere, bounds, STEPS, rays.near)
     counts = torch.bincount(march.ray, minlength=len(rays))
-    assert int(counts.max()) < most_steps(rays, bounds, rays.near, STEPS) < 100
+    assert int(counts.max()) < max_steps(rays, bounds, rays.near, STEPS) < 100
     assert torch.equal(march.resume, rays.far)
 
 
@@ -76,23 +77,23 @@ def test_compiled_march_keeps_the_same_intervals() -> None:
     alike(ours, theirs, len(rays))
 
 
-def hash_field() -> HashField:
+def random_ngp() -> FusedNGP:
     """Random, and about half transparent."""
     grid = HashGrid(levels=4, log2_size=10, base=4, finest=32)
     layer = lambda ins, outs: (torch.randn(outs, ins) / ins**0.5, 0.1 * torch.randn(outs))  # noqa: E731
     geometry, colour = (layer(8, 16), layer(16, 4)), (layer(3, 8), layer(8, 3))
-    return HashField(torch.randn(grid.entries, 2), grid, geometry, colour, "exp", -1.0, 0, "srgb", contracted_density=2.5)
+    return FusedNGP(torch.randn(grid.entries, 2), grid, geometry, colour, "exp", -1.0, 0, "srgb", contracted_density=2.5)
 
 
 def test_compiled_pictures_and_marches_scale_densities_alike() -> None:
     bounds, rays = single(*setting())
-    occupied, field, steps = torch.rand(16, 16, 16) < 0.6, hash_field(), replace(STEPS, step=0.02)
-    sums, alpha = numba.hash_render(rays, occupied, bounds, steps, field)
-    exact_sums, exact_alpha = reference.hash_render(rays, occupied, bounds, steps, field)
-    _, other = reference.hash_render(rays, occupied, bounds, steps, replace(field, contracted_density=0.0))
+    occupied, field, steps = torch.rand(16, 16, 16) < 0.6, random_ngp(), replace(STEPS, step=0.02)
+    sums, alpha = numba.ngp_render(rays, occupied, bounds, steps, field)
+    exact_sums, exact_alpha = reference.ngp_render(rays, occupied, bounds, steps, field)
+    _, other = reference.ngp_render(rays, occupied, bounds, steps, replace(field, contracted_density=0.0))
     assert 0.2 < float(exact_alpha.mean()) < 0.98
     assert float((exact_alpha - other).abs().mean()) > 0.05
     off = ((alpha - exact_alpha).abs() > 1e-4) | ((sums - exact_sums)[:, :3].abs() > 1e-4).any(dim=1)
     assert off.sum() <= 0.02 * len(rays)
-    ours, theirs = (kernels.hash_march(rays, occupied, bounds, steps, field, rays.near, 0.3) for kernels in (numba, reference))
+    ours, theirs = (kernels.ngp_march(rays, occupied, bounds, steps, field, rays.near, 0.3) for kernels in (numba, reference))
     alike(ours, theirs, len(rays))

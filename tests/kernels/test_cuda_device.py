@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from invgraphics import kernels
-from invgraphics.bench.subject import activated, camera, gaussian_field
+from invgraphics.bench.workload import activated, camera, gaussian_field
+from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
-from invgraphics.kernels.types import HashGrid
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
 
@@ -48,7 +48,7 @@ def test_gsplat_draws_the_same_picture() -> None:
         inputs = [footprints.means2d, footprints.conics, footprints.opacities.clamp_max(0.98), rgb]
 
     def draw(rasterise, means2d, conics, opacities, features):
-        rest = [x.to(means2d) for x in (footprints.depths, footprints.planes, footprints.radii)]
+        rest = [x.to(means2d) for x in (footprints.depths, footprints.depth_planes, footprints.radii)]
         return rasterise(type(footprints)(means2d, conics, opacities, *rest), features, 128, 128)
 
     compare(lambda *x: draw(kernels.splat_rasterise, *x), lambda *x: draw(reference.splat_rasterise, *x), inputs, 2e-3)

@@ -133,18 +133,18 @@ def test_same_picture_and_gradients(splat_rasterise, footprints) -> None:
 def test_absolute_gradients_are_handed_over(splat_rasterise, footprints) -> None:
     projected, rgb = footprints
     means = projected.means2d.clone().requires_grad_()
-    pull = torch.zeros_like(means).requires_grad_()
-    image, _ = splat_rasterise(replace(projected, means2d=means, pull=pull), rgb, WIDTH, HEIGHT)
+    absgrad = torch.zeros_like(means).requires_grad_()
+    image, _ = splat_rasterise(replace(projected, means2d=means, absgrad=absgrad), rgb, WIDTH, HEIGHT)
     image.sum().backward()
     assert means.grad is not None
-    assert pull.grad is not None
-    torch.testing.assert_close(pull.grad, means.grad.abs())
+    assert absgrad.grad is not None
+    torch.testing.assert_close(absgrad.grad, means.grad.abs())
 
 
 def test_what_gsplat_does_not_cover_goes_to_the_reference(splat_rasterise, footprints) -> None:
     projected, rgb = footprints
-    image, _ = splat_rasterise(projected, rgb, WIDTH, HEIGHT, receivers=2)
+    image, _ = splat_rasterise(projected, rgb, WIDTH, HEIGHT, max_grad_splats=2)
     assert torch.equal(image, reference.splat_rasterise(projected, rgb, WIDTH, HEIGHT, 16, 2)[0])
     none = replace(projected, **{name: getattr(projected, name)[:0] for name in ("means2d", "conics", "opacities", "radii")})
-    none = replace(none, depths=projected.depths[:0], planes=projected.planes[:0])
+    none = replace(none, depths=projected.depths[:0], depth_planes=projected.depth_planes[:0])
     assert not splat_rasterise(none, rgb[:0], WIDTH, HEIGHT)[1].any()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels.reference import grid_sample, hash_encode
 from invgraphics.kernels.reference.hash import entry_index
-from invgraphics.kernels.types import HashGrid
 
 TINY = HashGrid(levels=3, features=2, log2_size=6, base=2, finest=9)
 """One dense level (27 vertices) and two hashed ones."""

@@ -31,7 +31,7 @@ def _arithmetic(x, y, out):
     lanes.store(out, index(2), max(min(total, a), np.float32(-1.0)))
     chosen = lanes.where((a > b) & (b <= np.float32(0.5)), a, np.float32(7.0))
     lanes.store(out, index(2) + LANES, chosen)
-    lanes.store(out, index(2) + LANES + LANES, lanes.counting() + lanes.spread(np.float32(3.0)))
+    lanes.store(out, index(2) + LANES + LANES, lanes.lane_index() + lanes.broadcast(np.float32(3.0)))
     return lanes.any_of(a < b), lanes.any_of(a >= np.float32(100.0))
 
 
@@ -50,8 +50,8 @@ def test_arithmetic() -> None:
 @compiled
 def _places(cube, at, out):
     x, y, z = lanes.load(at, index(0)), lanes.load(at, LANES), lanes.load(at, LANES + LANES)
-    found = lanes.look_up(cube, x, y, z)
-    lanes.put(out, x * np.float32(5.0) + y, found)
+    found = lanes.gather_int8(cube, x, y, z)
+    lanes.scatter(out, x * np.float32(5.0) + y, found)
 
 
 def test_places_in_arrays() -> None:
@@ -85,8 +85,8 @@ def test_powers_and_bits() -> None:
 @compiled
 def _totals(x, out):
     a, b, c = (lanes.load(x, index(0)), lanes.load(x, LANES), lanes.load(x, LANES + LANES))
-    lanes.store(out, index(0), lanes.totals((a, b, c)))
-    return lanes.total(b)
+    lanes.store(out, index(0), lanes.reduce_sums((a, b, c)))
+    return lanes.reduce_sum(b)
 
 
 def test_totals() -> None:

@@ -3,16 +3,19 @@
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from invgraphics.kernels.numba import runtime
 
 BITS = """
 import hashlib, torch
 from dataclasses import replace
 from invgraphics import kernels
-from invgraphics.bench.sample_cases import hash_field, some_rays
-from invgraphics.bench.subject import activated, bounds, camera, gaussian_field, leaves, occupied
+from invgraphics.bench.sample_cases import random_ngp, some_rays
+from invgraphics.bench.workload import activated, bounds, camera, gaussian_field, leaves, occupied
 from invgraphics.kernels.types import MarchSteps
 
 def bits(*tensors):
@@ -23,17 +26,17 @@ table, unit = torch.rand(8, 8, 8, 3).requires_grad_(), torch.rand(5000, 3)
 values = kernels.grid_sample(unit, table)
 print(bits(values, *torch.autograd.grad(values.square().sum(), table)))
 rays = some_rays(500)
-call = rays, occupied(64), bounds(), MarchSteps(0.02), hash_field()
-march = kernels.hash_march(*call, rays.near, 0.01)
-print(bits(*kernels.hash_render(*call)), bits(march.t0, march.t1))
-gaussians, seen_by = activated(gaussian_field(3000)), camera(100)
-footprints, rgb = kernels.splat_project(gaussians, seen_by)
+call = rays, occupied(64), bounds(), MarchSteps(0.02), random_ngp()
+march = kernels.ngp_march(*call, rays.near, 0.01)
+print(bits(*kernels.ngp_render(*call)), bits(march.t0, march.t1))
+gaussians, viewpoint = activated(gaussian_field(3000)), camera(100)
+footprints, rgb = kernels.splat_project(gaussians, viewpoint)
 print(bits(kernels.splat_median(footprints, 100, 100)))
-for pull in (None, torch.zeros(3000, 2, requires_grad=True)):
-    for receivers in (0, 5):
-        pulled = replace(footprints, pull=pull)
-        image, alpha = kernels.splat_rasterise(pulled, rgb, 100, 100, receivers=receivers)
-        wanted = [*leaves(gaussians), *([] if pull is None else [pull])]
+for absgrad in (None, torch.zeros(3000, 2, requires_grad=True)):
+    for max_grad_splats in (0, 5):
+        pulled = replace(footprints, absgrad=absgrad)
+        image, alpha = kernels.splat_rasterise(pulled, rgb, 100, 100, max_grad_splats=max_grad_splats)
+        wanted = [*leaves(gaussians), *([] if absgrad is None else [absgrad])]
         loss = image.square().sum() + alpha.sum()
         print(bits(image, alpha, *torch.autograd.grad(loss, wanted, retain_graph=True)))
 """
@@ -63,6 +66,11 @@ def run(code: str, cache: Path, *, cold: bool) -> list[str]:
     return process.stdout.split()
 
 
+def test_the_processes_that_fill_the_cache_find_their_functions() -> None:
+    module = import_module(runtime.WARMUP)
+    assert all(callable(getattr(module, part)) for part in runtime.PARTS)
+
+
 def test_kernels_are_compiled_here_where_no_other_process_can(tmp_path: Path) -> None:
     assert run(ALONE, tmp_path, cold=True) == ["0", "2", "4"]
     assert run(ALONE, tmp_path, cold=False) == ["0", "2", "4"]
@@ -70,7 +78,7 @@ def test_kernels_are_compiled_here_where_no_other_process_can(tmp_path: Path) ->
 
 def test_without_a_compiler_the_reference_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    code = "from invgraphics.kernels import dispatch; print(dispatch.in_use(), dispatch.why_not('numba'))"
+    code = "from invgraphics.kernels import dispatch; print(dispatch.in_use(), dispatch.unavailable_reason('numba'))"
     words = run(code, tmp_path, cold=False)
     assert (words[0], words[2]) == ("reference", "NUMBA_DISABLE_JIT")
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
-from invgraphics.kernels.types import HashGrid, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 
 def differentiate(function, inputs, dtype):

@@ -47,22 +47,22 @@ def assert_close(numbers, truth, tolerance: float = 1e-5) -> None:
         assert worst < tolerance, f"relative to the largest entry: {worst}"
 
 
-def project(kernels, dtype, gaussians, view, planes):
+def project(kernels, dtype, gaussians, view, depth_planes):
     primitives, eye, leaves = leaves_of(gaussians, view, dtype)
     footprints, rgb = kernels.splat_project(primitives, eye)
     f, visible = footprints, footprints.radii > 0
-    values = [x[visible] for x in (f.means2d, f.conics, f.depths, f.planes, f.radii, rgb)]
+    values = [x[visible] for x in (f.means2d, f.conics, f.depths, f.depth_planes, f.radii, rgb)]
     generator = torch.Generator().manual_seed(1)
-    probed = [values[0], values[1], values[2], values[5]] + ([values[3]] if planes else [])
+    probed = [values[0], values[1], values[2], values[5]] + ([values[3]] if depth_planes else [])
     sum((x * torch.randn(x.shape, generator=generator).to(dtype)).sum() for x in probed).backward()
     return visible, [x.detach() for x in values], [leaf.grad for leaf in leaves if leaf.grad is not None]
 
 
-@pytest.mark.parametrize(("coefficients", "planes"), [(1, False), (4, False), (9, False), (16, True)])
-def test_projection_equals_reference(coefficients, planes):
+@pytest.mark.parametrize(("coefficients", "depth_planes"), [(1, False), (4, False), (9, False), (16, True)])
+def test_projection_equals_reference(coefficients, depth_planes):
     gaussians, view = cloud(300, coefficients), camera()
-    seen, values, gradients = project(numba, torch.float32, gaussians, view, planes)
-    truly_seen, true_values, true_gradients = project(reference, torch.float64, gaussians, view, planes)
+    seen, values, gradients = project(numba, torch.float32, gaussians, view, depth_planes)
+    truly_seen, true_values, true_gradients = project(reference, torch.float64, gaussians, view, depth_planes)
     assert torch.equal(seen, truly_seen)
     assert 100 < seen.sum() < 300
     assert len(gradients) == 5
@@ -74,7 +74,7 @@ def rasterise(kernels, dtype, footprints, features, size, tile=None):
     names = ("means2d", "conics", "opacities")
     leaves = [getattr(footprints, name).detach().to(dtype).requires_grad_() for name in names]
     leaves.append(features.detach().to(dtype).requires_grad_())
-    rest = {name: getattr(footprints, name).to(dtype) for name in ("depths", "planes", "radii")}
+    rest = {name: getattr(footprints, name).to(dtype) for name in ("depths", "depth_planes", "radii")}
     image, alpha = kernels.splat_rasterise(Footprints(*leaves[:3], **rest), leaves[3], *size, tile)
     generator = torch.Generator().manual_seed(1)
     probe = (image * torch.randn(image.shape, generator=generator).to(dtype)).sum()
@@ -103,7 +103,7 @@ def test_opaque_layers_stop_pixels_and_clamp_alpha():
         conics=torch.tensor([[0.02, 0.005, 0.03]]).repeat(n, 1),
         opacities=torch.ones(n),
         depths=torch.rand(n),
-        planes=torch.zeros(n, 3),
+        depth_planes=torch.zeros(n, 3),
         radii=torch.full((n,), 30.0),
     )
     features = torch.randn(n, 3)

@@ -1,4 +1,4 @@
-"""What rendering options need of the kernels: compensation, absolute gradients, limited receivers, median depth, discs."""
+"""What rendering options need of the kernels: compensation, absolute gradients, limited gradients, median depth, discs."""
 
 import math
 from dataclasses import replace
@@ -36,22 +36,22 @@ def test_compensation_keeps_the_integral_of_a_small_gaussian() -> None:
     xx, xy, yy = bare.conics[0]
     expected = 2 * math.pi * 0.9 / (xx * yy - xy * xy).sqrt()
     sums = {}
-    for compensate in (False, True):
-        footprints, rgb = reference.splat_project(small, view, 0.3, compensate)
+    for antialiased in (False, True):
+        footprints, rgb = reference.splat_project(small, view, 0.3, antialiased)
         footprints = replace(footprints, radii=torch.full((1,), 99.0, dtype=F64))
-        sums[compensate] = float(reference.splat_rasterise(footprints, rgb, 64, 64)[1].sum())
+        sums[antialiased] = float(reference.splat_rasterise(footprints, rgb, 64, 64)[1].sum())
     assert sums[True] == pytest.approx(float(expected), rel=0.1)  # what is below 1/255 is cut off
     assert sums[False] > 3 * float(expected)
 
 
 def test_compensated_energy_falls_with_the_square_of_distance() -> None:
-    def energy(distance: float, compensate: bool) -> float:
+    def energy(distance: float, antialiased: bool) -> float:
         pose = torch.eye(4, dtype=F64)
         pose[2, 3] = -distance
         view = Camera(pose, torch.full((2,), 60.0, dtype=F64), torch.full((2,), 16.0, dtype=F64), 32, 32)
         one = Gaussians(*(x.double() for x in (torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.03),
                                                torch.tensor([0.95]), torch.zeros(1, 1, 3))))  # fmt: skip
-        footprints, _ = reference.splat_project(one, view, 0.1, compensate)
+        footprints, _ = reference.splat_project(one, view, 0.1, antialiased)
         conic = footprints.conics[0]
         return float(2 * math.pi * footprints.opacities[0] / (conic[0] * conic[2] - conic[1] ** 2).sqrt())
 
@@ -102,17 +102,17 @@ def test_absolute_gradients_are_sums_over_pixels(kernels, dtype) -> None:
     truth = sum(torch.autograd.grad(pixel, mean, retain_graph=True)[0].abs() for pixel in pixels)
 
     cast = {name: value.to(dtype) for name, value in vars(footprints).items() if value is not None}
-    pull = torch.zeros(25, 2, dtype=dtype, requires_grad=True)
+    absgrad = torch.zeros(25, 2, dtype=dtype, requires_grad=True)
     cast["means2d"] = cast["means2d"].detach().requires_grad_()
-    image, _ = kernels.splat_rasterise(Footprints(**cast, pull=pull), rgb.to(dtype), *SIZE)
+    image, _ = kernels.splat_rasterise(Footprints(**cast, absgrad=absgrad), rgb.to(dtype), *SIZE)
     (image * probe.to(dtype)).sum().backward()
-    assert_close([pull.grad], [truth], 1e-4)
+    assert_close([absgrad.grad], [truth], 1e-4)
     assert bool((truth >= cast["means2d"].grad.abs() - 1e-5).all())
 
 
 @pytest.mark.parametrize("channels", [3, 6])
-@pytest.mark.parametrize("receivers", [1, 4])
-def test_only_the_first_splats_of_a_pixel_receive_gradients(receivers: int, channels: int) -> None:
+@pytest.mark.parametrize("max_grad_splats", [1, 4])
+def test_only_the_first_splats_of_a_pixel_receive_gradients(max_grad_splats: int, channels: int) -> None:
     """Brute force: every pixel's gradient, kept for the splats that come first on it."""
     footprints, features = small_cloud(40), torch.rand(40, channels, dtype=F64)
     probe = torch.randn(SIZE[1], SIZE[0], channels, dtype=F64)
@@ -126,7 +126,7 @@ def test_only_the_first_splats_of_a_pixel_receive_gradients(receivers: int, chan
             xx, xy, yy = footprints.conics.unbind(1)
             q = xx * offset[:, 0] ** 2 + 2 * xy * offset[:, 0] * offset[:, 1] + yy * offset[:, 1] ** 2
             seen = (footprints.opacities * torch.exp(-q / 2) >= ALPHA_MIN) & (footprints.radii > 0)
-            first = order[seen[order]][:receivers]
+            first = order[seen[order]][:max_grad_splats]
             for total, gradient in zip(
                 truth, torch.autograd.grad((image[y, x] * probe[y, x]).sum(), leaves, retain_graph=True), strict=True
             ):
@@ -134,14 +134,14 @@ def test_only_the_first_splats_of_a_pixel_receive_gradients(receivers: int, chan
     for kernels, dtype in ((reference, F64), (numba, torch.float32)):
         again = [leaf.detach().to(dtype).requires_grad_() for leaf in leaves]
         limited = Footprints(*again[:3], *rest_of(footprints, dtype))
-        whole, _ = kernels.splat_rasterise(limited, again[3], *SIZE, None, receivers)
+        whole, _ = kernels.splat_rasterise(limited, again[3], *SIZE, None, max_grad_splats)
         torch.testing.assert_close(whole.detach().double(), image.detach(), atol=1e-5, rtol=1e-4)
         (whole * probe.to(dtype)).sum().backward()
         assert_close([leaf.grad for leaf in again], truth, 1e-4)
 
 
 def rest_of(footprints: Footprints, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
-    return tuple(x.to(dtype) for x in (footprints.depths, footprints.planes, footprints.radii))
+    return tuple(x.to(dtype) for x in (footprints.depths, footprints.depth_planes, footprints.radii))
 
 
 @pytest.mark.parametrize("kernels", [reference, numba])
@@ -156,7 +156,7 @@ def test_median_is_where_half_of_the_light_is_gone(kernels) -> None:
         conics=torch.tensor([[1e-6, 0.0, 1e-6]]).repeat(n, 1),
         opacities=torch.tensor([opacity for opacity, _ in layers]),
         depths=torch.tensor([t for _, t in layers]),
-        planes=torch.tensor([[t, 0.1, 0.0] for _, t in layers]),
+        depth_planes=torch.tensor([[t, 0.1, 0.0] for _, t in layers]),
         radii=torch.full((n,), 100.0),
     )
     x = torch.arange(9) + 0.5

@@ -59,7 +59,7 @@ def test_projection_agrees_with_projected_samples(scales: tuple[float, float, fl
     features = torch.cat([torch.ones(count, 1, dtype=F64), offset], dim=1)
     fit = torch.linalg.lstsq(features, distance[:, None]).solution[:, 0]
     reach = torch.cat([torch.ones(1, dtype=F64), spread])
-    assert bool(((fit - footprints.planes[0]).abs() * reach < 0.02 * one.scales.max()).all())
+    assert bool(((fit - footprints.depth_planes[0]).abs() * reach < 0.02 * one.scales.max()).all())
 
 
 def test_colour_is_seen_from_the_camera() -> None:
@@ -180,7 +180,7 @@ def test_gradients_of_the_whole_pipeline_and_the_pose() -> None:
     def render(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, twist: Tensor) -> Tensor:
         moved = view.moved(se3_exp(twist) @ view.cam_to_world)
         footprints, rgb = reference.splat_project(Gaussians(means, quats, scales, opacities, sh), moved)
-        image, alpha = reference.splat_rasterise(footprints, torch.cat([rgb, footprints.planes], dim=1), 20, 16, 8)
+        image, alpha = reference.splat_rasterise(footprints, torch.cat([rgb, footprints.depth_planes], dim=1), 20, 16, 8)
         return (torch.cat([image, alpha[..., None]], dim=2) * cotangent).sum()
 
     inputs = (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.sh, torch.zeros(6, dtype=F64))
@@ -225,7 +225,7 @@ def test_discs_are_hit_where_rays_meet_their_plane() -> None:
         conics=torch.zeros(count, 3, dtype=F64),
         opacities=torch.full((count,), 0.9, dtype=F64),
         depths=torch.arange(count, dtype=F64),
-        planes=torch.zeros(count, 3, dtype=F64),
+        depth_planes=torch.zeros(count, 3, dtype=F64),
         radii=torch.full((count,), 100.0, dtype=F64),
         homography=homography,
     )

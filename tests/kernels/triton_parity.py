@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
+from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import cuda, reference
-from invgraphics.kernels.types import HashGrid
 
 
 def differentiate(function, inputs: list[Tensor], dtype: torch.dtype) -> list[Tensor]:

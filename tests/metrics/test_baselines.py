@@ -8,7 +8,8 @@ import torch
 from invgraphics.core import Bounds, Camera, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.metrics import baselines
-from invgraphics.metrics.protocols import PROTOCOLS, prepare
+from invgraphics.metrics.conventions import PROTOCOLS
+from invgraphics.metrics.protocols import prepare
 
 
 def view_at(angle: float, value: float, size: tuple[int, int] = (12, 16), alpha: float | None = None) -> View:

@@ -15,12 +15,14 @@ from torch.nn.functional import pad
 
 from invgraphics.core import Bounds, Camera, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb
-from invgraphics.metrics import perceptual
-from invgraphics.metrics.base import Skip
-from invgraphics.metrics.conventions import CONVENTIONS, NGP_KERNEL, VISER_GREY, Lpips, Psnr, Ssim
-from invgraphics.metrics.measures import measure, score_under, shown, summarise_under
+from invgraphics.metrics import perceptual, protocols
+from invgraphics.metrics.base import Pair, Skip
+from invgraphics.metrics.conventions import NGP_KERNEL, PROTOCOLS, VISER_GREY, Lpips, Measure, Psnr, Ssim
+from invgraphics.metrics.protocols import prepare, score, summarise
 
 HEIGHT, WIDTH, VIEWS = 40, 52, 3
+
+OTHERS = {name: protocol for name, protocol in PROTOCOLS.items() if protocol.source}
 SCENE_GREY = (0.3, 0.5, 0.9)
 """The toy data set's own background: neither of those that tools assume."""
 
@@ -57,9 +59,19 @@ def view_of(index: int, **more) -> tuple[Rendering, View]:
     return rendering, View(camera, truth, str(index), **{"alpha": alpha} | more)
 
 
+def shown(*case) -> tuple[torch.Tensor, torch.Tensor]:
+    """Prediction and truth as a tool compares them."""
+    pair = prepare(*case)
+    return pair.image, pair.truth
+
+
+def measure(how: Measure, image: torch.Tensor, truth: torch.Tensor) -> float:
+    return protocols.measure(how, Pair(image, truth, torch.ones(truth.shape[:2])))
+
+
 def scored(name: str) -> dict[str, float]:
-    scores = [score_under(*view_of(index), scene(), CONVENTIONS[name]) for index in range(VIEWS)]
-    quality, _ = summarise_under(scores, CONVENTIONS[name])
+    scores = [score(*view_of(index), scene(), PROTOCOLS[name]) for index in range(VIEWS)]
+    quality, _ = summarise(scores, PROTOCOLS[name])
     return {metric: entry["mean"] for metric, entry in quality.items()}
 
 
@@ -162,14 +174,14 @@ def test_a_convention_is_that_of_an_independent_implementation(name: str) -> Non
 
 
 def test_every_convention_has_an_independent_route_and_a_source() -> None:
-    assert set(ROUTES) == set(CONVENTIONS)
-    for name, convention in CONVENTIONS.items():
+    assert set(ROUTES) == set(OTHERS)
+    for name, convention in OTHERS.items():
         assert "@" in convention.source and ".py" in convention.source, name
         assert set(convention.measures) - {"lpips", "lpips_vgg", "psnr_of_mean_mse"} == set(ROUTES[name][3]), name
 
 
 def test_conventions_alone_spread_the_scores_of_one_set_of_pictures() -> None:
-    tables = {name: scored(name) for name in CONVENTIONS}
+    tables = {name: scored(name) for name in OTHERS}
     psnr = [table["psnr"] for table in tables.values()]
     ssim = [table["ssim"] for table in tables.values() if "ssim" in table]
     assert max(psnr) - min(psnr) > 0.5
@@ -186,7 +198,7 @@ def test_psnr_of_the_mean_error_is_below_the_mean_psnr() -> None:
 def test_photographs_keep_the_scenes_background() -> None:
     """Where the truth is opaque there is no background to choose, and the model was fitted in front of the scene's."""
     rendering, view = view_of(0, alpha=None)
-    for convention in CONVENTIONS.values():
+    for convention in OTHERS.values():
         image, _ = shown(rendering, view, scene(), convention)
         expected = rendering.over(torch.tensor(SCENE_GREY)).clamp(0, 1)
         torch.testing.assert_close(image, expected, atol=1.01 / 255, rtol=0)
@@ -195,7 +207,7 @@ def test_photographs_keep_the_scenes_background() -> None:
 def test_linear_scenes_are_composited_linearly_and_compared_in_srgb() -> None:
     rendering, view = view_of(0)
     linear = View(view.camera, view.image.float() / 255, "0", alpha=view.alpha)
-    image, truth = shown(rendering, linear, scene("linear"), CONVENTIONS["nerf-pytorch"])
+    image, truth = shown(rendering, linear, scene("linear"), PROTOCOLS["nerf-pytorch"])
     torch.testing.assert_close(image, linear_to_srgb(rendering.over(torch.ones(3))))
     torch.testing.assert_close(truth, linear_to_srgb(linear.over(torch.ones(3))))
 
@@ -204,23 +216,23 @@ def test_masks_are_those_of_the_tool() -> None:
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[:10] = False
     rendering, view = view_of(0, mask=mask)
-    image, truth = shown(rendering, view, scene(), CONVENTIONS["nerfbaselines"])
+    image, truth = shown(rendering, view, scene(), PROTOCOLS["nerfbaselines"])
     assert bool((image[:10] == 0).all()) and bool((truth[:10] == 0).all()) and float(image[10:].sum()) > 0
-    result = score_under(rendering, view, scene(), CONVENTIONS["gsplat"])
+    result = score(rendering, view, scene(), PROTOCOLS["gsplat"])
     assert result.values == {} and "gsplat knows no masks" in result.skipped["psnr"]
 
 
 def test_predictions_that_are_not_finite_are_skipped() -> None:
     rendering, view = view_of(0)
     rendering.rgb[3, 4, 0] = torch.nan
-    result = score_under(rendering, view, scene(), CONVENTIONS["gsplat"])
+    result = score(rendering, view, scene(), PROTOCOLS["gsplat"])
     assert result.values == {} and "not finite at 1 of" in result.skipped["ssim"]
-    assert summarise_under([result], CONVENTIONS["gsplat"])[1]["psnr"] == result.skipped["psnr"]
+    assert summarise([result], PROTOCOLS["gsplat"])[1]["psnr"] == result.skipped["psnr"]
 
 
 def test_equal_pictures_are_perfect_and_flat_ones_have_a_value() -> None:
     flat = torch.full((HEIGHT, WIDTH, 3), 0.25)
-    for convention in CONVENTIONS.values():
+    for convention in OTHERS.values():
         for how in convention.measures.values():
             if isinstance(how, Psnr):
                 assert measure(how, flat, flat) == pytest.approx(100)
@@ -231,7 +243,7 @@ def test_equal_pictures_are_perfect_and_flat_ones_have_a_value() -> None:
 
 def test_ssim_needs_a_whole_window() -> None:
     tiny = torch.zeros(10, 30, 3)
-    with pytest.raises(Skip, match="30x10 are smaller than SSIM's window of 11 x 11"):
+    with pytest.raises(Skip, match="30x10 are smaller than SSIM's 11 x 11 window"):
         measure(Ssim(), tiny, tiny)
     assert measure(Ssim(kernel=NGP_KERNEL, edges="reflect"), tiny, tiny) == 1
 
@@ -262,7 +274,7 @@ def test_lpips_gets_the_net_and_the_range_of_the_convention(monkeypatch, tmp_pat
     try:
         rendering, view = view_of(0)
         names = ("nerfbaselines", "3dgs-metrics", "gsplat")
-        results = [score_under(rendering, view, scene(), CONVENTIONS[name]) for name in names]
+        results = [score(rendering, view, scene(), PROTOCOLS[name]) for name in names]
     finally:
         perceptual._lpips_network.cache_clear()
     assert [(net, scaled) for net, scaled, _ in asked] == [("alex", True), ("vgg", True), ("vgg", False), ("alex", True)]

@@ -136,11 +136,11 @@ def test_lpips_says_what_is_missing(monkeypatch, tmp_path) -> None:
     pair = pair_of(np.zeros((40, 40, 3)), np.zeros((40, 40, 3)))
     monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(Skip, match=r"package lpips is not installed \(pip install"):
-        perceptual.lpips_alex(pair)
+        perceptual.lpips(pair)
     monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with pytest.raises(Skip, match="never downloads"):
-        perceptual.lpips_alex(pair)
+        perceptual.lpips(pair)
 
 
 def test_lpips_is_asked_the_right_question(monkeypatch, tmp_path) -> None:
@@ -163,7 +163,7 @@ def test_lpips_is_asked_the_right_question(monkeypatch, tmp_path) -> None:
     monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=Network))
     perceptual._lpips_network.cache_clear()
     try:
-        value = perceptual.lpips_alex(pair_of(np.full((40, 50, 3), 0.75), np.full((40, 50, 3), 0.25)))
+        value = perceptual.lpips(pair_of(np.full((40, 50, 3), 0.75), np.full((40, 50, 3), 0.25)))
     finally:
         perceptual._lpips_network.cache_clear()
     assert value == pytest.approx(0.5)

@@ -12,7 +12,8 @@ from invgraphics.core.colour import linear_to_srgb
 from invgraphics.errors import InputError
 from invgraphics.metrics import protocols
 from invgraphics.metrics.base import Metric, Pair
-from invgraphics.metrics.protocols import PROTOCOLS, Protocol, ViewScore, prepare, score, summarise
+from invgraphics.metrics.conventions import BLACK, PROTOCOLS, WHITE, Psnr, Ssim
+from invgraphics.metrics.protocols import ViewScore, prepare, score, summarise
 
 HEIGHT, WIDTH = 16, 20
 PLAIN = PROTOCOLS["float"]
@@ -39,7 +40,7 @@ def view_of(value: float = 0.5, **settings) -> View:
 def test_background_belongs_to_the_protocol() -> None:
     view = view_of(0.0, alpha=torch.zeros(HEIGHT, WIDTH))
     scene = scene_of(view, background=torch.tensor([0.2, 0.4, 0.6]))
-    for background, expected in {"scene": [0.2, 0.4, 0.6], "white": [1, 1, 1], "black": [0, 0, 0]}.items():
+    for background, expected in {"scene": [0.2, 0.4, 0.6], WHITE: [1, 1, 1], BLACK: [0, 0, 0]}.items():
         pair = prepare(rendering_of(0.0, 0.0), view, scene, replace(PLAIN, background=background))
         for picture in (pair.image, pair.truth):
             torch.testing.assert_close(picture, torch.tensor(expected, dtype=torch.float32).expand(HEIGHT, WIDTH, 3))
@@ -52,9 +53,9 @@ def test_a_wrong_alpha_shows_on_white_and_hides_on_black() -> None:
         background: score(black_but_opaque, view, scene_of(view), replace(PLAIN, background=background), ["psnr"]).values[
             "psnr"
         ]
-        for background in ("white", "black")
+        for background in (WHITE, BLACK)
     }
-    assert scores == {"white": pytest.approx(0.0), "black": pytest.approx(100.0)}
+    assert scores == {WHITE: pytest.approx(0.0), BLACK: pytest.approx(100.0)}
 
 
 def test_quantisation_rounds_to_bytes() -> None:
@@ -143,7 +144,7 @@ def test_summary_has_the_layout_of_scores_json() -> None:
 
 def test_mean_error_aggregation_joins_errors_rather_than_decibels() -> None:
     scores = [ViewScore(str(i), {"psnr": value, "ssim": value}, {}) for i, value in enumerate([20.0, 30.0])]
-    quality, _ = summarise(scores, Protocol("mean-mse", aggregation="psnr_of_mean_mse"))
+    quality, _ = summarise(scores, replace(PLAIN, measures={"psnr": Psnr(views="mean error"), "ssim": Ssim()}))
     assert quality["psnr"]["mean"] == pytest.approx(-10 * math.log10((0.01 + 0.001) / 2))
     assert quality["ssim"]["mean"] == 25.0
 

@@ -8,7 +8,7 @@ import pytest
 from made_up_runs import provenance_table
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import requested_method
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest, FitRequest
 from invgraphics.recipes.presets import announcements, preset_for
 from invgraphics.recipes.recipe import load_method
@@ -124,12 +124,13 @@ def test_the_budget_of_each_cell_chooses(recipe: str, tmp_path: Path) -> None:
     assert [planned.method.recipe.field.width for planned in plan] == [16, 32, 16]
     assert len({_kind(planned) for planned in plan}) == 2  # two forecasts
     for planned in plan:  # the process that fits comes to the same preset
-        assert requested_method(recipe, planned.fit).digest == planned.method.digest
+        assert Job.of(planned.fit).method.digest == planned.method.digest
 
 
 def test_a_request_names_its_method(recipe: str) -> None:
     request = FitRequest(method=recipe, scene="bricks", out="x", budget="45m", overrides=("field.width=5", "data.size=9"))
-    assert (requested_method(recipe, request).preset, requested_method(recipe, request).recipe.field.width) == ("long", 5)
+    method = Job.of(request).method
+    assert (method.preset, method.recipe.field.width) == ("long", 5)
 
 
 def _run(folder: Path, method: str, preset: str, **provenance: object):

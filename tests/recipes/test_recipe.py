@@ -1,15 +1,19 @@
 """Recipes: every built-in method builds under every preset; overrides and errors."""
 
+import copy
+import hashlib
+import json
 import tomllib
 
 import pytest
 import torch
 
-from invgraphics.core import check
+from invgraphics.cli.arguments import parse_list
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
-from invgraphics.recipes.recipe import load_method, methods, presets, resolve
+from invgraphics.recipes.recipe import load_method, methods, presets, resolve, split_name
 from invgraphics.testing import check_field, check_renderer, toy_scene
+from invgraphics.text import slug
 
 CELLS = [(name, preset) for name in methods() for preset in (*presets(name), "")]
 
@@ -28,10 +32,9 @@ def test_recipe_reads_and_survives_a_round_trip(name: str, preset: str) -> None:
 @pytest.mark.parametrize("space", ["box", "contracted"])
 def test_recipe_conforms(name: str, space: str) -> None:
     scene = toy_scene(views=3, size=8, space=space)
-    field, renderer = build_model(load_method(name), scene, 0, torch.device("cpu"))
-    check(field, renderer)
-    check_field(field, scene)
-    check_renderer(renderer, field, scene)
+    model = build_model(load_method(name), scene, 0, torch.device("cpu"))
+    check_field(model.field, scene)
+    check_renderer(model.renderer, model.field, scene)
 
 
 def test_overrides_take_toml_values() -> None:
@@ -72,3 +75,66 @@ def test_a_users_own_file_is_a_method(tmp_path) -> None:
         load_method(str(own))
     with pytest.raises(tomllib.TOMLDecodeError):
         tomllib.loads(own.read_text())
+
+
+@pytest.mark.parametrize(
+    ("hook", "words"),
+    [
+        ("density_control", "Gaussians"),
+        ("relocation", "Gaussians"),
+        ("smoothing", "Gaussians"),
+        ("limits", "Gaussians"),
+        ("sh_degree", "spherical harmonics"),
+    ],
+)
+def test_hooks_that_the_field_cannot_serve_are_refused_before_anything_is_built(hook: str, words: str) -> None:
+    table = load_method("volumetric/hash").table
+    with pytest.raises(InputError, match=f"hook '{hook}' needs {words}, which NeuralField does not have"):
+        resolve("mine", "", table | {"hooks": [{"type": hook}]})
+
+
+def test_a_cap_reaches_the_field_and_the_hooks_that_make_primitives() -> None:
+    recipe = load_method("splatting/gaussians", overrides=["max_primitives=123"]).recipe
+    assert recipe.field.max_init == recipe.field.count == 123
+    assert [hook.max_primitives for hook in recipe.hooks if hasattr(hook, "max_primitives")] == [123]
+    assert load_method("volumetric/hash", overrides=["max_primitives=123"]).recipe.field.layers == 1
+
+
+def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
+    """With the keys as they were first called; the digest, by which runs are found again, is over those names."""
+    method = load_method("splatting/gaussians", "long")
+    table = copy.deepcopy(method.table)
+    (hook,) = [hook for hook in table["hooks"] if hook["type"] == "density_control"]
+    for new, old in {"revised_opacity": "share_opacity", "cap_ramp": "pace", "latest_start_step": "start_steps"}.items():
+        hook[old] = hook.pop(new)
+    for new, old in {"antialiased": "compensate", "max_grad_splats": "receivers"}.items():
+        table["renderer"][old] = table["renderer"].pop(new)
+    assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
+    again = resolve(method.name, "long", table)
+    assert again.recipe == method.recipe and again.table == method.table
+    assert again.digest == method.digest == hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
+    with pytest.raises(InputError, match=r"Unknown key 'hooks\.1\.pace'"):
+        resolve(method.name, "", table | {"hooks": [table["hooks"][0], {"type": "density_control", "pace": 1, "cap_ramp": 1}]})
+
+
+def test_renderers_of_older_runs_still_resolve() -> None:
+    now = load_method("splatting/gaussians-mip", None, ["renderer.max_grad_splats=10"])
+    renderer = {key: value for key, value in now.table["renderer"].items() if key not in ("antialiased", "max_grad_splats")}
+    older = now.table | {"renderer": renderer | {"compensate": True, "receivers": 10}}
+    assert resolve(now.name, now.preset, older).table == now.table
+    hashed = load_method("volumetric/hash").table
+    sampler = {("wave" if key == "chunk" else key): value for key, value in hashed["renderer"]["sampler"].items()}
+    assert resolve("mine", "", hashed | {"renderer": hashed["renderer"] | {"sampler": sampler}}).table == hashed
+
+
+def test_a_name_may_carry_changes() -> None:
+    """Its own changes come last, and its own preset first; the name stays whole, so that it makes the method again."""
+    name = "volumetric/nerf:preset=paper:field.width=96:batches.rays=77"
+    assert split_name(name) == ("volumetric/nerf", "paper", ("field.width=96", "batches.rays=77"))
+    method = load_method(name, "laptop", ["field.width=8", "field.layers=7"])
+    assert (method.name, method.preset) == (name, "paper")
+    assert (method.recipe.field.width, method.recipe.field.layers, method.recipe.batches.rays) == (96, 7, 77)
+    assert split_name("C:/mine.toml") == ("C:/mine.toml", None, ())
+    assert slug(name) == "volumetric-nerf-preset=paper-field.width=96-batches.rays=77"
+    listed = "splatting/gaussians:batches.resolution=[0.5,1.0],volumetric/hash"
+    assert parse_list(listed, "--methods") == tuple(listed.replace("],", "]|").split("|"))

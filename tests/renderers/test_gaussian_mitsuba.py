@@ -17,7 +17,7 @@ import torch
 
 from invgraphics.core import Bounds, Camera, Context, Gaussians, Rays, harmonics
 from invgraphics.fields.gaussian import GaussianField
-from invgraphics.renderers.gaussian_rays import Encounters
+from invgraphics.renderers.gaussian_rays import Intersections
 from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
 from invgraphics.scenes.mitsuba.llvm import FAST, status
 from invgraphics.testing import toy_cameras
@@ -44,10 +44,10 @@ class ByEntry(GaussianSorted):
         super().__init__(GaussianSortedConfig("splat"))
         self.opacities = opacities
 
-    def order(self, encounters: Encounters, rays: Rays, axis: torch.Tensor | None) -> torch.Tensor:
-        squared = -2 * torch.log(-torch.expm1(-encounters.depth) / self.opacities[encounters.gaussian])
-        entry = encounters.t - encounters.sigma * (25 - squared.clamp(0, 25)).sqrt()
-        return super().order(replace(encounters, t=entry), rays, axis)
+    def order(self, intersections: Intersections, rays: Rays, axis: torch.Tensor | None) -> torch.Tensor:
+        squared = -2 * torch.log(-torch.expm1(-intersections.depth) / self.opacities[intersections.gaussian])
+        entry = intersections.t - intersections.sigma * (25 - squared.clamp(0, 25)).sqrt()
+        return super().order(replace(intersections, t=entry), rays, axis)
 
 
 def ours(given: Gaussians, camera: Camera, renderer: GaussianSorted) -> np.ndarray:

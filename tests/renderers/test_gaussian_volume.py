@@ -15,7 +15,7 @@ from scipy.stats import multivariate_normal, norm
 from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Gaussians, Quantity, Rays, Samples
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.fields.gaussian import GaussianFieldConfig
-from invgraphics.renderers.gaussian_rays import encounter, mean_inverse_scale, prepare
+from invgraphics.renderers.gaussian_rays import intersect, mean_inverse_scale, precompute
 from invgraphics.renderers.gaussian_volume import GaussianExactConfig, GaussianSortedConfig
 from invgraphics.testing import check_renderer, toy_cameras, toy_scene
 
@@ -81,7 +81,7 @@ def line_density(gaussians: Gaussians, i: int, rays: Rays, r: int) -> Callable[[
 
 def test_each_gaussian_on_a_ray_is_measured_as_scipy_integrates_it() -> None:
     gaussians, rays = some(4), some_rays(3)
-    found = encounter(prepare(gaussians, "physical", 1e-12), rays)
+    found = intersect(precompute(gaussians, "physical", 1e-12), rays)
     assert len(found) == 12
     strength = -np.log1p(-gaussians.opacities.numpy()) * mean_inverse_scale(gaussians.scales).numpy() / math.sqrt(2 * math.pi)
     for r, i, t, depth in zip(*(getattr(found, name).tolist() for name in ("ray", "gaussian", "t", "depth")), strict=True):
@@ -127,7 +127,7 @@ def test_mean_inverse_scale_is_that_of_an_ellipsoids_surface() -> None:
 def test_overlapping_gaussians_are_the_volume_rendering_equation(opacity: str) -> None:
     """Against brute force: 40,000 small steps of densities from scipy."""
     gaussians, rays = some(5, sh=torch.rand(5, 1, 3, dtype=F64)), some_rays(4)
-    found = encounter(prepare(gaussians, opacity, 1e-12), rays)
+    found = intersect(precompute(gaussians, opacity, 1e-12), rays)
     picture = show(replace(EXACT, opacity=opacity), gaussians, rays)
     rgb = (gaussians.sh[:, 0] * math.sqrt(1 / (4 * math.pi)) + 0.5).numpy()
     t = np.linspace(0, 6, 40_001)
@@ -150,7 +150,7 @@ def test_overlapping_gaussians_are_the_volume_rendering_equation(opacity: str) -
 def test_overlapping_gaussians_agree_with_free_flights() -> None:
     """Monte Carlo: photons stop at the first of each Gaussian's own exponential flights; who stops one gives the colour."""
     gaussians, rays, count = some(3, scales=torch.full((3, 3), 0.4, dtype=F64)), some_rays(1), 400_000
-    found = encounter(prepare(gaussians, "peak", 1e-12), rays)
+    found = intersect(precompute(gaussians, "peak", 1e-12), rays)
     t, sigma, depth = (getattr(found, name).numpy() for name in ("t", "sigma", "depth"))
     flights = np.random.default_rng(0).exponential(size=(count, len(t)))
     stops = np.where(flights < depth, t + sigma * norm.ppf(np.minimum(flights / depth, 1)), np.inf)

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from made_up_fields import NOTHING, OfDensity
 from torch import Tensor
 
-from invgraphics.core import Context, Field, Quantity, Samples, Scene, no_grad_density
+from invgraphics.core import Context, Field, Quantity, Samples, Scene
 from invgraphics.fields.analytic import GaussianBlob, Sphere
 from invgraphics.recipes.recipe import load_method
 from invgraphics.renderers.occupancy import Occupancy, OccupancyConfig
@@ -24,7 +25,7 @@ def context(scene: Scene, training: bool = True) -> Context:
 def learnt(config: OccupancyConfig, scene: Scene, field: Field, updates: int = 33) -> Occupancy:
     sampler, ctx = config.build(scene), context(scene)
     for _ in range(updates):
-        sampler.update(no_grad_density(field), ctx)
+        sampler.update(field, ctx)
     return sampler
 
 
@@ -76,15 +77,15 @@ def test_samples_behind_opaque_surfaces_are_left_out(make_scene: Callable[..., S
     scene, ball = make_scene(), Sphere(200.0, 0.8)
     rays = scene.bounds.clip(scene.train[0].camera.rays())
     ctx = context(scene, training=False)
-    density = no_grad_density(ball)
-    for wave in (1, 7, 32):
-        sampler = learnt(replace(SMALL, wave=wave, transmittance=0.01), scene, ball)
-        samples, _ = sampler.sample(rays, density, ctx)
+    density = ball.density_no_grad
+    for chunk in (1, 7, 32):
+        sampler = learnt(replace(SMALL, chunk=chunk, transmittance=0.01), scene, ball)
+        samples, _ = sampler.sample(rays, ball, ctx)
         tau = density(samples) * samples.delta
         before = in_front_of(tau, samples.ray)
         assert bool((before <= -torch.log(torch.tensor(0.01)) + 1e-4).all())
-        # The same as marching everything and cutting afterwards, whatever the wave.
-        whole, _ = learnt(replace(SMALL, stop="never"), scene, ball).sample(rays, density, ctx)
+        # The same as marching everything and cutting afterwards, whatever the chunk.
+        whole, _ = learnt(replace(SMALL, stop="never"), scene, ball).sample(rays, ball, ctx)
         before = in_front_of(density(whole) * whole.delta, whole.ray)
         visible = before <= -torch.log(torch.tensor(0.01))
         assert len(samples) < 0.7 * len(whole)
@@ -94,25 +95,19 @@ def test_samples_behind_opaque_surfaces_are_left_out(make_scene: Callable[..., S
 
 def test_stopping_in_evaluation_only(make_scene: Callable[..., Scene]) -> None:
     scene, ball = make_scene(), Sphere(200.0, 0.8)
-    rays, asked = scene.bounds.clip(scene.train[0].camera.rays()), 0
-
-    def density(samples: Samples) -> Tensor:
-        nonlocal asked
-        asked += len(samples)
-        return no_grad_density(ball)(samples)
-
+    rays, field = scene.bounds.clip(scene.train[0].camera.rays()), OfDensity(lambda s: ball.density_at(s.position))
     sampler = replace(SMALL, stop="evaluation").build(scene)
-    sampler.sample(rays, density, context(scene, training=True))
-    assert asked == 0
-    sampler.sample(rays, density, context(scene, training=False))
-    assert asked > 0
+    sampler.sample(rays, field, context(scene, training=True))
+    assert field.asked == []
+    sampler.sample(rays, field, context(scene, training=False))
+    assert sum(field.asked) > 0
 
 
 def test_jitter_shifts_the_whole_lattice(make_scene: Callable[..., Scene]) -> None:
     scene = make_scene()
     rays, sampler = scene.bounds.clip(scene.train[0].camera.rays()), replace(SMALL, stop="never").build(scene)
-    still, _ = sampler.sample(rays, None, context(scene, training=False))  # type: ignore[arg-type]
-    moved, _ = sampler.sample(rays, None, context(scene))  # type: ignore[arg-type]
+    still, _ = sampler.sample(rays, NOTHING, context(scene, training=False))
+    moved, _ = sampler.sample(rays, NOTHING, context(scene))
     for ray in range(0, len(rays), 17):
         offset = moved.t0[moved.ray == ray][:20] - still.t0[still.ray == ray][:20]
         assert float(offset.std()) < 1e-5
@@ -125,11 +120,11 @@ def test_evaluation_may_take_finer_steps(make_scene: Callable[..., Scene], space
     scene = make_scene(space)
     rays, coarse = scene.bounds.clip(scene.train[0].camera.rays())[:20], replace(SMALL, stop="never")
     fine, ctx = replace(coarse, evaluation_steps=512), context(scene, training=False)
-    long, short = (config.build(scene).sample(rays, None, ctx)[0] for config in (coarse, fine))  # type: ignore[arg-type]
+    long, short = (config.build(scene).sample(rays, NOTHING, ctx)[0] for config in (coarse, fine))
     assert len(short) == pytest.approx(2 * len(long), rel=0.02)
     assert float(short.delta[0]) == pytest.approx(float(long.delta[0]) / 2, rel=1e-5)
     ctx = [context(scene) for _ in range(2)]
-    trained = [config.build(scene).sample(rays, None, c)[0] for config, c in zip((coarse, fine), ctx, strict=True)]  # type: ignore[arg-type]
+    trained = [config.build(scene).sample(rays, NOTHING, c)[0] for config, c in zip((coarse, fine), ctx, strict=True)]
     assert torch.equal(trained[0].t0, trained[1].t0)
 
 
@@ -140,13 +135,13 @@ def test_training_may_begin_with_longer_steps(make_scene: Callable[..., Scene]) 
     sampler, lengths = config.build(scene), []
     for progress in (0.0, 0.125, 0.25, 1.0):
         ctx = replace(context(scene), progress=progress)
-        samples, _ = sampler.sample(rays, None, ctx)  # type: ignore[arg-type]
-        sampler.update(lambda samples: torch.ones(len(samples)), ctx)
+        samples, _ = sampler.sample(rays, NOTHING, ctx)
+        sampler.update(OfDensity(lambda samples: torch.ones(len(samples))), ctx)
         lengths.append(float(samples.delta[0]) / sampler.length)
         if progress == 0:
             assert float(sampler.ema.max()) == pytest.approx(4 * sampler.length, rel=1e-5)
     assert lengths == pytest.approx([4, 2, 1, 1], rel=1e-4)
-    seen, _ = sampler.sample(rays, None, context(scene, training=False))  # type: ignore[arg-type]
+    seen, _ = sampler.sample(rays, NOTHING, context(scene, training=False))
     assert float(seen.delta[0]) == pytest.approx(sampler.length, rel=1e-5)
 
 
@@ -156,22 +151,17 @@ def test_training_may_end_with_shorter_steps(make_scene: Callable[..., Scene]) -
     rays, config = scene.bounds.clip(scene.train[0].camera.rays())[:20], replace(SMALL, stop="never", late_steps=1024)
     sampler, lengths = config.build(scene), []
     for progress in (0.0, 0.5, 0.75, 1.0):
-        samples, _ = sampler.sample(rays, None, replace(context(scene), progress=progress))  # type: ignore[arg-type]
+        samples, _ = sampler.sample(rays, NOTHING, replace(context(scene), progress=progress))
         lengths.append(float(samples.delta[0]) / sampler.length)
     assert lengths == pytest.approx([1, 1, 1 / 2, 1 / 4], rel=1e-4)
 
 
 def test_looks_on_schedule_at_as_many_cells_as_allowed(make_scene: Callable[..., Scene]) -> None:
-    scene, looks = make_scene(), []
-
-    def density(samples: Samples) -> Tensor:
-        looks.append(len(samples))
-        return torch.ones(len(samples))
-
+    scene, fog = make_scene(), OfDensity(lambda samples: torch.ones(len(samples)))
     sampler, ctx = SMALL.build(scene), context(scene)
     for _ in range(48):
-        sampler.update(density, ctx)
-    assert looks == [16**3] * 8 + [512] * 4
+        sampler.update(fog, ctx)
+    assert fog.asked == [16**3] * 8 + [512] * 4
 
 
 def test_memory_fades_where_it_looked(make_scene: Callable[..., Scene]) -> None:
@@ -179,7 +169,7 @@ def test_memory_fades_where_it_looked(make_scene: Callable[..., Scene]) -> None:
     sampler, ctx = learnt(replace(SMALL, warmup=1000), scene, ball), context(scene)
     before = sampler.ema.clone()
     for _ in range(4 * 5):
-        sampler.update(lambda samples: torch.zeros(len(samples)), ctx)
+        sampler.update(NOTHING, ctx)
     torch.testing.assert_close(sampler.ema, before * SMALL.decay**5)
 
 
@@ -193,7 +183,7 @@ def test_a_wire_is_kept_by_the_patience_of_a_late_fit(make_scene: Callable[..., 
     for progress in (0.0, 1.0):
         ctx, present = replace(context(scene), progress=progress), []
         for _ in range(400):
-            sampler.update(no_grad_density(wire), ctx)
+            sampler.update(wire, ctx)
             present.append(float(sampler.occupied[middle, middle, middle].float().mean()))
         kept[progress] = sum(present[200:]) / 200
     assert kept[0.0] < 0.6
@@ -207,7 +197,7 @@ def test_steps_grow_with_a_cone(make_scene: Callable[..., Scene]) -> None:
     steps = SMALL.steps_per_diagonal / 4
     sampler = replace(SMALL, cone=1 / steps).build(scene)
     rays = scene.bounds.clip(scene.train[0].camera.rays())
-    samples, _ = sampler.sample(rays, lambda s: torch.zeros(len(s)), context(scene, training=False))
+    samples, _ = sampler.sample(rays, NOTHING, context(scene, training=False))
     first = samples[samples.ray == 0]
     assert float(first.t1[-1]) == pytest.approx(float(rays.far[0]))
     grown = first.t0 > steps * sampler.length
@@ -222,7 +212,7 @@ def test_endless_space_takes_as_many_steps_as_its_contraction_is_long(make_scene
     """Each but the last, which is cut, is the same part of the way through the contracted ball, to first order."""
     scene = make_scene("contracted")
     sampler, rays = replace(SMALL, steps_per_diagonal=2048).build(scene), scene.bounds.clip(scene.train[0].camera.rays())
-    samples, _ = sampler.sample(rays, lambda s: torch.zeros(len(s)), context(scene, training=False))
+    samples, _ = sampler.sample(rays, NOTHING, context(scene, training=False))
     first = samples[(samples.ray == 0) & (samples.t1 < 20)]
     ends = [scene.bounds.to_unit(rays[:1].at(t[None])[0]) for t in (first.t0, first.t1)]
     moved = (ends[1] - ends[0]).norm(dim=1) * 4 * scene.bounds.half[0]
@@ -233,13 +223,13 @@ def test_endless_space_takes_as_many_steps_as_its_contraction_is_long(make_scene
 def test_nothing_is_culled_before_the_field_was_fitted_at_all(make_scene: Callable[..., Scene]) -> None:
     """In thin fog every cell is below the threshold; culled at once, none would ever be sampled again."""
     scene = make_scene()
-    ctx, density = context(scene, training=True), lambda samples: torch.zeros(len(samples))
+    ctx = context(scene, training=True)
     sampler = replace(SMALL, grace=3, every=1).build(scene)
     for _ in range(3):
-        sampler.update(density, ctx)
+        sampler.update(NOTHING, ctx)
         assert bool(sampler.occupied.all())
         assert float(sampler.ema.max()) == 0
-    thick = lambda samples: (samples.position[:, 0] > 0).float() * 100  # noqa: E731
+    thick = OfDensity(lambda samples: (samples.position[:, 0] > 0).float() * 100)
     sampler.update(thick, ctx)
     assert 0.3 < float(sampler.occupied.float().mean()) < 0.7
 
@@ -251,12 +241,25 @@ def test_the_long_preset_gives_up_nothing_as_thick_as_the_fog_it_starts_with(mak
     sampler = recipe.renderer.sampler.build(scene)
     # The cable lies along z, in empty space; the ball makes the grid's mean large, so that it is not the threshold.
     ball, cable = Sphere(40.0, 0.6), lambda p: fog * ((p[:, :2] - 1.0).norm(dim=1) < 0.1)
+    both = OfDensity(lambda samples: ball.density_at(samples.position) + cable(samples.position))
     for _ in range(sampler.config.grace + 2 * sampler.config.every + 1):
-        sampler.update(lambda samples: ball.density_at(samples.position) + cable(samples.position), context(scene))
+        sampler.update(both, context(scene))
     centres = (torch.stack(torch.meshgrid(*[torch.arange(64)] * 3, indexing="ij"), dim=-1) + 0.5) / 64
     position = scene.bounds.from_unit(centres).reshape(-1, 3)
     assert float(sampler.occupied.float().mean()) < 0.1
     assert bool(sampler.occupied.flatten()[(position[:, :2] - 1.0).norm(dim=1) < 0.05].all())
+
+
+def test_an_untrained_grid_is_full_and_the_trained_one_stays(make_scene: Callable[..., Scene]) -> None:
+    for space in ("box", "contracted"):
+        scene = make_scene(space)
+        sampler = learnt(SMALL, scene, Sphere(40.0, 0.6))
+        few = int(sampler.occupied.sum())
+        fresh = sampler.untrained()
+        assert torch.equal(fresh.occupied, SMALL.build(scene).occupied)
+        assert int(sampler.occupied.sum()) == few < int(fresh.occupied.sum())
+        assert int(fresh.step) == 0
+        assert not bool(fresh.ema.any())
 
 
 def test_refusals() -> None:

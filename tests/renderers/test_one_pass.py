@@ -43,8 +43,8 @@ def setting(make_scene: Callable[..., Scene]) -> tuple[Scene, Volumetric, Camera
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[None]:
     """One entry for each picture made in one pass."""
     made: list[None] = []
-    original = kernels.hash_render
-    monkeypatch.setattr(kernels, "hash_render", lambda *args: (made.append(None), original(*args))[1])
+    original = kernels.ngp_render
+    monkeypatch.setattr(kernels, "ngp_render", lambda *args: (made.append(None), original(*args))[1])
     return made
 
 
@@ -80,7 +80,7 @@ def test_everything_else_is_composed(setting, calls, what: str) -> None:
     assert bool(picture.rgb.isfinite().all())
 
 
-def test_other_networks_are_no_hash_field(setting) -> None:
+def test_other_networks_are_not_fused(setting) -> None:
     scene, *_ = setting
     for change in (
         {"geometry": "sdf"},
@@ -88,15 +88,15 @@ def test_other_networks_are_no_hash_field(setting) -> None:
         {"layers": 2, "skip": 0},
         {"encoding": replace(GRID, features=4)},
     ):
-        assert replace(FIELD, **change).build(scene).hash_field(scene.bounds) is None
+        assert replace(FIELD, **change).build(scene).fused(scene.bounds) is None
 
 
 def test_training_marches_in_one_pass_and_sees_the_same(setting, monkeypatch) -> None:
     """Loss and gradients are those of a march, looks, and another march; in boxes only, and with steps of one length."""
     scene, renderer, camera = setting
     field, rays, made = fitted(FIELD, scene), camera.rays(), []
-    original = kernels.hash_march
-    monkeypatch.setattr(kernels, "hash_march", lambda *args: (made.append(None), original(*args))[1])
+    original = kernels.ngp_march
+    monkeypatch.setattr(kernels, "ngp_march", lambda *args: (made.append(None), original(*args))[1])
 
     def gradient() -> torch.Tensor:
         ctx = Context(scene.bounds, training=True, generator=torch.Generator().manual_seed(5))
@@ -115,7 +115,7 @@ def test_training_marches_in_one_pass_and_sees_the_same(setting, monkeypatch) ->
 
 def test_growing_steps_are_marched_in_parts(setting, monkeypatch) -> None:
     scene, _, camera = setting
-    monkeypatch.setattr(kernels, "hash_march", lambda *args: pytest.fail("no such kernel for these steps"))
+    monkeypatch.setattr(kernels, "ngp_march", lambda *args: pytest.fail("no such kernel for these steps"))
     renderer = Volumetric(replace(SAMPLER, cone=0.01).build(scene))
     picture, _ = renderer.render_rays(fitted(FIELD, scene), camera.rays(), Context(scene.bounds, training=True))
     assert bool(picture.rgb.isfinite().all())
@@ -125,7 +125,7 @@ def test_a_field_over_other_bounds_is_composed(setting, calls) -> None:
     """Its own bounds say where it is, whatever is looked at."""
     scene, renderer, camera = setting
     field = fitted(FIELD, scene)
-    assert field.hash_field(scene.bounds) is not None
+    assert field.fused(scene.bounds) is not None
     half = replace(scene.bounds, lo=scene.bounds.lo / 2, hi=scene.bounds.hi / 2)
     with torch.no_grad():
         renderer.render_image(field, camera, Context(half))

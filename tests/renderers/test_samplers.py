@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from made_up_fields import NOTHING
 
 from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Quantity, Rays, Samples, Scene
 from invgraphics.errors import NotComposableError
@@ -25,10 +25,6 @@ def clipped(scene: Scene) -> Rays:
     return scene.bounds.clip(both)
 
 
-def nowhere(samples: Samples) -> Tensor:
-    return torch.zeros(len(samples))
-
-
 def assert_tiles(samples: Samples, rays: Rays, per_ray: int) -> None:
     """The intervals of each ray that hits follow on one another from near to far; the others have none."""
     hit = torch.nonzero(rays.far > rays.near)[:, 0]
@@ -45,20 +41,21 @@ def assert_tiles(samples: Samples, rays: Rays, per_ray: int) -> None:
 def test_intervals_tile_the_ray(make_scene: Callable[..., Scene], space: str, training: bool) -> None:
     scene = make_scene(space)
     rays, ctx = clipped(scene), context(scene, training)
-    samples, levels = StratifiedConfig(20).build(scene).sample(rays, nowhere, ctx)
+    samples, levels = StratifiedConfig(20).build(scene).sample(rays, NOTHING, ctx)
     assert_tiles(samples, rays, 20)
     assert levels == ()
-    fine, levels = HierarchicalConfig(12, 7).build(scene).sample(rays, nowhere, ctx)
+    fine, levels = HierarchicalConfig(12, 7).build(scene).sample(rays, NOTHING, ctx)
     assert_tiles(fine, rays, 19)
-    assert levels == ()
+    # The coarse pass learns nothing, so that losses in training do not see it.
+    assert [len(level.samples) for level in levels] == ([] if training else [12 * len(torch.unique(fine.ray))])
 
 
 def test_jitter_only_in_training_and_only_from_the_generator(make_scene: Callable[..., Scene]) -> None:
     scene, sampler = make_scene(), StratifiedConfig(8).build(make_scene())
     rays = clipped(scene)
-    still = [sampler.sample(rays, nowhere, context(scene))[0].t0 for _ in range(2)]
+    still = [sampler.sample(rays, NOTHING, context(scene))[0].t0 for _ in range(2)]
     assert torch.equal(*still)
-    jittered = [sampler.sample(rays, nowhere, context(scene, training=True))[0].t0 for _ in range(2)]
+    jittered = [sampler.sample(rays, NOTHING, context(scene, training=True))[0].t0 for _ in range(2)]
     assert torch.equal(*jittered)
     shift = (jittered[0] - still[0]).view(-1, 8) / ((rays.far - rays.near)[rays.far > rays.near] / 8)[:, None]
     assert float(shift.abs().max()) <= 0.5 + 1e-4
@@ -91,10 +88,7 @@ def test_fine_samples_gather_where_the_density_is(
     scene, ball = make_scene(), Sphere(50.0, 0.3)
     ray = scene.bounds.clip(make_camera().to(torch.float32).rays(torch.tensor([[6.4, 4.7]])))
 
-    def density(samples: Samples) -> Tensor:
-        return ball.query(samples, Quantity.DENSITY).density  # type: ignore[return-value]
-
-    samples, _ = HierarchicalConfig(32, 64).build(scene).sample(ray, density, context(scene, training))
+    samples, _ = HierarchicalConfig(32, 64).build(scene).sample(ray, ball, context(scene, training))
     entry = float((ray.origins.norm(dim=1) - 0.3)[0])
     near_entry = (samples.mid - entry).abs() < 0.25
     # Uniform sampling would put a sixth of the 96 there.
@@ -113,7 +107,7 @@ class Dark(Field):
 def test_own_proposal_leaves_a_trainable_level(make_scene: Callable[..., Scene]) -> None:
     scene, ball = make_scene(), Sphere(5.0, 0.8, colour=(0.2, 0.5, 0.7))
     rays = clipped(scene)
-    samples, levels = Hierarchical(HierarchicalConfig(16, 16), ball).sample(rays, nowhere, context(scene))
+    samples, levels = Hierarchical(HierarchicalConfig(16, 16), ball).sample(rays, NOTHING, context(scene))
     (level,) = levels
     assert level.rays == len(rays)
     assert level.weights is not None
@@ -125,6 +119,16 @@ def test_own_proposal_leaves_a_trainable_level(make_scene: Callable[..., Scene])
     level.weights.sum().backward()
     assert ball.density.grad is not None
     assert float(ball.density.grad) > 0
+
+
+def test_the_density_itself_stands_in_for_a_proposal(make_scene: Callable[..., Scene]) -> None:
+    scene, ball = make_scene(), Sphere(5.0, 0.8)
+    taught = Hierarchical(HierarchicalConfig(16, 16), Sphere(1.0, 0.1))
+    plain = HierarchicalConfig(16, 16).build(scene)
+    rays = clipped(scene)
+    found, expected = (each.sample(rays, ball, context(scene))[0] for each in (taught.untrained(), plain))
+    assert torch.equal(found.t0, expected.t0)
+    assert plain.untrained() is plain
 
 
 def test_refusals() -> None:

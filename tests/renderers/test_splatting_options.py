@@ -82,10 +82,10 @@ def test_far_splats_keep_their_energy(make_camera: Callable[..., Camera]) -> Non
     """A field seen at a quarter of the size: with compensation the light per solid angle stays, without it grows."""
     splats = gaussians(30, scales=torch.full((30, 3), 0.01, dtype=F64), opacities=torch.full((30,), 0.9, dtype=F64))
     light = {}
-    for compensate in (False, True):
-        fine = render(splats, make_camera(160, 144, 200.0), compensate=compensate).alpha.sum() / 200**2
-        coarse = render(splats, make_camera(40, 36, 50.0), compensate=compensate).alpha.sum() / 50**2
-        light[compensate] = float(coarse / fine)
+    for antialiased in (False, True):
+        fine = render(splats, make_camera(160, 144, 200.0), antialiased=antialiased).alpha.sum() / 200**2
+        coarse = render(splats, make_camera(40, 36, 50.0), antialiased=antialiased).alpha.sum() / 50**2
+        light[antialiased] = float(coarse / fine)
     assert light[True] == pytest.approx(1.0, abs=0.12)
     assert light[False] > 1.8
 
@@ -123,7 +123,7 @@ def test_the_nearest_ellipsoid_hides_the_others(make_camera: Callable[..., Camer
 
 
 def test_refusals() -> None:
-    with pytest.raises(ValueError, match="receivers"):
-        SplattingConfig(receivers=-1)
+    with pytest.raises(ValueError, match="max_grad_splats"):
+        SplattingConfig(max_grad_splats=-1)
     with pytest.raises(ValueError, match="discs"):
-        SplattingConfig(shape="disc", compensate=True)
+        SplattingConfig(shape="disc", antialiased=True)

@@ -6,21 +6,21 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Bounds, Context, FieldValues, Quantity, Rays, Samples, Scene, no_grad_density
+from invgraphics.core import Bounds, Context, FieldValues, Quantity, Rays, Samples, Scene
 from invgraphics.fields.analytic import GaussianBlob, Sphere
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.kernels.types import March
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.samplers import StratifiedConfig
-from invgraphics.renderers.termination import Look, in_front, weighty
+from invgraphics.renderers.termination import Query, contributing_samples, visible_samples
 from invgraphics.renderers.volumetric import UNSEEN, Volumetric
 
 STOPPING = OccupancyConfig(resolution=8, steps_per_diagonal=128, stop="evaluation")
 
 
-def dense(function) -> Look:
-    """Samples to density, as a look."""
+def dense(function) -> Query:
+    """Samples to density, as a query."""
     return lambda samples: FieldValues(density=function(samples))
 
 
@@ -32,11 +32,11 @@ def marched(counts: list[int]) -> tuple[Rays, March]:
     return rays, March(ray, t0, t0 + 1, rays.far)
 
 
-@pytest.mark.parametrize("wave", [1, 2, 5, 100])
-def test_keeps_what_light_reaches(wave: int) -> None:
+@pytest.mark.parametrize("chunk", [1, 2, 5, 100])
+def test_keeps_what_light_reaches(chunk: int) -> None:
     """Density 1 everywhere: light e^-k reaches interval k, so that 5 intervals see more than e^-4.5."""
     rays, march = marched([0, 3, 40, 1, 17])
-    samples = in_front(rays, march, dense(lambda s: torch.ones(len(s))), 0.0111, wave)
+    samples = visible_samples(rays, march, dense(lambda s: torch.ones(len(s))), 0.0111, chunk)
     assert torch.bincount(samples.ray, minlength=5).tolist() == [0, 3, 5, 1, 5]
     assert samples.t0.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 0, 0, 1, 2, 3, 4]
     assert samples.density is not None
@@ -45,13 +45,13 @@ def test_keeps_what_light_reaches(wave: int) -> None:
 
 def test_hides_what_is_behind_an_infinite_density_only() -> None:
     rays, march = marched([6])
-    samples = in_front(rays, march, dense(lambda s: torch.where(s.t0 == 3, torch.inf, 0.1)), 1e-3, 2)
+    samples = visible_samples(rays, march, dense(lambda s: torch.where(s.t0 == 3, torch.inf, 0.1)), 1e-3, 2)
     assert samples.t0.tolist() == [0, 1, 2, 3]
 
 
 def test_without_a_limit_everything_is_kept() -> None:
     rays, march = marched([4, 9])
-    samples = in_front(rays, march, dense(lambda s: 50 + s.t0), 0.0, 3)
+    samples = visible_samples(rays, march, dense(lambda s: 50 + s.t0), 0.0, 3)
     assert torch.equal(samples.t0, march.t0)
     assert torch.equal(samples.ray, march.ray)
     assert samples.density is not None
@@ -61,7 +61,7 @@ def test_without_a_limit_everything_is_kept() -> None:
 def test_few_looks_even_where_nothing_is_opaque() -> None:
     rays, march = marched([600])
     looks = []
-    in_front(rays, march, dense(lambda s: looks.append(len(s)) or torch.zeros(len(s))), 1e-3, 6)
+    visible_samples(rays, march, dense(lambda s: looks.append(len(s)) or torch.zeros(len(s))), 1e-3, 6)
     assert sum(looks) == 600
     assert len(looks) <= 12
 
@@ -69,11 +69,11 @@ def test_few_looks_even_where_nothing_is_opaque() -> None:
 def test_what_is_not_looked_at_weighs_little() -> None:
     ray = torch.repeat_interleave(torch.arange(50), torch.randint(0, 40, (50,)))
     weights = torch.rand(len(ray)) ** 12 / 20
-    seen = weighty(weights, ray, 50, 0.01)
+    seen = contributing_samples(weights, ray, 50, 0.01)
     left = weights.index_fill(0, seen, 0.0)
     assert 0 < len(seen) < len(ray)
     assert float(torch.zeros(50).index_add(0, ray, left).max()) <= 0.01
-    assert weighty(weights, ray, 50, 0.0).tolist() == torch.nonzero(weights)[:, 0].tolist()
+    assert contributing_samples(weights, ray, 50, 0.0).tolist() == torch.nonzero(weights)[:, 0].tolist()
 
 
 def test_colours_are_asked_of_few_and_the_picture_stays(make_scene: Callable[..., Scene]) -> None:
@@ -179,7 +179,7 @@ def test_long_marches_go_on_behind_their_limit() -> None:
     )
     origins = torch.tensor([[-2.0, 0.1, 0.2], [0.3, -3.0, -0.4]])
     rays = bounds.clip(Rays.make(origins, torch.eye(3)[:2]))
-    samples, _ = sampler.sample(rays, no_grad_density(Sphere(1.0, 0.5)), Context(bounds))
+    samples, _ = sampler.sample(rays, Sphere(1.0, 0.5), Context(bounds))
     for ray in range(2):
         own = samples[samples.ray == ray]
         assert len(own) > 4000

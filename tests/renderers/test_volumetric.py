@@ -6,10 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Quantity, Rays, Samples, Scene
+from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Quantity, Rays, Samples, Scene, harmonics
 from invgraphics.core.transforms import se3_exp
 from invgraphics.fields.analytic import GaussianBlob, Slab, Sphere
-from invgraphics.fields.transformed import Transformed
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.samplers import HierarchicalConfig, StratifiedConfig
 from invgraphics.renderers.volumetric import Volumetric, VolumetricConfig, query
@@ -132,11 +131,15 @@ def test_turning_world_and_cameras_together_changes_nothing(
     make_scene: Callable[..., Scene], make_camera: Callable[..., Camera], sampler: object
 ) -> None:
     """Contracted bounds, whose sampling does not depend on the orientation; colour is directional (SH of degree 2)."""
-    blob = GaussianBlob(6.0, torch.diag(torch.tensor([0.05, 0.1, 0.2])), (0.2, 0.1, 0.0), torch.randn(9, 3) * 0.4).double()
+    covariance, centre = torch.diag(torch.tensor([0.05, 0.1, 0.2])).double(), torch.tensor([0.2, 0.1, 0.0]).double()
+    sh = torch.randn(9, 3).double() * 0.4
     motion, view = se3_exp(torch.tensor([0.7, -1.1, 0.4, 0.0, 0.0, 0.0]).double()), make_camera()
+    turn = motion[:3, :3]
+    blob = GaussianBlob(6.0, covariance, centre, sh).double()
+    moved = GaussianBlob(6.0, turn @ covariance @ turn.T, turn @ centre, harmonics.rotate(sh[None], turn)[0]).double()
     volumetric, ctx = renderer(sampler, make_scene("contracted")), Context(box("contracted"))
     before, _ = volumetric.render_image(blob, view, ctx)
-    after, _ = volumetric.render_image(Transformed(blob, motion), view.moved(motion @ view.cam_to_world), ctx)
+    after, _ = volumetric.render_image(moved, view.moved(motion @ view.cam_to_world), ctx)
     unturned, _ = volumetric.render_image(blob, view.moved(motion @ view.cam_to_world), ctx)
     torch.testing.assert_close(after.rgb, before.rgb, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.depth, before.depth, atol=1e-4, rtol=0)

@@ -1,4 +1,4 @@
-"""Strategies in turn, the judge between them, strays, and what later readers are told; on COLMAP's own synthetic scene."""
+"""Strategies in turn, the judge between them, outliers, and what later readers are told; on COLMAP's own synthetic scene."""
 
 import json
 import os
@@ -17,10 +17,10 @@ from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.scenes.photos import PhotoJob, reconstruct
 from invgraphics.scenes.photos.attempts import choice, try_strategies
 from invgraphics.scenes.photos.mapping import Matched
-from invgraphics.scenes.photos.pairs import Evidence, Pair
+from invgraphics.scenes.photos.outlier_cameras import isolation, remove_outlier_cameras
+from invgraphics.scenes.photos.pairs import MatchedPair, VerifiedMatches
 from invgraphics.scenes.photos.prepare import Prepared
 from invgraphics.scenes.photos.strategies import WIDE_ANGLE, Strategy, strategies
-from invgraphics.scenes.photos.strays import isolation, remove_strays
 
 COUNT = 10
 
@@ -42,7 +42,7 @@ def photos_of(model: pycolmap.Reconstruction) -> tuple[Prepared, ...]:
     )
 
 
-def evidence_of(model: pycolmap.Reconstruction) -> Evidence:
+def evidence_of(model: pycolmap.Reconstruction) -> VerifiedMatches:
     """Matches are the observations of one point."""
     numbers, seen = sorted(model.images), {}
     for number in numbers:
@@ -53,8 +53,8 @@ def evidence_of(model: pycolmap.Reconstruction) -> Evidence:
         shared = sorted(set(seen[first]) & set(seen[second]))
         if shared:
             places = [np.array([seen[number][point] for point in shared]) for number in (first, second)]
-            pairs.append(Pair(i, j, (places[0], places[1])))
-    return Evidence((1000,) * len(numbers), tuple(pairs))
+            pairs.append(MatchedPair(i, j, (places[0], places[1])))
+    return VerifiedMatches((1000,) * len(numbers), tuple(pairs))
 
 
 def turned(model: pycolmap.Reconstruction, every: int) -> pycolmap.Reconstruction:
@@ -88,7 +88,7 @@ def tried(truth: pycolmap.Reconstruction, outcomes: list, tmp_path: Path, **opti
 def test_a_sound_reconstruction_is_the_last(truth, tmp_path: Path) -> None:
     best, rows, used = tried(truth, [truth], tmp_path)
     assert used == [Strategy("incremental", "radial")]
-    assert (best.registered, best.suspicion["support"], best.strays) == (COUNT, 1.0, {})
+    assert (best.registered, best.consistency["support"], best.outliers) == (COUNT, 1.0, {})
     assert choice(rows) == "incremental mapper, radial lens"
 
 
@@ -109,7 +109,7 @@ def test_the_best_of_the_suspicious_is_kept(truth, tmp_path: Path) -> None:
     best, rows, used = tried(truth, [turned(truth, 2), turned(truth, 5), turned(truth, 2)], tmp_path)
     assert len(used) == len(set(used)) == len(rows) == 6
     assert [row["kept"] for row in rows].index(True) == 1
-    assert best.suspicion["suspicious"]
+    assert best.consistency["suspicious"]
 
 
 def test_settings_restrict_what_is_tried() -> None:
@@ -125,14 +125,14 @@ def test_settings_restrict_what_is_tried() -> None:
     assert strategies(PhotoJob("p", mapper="incremental"), photos)[0] == Strategy("incremental", "radial")
 
 
-def test_strays_are_named_and_left_out(truth) -> None:
+def test_outlier_cameras_are_removed_and_reported(truth) -> None:
     far, bare = sorted(truth.images)[2:4]
     frame = truth.frames[truth.images[far].frame_id]
     frame.rig_from_world = pycolmap.Rigid3d(np.column_stack([np.eye(3), [1e4, 0, 0]]))
     for index, point in enumerate(truth.images[bare].points2D):
         if index >= 5 and point.has_point3D():
             truth.delete_observation(bare, index)
-    found = remove_strays(truth, photos_of(truth))
+    found = remove_outlier_cameras(truth, photos_of(truth))
     assert set(found) == {f"{far}.jpg", f"{bare}.jpg"}
     assert "times as far" in found[f"{far}.jpg"]
     assert re.search(r"only [1-5] of the points", found[f"{bare}.jpg"])  # some of the first five may show none
@@ -145,11 +145,11 @@ def test_a_reconstruction_that_hangs_by_threads_is_left_as_it_is(truth) -> None:
         for index, point in enumerate(truth.images[number].points2D):
             if index >= 5 and point.has_point3D():
                 truth.delete_observation(number, index)
-    assert remove_strays(truth, photos_of(truth)) == {}
+    assert remove_outlier_cameras(truth, photos_of(truth)) == {}
     assert truth.num_reg_images() == COUNT
 
 
-def test_a_walk_has_no_strays() -> None:
+def test_a_walk_has_no_outliers() -> None:
     """Steps of one to three metres, then a look from ten metres away."""
     places = np.cumsum([1.0, 2, 3, 1, 2, 3, 1, 2, 3, 10])
     assert isolation(np.column_stack([places, 0 * places, 0 * places])).max() == pytest.approx(10 / 3)

@@ -22,7 +22,7 @@ from invgraphics.metrics.poses import pose_errors
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.scenes.photos import PhotoJob, mapping, reconstruct
 from invgraphics.scenes.photos.job import DATABASE, MODELS
-from invgraphics.scenes.photos.pairs import read_evidence
+from invgraphics.scenes.photos.pairs import read_verified_matches
 from invgraphics.scenes.photos.prepare import prepare
 from invgraphics.scenes.photos.quality import describe
 from invgraphics.scenes.photos.strategies import WIDE_ANGLE, Strategy
@@ -134,13 +134,13 @@ def test_each_way_from_matches_to_poses(strategy: Strategy, imported, box_photos
     job = PhotoJob(str(box_photos))
     photos = prepare(job, tmp_path, lambda *_: None).photos
     shutil.copy(imported[0] / ".import" / DATABASE, tmp_path)
-    before = read_evidence(tmp_path / DATABASE, photos)
+    before = read_verified_matches(tmp_path / DATABASE, photos)
     models = mapping.reconstruct(strategy, mapping.Matched(job, photos, before, tmp_path), lambda *_: None)
     assert models[0].num_reg_images() >= 9
     assert {camera.model_name for camera in models[0].cameras.values()} == {MODELS[strategy.lens]}
     quality = describe(models[0], photos)
     assert float(truth_errors(quality).rotation_degrees.max()) < 3
-    after = read_evidence(tmp_path / DATABASE, photos)
+    after = read_verified_matches(tmp_path / DATABASE, photos)
     assert [len(pair) for pair in after.pairs] == [len(pair) for pair in before.pairs]
 
 

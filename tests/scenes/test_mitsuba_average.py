@@ -14,7 +14,7 @@ from invgraphics.scenes.mitsuba.folder import psnr
 from invgraphics.scenes.mitsuba.forecast import RenderingForecast
 from invgraphics.scenes.mitsuba.job import Job, Source
 from invgraphics.scenes.mitsuba.larger import averaged
-from invgraphics.scenes.mitsuba.spec import Counts, Samples, locate, read
+from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel, description_path, read
 from invgraphics.scenes.open import open_scene
 from invgraphics.scenes.truth import Truth
 
@@ -122,7 +122,7 @@ def test_noise_of_averages_is_smaller(scene_file, tmp_path):
     for half in halves:
         half[..., :3] = 0.4 + 0.02 * rng.standard_normal((96, 128, 3))
     np.savez(tmp_path / "0000.npz", linear=(halves[0] + halves[1]) / 2, half_psnr=psnr(*halves, None))
-    spec, samples = read(locate(scene_file)), Samples(2, 2, 4)
+    spec, samples = read(description_path(scene_file)), SamplesPerPixel(2, 2, 4)
     job = Job(spec, (32, 24), Counts(), samples, 0, llvm.PORTABLE, Source((128, 96), Counts(), samples))
     linear, stated = average.mean_picture(tmp_path / "0000.npz", job)
     blocks = [half.reshape(24, 4, 32, 4, 4).mean(axis=(1, 3)) for half in halves]
@@ -176,13 +176,13 @@ def test_averages_are_kept_and_a_rendering_is_preferred(with_large, made, small,
 
 def test_what_was_averaged_before_is_taken_again(with_large, large, scene_file, monkeypatch):
     """A second, smaller source does not change the truth of runs that exist."""
-    spec = read(locate(scene_file))
-    job = Job(spec, (8, 6), Counts(2, 0, 1), Samples(2, 2, 4), 0, llvm.PORTABLE)
+    spec = read(description_path(scene_file))
+    job = Job(spec, (8, 6), Counts(2, 0, 1), SamplesPerPixel(2, 2, 4), 0, llvm.PORTABLE)
     first = averaged(job)
     assert first is not None and first.source is not None and first.source.size == LARGE
     (with_large / first.folder_name).mkdir()
     (with_large / first.folder_name / "truth.json").write_text(json.dumps({"schema": 1, "files": {}, "averaged_from": {}}))
-    middle = Job(spec, SMALL, Counts(2, 0, 1), Samples(2, 2, 4), 0, llvm.PORTABLE)
+    middle = Job(spec, SMALL, Counts(2, 0, 1), SamplesPerPixel(2, 2, 4), 0, llvm.PORTABLE)
     table = json.loads((large / "truth.json").read_text()) | {"size": list(SMALL), "files": {}}
     (with_large / middle.folder_name).mkdir()
     (with_large / middle.folder_name / "truth.json").write_text(json.dumps(table))
@@ -194,7 +194,7 @@ def test_what_was_averaged_before_is_taken_again(with_large, large, scene_file, 
 
 def test_rendered_jobs_keep_their_keys(scene_file):
     """Whatever is in people's caches was kept under the hash of a table without a source."""
-    job = Job(read(locate(scene_file)), SMALL, Counts(2, 0, 1), Samples(2, 2, 4), 0, llvm.PORTABLE)
+    job = Job(read(description_path(scene_file)), SMALL, Counts(2, 0, 1), SamplesPerPixel(2, 2, 4), 0, llvm.PORTABLE)
     assert "source" not in job.table()
 
 
@@ -203,8 +203,8 @@ class Told:
 
     def __init__(self, folder: Path) -> None:
         self.now, self.sentences = 0.0, []
-        spec = read(locate("bricks"))
-        job = Job(spec, (80, 60), Counts(3, 1, 2), Samples(100, 50, 400), 0, llvm.PORTABLE)
+        spec = read(description_path("bricks"))
+        job = Job(spec, (80, 60), Counts(3, 1, 2), SamplesPerPixel(100, 50, 400), 0, llvm.PORTABLE)
         self.forecast = RenderingForecast(job, folder, lambda *_: None, self.sentences.append, lambda: self.now)
 
     def view(self, what: str, seconds: float) -> None:

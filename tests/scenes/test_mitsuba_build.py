@@ -11,7 +11,7 @@ from invgraphics.scenes.mitsuba import ply
 from invgraphics.scenes.mitsuba.build import mesh as meshes
 from invgraphics.scenes.mitsuba.build.noise import fractal
 from invgraphics.scenes.mitsuba.render import build
-from invgraphics.scenes.mitsuba.spec import locate, names, read
+from invgraphics.scenes.mitsuba.spec import description_path, names, read
 
 
 def _volume(mesh: meshes.Mesh) -> float:
@@ -58,7 +58,7 @@ def test_rotations_are_right_handed():
 
 @pytest.mark.parametrize("name", names())
 def test_models_are_sound(name):
-    spec = read(locate(name))
+    spec = read(description_path(name))
     model = build(spec.builder, spec.seed)
     assert model.parts or model.fog
     assert model.lights or any(part.radiance for part in model.parts)

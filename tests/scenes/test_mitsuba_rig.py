@@ -8,7 +8,7 @@ import torch
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.mitsuba.rig import SPLITS, cameras, make_rig
-from invgraphics.scenes.mitsuba.spec import locate, names, read
+from invgraphics.scenes.mitsuba.spec import description_path, names, read
 
 TABLES = {
     "sphere": {"kind": "sphere", "radius": 3.0},
@@ -95,7 +95,7 @@ def test_wrong_rigs_are_refused(table, word):
 def test_built_in_scenes_describe_themselves():
     assert set(names()) >= {"bricks", "cloud", "fence", "materials", "room", "textured"}
     for name in names():
-        spec = read(locate(name))
+        spec = read(description_path(name))
         assert spec.name == name
         assert spec.summary.endswith(".")
         assert spec.stresses.endswith(".")
@@ -104,7 +104,7 @@ def test_built_in_scenes_describe_themselves():
 
 def test_unknown_scene_lists_the_known_ones():
     with pytest.raises(InputError, match="bricks") as caught:
-        locate("brikcs")
+        description_path("brikcs")
     assert "brikcs" in caught.value.sentence
 
 

@@ -15,7 +15,7 @@ from invgraphics.scenes.mitsuba.build.mesh import box
 from invgraphics.scenes.mitsuba.gbuffer import GBuffer
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.rig import cameras, make_rig
-from invgraphics.scenes.mitsuba.spec import Counts, Samples, SceneSpec
+from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel, SceneSpec
 from invgraphics.scenes.truth import Truth
 
 W, H = 12, 8
@@ -25,7 +25,7 @@ RIG = {"kind": "sphere", "radius": 2.0}
 def _write(folder: Path, *, opaque: bool = False, surface: bool = True) -> Path:
     background = None if opaque else (1.0, 0.5, 0.25)
     spec = SceneSpec("toy", "bricks", "A toy.", "Nothing.", (-1, -1, -1), (1, 1, 2), RIG, background=background)
-    job = Job(spec, (W, H), Counts(3, 1, 4), Samples(4, 2, 8), 0, "scalar_rgb")
+    job = Job(spec, (W, H), Counts(3, 1, 4), SamplesPerPixel(4, 2, 8), 0, "scalar_rgb")
     rng = np.random.default_rng(0)
     views = {}
     for split, count in (("train", 3), ("val", 1), ("test", 4)):

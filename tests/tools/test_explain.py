@@ -13,7 +13,6 @@ from training_fixtures import SMALL
 
 from invgraphics.cli import main
 from invgraphics.core import Bounds, Camera, Context
-from invgraphics.experiments.evaluate import render_view
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
@@ -23,7 +22,6 @@ from invgraphics.renderers.samplers import Hierarchical, HierarchicalConfig, Str
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.renderers.volumetric import Volumetric
 from invgraphics.studies.approximations import field_of, round_ones
-from invgraphics.tools.along import along_ray
 from invgraphics.tools.explain import ExplainRequest, explain
 
 METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians", "gaussian-volume/exact", "gaussian-volume/sorted")
@@ -49,7 +47,7 @@ def runs(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 def test_what_is_listed_adds_up_to_the_rendered_pixel(runs: dict[str, Path], tmp_path: Path, method: str, split) -> None:
     fitted = open_fitted(runs[method])
     camera = getattr(fitted.scene, split)[1].camera
-    picture = render_view(fitted.field, fitted.renderer, camera, fitted.scene, fitted.device).over(fitted.scene.background)
+    picture = fitted.model.render(camera).over(fitted.scene.background)
     for column, row in ((9, 12), (14, 10), (0, 0)):
         explained = explain(ExplainRequest(runs[method], 1, (column, row), split, tmp_path))
         with (tmp_path / "ray.csv").open() as file:
@@ -72,7 +70,7 @@ def test_two_splats_by_hand() -> None:
     """A red one of opacity 1/2 in front of a blue one of opacity 4/5, both on the axis."""
     means, rgb = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 1.0]]), torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     field = field_of(round_ones(means, torch.tensor([0.1, 0.1]), torch.tensor([0.8, 0.5]), rgb)).float()
-    found = along_ray(field, Splatting(SplattingConfig(dilation=0.0)), HEAD_ON, (10, 10), CTX)
+    found = Splatting(SplattingConfig(dilation=0.0)).contributions(field, HEAD_ON, (10, 10), CTX)
     assert found.kind == "splats"
     for name, expected in {
         "t": [1.0, 3.0],
@@ -99,8 +97,8 @@ def test_two_splats_by_hand() -> None:
     "renderer",
     [
         Splatting(SplattingConfig(shape="disc", dilation=0.5)),
-        Splatting(SplattingConfig(dilation=0.1, compensate=True)),
-        Splatting(SplattingConfig(receivers=3)),
+        Splatting(SplattingConfig(dilation=0.1, antialiased=True)),
+        Splatting(SplattingConfig(max_grad_splats=3)),
         GaussianSorted(GaussianSortedConfig("splat", "centre")),
         GaussianSorted(GaussianSortedConfig("physical", "ray")),
         GaussianExact(GaussianExactConfig("physical")),
@@ -118,7 +116,7 @@ def test_every_way_to_show_gaussians_adds_up(renderer) -> None:
     with torch.no_grad():
         picture, _ = renderer.render_image(field, HEAD_ON, CTX)
     for column, row in ((10, 10), (3, 7), (20, 0)):
-        found = along_ray(field, renderer, HEAD_ON, (column, row), CTX)
+        found = renderer.contributions(field, HEAD_ON, (column, row), CTX)
         assert found.colour.tolist() == pytest.approx(picture.rgb[row, column].tolist(), abs=2e-5)
         assert found.opacity == pytest.approx(float(picture.alpha[row, column]), abs=2e-5)
         assert bool((found.alpha > 0).all())
@@ -133,7 +131,7 @@ def test_a_ball_of_fog_in_closed_form(sampler: str) -> None:
         Stratified(StratifiedConfig(400)) if sampler == "stratified" else Hierarchical(HierarchicalConfig(coarse=200, fine=200))
     )
     bounds = Bounds(-3 * torch.ones(3), 3 * torch.ones(3))
-    found = along_ray(ball, Volumetric(chosen), HEAD_ON, (10, 10), Context(bounds))
+    found = Volumetric(chosen).contributions(ball, HEAD_ON, (10, 10), Context(bounds))
     assert found.opacity == pytest.approx(1 - math.exp(-3), abs=2e-3)
     t, light = found.profile.t.numpy(), found.profile.transmittance.numpy()
     at = np.array([1.0, 1.75, 2.0, 2.25, 2.8])
@@ -155,8 +153,8 @@ def test_overlapping_gaussians_share_their_light() -> None:
     """Two equal Gaussians at one place: half of the light each when integrated, unequal when one comes first."""
     twins = round_ones(torch.tensor([[0.0, 0.0, 2.0]] * 2), torch.tensor([0.1, 0.1]), torch.tensor([0.6, 0.6])).means
     field = field_of(round_ones(twins, torch.tensor([0.1, 0.1]), torch.tensor([0.6, 0.6]))).float()
-    exact = along_ray(field, GaussianExact(GaussianExactConfig()), HEAD_ON, (10, 10), CTX)
-    ordered = along_ray(field, GaussianSorted(GaussianSortedConfig()), HEAD_ON, (10, 10), CTX)
+    exact = GaussianExact(GaussianExactConfig()).contributions(field, HEAD_ON, (10, 10), CTX)
+    ordered = GaussianSorted(GaussianSortedConfig()).contributions(field, HEAD_ON, (10, 10), CTX)
     assert exact.weight.tolist() == pytest.approx([0.42, 0.42], abs=1e-4)
     assert ordered.weight.tolist() == pytest.approx([0.6, 0.24], abs=1e-4)
     assert exact.transmittance.tolist() == pytest.approx([0.4, 0.4], abs=1e-4)  # half of the optical depth of alpha 0.84
@@ -171,7 +169,7 @@ def test_the_order_of_centres_is_shown_where_it_is_wrong() -> None:
     quaternion = torch.tensor([[math.cos(-turn / 2), 0.0, math.sin(-turn / 2), 0.0], [1.0, 0, 0, 0]]).double()
     scales = torch.tensor([[1.2, 0.05, 0.05], [0.05, 0.05, 0.05]]).double()
     field = field_of(type(gaussians)(gaussians.means, quaternion, scales, gaussians.opacities, gaussians.sh)).float()
-    found = along_ray(field, Splatting(SplattingConfig(dilation=0.0)), HEAD_ON, (10, 10), CTX)
+    found = Splatting(SplattingConfig(dilation=0.0)).contributions(field, HEAD_ON, (10, 10), CTX)
     assert found.t[0] > found.t[1] + 0.3
 
 
@@ -182,11 +180,11 @@ def test_a_ray_that_meets_nothing(tmp_path: Path) -> None:
         GaussianExact(GaussianExactConfig()),
         GaussianSorted(GaussianSortedConfig()),
     ):
-        found = along_ray(field, renderer, HEAD_ON, (10, 10), CTX)
+        found = renderer.contributions(field, HEAD_ON, (10, 10), CTX)
         assert (len(found), found.opacity, found.expected_depth, found.median_depth) == (0, 0, math.inf, math.inf)
         assert found.colour.tolist() == [0, 0, 0]
     away = Bounds(torch.tensor([5.0, 5, 5]), torch.tensor([6.0, 6, 6]))
-    found = along_ray(Sphere(1.0, 0.5), Volumetric(Stratified(StratifiedConfig(4))), HEAD_ON, (10, 10), Context(away))
+    found = Volumetric(Stratified(StratifiedConfig(4))).contributions(Sphere(1.0, 0.5), HEAD_ON, (10, 10), Context(away))
     assert len(found) == 0
     assert found.profile is None
 

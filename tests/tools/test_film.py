@@ -200,7 +200,7 @@ def test_gaussians_start_from_another_run(toy_folder: Path, tmp_path: Path) -> N
     config = load_method(METHOD, None, items).recipe.field
     for seed in (0, 1):  # the run's own seed, which draws the same points, and another
         torch.manual_seed(seed)
-        again[seed] = config.converted(fitted.field, fitted.scene).means
+        again[seed] = config.converted(fitted.model.field, fitted.scene).means
     assert torch.equal(means, again[0])
     assert not torch.equal(means, again[1])
     for wrong, words in ((tmp_path / "none", "does not exist"), (folder, "not density and radiance")):

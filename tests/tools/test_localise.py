@@ -10,9 +10,8 @@ from PIL import Image
 
 from invgraphics.cli.main import run as command
 from invgraphics.core.transforms import apply_similarity, look_at
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import open_fitted
-from invgraphics.experiments.posed import inverse
 from invgraphics.metrics.poses import Similarity, rotation_angle
 from invgraphics.training.poses import motion_about
 
@@ -56,7 +55,7 @@ def test_a_photograph_is_found(run: Path, tmp_path: Path, capsys) -> None:
     fitted = open_fitted(run)
     start = fitted.scene.train[3].camera
     truth = start.moved(start.cam_to_world @ motion_about(torch.tensor([0.1, -0.08, 0.05, 0.1, 0.1, 0.2]), torch.tensor(3.0)))
-    picture = render_view(fitted.field, fitted.renderer, truth, fitted.scene, fitted.device, geometry=False)
+    picture = fitted.model.render(truth, normals=False)
     photo, out = tmp_path / "photo.png", tmp_path / "found.json"
     Image.fromarray(display(picture.over(fitted.scene.background), fitted.scene).numpy()).save(photo)
     assert command(["locate", str(run), str(photo), "--out", str(out), "--steps", "240", "--starts", "2"]) == 0
@@ -136,4 +135,4 @@ def test_the_way_back_undoes_a_similarity() -> None:
     turn = look_at(*(torch.randn(3, dtype=torch.float64) for _ in range(3)))[:3, :3]
     similarity = Similarity(1.7, turn, torch.tensor([0.3, -2.0, 0.7]).double())
     points = torch.randn(5, 3, dtype=torch.float64)
-    torch.testing.assert_close(inverse(similarity).points(similarity.points(points)), points)
+    torch.testing.assert_close(similarity.inverse().points(similarity.points(points)), points)

@@ -15,12 +15,12 @@ from training_fixtures import SMALL
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
-from invgraphics.metrics.conventions import CONVENTIONS, PROTOCOLS
+from invgraphics.metrics.conventions import PROTOCOLS
 from invgraphics.metrics.protocols import protocol_named
 from invgraphics.report.data.comparison import check_comparable
 from invgraphics.runs.run import read_run
 from invgraphics.tools.predictions import open_pictures
-from invgraphics.tools.rescore import check_same_truth, rescore, rules_named, why_unsuited
+from invgraphics.tools.rescore import check_same_truth, protocols_named, rescore, why_unsuited
 from invgraphics.tools.rescoring import Rescored, labels, rows_of, spread_of, winners, write_scores, write_tables
 
 METHOD = "splatting/gaussians"
@@ -58,7 +58,7 @@ def folders(tmp_path: Path):
 
 
 def scores_of(folder: Path, name: str, **more) -> dict:
-    return rescore([open_pictures(folder, **more)], rules_named(name))[0].scores[name]
+    return rescore([open_pictures(folder, **more)], protocols_named(name))[0].scores[name]
 
 
 def read(path: Path) -> np.ndarray:
@@ -98,8 +98,8 @@ def test_a_tools_convention_from_the_files_alone(run: Path) -> None:
 
 
 def test_all_protocols_stand_in_one_table_with_their_spread(run: Path, tmp_path: Path) -> None:
-    result = rescore([open_pictures(run)], rules_named("all"))[0]
-    assert set(result.scores) == set(PROTOCOLS) | set(CONVENTIONS)
+    result = rescore([open_pictures(run)], protocols_named("all"))[0]
+    assert set(result.scores) == set(PROTOCOLS)
     assert all("psnr" in scores.quality for scores in result.scores.values())
     assert spread_of(result, "psnr") > 0.1
     columns, rows = rows_of(result)
@@ -107,7 +107,7 @@ def test_all_protocols_stand_in_one_table_with_their_spread(run: Path, tmp_path:
     assert rows[-1][:2] == ["spread", f"{spread_of(result, 'psnr'):.3f}"]
     page, numbers = write_tables([result], tmp_path / "out")
     assert f"| spread | {spread_of(result, 'psnr'):.3f} |" in page.read_text()
-    assert CONVENTIONS["multinerf"].source in page.read_text()
+    assert PROTOCOLS["multinerf"].source in page.read_text()
     lines = list(csv.DictReader(numbers.open()))
     found = {line["protocol"]: float(line["mean"]) for line in lines if line["metric"] == "psnr"}
     assert found == {name: scores.quality["psnr"].mean for name, scores in result.scores.items()}
@@ -116,7 +116,7 @@ def test_all_protocols_stand_in_one_table_with_their_spread(run: Path, tmp_path:
 
 def test_scores_go_into_the_run_and_never_replace_its_own(run: Path) -> None:
     before = (run / "scores.json").read_bytes()
-    result = rescore([open_pictures(run)], rules_named("default,float,gsplat"))[0]
+    result = rescore([open_pictures(run)], protocols_named("default,float,gsplat"))[0]
     assert {path.name for path in write_scores(result, None)} == {"scores.float.json", "scores.gsplat.json"}
     assert (run / "scores.json").read_bytes() == before
     as_read = read_run(run, "gsplat")
@@ -135,7 +135,7 @@ def test_pictures_of_another_tool_score_like_the_run_they_came_from(run: Path, t
     expected = json.loads((run / "scores.json").read_text())["quality"]
     for metric in ("psnr", "ssim", "flip"):
         assert got.quality[metric].per_view == pytest.approx(expected[metric]["per_view"], abs=1e-9)
-    result = rescore([open_pictures(theirs, background=WHITE)], rules_named("multinerf,instant-ngp,3dgs-metrics"))[0]
+    result = rescore([open_pictures(theirs, background=WHITE)], protocols_named("multinerf,instant-ngp,3dgs-metrics"))[0]
     assert write_scores(result, None) == []  # nothing is written into a stranger's folder
     assert "psnr" in result.scores["multinerf"].quality
     assert "in front of black; here it is in front of white already" in result.scores["3dgs-metrics"].skipped["psnr"]
@@ -144,9 +144,9 @@ def test_pictures_of_another_tool_score_like_the_run_they_came_from(run: Path, t
 
 def test_eight_bits_stand_in_for_floats_only_when_allowed(folders) -> None:
     pictures = open_pictures(*folders())
-    assert "--allow-8bit" in why_unsuited(pictures, CONVENTIONS["gsplat"])
-    assert why_unsuited(pictures, CONVENTIONS["multinerf"]) == ""
-    scores = rescore([pictures], rules_named("gsplat,float,default"), allow_8bit=True)[0].scores
+    assert "--allow-8bit" in why_unsuited(pictures, PROTOCOLS["gsplat"])
+    assert why_unsuited(pictures, PROTOCOLS["multinerf"]) == ""
+    scores = rescore([pictures], protocols_named("gsplat,float,default"), allow_8bit=True)[0].scores
     assert scores["gsplat"].quality["psnr"].mean == pytest.approx(scores["default"].quality["psnr"].mean, abs=1e-6)
     assert any("8-bit pictures stand in" in note for note in scores["gsplat"].notes)
     assert not any("8-bit" in note for note in scores["default"].notes)
@@ -156,10 +156,10 @@ def test_backgrounds_are_never_guessed(folders) -> None:
     predictions, truth = folders(("RGB", "RGBA"))
     with pytest.raises(InputError, match=r"pictures of the predictions have no alpha channel.*\n.*--background white"):
         open_pictures(predictions, truth)
-    assert "in front of black" in why_unsuited(open_pictures(predictions, truth, WHITE), CONVENTIONS["3dgs-metrics"])
+    assert "in front of black" in why_unsuited(open_pictures(predictions, truth, WHITE), PROTOCOLS["3dgs-metrics"])
     clear = open_pictures(*folders(("RGBA", "RGBA"), ("clear", "clear_truth")))
     assert "needs the data set's background" in why_unsuited(clear, PROTOCOLS["default"])
-    assert why_unsuited(clear, CONVENTIONS["3dgs-metrics"]) == ""
+    assert why_unsuited(clear, PROTOCOLS["3dgs-metrics"]) == ""
     opaque = open_pictures(*folders(names=("photos", "photos_truth")))
     assert opaque.transparency == "opaque" and "scored as photographs" in opaque.notes[0]
 
@@ -171,7 +171,7 @@ def test_a_run_whose_truth_keeps_one_background_only_says_so(run: Path) -> None:
         arrays = dict(np.load(path))
         del arrays["rgb"]
         np.savez_compressed(path, **arrays)
-    result = rescore([open_pictures(run)], rules_named("default,gsplat,multinerf"))[0].scores
+    result = rescore([open_pictures(run)], protocols_named("default,gsplat,multinerf"))[0].scores
     assert "already, without alpha" in result["gsplat"].skipped["psnr"]
     first = json.loads((run / "scores.json").read_text())["quality"]["psnr"]["per_view"]
     assert result["default"].quality["psnr"].per_view == pytest.approx(first, abs=1e-9)
@@ -180,8 +180,8 @@ def test_a_run_whose_truth_keeps_one_background_only_says_so(run: Path) -> None:
 
 def test_wide_runs_are_not_what_3dgs_would_have_fitted(run: Path) -> None:
     wide = replace(open_pictures(run), size=(1601, 900))
-    assert "wider than 1600 pixels" in why_unsuited(wide, CONVENTIONS["3dgs-metrics-white"])
-    assert why_unsuited(replace(wide, size=(1600, 900)), CONVENTIONS["3dgs-metrics-white"]) == ""
+    assert "wider than 1600 pixels" in why_unsuited(wide, PROTOCOLS["3dgs-metrics-white"])
+    assert why_unsuited(replace(wide, size=(1600, 900)), PROTOCOLS["3dgs-metrics-white"]) == ""
 
 
 def test_only_the_same_truth_is_compared(run: Path, folders) -> None:
@@ -194,7 +194,7 @@ def test_only_the_same_truth_is_compared(run: Path, folders) -> None:
         ({"sha256": "0" * 64}, "different true pixels"),
     ):
         with pytest.raises(InputError, match=expected):
-            rescore([one, replace(one, **changes)], rules_named("default"))
+            rescore([one, replace(one, **changes)], protocols_named("default"))
 
 
 def test_reports_refuse_runs_over_different_backgrounds(run: Path) -> None:
@@ -232,7 +232,7 @@ def _gain(rescored: Rescored, protocol: str, gain: float) -> None:
 
 def test_the_winner_may_depend_on_the_protocol(run: Path) -> None:
     results = [
-        replace(one, label=label) for label in "ab" for one in rescore([open_pictures(run)], rules_named("float,gsplat"))
+        replace(one, label=label) for label in "ab" for one in rescore([open_pictures(run)], protocols_named("float,gsplat"))
     ]
     _gain(results[1], "float", 1)
     _gain(results[0], "gsplat", 1)

@@ -80,7 +80,7 @@ SPINNING = """
 import {first}
 import torch, time
 import invgraphics
-from invgraphics.kernels.waiting import limit_spinning
+from invgraphics.kernels.openmp import limit_spinning
 print(limit_spinning())
 torch.set_num_threads(2)
 values = torch.zeros(200_000)

@@ -40,8 +40,8 @@ def _state(count: int = 6) -> FitState:
     return FitState(field, SplattingConfig().build(scene), optimiser, scene, ctx, step=9)
 
 
-def _pull(state: FitState, hook, pixels: list[float], visible: list[bool] | None = None) -> None:
-    """Pretend that the loss pulled each Gaussian by so many (loss per pixel) on a 32 x 32 image."""
+def _gradients(state: FitState, hook, pixels: list[float], visible: list[bool] | None = None) -> None:
+    """Accumulate these screen-space gradients (loss per pixel) of a 32 x 32 image."""
     means2d = torch.zeros(len(pixels), 2, requires_grad=True)
     means2d.grad = torch.stack([torch.tensor(pixels), torch.zeros(len(pixels))], dim=1)
     radii = torch.tensor([1.0 if seen else 0.0 for seen in (visible or [True] * len(pixels))])
@@ -53,7 +53,7 @@ def test_small_gaussians_with_large_gradients_are_cloned() -> None:
     state = _state()
     hook = DensityControlConfig(every=10, threshold=1.0).build()
     # 1.0 per unit of NDC is 1/16 per pixel on an image 32 pixels wide.
-    _pull(state, hook, [0.99 / 16, 1.01 / 16, 0.0, 0.0, 0.0, 2.0])
+    _gradients(state, hook, [0.99 / 16, 1.01 / 16, 0.0, 0.0, 0.0, 2.0])
     before = state.field.means.detach().clone()
     hook.after_step(state)
     assert state.field.primitive_count() == 8
@@ -65,8 +65,8 @@ def test_gradient_is_averaged_over_the_views_that_see_a_gaussian() -> None:
     state = _state(2)
     hook = DensityControlConfig(every=10, threshold=1.0).build()
     for _ in range(3):
-        _pull(state, hook, [0.0, 0.0], visible=[False, True])
-    _pull(state, hook, [1.5 / 16, 1.5 / 16])
+        _gradients(state, hook, [0.0, 0.0], visible=[False, True])
+    _gradients(state, hook, [1.5 / 16, 1.5 / 16])
     hook.after_step(state)
     assert state.field.primitive_count() == 3  # the first was seen once: 1.5; the second four times: 0.375
 
@@ -76,7 +76,7 @@ def test_large_gaussians_split_into_two_smaller_ones_nearby() -> None:
     with torch.no_grad():
         state.field.log_scales[1] = math.log(0.5)
     hook = DensityControlConfig(every=10, threshold=1.0).build()
-    _pull(state, hook, [0.0, 1.0, 0.0])
+    _gradients(state, hook, [0.0, 1.0, 0.0])
     parent = state.field.means[1].detach().clone()
     hook.after_step(state)
     assert state.field.primitive_count() == 4
@@ -86,35 +86,35 @@ def test_large_gaussians_split_into_two_smaller_ones_nearby() -> None:
     assert bool((offsets > 0).all()) and bool((offsets < 0.5 * 5).all())
 
 
-def test_transparent_gaussians_go_and_one_always_stays() -> None:
+def test_transparent_gaussians_are_pruned_but_for_one() -> None:
     state = _state(4)
     with torch.no_grad():
         state.field.opacity_logits[:] = torch.tensor([-9.0, 0.0, -9.0, 3.0])
     hook = DensityControlConfig(every=10).build()
-    _pull(state, hook, [0.0] * 4)
+    _gradients(state, hook, [0.0] * 4)
     hook.after_step(state)
     assert state.field.primitive_count() == 2
     with torch.no_grad():
         state.field.opacity_logits.fill_(-9.0)
-    _pull(state, hook, [0.0] * 2)
+    _gradients(state, hook, [0.0] * 2)
     hook.after_step(state)
     assert state.field.primitive_count() == 1
 
 
-def test_cap_keeps_the_strongest() -> None:
+def test_the_cap_leaves_the_largest_gradients() -> None:
     state = _state(6)
     hook = DensityControlConfig(every=10, threshold=0.1, max_primitives=8).build()
-    _pull(state, hook, [1.0, 6.0, 2.0, 5.0, 3.0, 4.0])
+    _gradients(state, hook, [1.0, 6.0, 2.0, 5.0, 3.0, 4.0])
     before = state.field.means.detach().clone()
     hook.after_step(state)
     assert state.field.primitive_count() == 8
     assert torch.equal(state.field.means[6:], before[[1, 3]])
 
 
-def test_adam_forgets_the_new_and_remembers_the_old() -> None:
+def test_adam_keeps_moments_of_kept_rows_and_has_none_of_new_ones() -> None:
     state = _state(3)
     hook = DensityControlConfig(every=10, threshold=1.0).build()
-    _pull(state, hook, [0.0, 1.0, 0.0])
+    _gradients(state, hook, [0.0, 1.0, 0.0])
     hook.after_step(state)
     moments = state.optimiser.state()
     for row, name in enumerate(dict(state.field.named_parameters())):
@@ -126,12 +126,12 @@ def test_adam_forgets_the_new_and_remembers_the_old() -> None:
 def test_reset_lowers_opacities_and_arms_pruning_by_size() -> None:
     state = _state(3)
     hook = DensityControlConfig(every=10, resets=(0.25,), prune_opacity=0.005, prune_pixels=0.5).build()
-    _pull(state, hook, [0.0] * 3)
+    _gradients(state, hook, [0.0] * 3)
     hook.after_step(state)
     assert float(torch.sigmoid(state.field.opacity_logits).max()) == pytest.approx(0.01, abs=1e-6)
     with torch.no_grad():
         state.field.opacity_logits.fill_(0.0)
-    _pull(state, hook, [0.0] * 3, visible=[True, False, False])
+    _gradients(state, hook, [0.0] * 3, visible=[True, False, False])
     hook.after_step(state)
     assert state.field.primitive_count() == 2
 
@@ -139,19 +139,19 @@ def test_reset_lowers_opacities_and_arms_pruning_by_size() -> None:
 def test_nothing_grows_after_the_end() -> None:
     state = _state(3)
     hook = DensityControlConfig(every=10, threshold=1e-9, stop=0.2).build()
-    _pull(state, hook, [1.0] * 3)
+    _gradients(state, hook, [1.0] * 3)
     hook.after_step(state)
     assert state.field.primitive_count() == 3
 
 
 @pytest.mark.parametrize(("clone", "split", "count"), [(False, True, 4), (True, False, 4), (False, False, 3)])
 def test_switched_off_growth_takes_no_room(clone: bool, split: bool, count: int) -> None:
-    """Two small Gaussians are pulled most, then a large one; without cloning there is room for the large one."""
+    """Two small Gaussians have the largest gradients, then a large one; without cloning there is room for the large one."""
     state = _state(3)
     with torch.no_grad():
         state.field.log_scales[2] = math.log(0.5)
     hook = DensityControlConfig(every=10, threshold=0.1, clone=clone, split=split, max_primitives=4).build()
-    _pull(state, hook, [3.0, 0.0, 2.0])
+    _gradients(state, hook, [3.0, 0.0, 2.0])
     hook.after_step(state)
     assert state.field.primitive_count() == count
 
@@ -159,9 +159,9 @@ def test_switched_off_growth_takes_no_room(clone: bool, split: bool, count: int)
 def test_absolute_gradients_are_used_where_the_renderer_gathers_them() -> None:
     state = _state(2)
     hook = DensityControlConfig(every=10, threshold=1.0).build()
-    means2d, pull = torch.zeros(2, 2, requires_grad=True), torch.zeros(2, 2, requires_grad=True)
-    means2d.grad, pull.grad = torch.zeros(2, 2), torch.tensor([[0.0, 0.0], [1.0, 0.0]])
-    state.trace = Trace(screen=Screen(means2d, torch.ones(2), 32, 32, pull))
+    means2d, absgrad = torch.zeros(2, 2, requires_grad=True), torch.zeros(2, 2, requires_grad=True)
+    means2d.grad, absgrad.grad = torch.zeros(2, 2), torch.tensor([[0.0, 0.0], [1.0, 0.0]])
+    state.trace = Trace(screen=Screen(means2d, torch.ones(2), 32, 32, absgrad))
     hook.after_backward(state)
     hook.after_step(state)
     assert state.field.primitive_count() == 3
@@ -190,9 +190,9 @@ def test_growth_begins_by_steps_where_the_budget_is_long() -> None:
     """At a hundredth of the fit nothing is due by progress; after 500 steps it is, once and for all."""
     state = _state(3)
     state.ctx = replace(state.ctx, progress=0.01)
-    hook = DensityControlConfig(every=10, threshold=1.0, start=0.05, start_steps=500).build()
+    hook = DensityControlConfig(every=10, threshold=1.0, start=0.05, latest_start_step=500).build()
     state.step = 489
-    _pull(state, hook, [1.0] * 3)
+    _gradients(state, hook, [1.0] * 3)
     hook.after_step(state)
     assert state.field.primitive_count() == 3
     state.step = 509
@@ -201,32 +201,42 @@ def test_growth_begins_by_steps_where_the_budget_is_long() -> None:
 
 
 @pytest.mark.parametrize(("risen", "most"), [(0.0, 4), (0.25, 8), (0.5, 16), (1.0, 16)])
-def test_the_limit_rises_by_equal_factors(risen: float, most: int) -> None:
+def test_the_cap_rises_by_equal_factors(risen: float, most: int) -> None:
     """From 4 to 16 Gaussians within half of the fit: a quarter of it doubles them."""
     state = _state(4)
-    hook = DensityControlConfig(every=10, threshold=1e-3, start=0.0, stop=1.1, pace=0.5, max_primitives=16).build()
+    hook = DensityControlConfig(every=10, threshold=1e-3, start=0.0, stop=1.1, cap_ramp=0.5, max_primitives=16).build()
     state.ctx = replace(state.ctx, progress=0.0)
-    _pull(state, hook, [1.0] * 4)
+    _gradients(state, hook, [1.0] * 4)
     hook.after_step(state)
     assert state.field.primitive_count() == 4
     state.ctx = replace(state.ctx, progress=risen)
     for _ in range(3):
-        _pull(state, hook, [1.0] * state.field.primitive_count())
+        _gradients(state, hook, [1.0] * state.field.primitive_count())
         hook.after_step(state)
     assert state.field.primitive_count() == most
 
 
 @pytest.mark.parametrize("opacity", [0.02, 0.5, 0.98])
-def test_a_clone_and_its_parent_together_look_like_the_parent(opacity: float) -> None:
+def test_a_clone_and_its_parent_composite_to_the_parents_opacity(opacity: float) -> None:
     """Two in one place transmit (1 - o)², which must be what one transmitted; others keep their opacity."""
     state = _state(3)
     with torch.no_grad():
         state.field.opacity_logits[1] = math.log(opacity / (1 - opacity))
-    hook = DensityControlConfig(every=10, threshold=1.0, share_opacity=True).build()
-    _pull(state, hook, [0.0, 1.0, 0.0])
+    hook = DensityControlConfig(every=10, threshold=1.0, revised_opacity=True).build()
+    _gradients(state, hook, [0.0, 1.0, 0.0])
     hook.after_step(state)
     opacities = state.field.opacity_logits.detach().sigmoid()
     assert len(opacities) == 4
     assert float(opacities[1]) == pytest.approx(float(opacities[3]), rel=1e-6)
     assert float((1 - opacities[1]) * (1 - opacities[3])) == pytest.approx(1 - opacity, rel=1e-4)
     torch.testing.assert_close(opacities[[0, 2]], torch.full((2,), 0.5))
+
+
+def test_statistics_of_earlier_checkpoints_are_read() -> None:
+    hook, old = DensityControlConfig().build(), DensityControlConfig().build()
+    names = {"pull": "gradient_sum", "seen": "views", "radius": "max_radius", "first": "first_count"}
+    written = hook.state_dict() | {"gradient_sum": torch.ones(3), "views": torch.full((3,), 2.0), "max_radius": torch.zeros(3)}
+    written["first_count"] = torch.tensor(7)
+    old.load_state_dict({next((first for first, now in names.items() if now == name), name): v for name, v in written.items()})
+    for name, value in old.state_dict().items():
+        assert torch.equal(value, written[name]), name

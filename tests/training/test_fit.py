@@ -9,7 +9,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Context
 from invgraphics.errors import NumericalError
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
@@ -23,7 +22,7 @@ def _psnr(fit) -> float:
     errors = []
     with torch.no_grad():
         for view in scene.test:
-            picture, _ = fit.plan.renderer.render_image(fit.plan.field, view.camera, Context(scene.bounds))
+            picture = fit.plan.model.render(view.camera)
             errors.append((picture.over(scene.background).clamp(0, 1) - view.over(scene.background)).square().mean())
     return -10 * math.log10(float(torch.stack(errors).mean()))
 
@@ -85,8 +84,8 @@ def test_gaussian_count_goes_up_and_down(threshold: float, prune: float, sign: i
     """Growth alone raises the count, pruning alone lowers it; nothing changes between rounds."""
     settings = [f"hooks.1.threshold={threshold}", f"hooks.1.prune_opacity={prune}"]
     fit = make_fit("splatting/gaussians", scene, 100, 0, *settings)
-    counts = [fit.plan.field.primitive_count()]
-    fit.run(lambda loss: counts.append(fit.plan.field.primitive_count()) or False)
+    counts = [fit.plan.model.field.primitive_count()]
+    fit.run(lambda loss: counts.append(fit.plan.model.field.primitive_count()) or False)
     changes = {step: sign * (b - a) for step, (a, b) in enumerate(itertools.pairwise(counts), start=1)}
     assert max(changes.values()) > 0
     assert min(changes.values()) == 0
@@ -99,10 +98,10 @@ def test_nan_names_step_and_tensor(scene, make_fit) -> None:
     def poison(loss: float) -> bool:
         if fit.steps == 3:
             with torch.no_grad():
-                next(fit.plan.field.parameters()).view(-1)[0] = torch.nan
+                next(fit.plan.model.field.parameters()).view(-1)[0] = torch.nan
         return False
 
-    name = next(name for name, _ in fit.plan.field.named_parameters())
+    name = next(name for name, _ in fit.plan.model.field.named_parameters())
     with pytest.raises(NumericalError, match=rf"Step 3: field\.{name} is not finite"):
         fit.run(poison)
 
@@ -124,7 +123,7 @@ def test_processor_time_is_counted_beside_the_clock(scene, make_fit) -> None:
     resumed = make_fit("volumetric/nerf", scene, 9)
     resumed.load(fit.state(), clocks["seconds"])
     resumed.resume_clocks(clocks)
-    resumed.rehearse()  # on no clock
+    resumed.warmup_step()  # on no clock
     assert (resumed.clocks()["seconds"], resumed.clocks()["cpu_seconds"]) == (clocks["seconds"], clocks["cpu_seconds"])
     if clocks["ran_seconds"] is not None:
         assert resumed.clocks()["ran_seconds"] >= clocks["ran_seconds"] > 0

@@ -7,7 +7,7 @@ import pytest
 import torch
 from test_density_control import _scene
 
-from invgraphics.core import harmonics
+from invgraphics.core import Model, harmonics
 from invgraphics.fields.gaussian import PARAMETERS, GaussianField
 from invgraphics.kernels.dispatch import using
 from invgraphics.renderers.splatting import SplattingConfig
@@ -15,7 +15,7 @@ from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
 from invgraphics.training.limits import COLLAPSED, LimitsConfig, dead_gaussians, pixel_sizes
-from invgraphics.training.losses import PhotometricConfig
+from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
 
 
@@ -36,8 +36,9 @@ def _fit(colour: float, target: int, hooks: tuple = (LimitsConfig(),), **changes
     groups = OptimiserConfig({"field": GroupConfig("field", 0.05)}, eps=1e-15)
     built = [hook.build() for hook in hooks]
     field = GaussianField(tensors)
-    losses = [PhotometricConfig(distance="l1").build()]
-    return Fit(Plan(field, SplattingConfig().build(scene), scene, losses, built, groups, BatchConfig(), Budget(steps=100)))
+    losses = [PhotometricLoss(distance="l1")]
+    model = Model(field, SplattingConfig().build(scene), scene.bounds)
+    return Fit(Plan(model, scene, losses, built, groups, BatchConfig(), Budget(steps=100)))
 
 
 @pytest.fixture(params=["reference", "numba"], autouse=True)
@@ -49,22 +50,22 @@ def implementation(request):
 def test_a_black_gaussian_becomes_bright_again() -> None:
     """All three channels are below zero, where max(0, c) is flat; the photographs are white."""
     fit = _fit(colour=-0.2, target=255)
-    before = fit.plan.field.sh_dc.detach().clone()
+    before = fit.plan.model.field.sh_dc.detach().clone()
     fit.step()
-    assert bool((fit.plan.field.sh_dc > before).all())
+    assert bool((fit.plan.model.field.sh_dc > before).all())
     for _ in range(30):
         fit.step()
-    assert float(fit.plan.field.sh_dc.detach().min()) * harmonics.BAND_0 + 0.5 > 0.1
-    assert dead_gaussians(fit.plan.field, [view.camera for view in fit.plan.scene.train]).share == 0
+    assert float(fit.plan.model.field.sh_dc.detach().min()) * harmonics.BAND_0 + 0.5 > 0.1
+    assert dead_gaussians(fit.plan.model.field, [view.camera for view in fit.plan.scene.train]).share == 0
 
 
 def test_a_black_gaussian_that_should_be_black_stays() -> None:
     """The gradient that would push a channel further below zero does not pass: colours cannot run away."""
     fit = _fit(colour=-0.2, target=0)
-    before = fit.plan.field.sh_dc.detach().clone()
+    before = fit.plan.model.field.sh_dc.detach().clone()
     for _ in range(3):
         fit.step()
-    assert torch.equal(fit.plan.field.sh_dc, before)
+    assert torch.equal(fit.plan.model.field.sh_dc, before)
 
 
 @pytest.mark.parametrize(("hooks", "back"), [((LimitsConfig(),), True), ((), False)])
@@ -72,13 +73,13 @@ def test_a_saturated_opacity_can_fall_again(hooks: tuple, back: bool) -> None:
     """In float32 sigmoid(17) is 1 and its slope 0. The Gaussian is darker than the photographs, so it should fade."""
     fit = _fit(colour=0.1, target=255, hooks=hooks, logit=17.0)
     cameras = [view.camera for view in fit.plan.scene.train]
-    assert bool(dead_gaussians(fit.plan.field, cameras).saturated)
+    assert bool(dead_gaussians(fit.plan.model.field, cameras).saturated)
     fit.step()
-    assert bool(dead_gaussians(fit.plan.field, cameras).saturated) != back
-    after_one = float(fit.plan.field.opacity_logits.detach())
+    assert bool(dead_gaussians(fit.plan.model.field, cameras).saturated) != back
+    after_one = float(fit.plan.model.field.opacity_logits.detach())
     for _ in range(5):
         fit.step()
-    assert (float(fit.plan.field.opacity_logits.detach()) < after_one - 0.1) == back
+    assert (float(fit.plan.model.field.opacity_logits.detach()) < after_one - 0.1) == back
 
 
 @pytest.mark.parametrize(("hooks", "back"), [((LimitsConfig(),), True), ((), False)])
@@ -86,23 +87,23 @@ def test_a_collapsed_scale_can_grow_again(hooks: tuple, back: bool) -> None:
     """A scale of 2e-8 is nothing beside the low-pass filter. The photographs are white like the Gaussian: it should grow."""
     fit = _fit(colour=1.0, target=255, hooks=hooks, log_scale=math.log(2e-8), logit=2.0)
     cameras = [view.camera for view in fit.plan.scene.train]
-    assert bool(dead_gaussians(fit.plan.field, cameras).collapsed)
-    start = fit.plan.field.log_scales.detach().clone()
+    assert bool(dead_gaussians(fit.plan.model.field, cameras).collapsed)
+    start = fit.plan.model.field.log_scales.detach().clone()
     for _ in range(6):
         fit.step()
-    assert bool(dead_gaussians(fit.plan.field, cameras).collapsed) != back
-    assert bool((fit.plan.field.log_scales > start + 1).all()) == back
+    assert bool(dead_gaussians(fit.plan.model.field, cameras).collapsed) != back
+    assert bool((fit.plan.model.field.log_scales > start + 1).all()) == back
 
 
 def test_a_faded_gaussian_is_drawn_and_can_return() -> None:
     """Below 1/255 the rasteriser skips it, and nothing reaches it."""
     fit = _fit(colour=1.0, target=255, logit=-12.0)
     cameras = [view.camera for view in fit.plan.scene.train]
-    assert bool(dead_gaussians(fit.plan.field, cameras).faded)
+    assert bool(dead_gaussians(fit.plan.model.field, cameras).faded)
     for _ in range(10):
         fit.step()
-    assert not bool(dead_gaussians(fit.plan.field, cameras).faded)
-    assert float(fit.plan.field.opacity_logits.detach().sigmoid()) > 0.005
+    assert not bool(dead_gaussians(fit.plan.model.field, cameras).faded)
+    assert float(fit.plan.model.field.opacity_logits.detach().sigmoid()) > 0.005
 
 
 def test_limits_survive_an_interruption_bit_by_bit() -> None:
@@ -116,7 +117,7 @@ def test_limits_survive_an_interruption_bit_by_bit() -> None:
     for _ in range(3):
         second.step()
     for name in PARAMETERS:
-        assert torch.equal(getattr(whole.plan.field, name), getattr(second.plan.field, name)), name
+        assert torch.equal(getattr(whole.plan.model.field, name), getattr(second.plan.model.field, name)), name
 
 
 def test_pixel_sizes_are_distances_over_focal_lengths_of_the_nearest_camera() -> None:
@@ -128,7 +129,7 @@ def test_pixel_sizes_are_distances_over_focal_lengths_of_the_nearest_camera() ->
 
 def test_causes_are_told_apart() -> None:
     cameras = [view.camera for view in _scene().train]
-    field = _fit(0.5, 128).plan.field
+    field = _fit(0.5, 128).plan.model.field
     field.replace(
         {name: getattr(field, name).detach().repeat(4, *[1] * (getattr(field, name).dim() - 1)) for name in PARAMETERS}
     )

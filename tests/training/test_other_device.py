@@ -5,7 +5,6 @@ import torch
 from other_device import Elsewhere, other_device
 
 from invgraphics.experiments.build import build_plan
-from invgraphics.experiments.evaluate import render_view
 from invgraphics.experiments.recorder import Monitor
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -17,11 +16,11 @@ METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
 def test_fit_and_evaluate_elsewhere(name: str, scene, small) -> None:
     with other_device() as device:
         fit = Fit(build_plan(small(name), scene, Budget(steps=12), 0, device))
-        fit.rehearse()
+        fit.warmup_step()
         fit.run(lambda loss: False)
         assert fit.steps == 12
-        assert all(isinstance(parameter, Elsewhere) for parameter in fit.plan.field.parameters())
-        picture = render_view(fit.plan.field, fit.plan.renderer, scene.test[0].camera, scene, device)
+        assert all(isinstance(parameter, Elsewhere) for parameter in fit.plan.model.field.parameters())
+        picture = fit.plan.model.render(scene.test[0].camera)
         assert Monitor(scene, device).psnr(fit) > 0
     assert picture.rgb.device.type == picture.depth.device.type == "cpu"
     assert bool(torch.isfinite(picture.rgb).all())

@@ -8,28 +8,28 @@ import torch
 from torch import Tensor
 
 from invgraphics import kernels
-from invgraphics.core import Bounds, Context, Field, FieldValues, Quantity, Samples, Scene, View
+from invgraphics.core import Bounds, Context, Field, FieldValues, Model, Quantity, Samples, Scene, View
 from invgraphics.core.colour import quantise
+from invgraphics.core.ngp import HashGrid
 from invgraphics.core.transforms import se3_exp
 from invgraphics.experiments.build import build_model, build_plan
 from invgraphics.fields.encodings.frequency import FrequencyConfig
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.kernels import reference
-from invgraphics.kernels.types import HashGrid
 from invgraphics.metrics.poses import pose_errors
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
-from invgraphics.scenes.corrupt import TrainingData, corrupt
+from invgraphics.scenes.degrade import TrainingData, degrade
 from invgraphics.testing import toy_cameras
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
-from invgraphics.training.localise import Descent, descend
-from invgraphics.training.losses import PhotometricConfig
+from invgraphics.training.localise import PoseDescent, refine_pose
+from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import OptimiserConfig
-from invgraphics.training.poses import Poses, PosesConfig, motion_about, windows
+from invgraphics.training.poses import Poses, PosesConfig, coarse_to_fine_encodings, motion_about
 
 CPU = torch.device("cpu")
 ON = "training.poses.optimise=true"
@@ -121,9 +121,9 @@ def liven(field: Field) -> None:
 def test_gradients_of_a_pose(family: str, scene: Scene, small: Callable) -> None:
     """Through the field's positions and directions, against finite differences in float64."""
     name, settings = RENDERERS[family]
-    field, renderer = build_model(small(name, *settings), scene, 0, CPU)
-    liven(field)
-    field, renderer = field.double(), renderer.double()
+    model = build_model(small(name, *settings), scene, 0, CPU)
+    liven(model.field)
+    field, renderer = model.field.double(), model.renderer.double()
     camera = scene.train[0].camera.resized(8, 8).to(torch.float64)
     ctx = Context(scene.bounds.to(torch.float64))
     cotangent = torch.rand(8, 8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
@@ -148,12 +148,12 @@ def test_marching_keeps_the_gradients_of_positions(stop: str, scene: Scene, smal
     gradients = []
     for how in (stop, "never"):
         settings = [f"renderer.sampler.stop={how}", "renderer.sampler.transmittance=0.0"]
-        field, renderer = build_model(small("volumetric/hash", *settings), scene, 0, CPU)
-        liven(field)
+        model = build_model(small("volumetric/hash", *settings), scene, 0, CPU)
+        liven(model.field)
         twist = torch.zeros(6, requires_grad=True)
         camera = scene.train[0].camera
         moved = camera.moved(camera.cam_to_world @ se3_exp(twist))
-        picture, _ = renderer.render_image(field, moved, Context(scene.bounds))
+        picture, _ = model.renderer.render_image(model.field, moved, model.context())
         gradients.append(torch.autograd.grad(picture.rgb.square().sum(), twist)[0])
     assert float(gradients[0].abs().min()) > 0
     torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-4, atol=1e-4 * float(gradients[1].abs().max()))
@@ -188,8 +188,8 @@ def test_motions_turn_about_their_pivot() -> None:
 
 def test_window_opens_from_coarse_to_fine() -> None:
     config = PosesConfig(window=(0.2, 0.6))
-    assert [config.detail(progress) for progress in (0.0, 0.2, 0.6, 1.0)] == [0.0, 0.0, 1.0, 1.0]
-    assert config.detail(0.4) == pytest.approx(0.5)
+    assert [config.alpha(progress) for progress in (0.0, 0.2, 0.6, 1.0)] == [0.0, 0.0, 1.0, 1.0]
+    assert config.alpha(0.4) == pytest.approx(0.5)
     points = torch.rand(5, 3)
     for settings in (FrequencyConfig(octaves=4), HashConfig(levels=5, log2_size=8, finest=64)):
         encoding = settings.build()
@@ -223,7 +223,7 @@ def test_without_poses_nothing_is_different(name: str, scene: Scene, small: Call
 
 @pytest.mark.parametrize("name", METHODS)
 def test_resumed_with_poses_equals_uninterrupted(name: str, scene: Scene, small: Callable, tmp_path) -> None:
-    shown = corrupt(scene, TrainingData(pose_noise=2.0), 0)
+    shown = degrade(scene, TrainingData(pose_noise=2.0), 0)
 
     def fresh() -> Fit:
         return Fit(build_plan(small(name, ON), shown, Budget(steps=24), 0, CPU))
@@ -238,23 +238,22 @@ def test_resumed_with_poses_equals_uninterrupted(name: str, scene: Scene, small:
     assert same(whole.state(), second.state())
     assert whole.plan.poses is not None
     assert all(bool(turn.any()) for turn in whole.plan.poses.rotation)
-    opened = [encoding.detail for encoding in windows(whole.plan.field, whole.plan.renderer)]
+    opened = [encoding.detail for encoding in coarse_to_fine_encodings(whole.plan.model)]
     assert all(detail is not None and float(detail) == 1.0 for detail in opened)
     assert bool(opened) == name.startswith("volumetric")
 
 
 def test_poses_come_back(blobs: Scene) -> None:
     """Known field, 4 degrees and 4 per cent of error."""
-    shown = corrupt(blobs, TrainingData(pose_noise=4.0), 1)
+    shown = degrade(blobs, TrainingData(pose_noise=4.0), 1)
     config = PosesConfig(rotation_lr=3e-2, translation_lr=1e-2, window=(0.0, 0.0), rotation_warmup=0.0, translation_warmup=0.0)
     poses = Poses.of(config, shown)
     plan = Plan(
-        field=Blobs(),
-        renderer=VolumetricConfig(StratifiedConfig(32)).build(shown),
+        model=Model(Blobs(), VolumetricConfig(StratifiedConfig(32)).build(shown), shown.bounds),
         scene=shown,
-        losses=[PhotometricConfig().build()],
+        losses=[PhotometricLoss()],
         hooks=[],
-        optimiser=config.optimiser(OptimiserConfig(), seen=1.0),
+        optimiser=config.optimiser(OptimiserConfig(), view_share=1.0),
         batches=BatchConfig(rays=1200, views=6),
         budget=Budget(steps=250),
         poses=poses,
@@ -270,9 +269,9 @@ def test_poses_come_back(blobs: Scene) -> None:
 def test_a_photograph_finds_its_pose(blobs: Scene) -> None:
     view = blobs.test[0]
     wrong = view.camera.moved(view.camera.cam_to_world @ se3_exp(torch.tensor([0.08, -0.06, 0.1, 0.1, -0.1, 0.15])))
-    model = (Blobs(), VolumetricConfig(StratifiedConfig(32)).build(blobs))
+    model = Model(Blobs(), VolumetricConfig(StratifiedConfig(32)).build(blobs), blobs.bounds)
     misplaced = View(wrong, view.image, view.name)
-    found = descend(model, misplaced, blobs, Descent(steps=150, lr=2e-2, final=5e-4, rays=300))
+    found = refine_pose(model, misplaced, blobs, PoseDescent(steps=150, lr=2e-2, final=5e-4, rays=300))
     error = (found.cam_to_world - view.camera.cam_to_world).norm()
     assert float(error) < 0.15 * float((wrong.cam_to_world - view.camera.cam_to_world).norm())
 

@@ -8,14 +8,14 @@ import torch
 from test_density_control import _state
 
 from invgraphics.errors import InputError
-from invgraphics.training.relocation import RelocationConfig, shared_out
+from invgraphics.training.relocation import RelocationConfig, relocated_opacity
 
 
 @pytest.mark.parametrize("copies", [1, 2, 5, 30])
 @pytest.mark.parametrize("opacity", [0.05, 0.6, 0.99])
 def test_copies_look_like_the_one_they_replace(copies: int, opacity: float) -> None:
     """At the centre exactly, and along a line through it in the integral, taken numerically."""
-    each, shrink = shared_out(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies]))
+    each, shrink = relocated_opacity(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies]))
     assert 1 - (1 - float(each)) ** copies == pytest.approx(opacity, abs=1e-9)
     x = torch.linspace(-12, 12, 200_001, dtype=torch.float64)
     before = torch.trapezoid(opacity * torch.exp(-x.square() / 2), x)
@@ -89,7 +89,7 @@ def test_nothing_dead_or_nothing_alive_is_left_alone() -> None:
 def test_the_cap_rises_by_equal_factors() -> None:
     """From 10 to 1000 Gaussians within half of the fit: a quarter of it multiplies them by ten, and growth allows no more."""
     state = _state(10)
-    hook = RelocationConfig(every=10, start=0.0, growth=100.0, pace=0.5, max_primitives=1000, noise=0.0).build()
+    hook = RelocationConfig(every=10, start=0.0, growth=100.0, cap_ramp=0.5, max_primitives=1000, noise=0.0).build()
     for progress, count in ((0.0, 10), (0.25, 100), (0.4, 398), (0.5, 1000), (0.8, 1000)):
         state.ctx = replace(state.ctx, progress=progress)
         hook.after_step(state)
@@ -105,9 +105,9 @@ def test_resuming_gives_the_same_bits(make_fit, scene) -> None:
     kept = {part: {name: value.clone() for name, value in tensors.items()} for part, tensors in first.state().items()}
     second.load(kept, 0.0)
     second.run(lambda loss: False)
-    assert whole.plan.field.primitive_count() > 150
-    for name, value in whole.plan.field.state_dict().items():
-        assert torch.equal(value, second.plan.field.state_dict()[name]), name
+    assert whole.plan.model.field.primitive_count() > 150
+    for name, value in whole.plan.model.field.state_dict().items():
+        assert torch.equal(value, second.plan.model.field.state_dict()[name]), name
 
 
 def test_refusals(make_fit, scene) -> None:
@@ -116,4 +116,4 @@ def test_refusals(make_fit, scene) -> None:
     with pytest.raises(ValueError, match="dead"):
         RelocationConfig(dead=0.0)
     with pytest.raises(InputError, match="relocation"):
-        RelocationConfig().build().check(make_fit("volumetric/hash", scene, 1).plan.field, None)
+        RelocationConfig().build().check(make_fit("volumetric/hash", scene, 1).plan.model.field, None)

@@ -41,9 +41,6 @@ def test_smoothed_gaussians_keep_their_integral() -> None:
     after = field.primitives(Quantity.GAUSSIANS, ctx)
     torch.testing.assert_close(after.scales.square(), before.scales.square() + 0.05**2)
     torch.testing.assert_close(after.opacities * after.scales.prod(dim=1), before.opacities * before.scales.prod(dim=1))
-    moved = field.transformed(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0]))).primitives(Quantity.GAUSSIANS, ctx)
-    torch.testing.assert_close(moved.scales, 2 * after.scales)
-    torch.testing.assert_close(moved.opacities, after.opacities)
 
 
 def test_filter_follows_the_number_of_gaussians() -> None:
@@ -80,7 +77,7 @@ def test_mip_recipe_smooths_from_the_first_step(make_fit, scene) -> None:
     more = ["field.count=60", "field.max_init=60", "field.sh_degree=1", "hooks.1.every=4", "hooks.1.threshold=1e-6"]
     fit = make_fit("splatting/gaussians-mip", scene, 12, 0, *more)
     fit.run(lambda loss: False)
-    field = fit.plan.field
+    field = fit.plan.model.field
     assert field.primitive_count() > 60
     assert len(field.smoothing) == field.primitive_count()
     assert bool((field.smoothing > 0).all())

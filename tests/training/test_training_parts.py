@@ -12,8 +12,8 @@ from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
-from invgraphics.training.hooks import FitState, ShDegreeConfig
-from invgraphics.training.losses import CoarseConfig, DistortionConfig, PhotometricConfig, SsimConfig, picture_of
+from invgraphics.training.hooks import FitState, Hook, ShDegreeConfig
+from invgraphics.training.losses import CoarseLoss, DistortionLoss, PhotometricLoss, SsimLoss
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 
 BOX = Bounds(-torch.ones(3), torch.ones(3))
@@ -26,8 +26,8 @@ def _rendering(*shape: int) -> tuple[Rendering, Batch]:
     return picture, Batch(torch.rand(*shape, 3), torch.ones(*shape), torch.tensor([0.2, 0.5, 0.9]))
 
 
-def _samples(rays: int, per_ray: int) -> Samples:
-    edges = torch.rand(rays, per_ray + 1).sort(dim=1).values + 0.5
+def _samples(rays: int, per_ray: int, spread: float = 1.0) -> Samples:
+    edges = spread * torch.rand(rays, per_ray + 1).sort(dim=1).values + 0.5
     directions = torch.nn.functional.normalize(torch.randn(rays, 3), dim=1)
     packed = Rays.make(torch.zeros(rays, 3), directions)
     ray = torch.arange(rays).repeat_interleave(per_ray)
@@ -36,21 +36,13 @@ def _samples(rays: int, per_ray: int) -> Samples:
 
 def test_photometric_distances() -> None:
     picture, batch = _rendering(7)
-    difference = picture.rgb + (1 - picture.alpha[:, None]) * batch.background - batch.target
-    assert PhotometricConfig(2.0, "mse").build()(picture, Trace(), batch, CTX) == pytest.approx(
-        2 * float((difference**2).mean())
-    )
-    assert PhotometricConfig(1.0, "l1").build()(picture, Trace(), batch, CTX) == pytest.approx(float(difference.abs().mean()))
+    difference = picture.rgb - batch.target
+    squared = float((difference**2).mean())
+    assert PhotometricLoss(2.0, "mse")(picture, Trace(), batch, CTX) == pytest.approx(2 * squared)
+    assert PhotometricLoss(1.0, "l1")(picture, Trace(), batch, CTX) == pytest.approx(float(difference.abs().mean()))
     small = difference.abs() < 0.1
     huber = 10 * torch.where(small, difference**2 / 2, 0.1 * (difference.abs() - 0.05)).mean()
-    assert PhotometricConfig(1.0, "huber").build()(picture, Trace(), batch, CTX) == pytest.approx(float(huber), rel=1e-5)
-
-
-def test_one_picture_for_all_losses_of_a_step() -> None:
-    picture, batch = _rendering(7)
-    assert picture_of(picture, batch) is picture_of(picture, batch)
-    other = replace(batch, background=torch.zeros(3))
-    torch.testing.assert_close(picture_of(picture, other), picture.rgb)
+    assert PhotometricLoss(1.0, "huber")(picture, Trace(), batch, CTX) == pytest.approx(float(huber), rel=1e-5)
 
 
 def test_coarse_loss_is_the_level_composited_by_hand() -> None:
@@ -60,32 +52,69 @@ def test_coarse_loss_is_the_level_composited_by_hand() -> None:
     picture, batch = _rendering(5)
     colour = (weights[:, None] * radiance).view(5, 4, 3).sum(1)
     colour = colour + (1 - weights.view(5, 4).sum(1, keepdim=True)) * batch.background
-    got = CoarseConfig().build()(picture, Trace(levels=(level,)), batch, CTX)
+    got = CoarseLoss()(picture, Trace(levels=(level,)), batch, CTX)
     assert got == pytest.approx(float(((colour - batch.target) ** 2).mean()), rel=1e-5)
 
 
-def test_distortion_against_the_double_sum() -> None:
-    samples = _samples(3, 6)
-    weights = torch.rand(18)
-    scale = BOX.radius
-    s0, s1 = samples.t0 / (samples.t0 + scale), samples.t1 / (samples.t1 + scale)
+def _distortion(samples: Samples, weights: torch.Tensor, bounds: Bounds, rays: int) -> float:
+    picture, batch = _rendering(rays)
+    trace = Trace(samples, None, weights, rays=rays)
+    return float(DistortionLoss(1.0)(picture, trace, batch, Context(bounds, training=True)))
+
+
+def _by_hand(t: float, space: str, radius: float) -> float:
+    """Mip-NeRF 360's s: distance over the longest ray in a box; distance, then disparity, each over half of [0, 1]."""
+    if space == "box":
+        return t / (2 * radius)
+    return t / radius / 2 if t < radius else 1 - radius / t / 2
+
+
+@pytest.mark.parametrize("space", ["box", "contracted"])
+def test_distortion_is_the_papers_double_integral(space: str) -> None:
+    """Equation 14, the integral of w(u) w(v) |u - v| over all pairs of points, by midpoints."""
+    bounds, samples, weights = replace(BOX, space=space), _samples(3, 6, spread=3.0), torch.rand(18)
+    edges = [[_by_hand(float(t), space, 3**0.5) for t in ends] for ends in zip(samples.t0, samples.t1, strict=True)]
     expected = 0.0
-    for ray in range(3):
-        own = [i for i in range(18) if samples.ray[i] == ray]
-        for i in own:
-            expected += float(weights[i] ** 2 * (s1[i] - s0[i]) / 3)
-            for j in own:
-                expected += float(weights[i] * weights[j] * ((s0[i] + s1[i]) / 2 - (s0[j] + s1[j]) / 2).abs())
-    picture, batch = _rendering(3)
-    got = DistortionConfig(1.0).build()(picture, Trace(samples, None, weights, rays=3), batch, CTX)
-    assert got == pytest.approx(expected / 3, rel=1e-4)
+    for i, (a, b) in enumerate(edges):
+        for j, (c, d) in enumerate(edges):
+            if samples.ray[i] == samples.ray[j]:
+                u, v = (torch.linspace(0, 1, 401, dtype=torch.float64)[1:] - 1 / 800 for _ in range(2))
+                gaps = (a + (b - a) * u)[:, None] - (c + (d - c) * v)[None]
+                expected += float(weights[i] * weights[j] * gaps.abs().mean())
+    assert _distortion(samples, weights, bounds, 3) == pytest.approx(expected / 3, rel=1e-4)
+
+
+def test_distortion_in_a_box_does_not_depend_on_where_the_camera_stands() -> None:
+    samples, weights = _samples(2, 5), torch.rand(10)
+    moved = replace(samples, t0=samples.t0 + 2.0, t1=samples.t1 + 2.0)
+    assert _distortion(moved, weights, BOX, 2) == pytest.approx(_distortion(samples, weights, BOX, 2), rel=1e-4)
+
+
+def test_losses_see_the_rendering_in_front_of_the_background(scene, make_fit) -> None:
+    """Composited once by the step; alpha stays the scene's own."""
+    fit = make_fit("volumetric/hash", scene, 2)
+    seen = []
+
+    def record(rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> torch.Tensor:
+        seen.append((rendering, batch))
+        return rendering.rgb.sum() * 0
+
+    class Keep(Hook):
+        def after_backward(self, state: FitState) -> None:
+            seen.append(state.rendering)
+
+    fit.plan = replace(fit.plan, losses=[record, record], hooks=[Keep()])
+    fit.step()
+    (first, batch), (second, _), raw = seen
+    assert first is second and torch.equal(first.alpha, raw.alpha)
+    torch.testing.assert_close(first.rgb, raw.rgb + (1 - raw.alpha[:, None]) * batch.background)
 
 
 def test_ssim_loss_of_the_truth_is_zero() -> None:
     truth = torch.rand(24, 20, 3)
     picture = Rendering(truth, torch.ones(24, 20), torch.ones(24, 20))
     batch = Batch(truth, torch.ones(24, 20), torch.ones(3))
-    assert SsimConfig(1.0).build()(picture, Trace(), batch, CTX) == pytest.approx(0.0, abs=1e-5)
+    assert SsimLoss(1.0)(picture, Trace(), batch, CTX) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_learning_rates_follow_progress() -> None:

@@ -8,18 +8,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
 
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.tools.camera_path import read_camera_path
 
 viser = pytest.importorskip("viser")
 
-from invgraphics.viewer.cameras import Mount  # noqa: E402
+from invgraphics.viewer.cameras import LetterboxedView  # noqa: E402
+from invgraphics.viewer.launch import ViewerConfig, open_viewer  # noqa: E402
 from invgraphics.viewer.server import Viewer  # noqa: E402
-from invgraphics.viewer.view import ViewRequest, open_viewer  # noqa: E402
 
 pytestmark = pytest.mark.browser
 
@@ -130,7 +132,7 @@ def watch(browser: Any, tmp_path: Path, request: pytest.FixtureRequest) -> Itera
     opened: list[Any] = []
 
     def start(*runs: Path) -> Watcher:
-        viewer = open_viewer(ViewRequest(runs, port=0, longest=160), print)
+        viewer = open_viewer(ViewerConfig(runs, port=0, max_size=160), print)
         opened.append(viewer.stop)
         context = browser.new_context(viewport=WINDOW)
         opened.append(context.close)
@@ -149,12 +151,12 @@ def _at_photograph(watcher: Watcher, picture: np.ndarray) -> float:
     """Mean difference, 0 to 255, between what the window shows of a photograph's camera and ``picture``."""
     seen = watcher.canvas()
     height, width = seen.shape[:2]
-    mount = Mount.of(watcher.viewer._subjects[0].scene.test[0].camera, width / height)
-    scale = height / mount.height
-    left, top = round(mount.left * scale), round(mount.top * scale)
-    side = round(mount.camera.width * scale)
+    letterbox = LetterboxedView.fit(watcher.viewer._runs[0].scene.test[0].camera, width / height)
+    scale = height / letterbox.height
+    left, top = round(letterbox.left * scale), round(letterbox.top * scale)
+    side = round(letterbox.camera.width * scale)
     part = Image.fromarray(seen[top : top + side, left : left + side].astype(np.uint8))
-    small = np.asarray(part.resize((mount.camera.width, mount.camera.height), Image.Resampling.BOX)).astype(float)
+    small = np.asarray(part.resize((letterbox.camera.width, letterbox.camera.height), Image.Resampling.BOX)).astype(float)
     return _apart(small[2:-2, 2:-2], picture[2:-2, 2:-2])
 
 
@@ -188,7 +190,7 @@ def test_turning_leaves_the_photograph_and_truth_comes_back_to_one(watch: Any, r
     watcher.choose("Show", "truth")
     truth = watcher.canvas()
     watcher.turn()
-    assert watcher.value("View") == "anywhere"
+    assert watcher.value("View") == "free camera"
     assert watcher.page.get_by_text("the truth is known at photographs only").count() == 1
     free = watcher.canvas("turned")
     assert _apart(free, truth) > 1
@@ -212,6 +214,79 @@ def test_the_picture_can_be_saved_on_another_background(watch: Any, runs: dict[s
     download.value.save_as(tmp_path / "saved.png")
     saved = np.asarray(Image.open(tmp_path / "saved.png")).astype(float)
     assert float(saved.min()) < 5 and saved.shape[2] == 3
+    assert watcher.complaints == []
+
+
+def _open_folder(watcher: Watcher, name: str) -> None:
+    watcher.page.get_by_text(name, exact=True).click()
+    watcher.page.wait_for_timeout(500)
+
+
+def test_a_camera_path_is_recorded_played_saved_and_filmed(watch: Any, runs: dict[str, Path], tmp_path: Path) -> None:
+    watcher = watch(runs["splatting/gaussians"])
+    page = watcher.page
+    _open_folder(watcher, "Camera path")
+    page.get_by_role("button", name="Add keyframe").click()
+    page.get_by_text("1 keyframe, 0.0 s").wait_for(timeout=PATIENCE)
+    page.wait_for_timeout(1000)
+    assert watcher.value("View") == "test 0: r_0", "adding one does not move the camera"
+    watcher.turn()
+    page.get_by_role("button", name="Add keyframe").click()
+    page.get_by_text("2 keyframes, 2.0 s").wait_for(timeout=PATIENCE)
+    second = watcher.canvas("path")
+    watcher.choose("Keyframe", "1 of 2")
+    assert _apart(watcher.canvas(), second) > 1, "selecting a keyframe goes there"
+
+    with page.expect_download(timeout=PATIENCE) as download:
+        page.get_by_role("button", name="Save path").click()
+    download.value.save_as(tmp_path / "path.json")
+    path = read_camera_path(tmp_path / "path.json")
+    scene = watcher.viewer._runs[0].scene
+    assert len(path.keyframes) == 2
+    first = path.keyframes[0].local_pose(scene)
+    assert float((first - scene.test[0].camera.cam_to_world).abs().max()) < 2e-3, "it was recorded at test view 0"
+
+    page.get_by_role("button", name="Play", exact=True).click()
+    page.get_by_role("button", name="Stop", exact=True).wait_for(timeout=PATIENCE)
+    page.get_by_role("button", name="Play", exact=True).wait_for(timeout=PATIENCE)
+    watcher.rest()
+    assert _apart(watcher.canvas("played"), second) < 2, "it ends at the second keyframe"
+
+    with page.expect_download(timeout=2 * PATIENCE) as download:
+        page.get_by_role("button", name="Export film").click()
+    download.value.save_as(tmp_path / "film.mp4")
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "film.mp4"))
+    assert next(reader)["size"] == (32, 32)
+    film = [np.frombuffer(frame, np.uint8).reshape(32, 32, 3).astype(float) for frame in reader]
+    assert len(film) == 49, "two seconds of 24, both ends included"
+    prediction = np.asarray(Image.open(runs["splatting/gaussians"] / "test" / "0000.png")).astype(float)
+    assert _apart(film[0], prediction) < 8 < _apart(film[-1], prediction), "from test view 0 to elsewhere"
+
+    page.get_by_role("button", name="Delete keyframe").click()
+    page.get_by_text("1 keyframe, 0.0 s").wait_for(timeout=PATIENCE)
+    assert watcher.complaints == []
+
+
+def test_a_crop_box_hides_what_is_outside(watch: Any, runs: dict[str, Path]) -> None:
+    watcher = watch(runs["volumetric/hash"])
+    watcher.turn()
+    whole = watcher.canvas()
+    _open_folder(watcher, "Crop box")
+    watcher.tick("Crop")
+    assert watcher.page.get_by_text("Cropped: rays are sampled inside the box only.").count() == 1
+    thumb = watcher.page.locator(
+        "xpath=//*[text()='x (world units)']/following::*[contains(@class, 'thumb')][1]"
+    ).bounding_box()
+    x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
+    watcher.page.mouse.move(x, y)
+    watcher.page.mouse.down()
+    watcher.page.mouse.move(x + 130, y, steps=8)
+    watcher.page.mouse.up()
+    watcher.page.wait_for_timeout(500)
+    watcher.rest()
+    assert _apart(watcher.canvas("cropped"), whole) > 2
+    watcher.tick("Crop")
+    assert _apart(watcher.canvas(), whole) < 1
     assert watcher.complaints == []
 
 
@@ -263,13 +338,13 @@ def test_a_fit_is_followed(watch: Any, runs: dict[str, Path], tmp_path: Path) ->
     state["field"]["means"][:, 2] += 0.4
     checkpoint.save(run / CHECKPOINT, state)
     (run / "fit.json").write_text('{"steps": 12345, "seconds": 6.0}')
-    watcher.viewer.look_for_news()
+    watcher.viewer.reload_if_changed()
     watcher.page.get_by_text("step 12,345").wait_for(timeout=PATIENCE)
     watcher.page.wait_for_timeout(500)
     watcher.rest()
     assert _apart(watcher.canvas("followed"), before) > 2
     (run / CHECKPOINT).write_bytes(b"broken")
-    watcher.viewer.look_for_news()
+    watcher.viewer.reload_if_changed()
     watcher.page.get_by_text("is not a readable checkpoint").wait_for(state="attached", timeout=PATIENCE)
     assert _apart(watcher.canvas()[120:], watcher.canvas()[120:]) < 1
     assert watcher.complaints == []

@@ -10,9 +10,16 @@ import torch
 from invgraphics.core import Camera
 from invgraphics.core.transforms import look_at, rigid
 from invgraphics.testing import toy_cameras, toy_scene
-from invgraphics.viewer.cameras import Gaze, Mount, frustum, limited, part, quaternion
+from invgraphics.viewer.cameras import (
+    LetterboxedView,
+    ViewerCamera,
+    fov_and_aspect,
+    limit_size,
+    nearest_view,
+    rotation_quaternion,
+    subregion,
+)
 from invgraphics.viewer.server import upward
-from invgraphics.viewer.session import nearest
 
 POINTS = torch.rand(50, 3, generator=torch.Generator().manual_seed(3)) - 0.5
 
@@ -39,12 +46,12 @@ def _seen_by_browser(wxyz, position, fov: float, points: np.ndarray) -> np.ndarr
 @pytest.mark.parametrize("aspect", [0.6, 1.0, 2.3])
 def test_what_a_browser_reports_is_our_camera(aspect: float) -> None:
     pose = _lopsided().cam_to_world
-    gaze = Gaze.of(quaternion(pose), tuple(pose[:3, 3].tolist()), 0.9, aspect)
-    torch.testing.assert_close(gaze.pose, pose, atol=1e-6, rtol=0)
+    viewer_camera = ViewerCamera.from_viser(rotation_quaternion(pose), tuple(pose[:3, 3].tolist()), 0.9, aspect)
+    torch.testing.assert_close(viewer_camera.pose, pose, atol=1e-6, rtol=0)
     width, height = 317, 200
-    pixels, depth = gaze.camera(width, height).project(POINTS)
+    pixels, depth = viewer_camera.pinhole(width, height).project(POINTS)
     assert bool((depth > 0).all())
-    expected = _seen_by_browser(quaternion(pose), pose[:3, 3].numpy(), 0.9, POINTS.numpy())
+    expected = _seen_by_browser(rotation_quaternion(pose), pose[:3, 3].numpy(), 0.9, POINTS.numpy())
     ours = np.stack([(pixels[:, 0] / width * 2 - 1) * aspect, 1 - pixels[:, 1] / height * 2], axis=1)
     np.testing.assert_allclose(ours, expected, atol=1e-5)
 
@@ -53,27 +60,34 @@ def test_what_a_browser_reports_is_our_camera(aspect: float) -> None:
 @pytest.mark.parametrize("stretch", [1.0, 1.2])
 def test_a_mounted_photograph_fills_its_window_and_fits_the_browser(aspect: float, stretch: float) -> None:
     camera = _lopsided(stretch=stretch)
-    mount = Mount.of(camera, aspect)
-    assert mount.width / mount.height == pytest.approx(aspect, rel=0.03)
-    assert 0 <= mount.left <= mount.width - mount.camera.width and 0 <= mount.top <= mount.height - mount.camera.height
-    slack = min(mount.width - mount.camera.width, mount.height - mount.camera.height)
+    letterbox = LetterboxedView.fit(camera, aspect)
+    assert letterbox.width / letterbox.height == pytest.approx(aspect, rel=0.03)
+    assert (
+        0 <= letterbox.left <= letterbox.width - letterbox.camera.width
+        and 0 <= letterbox.top <= letterbox.height - letterbox.camera.height
+    )
+    slack = min(letterbox.width - letterbox.camera.width, letterbox.height - letterbox.camera.height)
     assert slack <= 16, "as large as it fits: only the principal point's offset leaves space"
     pixels, _ = camera.project(POINTS)
-    in_window = pixels * torch.tensor([mount.camera.width / camera.width, 1.0]) + torch.tensor([mount.left, mount.top])
-    browser = Gaze(camera.cam_to_world, mount.fov, mount.width / mount.height).camera(mount.width, mount.height)
+    in_window = pixels * torch.tensor([letterbox.camera.width / camera.width, 1.0]) + torch.tensor(
+        [letterbox.left, letterbox.top]
+    )
+    browser = ViewerCamera(camera.cam_to_world, letterbox.fov, letterbox.width / letterbox.height).pinhole(
+        letterbox.width, letterbox.height
+    )
     assert float((browser.project(POINTS)[0] - in_window).abs().max()) < 1.0
 
 
 def test_a_part_has_the_rays_of_the_whole() -> None:
     camera = _lopsided()
     whole = camera.rays().directions.view(60, 90, 3)
-    cut = part(camera, (11, 50), (5, 32))
+    cut = subregion(camera, (11, 50), (5, 32))
     torch.testing.assert_close(cut.rays().directions.view(27, 39, 3), whole[5:32, 11:50])
 
 
 def test_a_frustum_has_the_angles_between_its_corners() -> None:
     camera = toy_cameras(1, 40)[0].resized(60, 40)
-    fov, aspect = frustum(camera)
+    fov, aspect = fov_and_aspect(camera)
     corners = camera.rays(torch.tensor([[30.0, 0.0], [30.0, 40.0], [0.0, 20.0], [60.0, 20.0]])).directions
     assert fov == pytest.approx(float((corners[0] @ corners[1]).acos()), abs=1e-5)
     across = float((corners[2] @ corners[3]).acos())
@@ -82,21 +96,21 @@ def test_a_frustum_has_the_angles_between_its_corners() -> None:
 
 def test_limits() -> None:
     camera = _lopsided()
-    assert (limited(camera, 45).width, limited(camera, 45).height) == (45, 30)
-    assert limited(camera, 200) is camera
+    assert (limit_size(camera, 45).width, limit_size(camera, 45).height) == (45, 30)
+    assert limit_size(camera, 200) is camera
 
 
 def test_standing_at_a_photograph_is_noticed_and_leaving_too() -> None:
     pose = _lopsided().cam_to_world
-    here = Gaze(pose, 1.0, 1.0)
-    assert here.sees_from(pose, 1e-3, 1e-3)
+    here = ViewerCamera(pose, 1.0, 1.0)
+    assert here.is_at(pose, 1e-3, 1e-3)
     aside = pose.clone()
     aside[0, 3] += 2e-3
-    assert not here.sees_from(aside, 1e-3, 1.0) and here.sees_from(aside, 3e-3, 1e-3)
+    assert not here.is_at(aside, 1e-3, 1.0) and here.is_at(aside, 3e-3, 1e-3)
     angle = 3e-3
     turn = torch.tensor([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     turned = rigid(pose[:3, :3] @ turn, pose[:3, 3])
-    assert not here.sees_from(turned, 1.0, 1e-3) and here.sees_from(turned, 1e-3, 4e-3)
+    assert not here.is_at(turned, 1.0, 1e-3) and here.is_at(turned, 1e-3, 4e-3)
 
 
 def test_the_nearest_photograph() -> None:
@@ -104,7 +118,7 @@ def test_the_nearest_photograph() -> None:
     for index, view in enumerate(scene.train):
         pose = view.camera.cam_to_world.clone()
         pose[:3, 3] *= 1.1
-        assert nearest(scene.train, Gaze(pose, 1.0, 1.0), scene.extent) == index
+        assert nearest_view(scene.train, ViewerCamera(pose, 1.0, 1.0), scene.extent) == index
 
 
 def test_up_is_the_frames_unless_the_photographs_disagree() -> None:

@@ -21,8 +21,8 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.runs.folder import CHECKPOINT
-from invgraphics.viewer.subject import open_subject
-from invgraphics.viewer.view import ViewRequest, check_place, is_loopback, open_viewer
+from invgraphics.viewer.launch import ViewerConfig, check_address, is_loopback, open_viewer
+from invgraphics.viewer.loaded_run import open_run
 
 
 def _refused(words: list[str], sentence: str, capsys) -> None:
@@ -48,7 +48,7 @@ def test_a_port_in_use(runs: dict[str, Path], capsys) -> None:
         taken.listen(1)
         port = taken.getsockname()[1]
         _refused([str(runs["volumetric/hash"]), "--port", str(port)], f"Port {port} at 127.0.0.1 is in use", capsys)
-    check_place("127.0.0.1", port)
+    check_address("127.0.0.1", port)
 
 
 def test_without_viser(runs: dict[str, Path], monkeypatch, capsys) -> None:
@@ -64,7 +64,7 @@ def test_a_run_without_checkpoint_is_refused_or_awaited(runs: dict[str, Path], t
     said = []
     timer = threading.Timer(0.3, lambda: (tmp_path / "later").rename(run / CHECKPOINT))
     timer.start()
-    assert open_subject(run, None, live=True, say=said.append).steps == 150
+    assert open_run(run, None, live=True, say=said.append).steps == 150
     assert len(said) == 1 and "Waiting for a fit" in said[0]
 
 
@@ -74,17 +74,17 @@ def test_runs_of_different_scenes(runs: dict[str, Path], toy_folder: Path, tmp_p
         method=method, scene=str(toy_folder), out=str(tmp_path / "b"), budget="1steps", overrides=tuple(SMALL[method])
     )
     with pytest.raises(InputError, match="different scenes"):
-        open_viewer(ViewRequest((runs[method], fit_run(request)), port=0), print)
+        open_viewer(ViewerConfig((runs[method], fit_run(request)), port=0), print)
 
 
 def test_a_checkpoint_of_another_recipe(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
     run = Path(shutil.copytree(runs["volumetric/hash"], tmp_path / "run"))
-    subject = open_subject(run, None, live=False, say=print)
+    loaded = open_run(run, None, live=False, say=print)
     shutil.copy(runs["volumetric/nerf"] / CHECKPOINT, run / CHECKPOINT)
-    assert subject.changed()
+    assert loaded.has_update()
     with pytest.raises(InputError, match="has become another run"):
-        subject.refresh()
-    assert not subject.changed(), "said once"
+        loaded.reload()
+    assert not loaded.has_update(), "said once"
 
 
 @pytest.mark.parametrize(("host", "answer"), [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False)])
@@ -126,5 +126,5 @@ def test_the_command_serves_this_machine_until_it_is_interrupted(runs: dict[str,
 
 
 def test_nobody_can_ask_to_open_it_to_the_internet(runs: dict[str, Path]) -> None:
-    with open_viewer(ViewRequest((runs["volumetric/hash"],), port=0), print) as viewer:
+    with open_viewer(ViewerConfig((runs["volumetric/hash"],), port=0), print) as viewer:
         assert viewer._server.request_share_url() is None and viewer._server._share_tunnel is None

@@ -1,9 +1,9 @@
-"""Speed of the kernels and of whole iterations, against the plain reference, the machine's limits and other people's code."""
+"""Benchmarks of kernels and training steps against the reference, the machine's limits and third-party implementations."""
 
 PARTS = ("splats", "hash", "grid", "march", "composite", "picture", "ssim", "iterations", "threads", "memory", "peers")
-"""What can be measured alone; the order in which a run takes them."""
+"""Parts of the benchmark, in the order in which they run."""
 
 KERNELS = PARTS[: PARTS.index("iterations")]
-"""Those that measure one kernel each."""
+"""Parts that measure one kernel each."""
 QUICK = (*KERNELS, "iterations")
-"""What a quick run measures unless it is told otherwise."""
+"""Default parts of a quick run."""

@@ -1,4 +1,4 @@
-"""A kernel on one size of input, ready to be timed."""
+"""Benchmark cases: one kernel on one input size, with the work and the hardware limit of each direction."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ LARGE = "the plain reference would need gigabytes at this size"
 
 
 @dataclass(frozen=True)
-class Pass:
-    """One direction of a kernel.
+class KernelPass:
+    """One direction of a kernel, forward or forward and backward.
 
     Attributes:
-        run: one call, by whichever kernels are chosen while it runs.
-        amount: work of one call, in the units of ``limit``; 0 where it cannot be counted.
-        limit: what bounds its rate; ``None`` where that cannot be measured here.
-        unit: what is counted.
+        run: one call, with the kernels selected by `kernels.using`.
+        amount: work of one call, in the unit of ``limit``; 0 where it cannot be counted.
+        limit: hardware limit of its throughput; ``None`` where that cannot be measured here.
+        unit: unit of work.
     """
 
     run: Run
@@ -32,18 +32,18 @@ class Pass:
 
 @dataclass(frozen=True)
 class Case:
-    """A kernel on one size.
+    """A kernel on one input size.
 
     Attributes:
         operation: the kernel's name.
-        sizes: what its time depends on.
-        prepare: makes the input, and one `Pass` per direction.
+        sizes: problem size.
+        prepare: builds the input, and one `KernelPass` per direction.
         without_reference: why the reference is not measured; empty if it is.
     """
 
     operation: str
     sizes: dict[str, int]
-    prepare: Callable[[], Mapping[str, Pass]]
+    prepare: Callable[[], Mapping[str, KernelPass]]
     without_reference: str = ""
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""What the project promises about speed, as ratios within one run."""
+"""Performance gates: the speed that the project promises, as ratios within one run."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from invgraphics.bench.results import BOTH, Results
 
 @dataclass(frozen=True)
 class Gate:
-    """A promise.
+    """A performance target and its measurement.
 
     Attributes:
         name: what is promised.
         bound: ``at least`` or ``at most``.
         target: the promised ratio.
-        measured: the ratio found; ``None`` where it was not measured.
+        measured: the measured ratio; ``None`` where it was not measured.
     """
 
     name: str
@@ -27,7 +27,7 @@ class Gate:
 
     @property
     def verdict(self) -> str:
-        """PASS, MISS, or a dash where there is no measurement."""
+        """PASS, MISS, or a dash without a measurement."""
         if self.measured is None:
             return "-"
         kept = self.measured >= self.target if self.bound == "at least" else self.measured <= self.target
@@ -35,7 +35,7 @@ class Gate:
 
 
 def gates(results: Results) -> list[Gate]:
-    """All promises beside what this run found."""
+    """All performance gates with the ratios of a run."""
     splat, encode = splat_cases.GATE, sample_cases.GATE
     fast, plain = (results.find("splats", name, BOTH, **splat) for name in ("numba", "reference"))
     raster = results.find("splat_rasterise", "numba", BOTH, **splat)

@@ -1,4 +1,4 @@
-"""How cost grows: the exponent p of time ~ size^p, fitted wherever one size varies and all else stays."""
+"""Empirical complexity: the exponent p of time ~ size^p, fitted wherever one size varies and all others are fixed."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import numpy as np
 from invgraphics.bench.results import Measurement
 
 PIXEL_KEYS = {"width": ("pixels", 2)}
-"""Sizes that readers know by another name: edge of a square picture, whose pixels are its square."""
+"""Sizes and the quantity that cost grows with: image width, and pixels as its square."""
 TABLE_KEYS = {"log2_size": "entries per level"}
-"""Sizes that are logarithms already."""
+"""Sizes given as log2, and the quantity itself."""
 
 
 @dataclass(frozen=True)
 class Growth:
-    """A fitted power law.
+    """A power law fitted to timings.
 
     Attributes:
         operation: what was timed.
         implementation: by which kernels.
         direction: forward, or both.
-        along: the size that varied.
-        fixed: the sizes that did not.
-        values: its values.
-        milliseconds: medians.
+        along: the varied size.
+        fixed: the fixed sizes.
+        values: values of the varied size.
+        milliseconds: median times.
         exponent: slope in a log-log plot, by least squares.
     """
 
@@ -41,7 +41,7 @@ class Growth:
 
 
 def growths(measurements: list[Measurement]) -> list[Growth]:
-    """All power laws that at least three measurements support."""
+    """Power laws of all series of at least three measurements."""
     found = []
     for along in dict.fromkeys(key for m in measurements for key in m.sizes):
         groups: dict[tuple, list[Measurement]] = defaultdict(list)
@@ -62,12 +62,12 @@ def growths(measurements: list[Measurement]) -> list[Growth]:
 
 
 def name_of(key: str) -> str:
-    """What readers call a size."""
+    """Display name of a size."""
     return PIXEL_KEYS[key][0] if key in PIXEL_KEYS else TABLE_KEYS.get(key, key)
 
 
 def size_of(key: str, value: int) -> float:
-    """A size as the number that cost grows with."""
+    """A size as the quantity that cost grows with."""
     if key in PIXEL_KEYS:
         return float(value) ** PIXEL_KEYS[key][1]
     return 2.0**value if key in TABLE_KEYS else float(value)

@@ -1,4 +1,4 @@
-"""Whole steps of a fit, beside the part of them that the kernels (or the networks) cannot do without."""
+"""Whole training steps, compared with the kernels or networks alone that bound them from below."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing_extensions import override
 from invgraphics.bench.results import BOTH, Measurement
 from invgraphics.bench.splat_cases import GATE as SPLAT_GATE
 from invgraphics.bench.splat_cases import both_ways, splat_pipeline
-from invgraphics.bench.subject import activated, gaussian_field, leaves, scene
 from invgraphics.bench.timing import Effort, alternate
-from invgraphics.core import Field, Renderer, Scene, harmonics
+from invgraphics.bench.workload import activated, gaussian_field, leaves, scene
+from invgraphics.core import Model, Scene, harmonics
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.gaussian import GaussianField
 from invgraphics.fields.neural import CPU_CHUNK, NeuralField, NeuralFieldConfig
@@ -26,14 +26,14 @@ from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
 from invgraphics.training.hooks import FitState, Hook
-from invgraphics.training.losses import Loss, PhotometricConfig, SsimConfig
+from invgraphics.training.losses import Loss, PhotometricLoss, SsimLoss
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
 
 VIEWS = 4
 SPLAT_STEP, SPLAT_SHARE = "splat step", "splat step: rasteriser alone"
 NERF_STEP, NERF_SHARE = "hash step", "hash step: networks alone"
 ALL_STEPS = 10**9
-"""A budget that keeps a fit at its beginning: schedules stand still while steps are timed."""
+"""A budget so long that schedules are constant while steps are timed."""
 
 NERF_GATE = {"levels": 16, "log2_size": 15, "hidden": 64}
 """Instant-NGP's networks over a table that suits a CPU's cache."""
@@ -42,13 +42,13 @@ NERF_SMALL = {"levels": 8, "log2_size": 15, "hidden": 32}
 SAMPLES = 1 << 16
 """Samples per step."""
 WARM_STEPS, WARM_SAMPLES = 96, 1 << 13
-"""Smaller steps before the clock: the occupancy grid must have found the empty space."""
+"""Smaller warm-up steps before timing, in which the occupancy grid finds empty space."""
 REFRESH = 16
-"""Steps between two looks at the occupancy grid; one timed call takes as many, so that each holds one look."""
+"""Steps between updates of the occupancy grid; one timed call makes as many, so that each includes one update."""
 
 
 def splat_step(n: int, width: int, effort: Effort) -> list[Measurement]:
-    """A step of splatting (render, 0.8 L1 + 0.2 SSIM, fused Adam) beside project, bin and rasterise on the same pictures."""
+    """Training step of splatting (render, 0.8 L1 + 0.2 SSIM, fused Adam) against project, bin, rasterise on the same views."""
     field = gaussian_field(n)
     pictures = scene(field, VIEWS, width)
     primitives, fit = activated(field), splat_fit(field, pictures)
@@ -66,15 +66,15 @@ def splat_step(n: int, width: int, effort: Effort) -> list[Measurement]:
 
 
 def splat_fit(field: GaussianField, pictures: Scene) -> Fit:
-    """A fit of Gaussians that show ``pictures`` already, their colours disturbed, or there would be no gradients."""
+    """A fit that starts from the Gaussians of ``pictures``, with perturbed colours so that gradients are not zero."""
     with torch.no_grad():
         field.sh_dc += 0.1 * torch.randn(field.sh_dc.shape, generator=torch.Generator().manual_seed(1))
-    losses = [PhotometricConfig(0.8, "l1").build(), SsimConfig(0.2).build()]
-    return _fit(field, SplattingConfig().build(pictures), pictures, losses, [], BatchConfig())
+    losses = [PhotometricLoss(0.8, "l1"), SsimLoss(0.2)]
+    return _fit(Model(field, SplattingConfig().build(pictures), pictures.bounds), pictures, losses, [], BatchConfig())
 
 
 class _CountSamples(Hook):
-    """Remembers how many samples each step kept, and on how many rays."""
+    """Records the numbers of samples and rays of each step."""
 
     def __init__(self) -> None:
         self.samples: list[int] = []
@@ -89,25 +89,25 @@ class _CountSamples(Hook):
 
 @dataclass(frozen=True)
 class NerfFit:
-    """A fit of a hash grid in full swing, and its counter."""
+    """A warmed-up fit of a hash grid, and its sample counter."""
 
     fit: Fit
     field: NeuralField
     counter: _CountSamples
 
     def refresh_cycle(self) -> None:
-        """As many steps as there are between two looks at the occupancy grid."""
+        """The steps from one update of the occupancy grid to the next."""
         for _ in range(REFRESH):
             self.fit.step()
 
 
 def nerf_scene() -> Scene:
-    """Pictures of the synthetic object for a hash grid."""
+    """Training scene of the synthetic object for a hash grid."""
     return scene(gaussian_field(20_000), VIEWS, 200)
 
 
 def nerf_fit(pictures: Scene, levels: int, log2_size: int, hidden: int, warm_steps: int) -> NerfFit:
-    """A fit of a hash grid to ``pictures`` whose occupancy grid has had ``warm_steps`` small steps to settle."""
+    """A fit of a hash grid to ``pictures``, after ``warm_steps`` small steps that warm up its occupancy grid."""
     config = NeuralFieldConfig(
         encoding=HashConfig(levels=levels, log2_size=log2_size),
         layers=1, width=hidden, skip=-1, geometry_features=15, colour_layers=2, colour_width=hidden,
@@ -117,20 +117,21 @@ def nerf_fit(pictures: Scene, levels: int, log2_size: int, hidden: int, warm_ste
         resolution=64, steps_per_diagonal=256, grace=REFRESH, warmup=WARM_STEPS, every=REFRESH, decay=0.5, stop="evaluation"
     )
     torch.manual_seed(0)
-    field, renderer, counter = config.build(pictures), VolumetricConfig(sampler).build(pictures), _CountSamples()
-    losses: list[Loss] = [PhotometricConfig(distance="huber").build()]
-    warming = _fit(field, renderer, pictures, losses, [], BatchConfig(rays=256, views=VIEWS, samples=WARM_SAMPLES), lr=1e-2)
+    field, counter = config.build(pictures), _CountSamples()
+    model = Model(field, VolumetricConfig(sampler).build(pictures), pictures.bounds)
+    losses: list[Loss] = [PhotometricLoss(distance="huber")]
+    warmup_fit = _fit(model, pictures, losses, [], BatchConfig(rays=256, views=VIEWS, samples=WARM_SAMPLES), lr=1e-2)
     for _ in range(warm_steps):
-        warming.step()
+        warmup_fit.step()
     batches = BatchConfig(rays=1024, views=VIEWS, samples=SAMPLES)
-    return NerfFit(_fit(field, renderer, pictures, losses, [counter], batches, lr=1e-2), field, counter)
+    return NerfFit(_fit(model, pictures, losses, [counter], batches, lr=1e-2), field, counter)
 
 
 def nerf_step(sizes: dict[str, int], effort: Effort) -> list[Measurement]:
-    """A step of a hash grid (draw, march, encode, networks, composite, Adam) beside its two networks alone."""
+    """Training step of a hash grid (march, encode, networks, composite, Adam) against its two networks alone."""
     running = nerf_fit(nerf_scene(), **sizes, warm_steps=WARM_STEPS)
     timings = alternate({NERF_SHARE: networks_alone(running.field, SAMPLES), NERF_STEP: running.refresh_cycle}, effort)
-    # While the first cycle runs, the number of rays settles; it counts only where there is no other.
+    # The number of rays adapts during the first cycle, which is discarded where there is another.
     settled = REFRESH if len(running.counter.samples) > REFRESH else 0
     counted, rays = running.counter.samples[settled:], running.counter.rays[settled:]
     per_step = sum(counted) / len(counted)
@@ -143,22 +144,22 @@ def nerf_step(sizes: dict[str, int], effort: Effort) -> list[Measurement]:
 
 
 def networks_alone(field: NeuralField, samples: int) -> Callable[[], object]:
-    """Both networks forward and backward on ready features, in the chunks that the field uses on a CPU."""
+    """Both networks forward and backward on precomputed features, in the chunks that the field uses on a CPU."""
     generator = torch.Generator().manual_seed(0)
     features = torch.rand(samples, field.geometry_net.inputs, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(samples, 3, generator=generator), dim=1)
-    seen = harmonics.basis(directions, field.config.direction_degree - 1)
+    direction_sh = harmonics.basis(directions, field.config.direction_degree - 1)
     parameters = [*field.geometry_net.parameters(), *field.colour_net.parameters()]
     chunks = [
-        (part.clone().requires_grad_(), look)
-        for part, look in zip(features.split(CPU_CHUNK), seen.split(CPU_CHUNK), strict=True)
+        (part.clone().requires_grad_(), sh)
+        for part, sh in zip(features.split(CPU_CHUNK), direction_sh.split(CPU_CHUNK), strict=True)
     ]
 
     def run() -> list[tuple[Tensor, ...]]:
         gradients = []
-        for part, look in chunks:
+        for part, sh in chunks:
             geometry = field.geometry_net(part)
-            colour = field.colour_net(torch.cat([geometry[:, 1:], look], dim=1))
+            colour = field.colour_net(torch.cat([geometry[:, 1:], sh], dim=1))
             # The encoding needs the features' gradients too.
             gradients.append(torch.autograd.grad(geometry[:, 0].sum() + colour.sum(), [part, *parameters]))
         return gradients
@@ -167,8 +168,7 @@ def networks_alone(field: NeuralField, samples: int) -> Callable[[], object]:
 
 
 def _fit(
-    field: Field,
-    renderer: Renderer,
+    model: Model,
     pictures: Scene,
     losses: list[Loss],
     hooks: list[Hook],
@@ -176,11 +176,11 @@ def _fit(
     lr: float = 1e-4,
 ) -> Fit:
     optimiser = OptimiserConfig({"field": GroupConfig("field", lr)})
-    return Fit(Plan(field, renderer, pictures, losses, hooks, optimiser, batches, Budget(steps=ALL_STEPS)))
+    return Fit(Plan(model, pictures, losses, hooks, optimiser, batches, Budget(steps=ALL_STEPS)))
 
 
 def steps(quick: bool, effort: Effort) -> list[Measurement]:
-    """All whole steps: the sizes that are promised, and in a full run smaller ones."""
+    """All training steps: the gated sizes, and in a full run smaller ones."""
     found = splat_step(SPLAT_GATE["gaussians"], SPLAT_GATE["width"], effort) + nerf_step(NERF_GATE, effort)
     if not quick:
         found += splat_step(10_000, 200, effort) + nerf_step(NERF_SMALL, effort)

@@ -1,4 +1,4 @@
-"""What the machine can do at best: the yardsticks that rates are compared with, as work to be timed beside the kernels."""
+"""Hardware limits (roofline): peak rates of matrix products, memory streams, gathers and exponentials."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 
 import torch
 
-from invgraphics.kernels.dispatch import why_not
+from invgraphics.kernels.dispatch import unavailable_reason
 
 MATRIX = 2048
 """Edge of the square matrices of `sgemm`."""
@@ -23,12 +23,12 @@ GATHER_BYTES = tuple(1 << power for power in (18, 20, 22, 25, 27))
 
 @dataclass(frozen=True)
 class Limit:
-    """A yardstick.
+    """A microbenchmark of a peak rate of the machine.
 
     Attributes:
-        name: what a reader sees.
+        name: display name.
         amount: work of one call, in ``unit``.
-        unit: what is counted.
+        unit: unit of work.
         run: one call.
         sizes: its size, by `results.SIZE_KEYS`.
     """
@@ -58,7 +58,7 @@ def triad() -> Limit:
 
 def gather(size: int) -> Limit | None:
     """Random reads of 8-byte entries in a table of ``size`` bytes; counts entries. ``None`` without Numba."""
-    if why_not("numba"):
+    if unavailable_reason("numba"):
         return None
     import numpy as np
 
@@ -66,15 +66,15 @@ def gather(size: int) -> Limit | None:
     from invgraphics.kernels.numba.runtime import threads
 
     entries = max(size // 8, 1)
-    places = np.random.default_rng(0).integers(0, entries, LOOKUPS, dtype=np.uint32)
+    indices = np.random.default_rng(0).integers(0, entries, LOOKUPS, dtype=np.uint32)
     table, sums = np.ones(entries, np.int64), np.empty(torch.get_num_threads(), np.int64)
-    run = lambda: gather_sum(table, places, threads(), sums)  # noqa: E731
+    run = lambda: gather_sum(table, indices, threads(), sums)  # noqa: E731
     return Limit(f"gather {readable_bytes(size)}", float(LOOKUPS), "look-ups", run, {"bytes": size})
 
 
 def exp2() -> Limit | None:
     """The kernels' exp2 polynomial on arrays in the L1 cache; counts exponentials. ``None`` without Numba."""
-    if why_not("numba"):
+    if unavailable_reason("numba"):
         return None
     import numpy as np
 
@@ -88,7 +88,7 @@ def exp2() -> Limit | None:
 
 
 def all_limits() -> list[Limit]:
-    """Every limit that can be measured here."""
+    """All limits that can be measured on this machine."""
     found = [sgemm(), triad(), exp2(), *(gather(size) for size in GATHER_BYTES)]
     return [limit for limit in found if limit is not None]
 

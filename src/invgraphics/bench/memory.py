@@ -1,7 +1,7 @@
-"""Memory per primitive and per sample, each operation in a process of its own.
+"""Peak memory per primitive and per sample, each operation in a process of its own.
 
-Torch and Numba allocate behind Python's back, so the kernel's high-water mark of the resident set is read. It is put back
-(``/proc/self/clear_refs``) when the input is made and the code is loaded; inherited marks of ``getrusage`` would mislead.
+Torch and Numba allocate outside of Python, so the operating system's peak resident set is read. It is reset
+(``/proc/self/clear_refs``) once input and code are loaded; the peak of ``getrusage`` is inherited and cannot be reset.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from invgraphics.bench.results import Footprint, Results, Skipped
+from invgraphics.bench.results import PeakMemory, Results, Skipped
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 PEAK_TO_NOW = "5"
-"""Written to `CLEAR`, sets the high-water mark to what is held now (Linux 4.0)."""
+"""Written to `CLEAR`, resets the peak resident set to the current one (Linux 4.0)."""
 
 GAUSSIANS, WIDTH = 50_000, 100
-"""Many primitives on few pixels, so that the picture hardly counts."""
+"""Many primitives on few pixels, so that the image's memory is negligible."""
 POINTS, SAMPLES, PIXELS = 1 << 16, 1 << 20, 800
 STEPS = 4
-"""Whole steps until memory has settled: Adam's moments come with the first."""
+"""Training steps until memory is stationary: Adam's moments are allocated in the first."""
 
 
 @dataclass(frozen=True)
-class Subject:
-    """What is run once while memory is watched.
+class MemoryCase:
+    """An operation whose peak memory is measured.
 
     Attributes:
-        unit: what the bytes are counted per.
-        count: how many there are; for steps of a hash grid, the number is found in the run.
+        unit: unit that bytes are reported per.
+        count: number of units; 0 where the run determines it (samples of a hash-grid step).
         kernels: implementations to measure.
     """
 
@@ -42,23 +42,23 @@ class Subject:
     kernels: tuple[str, ...] = ("reference", "numba")
 
 
-SUBJECTS = {
-    "splats": Subject("Gaussian", GAUSSIANS),
-    "hash_encode": Subject("point", POINTS),
-    "composite": Subject("sample", SAMPLES),
-    "ssim": Subject("pixel", PIXELS**2),
-    "splat step": Subject("Gaussian", GAUSSIANS, ("numba",)),
-    "hash step": Subject("sample", 0, ("numba",)),
+MEMORY_CASES = {
+    "splats": MemoryCase("Gaussian", GAUSSIANS),
+    "hash_encode": MemoryCase("point", POINTS),
+    "composite": MemoryCase("sample", SAMPLES),
+    "ssim": MemoryCase("pixel", PIXELS**2),
+    "splat step": MemoryCase("Gaussian", GAUSSIANS, ("numba",)),
+    "hash step": MemoryCase("sample", 0, ("numba",)),
 }
 
 
-def footprints(implementations: tuple[str, ...], results: Results) -> None:
-    """Measure every subject by every implementation."""
+def measure_memory(implementations: tuple[str, ...], results: Results) -> None:
+    """Measure every case with every implementation, into ``results.memory``."""
     if not (STATUS.exists() and CLEAR.exists()):
         results.skipped.append(Skipped("memory", "this system keeps no high-water mark that can be put back (Linux does)"))
         return
-    for name, subject in SUBJECTS.items():
-        for kernels in subject.kernels:
+    for name, case in MEMORY_CASES.items():
+        for kernels in case.kernels:
             if kernels not in implementations:
                 continue
             command = [sys.executable, "-m", __name__, name, kernels]
@@ -68,24 +68,24 @@ def footprints(implementations: tuple[str, ...], results: Results) -> None:
                 results.skipped.append(Skipped(f"memory of {name} ({kernels})", why))
             else:
                 total, count = (int(word) for word in done.stdout.split()[-2:])
-                results.footprints.append(Footprint(f"{name}, forward and backward", kernels, count, subject.unit, total))
+                results.memory.append(PeakMemory(f"{name}, forward and backward", kernels, count, case.unit, total))
 
 
 def measure(name: str, kernels: str) -> tuple[int, int]:
-    """Bytes held at the peak beyond what was held before, and the number of primitives or samples."""
+    """Peak resident bytes above the level before the call, and the number of primitives or samples."""
     from invgraphics.kernels import dispatch
 
     dispatch.use(kernels)
     dispatch.warm_up()
     run = _PREPARE[name]()
-    before = held("VmRSS")
+    before = status_bytes("VmRSS")
     CLEAR.write_text(PEAK_TO_NOW)
     count = run()
-    return held("VmHWM") - before, count
+    return status_bytes("VmHWM") - before, count
 
 
-def held(entry: str) -> int:
-    """Bytes that the system's status of this process gives for an entry."""
+def status_bytes(entry: str) -> int:
+    """Bytes of an entry of ``/proc/self/status``."""
     found = re.search(rf"^{entry}:\s+(\d+) kB", STATUS.read_text(), re.MULTILINE)
     assert found is not None, entry
     return int(found.group(1)) * 1024
@@ -93,14 +93,14 @@ def held(entry: str) -> int:
 
 def _splats() -> Callable[[], int]:
     from invgraphics.bench.splat_cases import both_ways, splat_pipeline
-    from invgraphics.bench.subject import activated, camera, gaussian_field, leaves
+    from invgraphics.bench.workload import activated, camera, gaussian_field, leaves
 
-    gaussians, seen_by = activated(gaussian_field(GAUSSIANS)), camera(WIDTH)
-    return _counted(both_ways(lambda: splat_pipeline(gaussians, seen_by), leaves(gaussians)), GAUSSIANS)
+    gaussians, viewpoint = activated(gaussian_field(GAUSSIANS)), camera(WIDTH)
+    return _counted(both_ways(lambda: splat_pipeline(gaussians, viewpoint), leaves(gaussians)), GAUSSIANS)
 
 
 def _case(operation: str, count: int, **sizes: int) -> Callable[[], Callable[[], int]]:
-    """The forward and backward pass of a benchmark's case, without a look at its limits."""
+    """The forward and backward pass of a benchmark case, without its limit."""
 
     def prepare() -> Callable[[], int]:
         from invgraphics.bench import sample_cases, splat_cases
@@ -117,7 +117,7 @@ def _case(operation: str, count: int, **sizes: int) -> Callable[[], Callable[[],
 
 def _counted(run: Callable[[], object], count: int) -> Callable[[], int]:
     def once() -> int:
-        kept = run()  # the gradients are part of what is held
+        kept = run()  # the gradients are part of what is status_bytes
         del kept
         return count
 
@@ -126,7 +126,7 @@ def _counted(run: Callable[[], object], count: int) -> Callable[[], int]:
 
 def _splat_step() -> Callable[[], int]:
     from invgraphics.bench.iterations import VIEWS, splat_fit
-    from invgraphics.bench.subject import gaussian_field, scene
+    from invgraphics.bench.workload import gaussian_field, scene
 
     pictures = scene(gaussian_field(GAUSSIANS), VIEWS, WIDTH)
 

@@ -1,4 +1,4 @@
-"""The files that a run leaves: tables, the record of what was run where, and the page."""
+"""Output files of a benchmark run: CSV tables, JSON record, plots and the HTML page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from invgraphics.bench import plots, tables
 from invgraphics.bench.gates import Gate, gates
 from invgraphics.bench.growth import growths
-from invgraphics.bench.plots import Look
+from invgraphics.bench.plots import PlotStyle
 from invgraphics.bench.results import Results, write_tables
 from invgraphics.bench.tables import Table, kernels_of
 
@@ -20,11 +20,11 @@ class Section:
     """A part of the page.
 
     Attributes:
-        anchor: its place in the page's address.
+        anchor: HTML id.
         title: heading.
-        text: what a reader needs to know before the numbers.
-        table: the numbers.
-        plots: pictures of them.
+        text: introduction.
+        table: measurements.
+        plots: figures.
     """
 
     anchor: str
@@ -34,14 +34,14 @@ class Section:
     plots: tuple[plots.Plot, ...] = ()
 
 
-def write(results: Results, record: Mapping[str, object], folder: Path, look: Look) -> Path:
+def write(results: Results, record: Mapping[str, object], folder: Path, style: PlotStyle) -> Path:
     """Write ``results.csv``, ``memory.csv``, ``bench.json``, plots and ``index.html``; returns the page's path.
 
     Args:
-        results: what was measured.
-        record: what the numbers depend on: machine, versions, load, command.
-        folder: made if needed.
-        look: of plots and page.
+        results: measurements.
+        record: provenance: machine, versions, load, command.
+        folder: output folder, created if needed.
+        style: style of plots and page.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_tables(results, folder)
@@ -53,10 +53,10 @@ def write(results: Results, record: Mapping[str, object], folder: Path, look: Lo
         "skipped": [asdict(skipped) for skipped in results.skipped],
     }
     (folder / "bench.json").write_text(json.dumps(whole, indent=2) + "\n", encoding="utf-8")
-    return _write_page(results, record, found, folder, look)
+    return _write_page(results, record, found, folder, style)
 
 
-def _write_page(results: Results, record: Mapping[str, object], found: list[Gate], folder: Path, look: Look) -> Path:
+def _write_page(results: Results, record: Mapping[str, object], found: list[Gate], folder: Path, style: PlotStyle) -> Path:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -68,12 +68,12 @@ def _write_page(results: Results, record: Mapping[str, object], found: list[Gate
     )
     page = folder / "index.html"
     context = {
-        "stylesheet": look.stylesheet,
+        "stylesheet": style.stylesheet,
         "record": {name: str(value) for name, value in record.items() if name != "command"},
         "command": record.get("command", ""),
         "gates": tables.gate_table(found),
         "headline": headline(found),
-        "sections": [section for section in _sections(results, folder / "figures", look) if section.table.rows],
+        "sections": [section for section in _sections(results, folder / "figures", style) if section.table.rows],
         "skipped": results.skipped,
         "url": lambda path: path.relative_to(folder).as_posix(),
     }
@@ -82,16 +82,16 @@ def _write_page(results: Results, record: Mapping[str, object], found: list[Gate
 
 
 def headline(found: list[Gate]) -> str:
-    """The answer in a sentence."""
+    """Summary of the gates in a sentence."""
     verdicts = [gate.verdict for gate in found]
     kept, missed, unknown = (verdicts.count(verdict) for verdict in ("PASS", "MISS", "-"))
-    told = f"{kept} of {len(found)} promises kept, {missed} missed"
-    return f"{told}, {unknown} not measured." if unknown else f"{told}."
+    summary = f"{kept} of {len(found)} promises kept, {missed} missed"
+    return f"{summary}, {unknown} not measured." if unknown else f"{summary}."
 
 
-def _sections(results: Results, figures: Path, look: Look) -> list[Section]:
+def _sections(results: Results, figures: Path, style: PlotStyle) -> list[Section]:
     drawn = {
-        name: (plot,) if (plot := draw(results, figures, look)) else ()
+        name: (plot,) if (plot := draw(results, figures, style)) else ()
         for name, draw in (("shares", plots.share_plot), ("gather", plots.gather_plot), ("threads", plots.thread_plot))
     }
     return [
@@ -102,10 +102,10 @@ def _sections(results: Results, figures: Path, look: Look) -> list[Section]:
             "Growth of cost",
             _GROWTH,
             tables.growth_table(growths(kernels_of(results))),
-            tuple(plots.growth_plots(results, figures, look)),
+            tuple(plots.growth_plots(results, figures, style)),
         ),
         Section("threads", "Threads", _THREADS, tables.thread_table(results), drawn["threads"]),
-        Section("memory", "Memory", _MEMORY, tables.memory_table(results.footprints)),
+        Section("memory", "Memory", _MEMORY, tables.memory_table(results.memory)),
         Section("peers", "Peers", _PEERS, tables.peer_table(results)),
         Section("limits", "Limits of this machine", _LIMITS, tables.limit_table(results), drawn["gather"]),
     ]
@@ -115,18 +115,18 @@ _KERNELS = (
     "Median time and quartiles of one call. The reference (plain torch), Numba and the limit take turns, call by call, so a "
     "disturbance meets all of them. Splats count the alphas that the rasteriser evaluates (16 for every visit of a footprint "
     "to a block of 4 x 4 pixels; the backward pass visits again) against exponentials per second; hash encoding counts 8 "
-    "look-ups per level and point and pass against random reads in a table of one level's size; what streams through memory "
+    "style-ups per level and point and pass against random reads in a table of one level's size; what streams through memory "
     "is compared with the triad, SSIM's filters with the matrix product."
 )
 _STEPS = (
-    "A whole step of a fit (draw, render, compare, differentiate, Adam; for the hash grid also its share of a look at the "
+    "A whole step of a fit (draw, render, compare, differentiate, Adam; for the hash grid also its share of a style at the "
     "occupancy grid) beside what it cannot do without: project, bin and rasterise there and back on the same pictures, or the "
     "two networks alone on as many samples in the same chunks. The rate ratio compares Gaussians or samples per second."
 )
 _GROWTH = "The exponent p of time ~ size^p, fitted where one size varies and all else stays: 1 is proportional."
 _THREADS = "One size of each kernel, forward and backward, with fewer threads."
 _MEMORY = (
-    "High-water mark of the resident set in a process of its own, beyond what it held with its input made and its code "
+    "High-water mark of the resident set in a process of its own, beyond what it status_bytes with its input made and its code "
     "loaded; whole steps include parameters, gradients and Adam's moments."
 )
 _PEERS = (

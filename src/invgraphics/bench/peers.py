@@ -1,6 +1,6 @@
-"""Other people's code on the same machine, in the same run: reported beside ours, never gated.
+"""Third-party implementations on the same machine, in the same run: nerfstudio, Dr.Jit and Mitsuba; reported, never gated.
 
-The torch-only tile rasteriser that splats can be compared with is our own reference, which every run measures anyway.
+The torch-only tile rasteriser is our own reference, which every run measures anyway.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from invgraphics.bench.sample_cases import BASE, FINEST, ray_ordered
 from invgraphics.bench.sample_cases import GATE as HASH_GATE
 from invgraphics.bench.splat_cases import GATE as SPLAT_GATE
 from invgraphics.bench.splat_cases import both_ways, splat_pipeline, without_gradient
-from invgraphics.bench.subject import activated, camera, gaussian_field
 from invgraphics.bench.timing import Effort, Timing, alternate
-from invgraphics.kernels.types import HashGrid
+from invgraphics.bench.workload import activated, camera, gaussian_field
+from invgraphics.core.ngp import HashGrid
 
 GROWTH = (FINEST / BASE) ** (1 / (HASH_GATE["levels"] - 1))
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Mitsuba's cameras have x to the left and y up, ours x to the right and y down."""
 SHELL = 3.0
-"""Standard deviations at which Mitsuba cuts a Gaussian off."""
+"""Standard deviations at which Mitsuba truncates a Gaussian."""
 
 
 class MissingError(Exception):
-    """Why a peer cannot be measured here."""
+    """A peer is not available here; the message says why."""
 
 
 def peers(effort: Effort, results: Results) -> None:
-    """Measure what is installed in alternation with our kernels; say of the rest why it is missing."""
+    """Time installed peers in alternation with our kernels; record why others are skipped."""
     ours = kernels.in_use()
     encoders: dict[str, dict[str, Run]] = {ours: _our_hash()}
     for name, make in {"nerfstudio (torch)": _nerfstudio, "Dr.Jit (LLVM)": _drjit}.items():
@@ -71,7 +71,7 @@ def _add(runs: dict[str, dict[str, Run]], what: str, name: str, make: Callable[[
             run()
     except MissingError as missing:
         results.skipped.append(Skipped(what, str(missing)))
-    except Exception as error:  # a peer's failure is news about the peer, not the end of our run
+    except Exception as error:  # a failing peer must not end the run
         first = (str(error).splitlines() or [""])[0]
         results.skipped.append(Skipped(what, f"it failed: {type(error).__name__}: {first}"))
     else:
@@ -86,8 +86,8 @@ def _our_hash() -> dict[str, Run]:
 
 
 def _our_splats() -> dict[str, Run]:
-    gaussians, seen_by = activated(gaussian_field(SPLAT_GATE["gaussians"])), camera(SPLAT_GATE["width"])
-    return {FORWARD: without_gradient(lambda: splat_pipeline(gaussians, seen_by))}
+    gaussians, viewpoint = activated(gaussian_field(SPLAT_GATE["gaussians"])), camera(SPLAT_GATE["width"])
+    return {FORWARD: without_gradient(lambda: splat_pipeline(gaussians, viewpoint))}
 
 
 def _nerfstudio() -> dict[str, Run]:
@@ -176,11 +176,11 @@ def _mitsuba() -> dict[str, Run]:
 
 
 def _mitsuba_scene(mitsuba: Any) -> dict[str, object]:
-    gaussians, seen_by = activated(gaussian_field(SPLAT_GATE["gaussians"])), camera(SPLAT_GATE["width"])
+    gaussians, viewpoint = activated(gaussian_field(SPLAT_GATE["gaussians"])), camera(SPLAT_GATE["width"])
     numpy = lambda x: np.ascontiguousarray(x.detach().numpy())  # noqa: E731
     tensor = lambda x: mitsuba.TensorXf(numpy(x))  # noqa: E731
     w_last: Tensor = torch.nn.functional.normalize(gaussians.quaternions, dim=1).roll(-1, dims=1)
-    field_of_view = float(np.degrees(2 * np.arctan(seen_by.width / (2 * float(seen_by.focal[0])))))
+    field_of_view = float(np.degrees(2 * np.arctan(viewpoint.width / (2 * float(viewpoint.focal[0])))))
     return {
         "type": "scene",
         "integrator": {"type": "volprim_rf_basic", "srgb_primitives": False},
@@ -188,8 +188,8 @@ def _mitsuba_scene(mitsuba: Any) -> dict[str, object]:
             "type": "perspective",
             "fov": field_of_view,
             "fov_axis": "x",
-            "to_world": mitsuba.ScalarTransform4f(seen_by.cam_to_world.double().numpy() @ FLIP),
-            "film": {"type": "hdrfilm", "width": seen_by.width, "height": seen_by.height, "rfilter": {"type": "box"}},
+            "to_world": mitsuba.ScalarTransform4f(viewpoint.cam_to_world.double().numpy() @ FLIP),
+            "film": {"type": "hdrfilm", "width": viewpoint.width, "height": viewpoint.height, "rfilter": {"type": "box"}},
         },
         "gaussians": {
             "type": "ellipsoids",

@@ -1,4 +1,4 @@
-"""Plots of a run, in the look that the caller brings along."""
+"""Plots of a benchmark run, in a style injected by the caller."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ ROW = 26.0
 
 
 @dataclass(frozen=True)
-class Look:
-    """How plots and the page look; the report's own look is handed in, because this package stands beside it.
+class PlotStyle:
+    """Style of plots and page. Injected by the caller, since this package may not import the report's.
 
     Attributes:
         canvas: an empty plot of a width and a height, as a context with figure and axes.
@@ -38,7 +38,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot on disk, and what a reader who cannot see it should know."""
+    """A plot on disk and its alternative text."""
 
     path: Path
     alt: str
@@ -46,7 +46,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Line:
-    """One curve: its name, the number of its look, and its points."""
+    """One curve: its name, the index of its style, and its points."""
 
     name: str
     series: int
@@ -54,8 +54,8 @@ class Line:
     y: tuple[float, ...]
 
 
-def growth_plots(results: Results, folder: Path, look: Look) -> list[Plot]:
-    """Time against every size that varies, one plot per kernel and size."""
+def growth_plots(results: Results, folder: Path, style: PlotStyle) -> list[Plot]:
+    """Log-log plots of time against every varied size, one per kernel and size."""
     groups: dict[tuple[str, str, str, str], list[Growth]] = {}
     for g in growths(kernels_of(results)):
         if g.direction == BOTH or g.operation in FORWARD_ONLY:
@@ -73,19 +73,19 @@ def growth_plots(results: Results, folder: Path, look: Look) -> list[Plot]:
         ]
         title = f"{operation}, {direction}" + (f"; {sizes(members[0].fixed)}" if members[0].fixed else "")
         stem = folder / f"growth-{number:02d}-{operation}-{along.replace(' ', '-')}"
-        plots.append(_log_log(lines, title, (along, "ms"), stem, look))
+        plots.append(_log_log(lines, title, (along, "ms"), stem, style))
     return plots
 
 
-def share_plot(results: Results, folder: Path, look: Look) -> Plot | None:
-    """How much of its limit each kernel reaches, at the last size that was measured."""
+def share_plot(results: Results, folder: Path, style: PlotStyle) -> Plot | None:
+    """Bar chart of each kernel's fraction of its hardware limit, at the largest measured size."""
     largest = {(m.operation, m.direction): m for m in kernels_of(results) if m.share and m.implementation == "numba"}
     if not largest:
         return None
     names = [f"{operation}, {direction}" for operation, direction in largest]
     shares = [100 * (m.share or 0) for m in largest.values()]
-    with look.canvas(2 * PANEL[0], 90 + ROW * len(names)) as (figure, axes):
-        axes.barh(names[::-1], shares[::-1], color=look.series(1).colour, height=0.6)
+    with style.canvas(2 * PANEL[0], 90 + ROW * len(names)) as (figure, axes):
+        axes.barh(names[::-1], shares[::-1], color=style.series(1).colour, height=0.6)
         for place, (share, m) in enumerate(zip(shares[::-1], [*largest.values()][::-1], strict=True)):
             axes.annotate(
                 f"{share:.2g} % of {m.limit}", (share, place), (5, 0), textcoords="offset points", va="center", fontsize=11
@@ -94,22 +94,22 @@ def share_plot(results: Results, folder: Path, look: Look) -> Plot | None:
         axes.set_xlabel("% of the limit, measured in alternation")
         axes.grid(visible=False, axis="y")
         axes.set_title("Share of the machine's limit, at each kernel's last size")
-        path = look.save(figure, folder / "shares")
-    told = "; ".join(f"{name} {share:.2g} %" for name, share in zip(names, shares, strict=True))
-    return Plot(path, f"Share of the machine's limit: {told}.")
+        path = style.save(figure, folder / "shares")
+    summary = "; ".join(f"{name} {share:.2g} %" for name, share in zip(names, shares, strict=True))
+    return Plot(path, f"Share of the machine's limit: {summary}.")
 
 
-def gather_plot(results: Results, folder: Path, look: Look) -> Plot | None:
-    """Random look-ups per second against the table's bytes."""
+def gather_plot(results: Results, folder: Path, style: PlotStyle) -> Plot | None:
+    """Random style-ups per second against the table's bytes."""
     found = [m for m in results.measurements if m.implementation == MACHINE and m.operation.startswith("gather")]
     if len(found) < 2:
         return None
     line = Line("", 0, tuple(m.sizes["bytes"] / 2**20 for m in found), tuple(m.rate / 1e6 for m in found))
-    labels = ("table, MB", "million look-ups/s")
-    return _log_log([line], "Random look-ups of 8 bytes", labels, folder / "gather", look)
+    labels = ("table, MB", "million style-ups/s")
+    return _log_log([line], "Random style-ups of 8 bytes", labels, folder / "gather", style)
 
 
-def thread_plot(results: Results, folder: Path, look: Look) -> Plot | None:
+def thread_plot(results: Results, folder: Path, style: PlotStyle) -> Plot | None:
     """Speed-up against threads."""
     found = [m for m in results.measurements if m.operation.startswith(THREADS)]
     lines = []
@@ -119,16 +119,16 @@ def thread_plot(results: Results, folder: Path, look: Look) -> Plot | None:
         lines.append(Line(operation.rpartition(": ")[2], len(lines), counts, tuple(times[0] / t for t in times)))
     if not lines:
         return None
-    return _log_log(lines, "Speed-up with threads", ("threads", "times faster than one"), folder / "threads", look)
+    return _log_log(lines, "Speed-up with threads", ("threads", "times faster than one"), folder / "threads", style)
 
 
-def _log_log(lines: list[Line], title: str, labels: tuple[str, str], stem: Path, look: Look) -> Plot:
+def _log_log(lines: list[Line], title: str, labels: tuple[str, str], stem: Path, style: PlotStyle) -> Plot:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-    with look.canvas(*PANEL) as (figure, axes):
+    with style.canvas(*PANEL) as (figure, axes):
         for line in lines:
-            style = look.series(line.series)
-            axes.plot(line.x, line.y, color=style.colour, marker=style.marker, linestyle=style.dash, label=line.name)
+            series = style.series(line.series)
+            axes.plot(line.x, line.y, color=series.colour, marker=series.marker, linestyle=series.dash, label=line.name)
         axes.set(xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1])
         ticks = sorted({x for line in lines for x in line.x})
         axes.set_xticks(ticks, [quantity(x) for x in ticks])
@@ -139,6 +139,6 @@ def _log_log(lines: list[Line], title: str, labels: tuple[str, str], stem: Path,
         if len(lines) > 1 or lines[0].name:
             axes.legend(frameon=False, fontsize=11)
         axes.set_title(title, fontsize=11)
-        path = look.save(figure, stem)
-    told = "; ".join(f"{line.name}: {', '.join(f'{y:.3g}' for y in line.y)}" for line in lines)
-    return Plot(path, f"{title}. {labels[1]} against {labels[0]}. {told}.")
+        path = style.save(figure, stem)
+    summary = "; ".join(f"{line.name}: {', '.join(f'{y:.3g}' for y in line.y)}" for line in lines)
+    return Plot(path, f"{title}. {labels[1]} against {labels[0]}. {summary}.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.runtime import exp2, index, parallel, prange, share
+from invgraphics.kernels.numba.runtime import exp2, index, job_start, parallel, prange
 
 _ONE = np.float32(1.0)
 
@@ -25,6 +25,6 @@ def gather_sum(table, places, jobs, sums):
     """Per job, the sum of the entries of ``table`` at its share of ``places``."""
     for job in prange(jobs):
         total = np.int64(0)
-        for number in range(share(len(places), jobs, job), share(len(places), jobs, job + 1)):
+        for number in range(job_start(len(places), jobs, job), job_start(len(places), jobs, job + 1)):
             total += table[index(places[index(number)])]
         sums[job] = total

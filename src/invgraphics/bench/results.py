@@ -1,4 +1,4 @@
-"""What a run of the benchmark hands on: measurements, memory, what was left out; as objects and as files."""
+"""Results of a benchmark run: measurements, peak memory and skipped cases, as objects and as CSV."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from invgraphics.bench.timing import Timing
 
 FORWARD, BOTH = "forward", "forward+backward"
 """Directions."""
-FORWARD_ONLY = ("ray_march", "hash_render")
+FORWARD_ONLY = ("ray_march", "ngp_render")
 """Operations without a gradient."""
 
 SIZE_KEYS = (
     "gaussians", "width", "points", "levels", "log2_size", "hidden", "resolution", "channels", "rays", "samples", "bytes",
 )  # fmt: skip
-"""Columns of sizes, in order."""
+"""Columns of problem sizes, in order."""
 
 COLUMNS = (
     "operation", "implementation", "direction", *SIZE_KEYS, "threads", "median_ms", "low_ms", "high_ms", "repetitions",
@@ -27,9 +27,9 @@ COLUMNS = (
 MEMORY_COLUMNS = ("operation", "implementation", "count", "unit", "peak_bytes", "bytes_per_unit")
 
 MACHINE = "machine"
-"""Implementation of the operations that measure the machine's limits."""
+"""Implementation name of measurements of the machine's limits."""
 THREADS, PEERS = "threads", "peers"
-"""What precedes an operation's name in measurements of other thread counts, and beside other people's code."""
+"""Prefixes of operation names in measurements of thread counts and of third-party code."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,14 @@ class Measurement:
         operation: name of the kernel, the iteration or the limit.
         implementation: ``reference``, ``numba``, a peer, or `MACHINE`.
         direction: `FORWARD`, `BOTH`, or empty.
-        sizes: what the time depends on, by `SIZE_KEYS`.
-        threads: threads that shared the work.
+        sizes: problem size, by `SIZE_KEYS`.
+        threads: number of threads.
         timing: seconds of one call.
         amount: work of one call, in ``unit``; 0 where it is not counted.
-        unit: what is counted, for instance ``look-ups``.
-        limit: the machine's limit that the rate is compared with; empty for none.
-        limit_rate: that limit per second, measured in alternation with the operation.
-        note: anything a reader must know.
+        unit: unit of work, for instance ``look-ups``.
+        limit: hardware limit that the rate is compared with; empty for none.
+        limit_rate: the limit per second, measured in alternation with the operation.
+        note: remark.
     """
 
     operation: str
@@ -69,11 +69,11 @@ class Measurement:
 
     @property
     def share(self) -> float | None:
-        """Part of the limit that was reached."""
+        """Fraction of the hardware limit reached."""
         return self.rate / self.limit_rate if self.limit_rate and self.amount else None
 
     def row(self) -> dict[str, object]:
-        """The measurement as a line of the table."""
+        """The measurement as a CSV row."""
         t, share = self.timing, self.share
         return {
             "operation": self.operation,
@@ -95,15 +95,15 @@ class Measurement:
 
 
 @dataclass(frozen=True)
-class Footprint:
-    """Memory that an operation holds at its peak, beyond what was there before.
+class PeakMemory:
+    """Peak memory of an operation, above the level before it.
 
     Attributes:
-        operation: what was run, forward and backward.
-        implementation: by which kernels.
-        count: how many of ``unit`` there were.
+        operation: name of the operation, forward and backward.
+        implementation: kernels that ran it.
+        count: number of units.
         unit: primitive or sample.
-        total: bytes at the peak.
+        total: peak bytes.
     """
 
     operation: str
@@ -118,14 +118,14 @@ class Footprint:
         return self.total / self.count
 
     def row(self) -> dict[str, object]:
-        """The line of the table."""
+        """The CSV row."""
         values = (self.operation, self.implementation, self.count, self.unit, self.total, f"{self.each:.5g}")
         return dict(zip(MEMORY_COLUMNS, values, strict=True))
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """What was not measured, and why."""
+    """A case that was not measured, and the reason."""
 
     what: str
     why: str
@@ -133,14 +133,14 @@ class Skipped:
 
 @dataclass
 class Results:
-    """Everything one run has measured so far."""
+    """Accumulated results of a run."""
 
     measurements: list[Measurement] = field(default_factory=list)
-    footprints: list[Footprint] = field(default_factory=list)
+    memory: list[PeakMemory] = field(default_factory=list)
     skipped: list[Skipped] = field(default_factory=list)
 
     def find(self, operation: str, implementation: str, direction: str, **sizes: int) -> Measurement | None:
-        """The first measurement with these keys whose sizes contain ``sizes``."""
+        """First measurement with these keys whose sizes contain ``sizes``; else ``None``."""
         for m in self.measurements:
             named = (m.operation, m.implementation, m.direction) == (operation, implementation, direction)
             if named and sizes.items() <= m.sizes.items():
@@ -151,7 +151,7 @@ class Results:
 def write_tables(results: Results, folder: Path) -> None:
     """Write ``results.csv``, one line per measurement, and ``memory.csv``."""
     _write(folder / "results.csv", COLUMNS, (m.row() for m in results.measurements))
-    _write(folder / "memory.csv", MEMORY_COLUMNS, (f.row() for f in results.footprints))
+    _write(folder / "memory.csv", MEMORY_COLUMNS, (f.row() for f in results.memory))
 
 
 def _write(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, object]]) -> None:

@@ -1,4 +1,4 @@
-"""The benchmark: takes the parts in order, and measures every kernel in alternation with the reference and with its limit."""
+"""The benchmark run: every part in order, every kernel in alternation with the reference and its hardware limit."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import torch
 from invgraphics import kernels
 from invgraphics.bench import PARTS, iterations, limits, sample_cases, splat_cases
 from invgraphics.bench.case import Case
-from invgraphics.bench.memory import footprints
+from invgraphics.bench.memory import measure_memory
 from invgraphics.bench.peers import peers
 from invgraphics.bench.results import BOTH, FORWARD_ONLY, MACHINE, THREADS, Measurement, Results, Skipped
 from invgraphics.bench.timing import Effort, alternate
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.dispatch import IMPLEMENTATIONS, here, why_not
+from invgraphics.kernels.dispatch import IMPLEMENTATIONS, cpu_implementations, unavailable_reason
 
 QUICK, FULL = Effort(0.4, 2, 9), Effort(0.6, 3, 15)
-"""How long to look at each variant."""
+"""Measurement budget of each kernel variant."""
 STEPS_QUICK, STEPS_FULL = Effort(2.0, 2, 9), Effort(4.0, 3, 15)
-"""The same for whole steps."""
+"""Measurement budget of each training step."""
 
 _CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
     "splats": splat_cases.splats,
@@ -28,41 +28,43 @@ _CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
     "grid": sample_cases.grid_sample,
     "march": sample_cases.ray_march,
     "composite": sample_cases.composite,
-    "picture": sample_cases.hash_render,
+    "picture": sample_cases.ngp_render,
     "ssim": splat_cases.ssim,
 }
 
 
 @dataclass(frozen=True)
-class Request:
-    """What to measure.
+class BenchRequest:
+    """Options of a benchmark run.
 
     Attributes:
         parts: some of `PARTS`.
-        quick: only small sizes and those that promises are made for.
-        kernels: measure only this implementation; ``None`` for all that work here.
-        say: told, in a sentence, what comes next.
+        quick: only small sizes and those of the gates.
+        kernels: measure only this implementation; ``None`` for all available ones.
+        progress: callback that receives a sentence about the next step.
     """
 
     parts: tuple[str, ...] = PARTS
     quick: bool = False
     kernels: str | None = None
-    say: Callable[[str], None] = field(default=lambda sentence: None)
+    progress: Callable[[str], None] = field(default=lambda sentence: None)
 
     @property
     def implementations(self) -> tuple[str, ...]:
-        """Kernels to measure, in alternation."""
-        return (self.kernels,) if self.kernels else here()
+        """Implementations to measure, in alternation."""
+        return (self.kernels,) if self.kernels else cpu_implementations()
 
 
-def bench(request: Request) -> Results:
-    """Measure; the kernels in use afterwards are those in use before."""
+def bench(request: BenchRequest) -> Results:
+    """Run the benchmark; the kernel selection is restored afterwards."""
     keep_freed_memory()
     results = Results()
     if not request.kernels:
-        missing = (name for name in IMPLEMENTATIONS if name not in here())
-        results.skipped += [Skipped(f"{name} kernels", why_not(name) or "measured on a CPU only") for name in missing]
-    request.say("compiling")
+        missing = (name for name in IMPLEMENTATIONS if name not in cpu_implementations())
+        results.skipped += [
+            Skipped(f"{name} kernels", unavailable_reason(name) or "measured on a CPU only") for name in missing
+        ]
+    request.progress("compiling")
     with kernels.using(request.kernels):
         kernels.warm_up()
         _measure_limits(request, results)
@@ -71,15 +73,15 @@ def bench(request: Request) -> Results:
     return results
 
 
-def _measure_limits(request: Request, results: Results) -> None:
-    request.say("limits of the machine")
+def _measure_limits(request: BenchRequest, results: Results) -> None:
+    request.progress("limits of the machine")
     for limit in limits.all_limits():
         timing = alternate({"": limit.run}, _effort(request))[""]
         sizes, threads = limit.sizes, torch.get_num_threads()
         results.measurements.append(Measurement(limit.name, MACHINE, "", sizes, threads, timing, limit.amount, limit.unit))
 
 
-def _measure_part(part: str, request: Request, results: Results) -> None:
+def _measure_part(part: str, request: BenchRequest, results: Results) -> None:
     steps = STEPS_QUICK if request.quick else STEPS_FULL
     if part in _CASES:
         for case in _CASES[part](request.quick):
@@ -89,26 +91,26 @@ def _measure_part(part: str, request: Request, results: Results) -> None:
     elif "numba" not in request.implementations:
         results.skipped.append(Skipped(part, "it is measured with the Numba kernels only"))
     elif part == "iterations":
-        request.say("whole steps")
+        request.progress("whole steps")
         results.measurements += iterations.steps(request.quick, steps)
     elif part == "memory":
-        request.say("memory")
-        footprints(request.implementations, results)
+        request.progress("memory")
+        measure_memory(request.implementations, results)
     elif part == "peers":
-        request.say("peers")
+        request.progress("peers")
         peers(_effort(request), results)
 
 
-def measure_case(case: Case, request: Request, skipped: list[Skipped]) -> list[Measurement]:
-    """One kernel on one size, every direction: all implementations and the limit in turn."""
-    request.say(str(case))
+def measure_case(case: Case, request: BenchRequest, skipped: list[Skipped]) -> list[Measurement]:
+    """Measure a case in every direction: all implementations and the limit, in alternation."""
+    request.progress(str(case))
     names = list(request.implementations)
     if case.without_reference and "reference" in names and len(names) > 1:
         names.remove("reference")
         skipped.append(Skipped(f"{case} by the reference", case.without_reference))
     found = []
     for direction, work in case.prepare().items():
-        variants = {name: _by(name, work.run) for name in names}
+        variants = {name: _with_kernels(name, work.run) for name in names}
         if work.limit:
             variants[MACHINE] = work.limit.run
         timings = alternate(variants, _effort(request))
@@ -123,8 +125,8 @@ def measure_case(case: Case, request: Request, skipped: list[Skipped]) -> list[M
     return found
 
 
-def _by(name: str, run: Callable[[], object]) -> Callable[[], object]:
-    """The call with kernels forced."""
+def _with_kernels(name: str, run: Callable[[], object]) -> Callable[[], object]:
+    """``run`` with kernels ``name`` forced."""
 
     def forced() -> object:
         with kernels.using(name):
@@ -133,7 +135,7 @@ def _by(name: str, run: Callable[[], object]) -> Callable[[], object]:
     return forced
 
 
-def _effort(request: Request) -> Effort:
+def _effort(request: BenchRequest) -> Effort:
     return QUICK if request.quick else FULL
 
 
@@ -142,18 +144,18 @@ def thread_counts(most: int) -> list[int]:
     return sorted({min(1 << power, most) for power in range(most.bit_length() + 1)})
 
 
-def _measure_threads(request: Request, results: Results) -> None:
-    """The promised sizes once more with fewer threads."""
+def _measure_threads(request: BenchRequest, results: Results) -> None:
+    """Thread scaling: one size of each kernel with 1, 2, 4, ... threads."""
     most = torch.get_num_threads()
     if most == 1:
         results.skipped.append(Skipped("growth with threads", "there is one thread only"))
         return
     fast = [name for name in request.implementations if name != "reference"] or ["reference"]
-    alone = Request(request.parts, request.quick, fast[0], request.say)
+    alone = BenchRequest(request.parts, request.quick, fast[0], request.progress)
     try:
         for count in thread_counts(most):
             torch.set_num_threads(count)
-            for case in _promised():
+            for case in _gated():
                 for m in measure_case(case, alone, results.skipped):
                     if m.direction == BOTH or case.operation in FORWARD_ONLY:
                         results.measurements.append(_renamed(m))
@@ -162,11 +164,11 @@ def _measure_threads(request: Request, results: Results) -> None:
 
 
 def _renamed(m: Measurement) -> Measurement:
-    """Kept apart from the other measurements of the same size."""
+    """Prefix the operation, to separate it from other measurements of the same size."""
     return replace(m, operation=f"{THREADS}: {m.operation}")
 
 
-def _promised() -> Iterable[Case]:
+def _gated() -> Iterable[Case]:
     """One size of each kernel."""
     everything = [case for make in _CASES.values() for case in make(True)]
     last = {case.operation: case for case in everything}

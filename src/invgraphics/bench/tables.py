@@ -1,4 +1,4 @@
-"""Measurements arranged for readers: tables of words, for the terminal and for the page."""
+"""Tables of formatted measurements, for the terminal and the page."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from invgraphics.bench.gates import Gate
 from invgraphics.bench.growth import Growth
 from invgraphics.bench.iterations import NERF_SHARE, NERF_STEP, SPLAT_SHARE, SPLAT_STEP
 from invgraphics.bench.limits import readable_bytes
-from invgraphics.bench.results import MACHINE, PEERS, THREADS, Footprint, Measurement, Results
+from invgraphics.bench.results import MACHINE, PEERS, THREADS, Measurement, PeakMemory, Results
 from invgraphics.bench.timing import Timing
 
 STEPS = {SPLAT_STEP: SPLAT_SHARE, NERF_STEP: NERF_SHARE}
-"""Whole steps, and the part of each that it is compared with."""
+"""Training steps, and the part of each that it is compared with."""
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of words; the first ``names`` columns are read along, the others are numbers."""
+    """A table of formatted cells; the first ``names`` columns are labels, the others numbers."""
 
     columns: tuple[str, ...]
     rows: list[tuple[str, ...]]
@@ -27,7 +27,7 @@ class Table:
 
 
 def gate_table(gates: list[Gate]) -> Table:
-    """Promises, what was found, and the verdict."""
+    """Gates: verdict, promise, target and measured ratio."""
     rows = [
         (gate.verdict, gate.name, f"{gate.bound} {gate.target:g}", "" if gate.measured is None else f"{gate.measured:.3g}")
         for gate in gates
@@ -36,7 +36,7 @@ def gate_table(gates: list[Gate]) -> Table:
 
 
 def kernel_table(results: Results) -> Table:
-    """Every kernel, size and direction: both implementations side by side."""
+    """Kernels by size and direction: reference, Numba, speed-up, rate and fraction of the limit."""
     cells: dict[tuple[str, str, str], dict[str, Measurement]] = {}
     for m in kernels_of(results):
         cells.setdefault((m.operation, sizes(m.sizes), m.direction), {})[m.implementation] = m
@@ -63,7 +63,7 @@ def kernel_table(results: Results) -> Table:
 
 
 def step_table(results: Results) -> Table:
-    """Whole steps beside their yardstick."""
+    """Training steps compared with their lower bound."""
     rows = []
     for m in results.measurements:
         part = next((x for x in results.measurements if x.operation == STEPS.get(m.operation) and x.sizes == m.sizes), None)
@@ -78,7 +78,7 @@ def step_table(results: Results) -> Table:
 
 
 def growth_table(growths: list[Growth]) -> Table:
-    """Fitted exponents."""
+    """Fitted power-law exponents."""
     rows = [
         (
             g.operation,
@@ -96,7 +96,7 @@ def growth_table(growths: list[Growth]) -> Table:
 
 
 def thread_table(results: Results) -> Table:
-    """Time by thread count, and the speed-up of the most over one."""
+    """Time by thread count, and the speed-up of the largest count over one."""
     found = [m for m in results.measurements if m.operation.startswith(THREADS)]
     counts = sorted({m.threads for m in found})
     rows = []
@@ -109,17 +109,17 @@ def thread_table(results: Results) -> Table:
     return Table(("kernel", "size", *(f"{n} thread{'s' * (n > 1)}, ms" for n in counts), "speed-up"), rows, names=2)
 
 
-def memory_table(footprints: list[Footprint]) -> Table:
-    """Bytes per primitive and sample."""
+def memory_table(memory: list[PeakMemory]) -> Table:
+    """Peak memory, total and per primitive or sample."""
     rows = [
         (f.operation, f.implementation, quantity(f.count), readable_bytes(f.total), f"{f.each:,.0f} per {f.unit}")
-        for f in footprints
+        for f in memory
     ]
     return Table(("operation", "implementation", "count", "peak", "bytes"), rows, names=2)
 
 
 def peer_table(results: Results) -> Table:
-    """Other people's code beside ours."""
+    """Third-party implementations compared with ours."""
     found = [m for m in results.measurements if m.operation.startswith(PEERS)]
     rows = []
     for m in found:
@@ -130,7 +130,7 @@ def peer_table(results: Results) -> Table:
 
 
 def limit_table(results: Results) -> Table:
-    """What the machine can do."""
+    """Measured hardware limits."""
     found = [m for m in results.measurements if m.implementation == MACHINE]
     rows = [(m.operation, str(m.threads), milliseconds(m.timing), f"{quantity(m.rate)} {m.unit}/s") for m in found]
     return Table(("limit", "threads", "ms", "rate"), rows)
@@ -168,7 +168,7 @@ def milliseconds(timing: Timing) -> str:
 
 
 def number(x: float) -> str:
-    """Three digits that count, without an exponent."""
+    """Three significant digits, without an exponent."""
     return f"{x:.0f}" if x >= 100 else f"{x:.3g}"
 
 
@@ -181,5 +181,5 @@ def quantity(x: float) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share with two digits that count."""
+    """A fraction as a percentage with two significant digits."""
     return "" if share is None else f"{100 * share:.2g} %"

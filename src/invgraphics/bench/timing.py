@@ -1,4 +1,4 @@
-"""The clock: variants of one piece of work in alternation, so that whatever disturbs the machine disturbs them alike."""
+"""Timing in alternation: variants of the same work take turns, so that disturbances of the machine affect all alike."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of one call: the median and the quartiles over repetitions."""
+    """Seconds per call: median and quartiles over repetitions."""
 
     median: float
     low: float
@@ -20,32 +20,32 @@ class Timing:
 
     @staticmethod
     def of(seconds: list[float]) -> Timing:
-        """Summary of single calls."""
+        """Summary of the seconds of single calls."""
         low, median, high = (float(x) for x in np.quantile(seconds, (0.25, 0.5, 0.75)))
         return Timing(median, low, high, len(seconds))
 
     def per(self, calls: int) -> Timing:
-        """The same for one of ``calls`` equal pieces."""
+        """Timing per call, where each measurement made ``calls`` calls."""
         return Timing(self.median / calls, self.low / calls, self.high / calls, self.repetitions)
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long to measure.
+    """Measurement budget of a variant.
 
     Attributes:
-        seconds: time that one variant may take; a slow one is repeated less often.
-        least: fewest repetitions of any variant.
-        most: most repetitions of any variant.
+        seconds: total time; slow variants are repeated less often.
+        min_repetitions: lower bound of repetitions.
+        max_repetitions: upper bound of repetitions.
     """
 
     seconds: float
-    least: int
-    most: int
+    min_repetitions: int
+    max_repetitions: int
 
     def repetitions(self, seconds: float) -> int:
-        """How often to repeat what takes ``seconds``."""
-        return max(self.least, min(self.most, int(self.seconds / max(seconds, 1e-9))))
+        """Number of repetitions of a call that takes ``seconds``."""
+        return max(self.min_repetitions, min(self.max_repetitions, int(self.seconds / max(seconds, 1e-9))))
 
 
 def clock(work: Callable[[], object]) -> float:
@@ -56,10 +56,10 @@ def clock(work: Callable[[], object]) -> float:
 
 
 def alternate(variants: Mapping[str, Callable[[], object]], effort: Effort) -> dict[str, Timing]:
-    """Time variants in turn: A B C A B C ... The first round, which compiles and fills caches, does not count, except for
-    those whose one call takes all of their time.
+    """Time variants in alternation: A B C A B C ... The first round warms caches and is discarded, except for variants whose
+    single call exceeds the budget.
 
-    A variant that has had its repetitions drops out, so after the slow ones only the fast ones go on.
+    A variant that has had its repetitions drops out.
     """
     first = {name: clock(work) for name, work in variants.items()}
     seconds: dict[str, list[float]] = {name: [taken] if taken >= effort.seconds else [] for name, taken in first.items()}

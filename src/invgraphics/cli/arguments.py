@@ -175,12 +175,12 @@ def parse_samples(count: int | None) -> int | None:
 
 
 def parse_list(text: str, option: str) -> tuple[str, ...]:
-    """Read a comma-separated list.
+    """Read a comma-separated list; commas within brackets do not separate.
 
     Raises:
         InputError: nothing in it.
     """
-    items = tuple(item.strip() for item in text.split(",") if item.strip())
+    items = tuple(item.strip() for item in re.split(r",(?![^\[]*\])", text) if item.strip())
     if not items:
         raise InputError(f"{option} is empty.", "Expected one name or several, with commas between them.")
     return items

@@ -18,8 +18,8 @@ from invgraphics.cli.output import show_table
 from invgraphics.errors import InputError
 
 if TYPE_CHECKING:
-    from invgraphics.bench.plots import Look
-    from invgraphics.bench.run import Request
+    from invgraphics.bench.plots import PlotStyle
+    from invgraphics.bench.run import BenchRequest
 
 
 @dataclass(frozen=True)
@@ -79,21 +79,21 @@ class Bench:
                 raise InputError(f"--only: there is no part '{part}'.", f"Parts: {', '.join(PARTS)}.")
         return parts
 
-    def request(self, parts: tuple[str, ...]) -> Request:
+    def request(self, parts: tuple[str, ...]) -> BenchRequest:
         """The same as plain values, checked.
 
         Raises:
             InputError: the kernels are unknown, or do not work here.
         """
         from invgraphics import kernels
-        from invgraphics.bench.run import Request
+        from invgraphics.bench.run import BenchRequest
         from invgraphics.errors import InputError
-        from invgraphics.kernels.dispatch import here
+        from invgraphics.kernels.dispatch import cpu_implementations
 
         with kernels.using(self.kernels):  # refuses what cannot be used
-            if self.kernels not in (None, *here()):
+            if self.kernels not in (None, *cpu_implementations()):
                 raise InputError(f"The {self.kernels} kernels do not run on a CPU, and that is what `bench` measures.")
-            return Request(parts, self.quick, self.kernels, lambda sentence: print(sentence, file=sys.stderr, flush=True))
+            return BenchRequest(parts, self.quick, self.kernels, lambda sentence: print(sentence, file=sys.stderr, flush=True))
 
     def _record(self) -> dict[str, object]:
         import torch
@@ -109,12 +109,12 @@ def _load() -> str:
     return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
 
 
-def _look() -> Look:
+def _look() -> PlotStyle:
     """The look of the reports."""
     from importlib.resources import files
 
-    from invgraphics.bench.plots import Look
+    from invgraphics.bench.plots import PlotStyle
     from invgraphics.report.figures import style
 
     sheet = files("invgraphics.report").joinpath("templates", "style.css").read_text(encoding="utf-8")
-    return Look(style.canvas, style.save, style.series_style, sheet)
+    return PlotStyle(style.canvas, style.save, style.series_style, sheet)

@@ -25,7 +25,7 @@ class Compare(Shared):
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """A built-in scene (see `invgraphics list scenes`), or the path of a data set."""
     methods: Annotated[str, arg(metavar="A,B,C")]
-    """Methods with commas between them (see `invgraphics list methods`)."""
+    """Methods with commas between them (see `invgraphics list methods`); METHOD:key=value changes a value of the recipe."""
     seeds: Annotated[str, arg(metavar="0,1,2")] = "0"
     """Each method is fitted once per seed."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/compare-SCENE)")] = None

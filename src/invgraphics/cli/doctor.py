@@ -74,9 +74,9 @@ def _processor() -> Iterator[Finding]:
 
 def _kernels(warm_up: bool) -> Finding:
     from invgraphics import kernels
-    from invgraphics.kernels.dispatch import why_not
+    from invgraphics.kernels.dispatch import unavailable_reason
 
-    reason = why_not("numba")
+    reason = unavailable_reason("numba")
     if reason:
         return Finding("Numba kernels", f"not usable: {reason}", "reinstall with `pip install --force-reinstall numba`")
     compiled = f", compiled in {kernels.warm_up():.1f} s" if warm_up else ", compiled at first use (--warm-up does it now)"

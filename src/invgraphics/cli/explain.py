@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 ROWS = 24
 """Contributions that are printed, those that weigh most; the file has all."""
-NOUNS = {"samples": "samples", "splats": "splats", "gaussians": "Gaussians"}
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ def show_contributions(explanation: Explanation) -> None:
     """Print the contributions that weigh most, in the order in which they are composited."""
     found = explanation.contributions
     heaviest = sorted(found.weight.argsort(descending=True)[:ROWS].tolist())
-    names = ["distance", "from", "to", "alpha", "T", "weight", "red", "green", "blue"]
+    names = ["distance (world)", "from", "to", "alpha", "T", "weight", "red", "green", "blue"]
     columns = [found.t, found.begin, found.end, found.alpha, found.transmittance, found.weight, *found.rgb.T]
     if found.density is not None:
         names.insert(3, "density")
@@ -84,7 +83,7 @@ def show_contributions(explanation: Explanation) -> None:
     record = explanation.record
     what = f"pixel {record.pixel.column},{record.pixel.row} of {record.split} view {record.view}"
     shown = "" if len(rows) == len(found) else f", the {len(rows)} heaviest"
-    show_table(f"{record.method}, {what}: {len(found)} {NOUNS[found.kind]}{shown}", ["", *names], rows)
+    show_table(f"{record.method}, {what}: {len(found)} {found.kind}{shown}", ["", *names], rows)
 
 
 def sentences(explanation: Explanation) -> list[str]:
@@ -101,7 +100,7 @@ def sentences(explanation: Explanation) -> list[str]:
         told.append(f"In the whole model, {record.dead.sentence}")
     depths = {"mean": pixel.expected, "median": pixel.median, "true": pixel.true_depth}
     known = [f"{name} {value:.4g}" for name, value in depths.items() if value is not None]
-    return [*told, f"Depth: {', '.join(known)}."] if known else told
+    return [*told, f"Depth in world units: {', '.join(known)}."] if known else told
 
 
 def _colour(values: Sequence[float | None]) -> str:

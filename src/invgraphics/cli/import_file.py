@@ -52,26 +52,23 @@ class ImportFile:
         if not self.file.is_file():
             raise InputError(f"There is no file '{self.file}'.")
 
+        from invgraphics.experiments.request import FitRequest
         from invgraphics.runs.folder import RunFolder
         from invgraphics.tools.import_gaussians import ImportRequest, import_run
 
         out = self.out or Path("runs") / f"{Path(self.scene).resolve().name}-{self.file.name}"
-        folder = import_run(
-            ImportRequest(
-                file=str(self.file),
-                scene=self.scene,
-                out=str(out),
-                method=self.method,
-                overrides=tuple(self.overrides),
-                frame=self.frame,
-                world=self.world,
-                size=size,
-                test_views=views,
-                device=self.device,
-                kernels=self.kernels,
-                protocol=self.protocol,
-            )
+        run = FitRequest(
+            scene=self.scene,
+            out=str(out),
+            method=self.method,
+            overrides=tuple(self.overrides),
+            size=size,
+            test_views=views,
+            device=self.device,
+            kernels=self.kernels,
+            protocol=self.protocol,
         )
+        folder = import_run(ImportRequest(file=str(self.file), run=run, frame=self.frame, world=self.world))
         show_scores(RunFolder(folder).read_scores())
         print(folder)
         return 0

@@ -109,10 +109,9 @@ def _list_studies() -> None:
 
 
 def _list_protocols() -> None:
-    from invgraphics.metrics.conventions import CONVENTIONS, PROTOCOLS
+    from invgraphics.metrics.conventions import PROTOCOLS
 
-    rows = [(name, protocol.summary, "built in") for name, protocol in PROTOCOLS.items()]
-    rows += [(name, convention.summary, convention.source) for name, convention in CONVENTIONS.items()]
+    rows = [(name, protocol.summary, protocol.source or "built in") for name, protocol in PROTOCOLS.items()]
     show_table("Protocols (for --protocol of rescore; fit and evaluate take ours)", ("name", "summary", "as read in"), rows)
 
 

@@ -60,9 +60,9 @@ class MakeScene:
         if isinstance(size, tuple):
             return size
 
-        from invgraphics.scenes.mitsuba.spec import locate, read
+        from invgraphics.scenes.mitsuba.spec import description_path, read
 
-        width, height = read(locate(self.scene)).size
+        width, height = read(description_path(self.scene)).size
         return round(size * width / max(width, height)), round(size * height / max(width, height))
 
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from tyro.conf import Positional, arg
 
 from invgraphics.cli.arguments import parse_size
+from invgraphics.errors import InputError
 from invgraphics.runs.folder import check_run
+
+if TYPE_CHECKING:
+    from invgraphics.tools.film import FilmPath
+
+NAMES = ("orbit", "spiral", "interpolate", "timelapse")
 
 
 @dataclass(frozen=True)
@@ -21,13 +27,15 @@ class Render:
     out: Annotated[Path, arg(metavar="FILM.mp4")]
     """File to write."""
     path: Annotated[
-        Literal["orbit", "spiral", "interpolate", "timelapse"] | None,
-        arg(help_behavior_hint="(default: what suits the capture)"),
+        str | None,
+        arg(metavar="orbit|spiral|interpolate|timelapse|FILE.json", help_behavior_hint="(default: what suits the capture)"),
     ] = None
     """The camera's path: orbit where photographs surround the subject, spiral where they face one way, else interpolate from
-    photograph to photograph. A timelapse stands still and shows the states that `fit --snapshots N` kept; of Gaussians also the
-    ellipsoids."""
-    frames: Annotated[int, arg(metavar="N")] = 90
+    photograph to photograph; or a file that `invgraphics view` saved. A timelapse stands still and shows the states that
+    `fit --snapshots N` kept; of Gaussians also the ellipsoids."""
+    show: Literal["prediction", "depth", "normal"] = "prediction"
+    """What the pictures show; depth in world units, which are printed, and in one range for all."""
+    frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 90, or the duration of FILE.json)")] = None
     """Pictures of a path."""
     fps: Annotated[int, arg(metavar="N")] = 15
     """Pictures per second."""
@@ -45,5 +53,22 @@ class Render:
 
         from invgraphics.tools.film import FilmRequest, film
 
-        print(film(FilmRequest(self.folder, self.out, self.path, self.frames, self.fps, size, self.view, self.scene)))
+        path = parse_path(self.path)
+        request = FilmRequest(self.folder, self.out, path, self.frames, self.fps, size, self.view, self.scene, self.show)
+        print(film(request))
         return 0
+
+
+def parse_path(text: str | None) -> FilmPath | Path | None:
+    """The name of a camera path, or the file of a saved one.
+
+    Raises:
+        InputError: neither.
+    """
+    if text is None or text in NAMES:
+        return cast("FilmPath | None", text)
+    if Path(text).suffix == ".json":
+        return Path(text)
+    raise InputError(
+        f"--path cannot be '{text}'.", f"Expected {', '.join(NAMES)}, or a .json file saved by `invgraphics view`."
+    )

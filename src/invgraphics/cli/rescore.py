@@ -42,13 +42,13 @@ class Rescore:
             raise InputError("There is nothing to score.", "Give a run, or a folder of predicted pictures.")
 
         from invgraphics.tools.predictions import open_pictures
-        from invgraphics.tools.rescore import rescore, rules_named
+        from invgraphics.tools.rescore import protocols_named, rescore
         from invgraphics.tools.rescoring import reasons, rows_of, winners, write_scores, write_tables
 
-        rules = rules_named(self.protocol)
+        protocols = protocols_named(self.protocol)
         compared = {folder: RunFolder(folder).has(ComparisonRecord) for folder in self.folders}
         folders = [one for folder in self.folders for one in (runs_in(folder) if compared[folder] else [folder])]
-        results = rescore([open_pictures(folder, self.truth, background) for folder in folders], rules, self.allow_8bit)
+        results = rescore([open_pictures(folder, self.truth, background) for folder in folders], protocols, self.allow_8bit)
         for one in results:
             width, height = one.pictures.size
             title = f"{one.label}: {len(one.pictures.names)} views of {width}x{height}, truth {one.pictures.sha256[:12]}"

@@ -1,4 +1,4 @@
-"""``invgraphics view``: a window into a run, in a browser."""
+"""``invgraphics view``: interactive viewer of a run in a browser."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from invgraphics.errors import InputError
 
 @dataclass(frozen=True)
 class View:
-    """Look around in a run, or in two of one scene side by side, in a browser: coarse while moving, fine when still.
+    """View a run in a browser, or two of one scene side by side: at reduced resolution while moving, at full size at rest.
 
     Shows prediction, truth, error, depth and normals, and the photographs where they were taken. Ctrl-C ends it.
     """
@@ -48,11 +48,11 @@ class View:
         if self.max_size < SMALLEST:
             raise InputError(f"--max-size cannot be {self.max_size}.", f"Expected {SMALLEST} pixels or more.")
 
-        from invgraphics.viewer.view import ViewRequest, is_loopback, open_viewer
+        from invgraphics.viewer.launch import ViewerConfig, is_loopback, open_viewer
 
         runs = (self.folder,) if self.other is None else (self.folder, self.other)
-        request = ViewRequest(runs, self.live, self.view, self.host, self.port, self.max_size, self.scene)
-        with open_viewer(request, _say) as viewer:
+        config = ViewerConfig(runs, self.live, self.view, self.host, self.port, self.max_size, self.scene)
+        with open_viewer(config, _say) as viewer:
             host = self.host if is_loopback(self.host) else "localhost"
             url = f"http://{f'[{host}]' if ':' in host else host}:{viewer.port}"
             if not is_loopback(self.host):
@@ -61,12 +61,12 @@ class View:
             if self.open and _has_screen():
                 webbrowser.open(url)
             with contextlib.suppress(KeyboardInterrupt):
-                viewer.watch(self.live)
+                viewer.serve(self.live)
         return 0
 
 
 def _has_screen() -> bool:
-    """Whether a browser would have a window; on a bare terminal a text browser would take it over."""
+    """Whether there is a display; without one a text browser would take over the terminal."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 

@@ -2,17 +2,21 @@
 
 from invgraphics.core.bounds import Bounds as Bounds
 from invgraphics.core.camera import Camera as Camera
-from invgraphics.core.field import Conditional as Conditional
+from invgraphics.core.contributions import Contributions as Contributions
+from invgraphics.core.contributions import Pass as Pass
+from invgraphics.core.contributions import Profile as Profile
 from invgraphics.core.field import Encoding as Encoding
 from invgraphics.core.field import Field as Field
 from invgraphics.core.field import Gaussians as Gaussians
 from invgraphics.core.field import Quantity as Quantity
-from invgraphics.core.field import RayRenderer as RayRenderer
-from invgraphics.core.field import Renderer as Renderer
-from invgraphics.core.field import Sampler as Sampler
-from invgraphics.core.field import check as check
-from invgraphics.core.field import no_grad_density as no_grad_density
+from invgraphics.core.model import Model as Model
+from invgraphics.core.ngp import FusedNGP as FusedNGP
+from invgraphics.core.ngp import HashGrid as HashGrid
 from invgraphics.core.rays import Rays as Rays
+from invgraphics.core.renderer import RayRenderer as RayRenderer
+from invgraphics.core.renderer import Renderer as Renderer
+from invgraphics.core.renderer import Sampler as Sampler
+from invgraphics.core.renderer import check as check
 from invgraphics.core.rendering import Context as Context
 from invgraphics.core.rendering import Rendering as Rendering
 from invgraphics.core.rendering import Screen as Screen

@@ -27,12 +27,15 @@ class Bounds:
         space: ``box`` ends rays at the box; ``contracted`` maps all space into a ball of twice the box's size
             (mip-NeRF 360, equation 10).
         near: no sample is taken closer to a camera than this, in local units.
+        crop: lowest and highest corner of a box outside which rays have no samples; the field's coordinates do not depend on
+            it (instant-ngp's render_aabb). ``None`` for no crop.
     """
 
     lo: Float[Tensor, 3]
     hi: Float[Tensor, 3]
     space: Space = "box"
     near: float = 0.05
+    crop: tuple[Float[Tensor, 3], Float[Tensor, 3]] | None = None
 
     @property
     def centre(self) -> Float[Tensor, 3]:
@@ -75,23 +78,34 @@ class Bounds:
         return x & y & z
 
     def clip(self, rays: Rays) -> Rays:
-        """Give rays their sampling interval: the box's entry and exit, or [near, FAR half-extents] when contracted.
+        """Give rays their sampling interval: the box's entry and exit, or [near, FAR half-extents] when contracted; less what
+        is outside ``crop``.
 
         A ray that misses the box gets ``far = near``.
         """
+        rays = self._clip_to_field(rays)
+        return rays if self.crop is None else _clip_to_box(rays, *self.crop)
+
+    def _clip_to_field(self, rays: Rays) -> Rays:
         if self.space == "contracted":
             far = FAR * float(self.half.max())
             return rays.within(rays.near.clamp_min(self.near), rays.far.clamp_max(far))
-        # Slab test; an axis-parallel ray divides by zero, and the infinities then sort themselves out.
-        direction = torch.where(rays.directions == 0, torch.full_like(rays.directions, 1e-20), rays.directions)
-        a, b = (self.lo - rays.origins) / direction, (self.hi - rays.origins) / direction
-        near = torch.minimum(a, b).amax(dim=1).maximum(rays.near.clamp_min(self.near))
-        far = torch.maximum(a, b).amin(dim=1).minimum(rays.far)
-        return rays.within(near, far.maximum(near))
+        return _clip_to_box(rays.within(rays.near.clamp_min(self.near), rays.far), self.lo, self.hi)
 
     def to(self, *args: Any) -> Bounds:
         """Move or cast the tensors."""
-        return replace(self, lo=self.lo.to(*args), hi=self.hi.to(*args))
+        crop = None if self.crop is None else (self.crop[0].to(*args), self.crop[1].to(*args))
+        return replace(self, lo=self.lo.to(*args), hi=self.hi.to(*args), crop=crop)
+
+
+def _clip_to_box(rays: Rays, lo: Float[Tensor, 3], hi: Float[Tensor, 3]) -> Rays:
+    """Intersect the rays' intervals with a box."""
+    # Slab test; an axis-parallel ray divides by zero, and the infinities then sort themselves out.
+    direction = torch.where(rays.directions == 0, torch.full_like(rays.directions, 1e-20), rays.directions)
+    a, b = (lo - rays.origins) / direction, (hi - rays.origins) / direction
+    near = torch.minimum(a, b).amax(dim=1).maximum(rays.near)
+    far = torch.maximum(a, b).amin(dim=1).minimum(rays.far)
+    return rays.within(near, far.maximum(near))
 
 
 def contract(x: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:

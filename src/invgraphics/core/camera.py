@@ -59,6 +59,10 @@ class Camera:
         pixels = self.pixel_centres().reshape(-1, 2) if pixels is None else pixels
         return _rays(pixels, self.cam_to_world, (self.focal, self.centre), view)
 
+    def ray(self, pixel: tuple[int, int]) -> Rays:
+        """The one ray through the centre of ``pixel``: column and row, from 0."""
+        return self.rays(self.focal.new_tensor([pixel]) + 0.5)
+
     def project(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
         """Image coordinates (x, y) of world points and their depth along the optical axis (z in camera axes).
 

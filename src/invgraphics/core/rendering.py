@@ -1,4 +1,4 @@
-"""What a renderer gives back: a picture, and a trace of how it was made."""
+"""A renderer's results: a picture, and a trace of the samples or primitives behind it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.compositing import over
+from invgraphics.core.display import encode_png
 from invgraphics.core.samples import FieldValues, Samples
 
 
@@ -22,7 +23,7 @@ class Rendering:
         rgb: colour, premultiplied by alpha, in the scene's colour space.
         alpha: opacity in [0, 1].
         depth: expected distance along the unit ray, Σ w t / Σ w, local units; ``far`` (may be inf) where alpha < 0.5.
-        normal: unit, local frame, facing the camera; zero where alpha < 0.5. ``None`` where it was not asked for.
+        normal: unit, local frame, facing the camera; zero where alpha < 0.5. ``None`` where it was not rendered.
     """
 
     rgb: Float[Tensor, "*p 3"]
@@ -44,6 +45,15 @@ class Rendering:
         normal = None if self.normal is None else self.normal.detach()
         return Rendering(self.rgb.detach(), self.alpha.detach(), self.depth.detach(), normal)
 
+    def to(self, device: torch.device | str) -> Rendering:
+        """The same picture on another device."""
+        normal = None if self.normal is None else self.normal.to(device)
+        return Rendering(self.rgb.to(device), self.alpha.to(device), self.depth.to(device), normal)
+
+    def _repr_png_(self) -> bytes | None:
+        """The picture in a notebook, over white, taken as display sRGB; ``None`` for pixels that are no picture."""
+        return encode_png(self.over(torch.ones(3, device=self.rgb.device))) if self.rgb.ndim == 3 else None
+
     @staticmethod
     def cat(parts: Sequence[Rendering]) -> Rendering:
         """Join packed renderings, in order."""
@@ -58,14 +68,14 @@ class Rendering:
 
 @dataclass(eq=False)
 class Screen:
-    """What a splatting pass knows about its n primitives, for density control and for losses on them.
+    """Screen-space state of n splatted primitives, for density control and for losses on them.
 
     Attributes:
         means2d: image positions; after ``backward`` its ``grad`` is the gradient in pixels.
         radii: extent in pixels, 0 where the primitive was culled.
         width: image width in pixels.
         height: image height in pixels.
-        pull: after ``backward`` its ``grad`` is the sum over pixels of the absolute gradients in pixels, where that was wanted.
+        absgrad: after ``backward`` its ``grad`` is the sum of absolute gradients over pixels; ``None`` if not wanted.
         opacities: peak opacities in [0, 1].
         scales: standard deviations along the primitives' axes, local units.
     """
@@ -74,26 +84,26 @@ class Screen:
     radii: Float[Tensor, " n"]
     width: int
     height: int
-    pull: Float[Tensor, "n 2"] | None = None
+    absgrad: Float[Tensor, "n 2"] | None = None
     opacities: Float[Tensor, " n"] | None = None
     scales: Float[Tensor, "n 3"] | None = None
 
     @property
     def gradient(self) -> Float[Tensor, "n 2"] | None:
-        """What pulls each primitive over the screen, in loss per pixel: of absolute values, if those were wanted."""
-        return self.means2d.grad if self.pull is None else self.pull.grad
+        """Screen-space gradient ∂L/∂means2d, in loss per pixel; in absolute values where ``absgrad`` is there."""
+        return self.means2d.grad if self.absgrad is None else self.absgrad.grad
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """How a picture came about, for losses and for study; never for scores.
+    """Samples, weights and screen-space state behind a rendering, for losses and for study; never for scores.
 
     Attributes:
         samples: the samples of the last level, if the renderer took any.
-        values: what the field said there.
+        values: the field's values there.
         weights: contribution T_i alpha_i of each sample to its ray.
         levels: traces of earlier passes (coarse or proposal), first to last.
-        screen: what a splatting pass knows about its primitives.
+        screen: screen-space state of a splatting pass.
         rays: number of rays rendered.
     """
 
@@ -107,15 +117,15 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """Circumstances of one rendering.
+    """Settings of one rendering, besides the camera.
 
     Attributes:
         bounds: the region the field describes.
-        training: whether randomness (jitter, dropout of detail) is wanted; evaluation is deterministic.
+        training: whether there is randomness (jitter, dropout of detail); evaluation is deterministic.
         progress: how much of the fit's budget is spent, in [0, 1].
         generator: source of randomness; ``None`` uses torch's global one.
-        chunk: most samples to hand to a field at once.
-        geometry: whether normals are wanted (they can cost a gradient).
+        chunk: most samples of one field query.
+        geometry: whether normals are rendered (they can cost a gradient).
     """
 
     bounds: Bounds

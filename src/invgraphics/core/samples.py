@@ -1,4 +1,4 @@
-"""Packed samples along rays, and what a field says about them."""
+"""Packed samples along rays, and a field's values at samples."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Samples:
         direction: unit direction of the ray.
         radius: pixel footprint of the ray at distance 1.
         view: training-view index of the ray, -1 where there is none.
-        density: what the sampler has found the field's density to be, outside the graph; ``None`` where it did not ask.
-        features: what the field told the sampler besides, from which it can say a colour without looking there again.
+        density: the field's density as the sampler has queried it, outside the graph; ``None`` where it did not.
+        features: the field's features from the same query, from which it evaluates radiance without another look-up.
     """
 
     ray: Int[Tensor, " m"]
@@ -46,7 +46,7 @@ class Samples:
 
     @staticmethod
     def at(position: Float[Tensor, "m 3"], direction: Float[Tensor, "m 3"] | None = None) -> Samples:
-        """Free-standing points, for asking a field outside a rendering; without a direction they look along +z."""
+        """Points without rays, for field queries outside a rendering; without ``direction`` it is +z."""
         m, none = len(position), torch.zeros_like(position[:, 0])
         if direction is None:
             direction = position.new_tensor([0.0, 0.0, 1.0]).expand(m, 3)
@@ -85,7 +85,7 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class FieldValues:
-    """What a field says at m samples; what was not asked for is ``None``.
+    """Values of a field at m samples; quantities that were not queried are ``None``.
 
     Attributes:
         density: volume density, per local length unit, >= 0.

@@ -13,7 +13,9 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
+from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.compositing import straight_over
+from invgraphics.core.display import contact_sheet, encode_png, figure_html
 
 Pixels = UInt8[Tensor, "h w c"] | Float[Tensor, "h w c"]
 
@@ -30,7 +32,7 @@ class View:
         depth: true distance along the unit ray, local units, inf where nothing is hit; one ray per pixel centre.
         normal: true unit normal, local frame, facing the camera; zero where nothing is hit.
         mask: True where the pixel counts; ``None`` means everywhere.
-        undisturbed: the camera's pose before it was disturbed on purpose; ``None`` where it was not. For scores only.
+        ground_truth_pose: the camera's pose before it was degraded on purpose; ``None`` where it was not. For scores only.
     """
 
     camera: Camera
@@ -40,12 +42,12 @@ class View:
     depth: Float[Tensor, "h w"] | None = None
     normal: Float[Tensor, "h w 3"] | None = None
     mask: Tensor | None = None
-    undisturbed: Float[Tensor, "4 4"] | None = None
+    ground_truth_pose: Float[Tensor, "4 4"] | None = None
 
     @property
     def true_pose(self) -> Float[Tensor, "4 4"]:
         """The best that is known of the camera's pose; fits see ``camera`` only."""
-        return self.camera.cam_to_world if self.undisturbed is None else self.undisturbed
+        return self.camera.cam_to_world if self.ground_truth_pose is None else self.ground_truth_pose
 
     def colour(self, index: Tensor | None = None) -> Float[Tensor, "*p 3"]:
         """Straight colour as floats: the whole image, or the pixels with flat indices ``index`` only."""
@@ -64,6 +66,10 @@ class View:
             return self.colour(index)
         return straight_over(self.colour(index), self.opacity(index), background)
 
+    def _repr_png_(self) -> bytes:
+        """The photograph in a notebook, over white, taken as display sRGB."""
+        return encode_png(self.over(torch.ones(3, device=self.image.device)))
+
 
 def _floats(values: Tensor) -> Tensor:
     return values.float() / 255 if values.dtype == torch.uint8 else values.float()
@@ -78,6 +84,10 @@ class Points:
 
     def __len__(self) -> int:
         return len(self.position)
+
+    def joined(self, others: Points) -> Points:
+        """These points, then the others."""
+        return Points(torch.cat([self.position, others.position]), torch.cat([self.rgb, others.rgb]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +159,21 @@ class Scene:
                     sha.update(repr((tuple(values.shape), str(values.dtype))).encode())
                     sha.update(np.ascontiguousarray(values.cpu().numpy()).tobytes())
         return sha.hexdigest()
+
+    def _repr_html_(self) -> str:
+        """A contact sheet and the scene's facts, in a notebook."""
+        pictures = [view.over(self.background).cpu() for view in (*self.train[:12], *self.test[:4])]
+        shown = [linear_to_srgb(picture) for picture in pictures] if self.colour == "linear" else pictures
+        sizes = {f"{view.camera.width} x {view.camera.height}" for view in (*self.train, *self.test)}
+        facts = {
+            "scene": self.name,
+            "views": f"{len(self.train)} to fit, {len(self.val)} to watch, {len(self.test)} to score",
+            "pixels": ", ".join(sorted(sizes)),
+            "bounds": f"{self.bounds.space}, {self.bounds.lo.tolist()} to {self.bounds.hi.tolist()}",
+            "colour": f"{self.colour}, {'with alpha' if self.has_alpha else 'opaque'}",
+            "points": "none" if self.points is None else f"{len(self.points):,}",
+        }
+        return figure_html(contact_sheet(shown), facts)
 
     def camera_digest(self) -> str:
         """SHA-256 of all cameras of all splits, in world order of the views."""

@@ -5,28 +5,24 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-
-import torch
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import device_of, open_requested, requested_method, training_data
+from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.base import INTERRUPTED
 from invgraphics.experiments.executors.local import LocalExecutor
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import protocol_note
-from invgraphics.experiments.recorder import Cadence
-from invgraphics.experiments.renderings import check_eyes
+from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
-from invgraphics.metrics.protocols import protocol_named
 from invgraphics.runs.comparison import ComparisonRecord, Failure, SceneFacts
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.scores import quality_of
-from invgraphics.scenes.corrupt import corrupt
-from invgraphics.training.budget import Budget
+from invgraphics.scenes.degrade import degrade
 
 
 def compare(request: CompareRequest) -> tuple[Path, int]:
@@ -42,11 +38,11 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
         KeyboardInterrupt: interrupted; the record covers what is finished.
     """
     began = time.monotonic()
-    scene = _validate(request)
+    jobs, scene = _resolve(request)
     folder = RunFolder(Path(request.out))
     folder.create()
     failures: list[Failure] = []
-    summary = _summary(request, scene)
+    summary = _summary(request, jobs, scene)
     interrupted = False
     try:
         with closing(LocalExecutor().run(request.fits(), folder.root / "jobs")) as outcomes:
@@ -67,30 +63,29 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
     return folder.root, len(failures)
 
 
-def _validate(request: CompareRequest) -> Scene:
-    """Look at everything that could be wrong before any time is spent."""
+def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
+    """A job of each method, with the first seed, and the scene as that one sees it.
+
+    Raises:
+        InputError: anything that could be wrong, before any time is spent.
+    """
     if not request.methods:
         raise InputError("--methods is empty.", "Example: --methods volumetric/hash,splatting/gaussians.")
     if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
         raise InputError("A method or a seed is named twice.")
-    Budget.parse(request.budget)
-    Cadence.parse(request.checkpoint_every)
-    device_of(request.device)
-    protocol_named(request.protocol)
-    methods = [requested_method(name, request) for name in request.methods]
-    data = training_data(request)
+    jobs = [Job.of(fit) for fit in request.fits() if fit.seed == request.seeds[0]]
     RunFolder(Path(request.out)).create()
-    scene = open_requested(request)
-    check_eyes(request.render_with, methods, scene)
-    return corrupt(scene, data, request.seeds[0])
+    scene = open_with_progress(request.scene, jobs[0].options)
+    check_variants(jobs[0].variants, [job.method for job in jobs], scene)
+    return jobs, degrade(scene, jobs[0].data, request.seeds[0])
 
 
-def _summary(request: CompareRequest, scene: Scene) -> ComparisonRecord:
+def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> ComparisonRecord:
     """Everything that is known before the fits."""
-    protocol = protocol_named(request.protocol)
+    protocol, budget = jobs[0].protocol, jobs[0].budget
     camera = scene.test[0].camera
-    names, budget = ", ".join(request.methods), Budget.parse(request.budget)
-    methods = [requested_method(name, request) for name in request.methods]
+    names = ", ".join(request.methods)
+    methods = [job.method for job in jobs]
     notes = {protocol_note(method) for method in methods} - {""}
     baselines = baseline_scores(scene, protocol)
     return ComparisonRecord(
@@ -109,9 +104,9 @@ def _summary(request: CompareRequest, scene: Scene) -> ComparisonRecord:
         command=request.shell(),
         baselines={name: quality_of(quality) for name, quality in baselines.items()},
         noise_ceiling=scene.noise_ceiling,
-        protocol=asdict(protocol) | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
+        protocol=protocol.record() | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
         scene_info=_scene_facts(scene),
-        environment=environment(torch.device(request.device or "cpu")),
+        environment=environment(jobs[0].device),
         runs=(),
     )
 

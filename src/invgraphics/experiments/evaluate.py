@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -12,13 +14,13 @@ import numpy as np
 import torch
 from PIL import Image
 
-from invgraphics.core import Camera, Context, Field, Renderer, Rendering, Scene, View
+from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
-from invgraphics.experiments.shortfall import observe, shortfall
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
@@ -34,24 +36,12 @@ TIMED = 6
 """Test views that are timed where the truth has normals, at most: there the timed picture is one more than the scored one."""
 
 
-def render_view(
-    field: Field, renderer: Renderer, camera: Camera, scene: Scene, device: torch.device, geometry: bool = True
-) -> Rendering:
-    """One picture for scoring: deterministic, on the CPU, outside the graph."""
-    ctx = Context(scene.bounds.to(device), training=False, geometry=geometry)
-    with torch.no_grad():
-        rendering, _ = renderer.render_image(field, camera.to(device), ctx)
-    rendering = rendering.detach()
-    normal = None if rendering.normal is None else rendering.normal.cpu()
-    return Rendering(rendering.rgb.cpu(), rendering.alpha.cpu(), rendering.depth.cpu(), normal)
-
-
-def expected_seconds(field: Field, renderer: Renderer, scene: Scene, device: torch.device) -> float:
+def expected_seconds(model: Model, scene: Scene) -> float:
     """Seconds for all test views, extrapolated from one small picture with the unfitted model."""
     camera = scene.test[0].camera
     small = camera.resized(max(8, camera.width // 8), max(8, camera.height // 8))
     began = time.perf_counter()
-    render_view(field, renderer, small, scene, device)
+    model.render(small)
     seconds = time.perf_counter() - began
     return seconds * len(scene.test) * (camera.width * camera.height) / (small.width * small.height)
 
@@ -59,7 +49,7 @@ def expected_seconds(field: Field, renderer: Renderer, scene: Scene, device: tor
 def evaluate(
     folder: RunFolder,
     scene: Scene,
-    model: tuple[Field, Renderer],
+    model: Model,
     protocol: str,
     costs: dict[str, float | None],
     method: Method,
@@ -69,73 +59,98 @@ def evaluate(
 
     Where the fit has refined its training poses, test poses are aligned and refined first (see `experiments.posed`).
     """
-    rules = protocol_named(protocol)
-    field, renderer = model
-    device = next(field.parameters()).device
     folder.arrays(0).parent.mkdir(exist_ok=True)
-    scores, seconds, observed = [], [], []
-    posed = None if poses is None else PosedEvaluation(poses, scene, model)
-    with Reporter(f"{method.name} evaluation") as reporter:
-        render_view(field, renderer, scene.test[0].camera.resized(16, 16), scene, device)  # first use pays for allocation
-        for index, view in enumerate(scene.test):
-            camera = view.camera if posed is None else posed.camera(view)
-            timed = index % ceil(len(scene.test) / TIMED) == 0
-            picture, took = _picture(model, camera, scene, normals=view.normal is not None, timed=timed)
-            seconds += took
-            picture = picture if posed is None else posed.as_seen(picture, camera, view)
-            _save_view(folder, index, picture, scene)
-            scores.append(score(picture, view, scene, rules))
-            observed.append(observe(picture, view.camera, scene))
-            reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
-    quality, skipped = summarise(scores, rules)
-    joined = quality_of(quality)
-    result = Scores(
-        method=method.name,
+    found = score_model(
+        model,
+        scene,
+        protocol,
+        method.name,
+        poses,
+        keep=lambda index, picture: _save_view(folder, index, picture, scene),
+    )
+    result = replace(
+        found,
         preset=method.preset,
         preset_choice=method.preset_choice,
-        scene=scene.name,
         seed=folder.read(Provenance).seed,
-        protocol=protocol,
-        views=tuple(view.name for view in scene.test),
-        cost=costs | _model_costs(model, scene, statistics.median(seconds)),
-        quality=joined if posed is None else joined | posed.quality(),
-        skipped=skipped,
+        cost=costs | found.cost,
         disturbed=disturbance(costs.get("fit_processor_share")),
-        shortfall=shortfall(method.name, quality, observed, scene, rules),
-        test_poses="" if posed is None else protocol_note(method),
+        test_poses="" if poses is None else protocol_note(method),
     )
     folder.write(result)
     return result
 
 
-def _model_costs(model: tuple[Field, Renderer], scene: Scene, seconds: float) -> dict[str, float | None]:
+def score_model(
+    model: Model,
+    scene: Scene,
+    protocol: str,
+    title: str,
+    poses: Poses | None = None,
+    keep: Callable[[int, Rendering], None] = lambda index, picture: None,
+) -> Scores:
+    """Render and score all test views of ``scene``; the part of the scores that needs no run folder.
+
+    Args:
+        model: what is scored.
+        scene: as loaded.
+        protocol: name of the rules.
+        title: what the model is called, on the progress bar, in sentences and in the scores.
+        poses: of the training views, where the fit has refined them: test poses are then aligned and refined first.
+        keep: is given each picture with the number of its view.
+    """
+    rules = protocol_named(protocol)
+    scores, seconds, statistics_of_views = [], [], []
+    posed = None if poses is None else PosedEvaluation(poses, scene, model)
+    with Reporter(f"{title} evaluation") as reporter:
+        model.render(scene.test[0].camera.resized(16, 16))  # first use pays for allocation
+        for index, view in enumerate(scene.test):
+            camera = view.camera if posed is None else posed.camera(view)
+            timed = index % ceil(len(scene.test) / TIMED) == 0
+            picture, took = _picture(model, camera, normals=view.normal is not None, timed=timed)
+            seconds += took
+            picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
+            keep(index, picture)
+            scores.append(score(picture, view, scene, rules))
+            statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
+            reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
+    quality, skipped = summarise(scores, rules)
+    joined = quality_of(quality)
+    return Scores(
+        method=title,
+        scene=scene.name,
+        protocol=protocol,
+        views=tuple(view.name for view in scene.test),
+        cost=_model_costs(model, scene, statistics.median(seconds)),
+        quality=joined if posed is None else joined | posed.quality(),
+        skipped=skipped,
+        shortfall=below_baseline(title, quality, statistics_of_views, scene, rules),
+    )
+
+
+def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, float | None]:
     """What a fitted model costs, and warns of primitives that no gradient could change; ``seconds`` are those of one view."""
-    field = model[0]
-    dead = dead_gaussians(field, [view.camera for view in scene.train])
+    dead = dead_gaussians(model.field, [view.camera for view in scene.train])
     if dead is not None and dead.share > DEAD_SHARE:
         warn(f"Warning: {dead.sentence()}")
     return {
         "render_seconds_per_view": seconds,
         "render_fps": 1 / max(seconds, 1e-9),
-        "model_bytes": model_bytes(model),
-        "parameters": parameter_count(model),
-        "primitives": field.primitive_count(),
+        "model_bytes": model_bytes(model.parts.values()),
+        "parameters": parameter_count(model.parts.values()),
+        "primitives": model.field.primitive_count(),
         "dead": None if dead is None else dead.share,
     }
 
 
-def _picture(
-    model: tuple[Field, Renderer], camera: Camera, scene: Scene, *, normals: bool, timed: bool
-) -> tuple[Rendering, list[float]]:
+def _picture(model: Model, camera: Camera, *, normals: bool, timed: bool) -> tuple[Rendering, list[float]]:
     """A picture for scoring, and the seconds that one takes as a viewer would ask for it: colour, alpha and depth."""
-    field, renderer = model
-    device = next(field.parameters()).device
     if normals and not timed:
-        return render_view(field, renderer, camera, scene, device), []
+        return model.render(camera), []
     began = time.perf_counter()
-    picture = render_view(field, renderer, camera, scene, device, geometry=False)
+    picture = model.render(camera, normals=False)
     seconds = [time.perf_counter() - began]
-    return (render_view(field, renderer, camera, scene, device) if normals else picture), seconds
+    return (model.render(camera) if normals else picture), seconds
 
 
 def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> Scores:
@@ -157,8 +172,8 @@ def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> Scores:
 
 
 def _evaluate_fitted(fitted: Fitted, protocol: str) -> Scores:
-    costs, model = fit_costs(fitted.source.read(FitRecord)), (fitted.field, fitted.renderer)
-    return evaluate(fitted.folder, fitted.scene, model, protocol, costs, fitted.method, fitted.poses)
+    costs = fit_costs(fitted.source.read(FitRecord))
+    return evaluate(fitted.folder, fitted.scene, fitted.model, protocol, costs, fitted.method, fitted.poses)
 
 
 def _save_view(folder: RunFolder, index: int, picture: Rendering, scene: Scene) -> None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from invgraphics import plugins
-from invgraphics.core import Field, Renderer, Scene
+from invgraphics.core import Model, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
-from invgraphics.experiments.posed import optimised, scene_of_fit
+from invgraphics.experiments.posed import refined_poses, scene_in_fit_frame
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.waiting import limit_spinning
+from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
@@ -29,10 +31,8 @@ class Fitted:
     Attributes:
         folder: of the run.
         method: its recipe.
-        scene: undisturbed, at the run's size and with its test views.
-        field: fitted.
-        renderer: fitted as well, where it has parameters.
-        device: where both are.
+        scene: as loaded, at the run's size and with its test views.
+        model: fitted, on the run's device.
         source: the folder that holds the checkpoint: the run itself, or the run that a rendering shows.
         poses: of the training views as the fit saw them, where it refined them.
     """
@@ -40,15 +40,24 @@ class Fitted:
     folder: RunFolder
     method: Method
     scene: Scene
-    field: Field
-    renderer: Renderer
-    device: torch.device
+    model: Model
     source: RunFolder
     poses: Poses | None = None
 
+    def load(self, state: Mapping[str, Mapping[str, Any]]) -> None:
+        """Take over a checkpoint's tensors; of a rendering, whose renderer was not fitted, only the field's.
+
+        Raises:
+            RuntimeError: they do not fit the model.
+        """
+        if self.source is self.folder:
+            self.model.load_state_dict(state)
+        else:
+            self.model.field.load_state_dict(state.get("field", {}))
+
     def in_its_frame(self) -> Fitted:
         """The same with the scene where the fit has it: a fit that refines poses may drift from those that it was given."""
-        return self if self.poses is None else replace(self, scene=scene_of_fit(self.poses, self.scene))
+        return self if self.poses is None else replace(self, scene=scene_in_fit_frame(self.poses, self.scene))
 
 
 def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
@@ -75,18 +84,20 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     provenance = folder.read(Provenance)
     method = replace(_method(folder, provenance), preset_choice=provenance.preset_choice)
     device = device_of("cuda" if provenance.device.startswith("cuda") and torch.cuda.is_available() else "cpu")
-    field, renderer = build_model(method, scene, provenance.seed, device)
+    model = build_model(method, scene, provenance.seed, device)
     shown = provenance.fitted_run
+    if shown is not None:
+        model = replace(model, renderer=model.renderer.untrained())
     source = folder if shown is None else RunFolder(folder.root / shown)
     state = checkpoint.load(source.checkpoint, device)
-    config = optimised(method)
+    config = refined_poses(method)
+    fitted = Fitted(folder, method, scene, model, source)
     try:
         poses = Poses.restored(config, state["poses"]).to(device) if config is not None and "poses" in state else None
-        field.load_state_dict(state.get("field", {}))
-        renderer.load_state_dict(state.get("renderer", {}) if shown is None else {})
+        fitted.load(state)
     except RuntimeError as error:
         raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
-    return Fitted(folder, method, scene, field, renderer, device, source, poses)
+    return replace(fitted, poses=poses)
 
 
 def _method(folder: RunFolder, provenance: Provenance) -> Method:

@@ -7,13 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.core import Scene
-from invgraphics.experiments.build import training_data
 from invgraphics.experiments.environment import code_version
-from invgraphics.experiments.request import FitRequest
-from invgraphics.recipes.recipe import Method
+from invgraphics.experiments.job import Job
 from invgraphics.runs.folder import RunFolder
 from invgraphics.text import sha256_of
-from invgraphics.training.budget import Budget
 
 
 @dataclass(frozen=True)
@@ -34,16 +31,16 @@ class TruthDigest:
         return TruthDigest((scene.digest("train"), scene.digest("val"), scene.digest("test")), scene.camera_digest())
 
 
-def identify(request: FitRequest, method: Method, truth: TruthDigest, threads: int) -> str:
+def identify(job: Job, truth: TruthDigest, threads: int) -> str:
     """The identity of a run: equal for equal bits, on one machine.
 
     Args:
-        request: what is asked for; its disturbances of training data follow from the undisturbed truth, the settings and the
-            seed, so that nothing needs to be disturbed to know them.
-        method: its resolved recipe.
-        truth: of the undisturbed scene.
+        job: of the run; its degradations of training data follow from the truth as loaded, the settings and the seed, so that
+            nothing needs to be disturbed to know them.
+        truth: of the scene as loaded.
         threads: of the process that fits, which decide the order of sums.
     """
+    method = job.method
     source = getattr(method.recipe.field, "source", "")
     started_from = {"source": RunFolder(Path(source)).identity} if source else {}
     return sha256_of(
@@ -53,23 +50,24 @@ def identify(request: FitRequest, method: Method, truth: TruthDigest, threads: i
             "recipe": method.digest,
             "truth": truth.pixels,
             "cameras": truth.cameras,
-            "data": training_data(request).changes(),
-            "request": _asked(request),
+            "data": job.data.changes(),
+            "request": _asked(job),
             "code": code_version(),
             "threads": threads,
         }
     )
 
 
-def define(request: FitRequest, method: Method) -> str:
+def define(job: Job) -> str:
     """The identity of a cell of a study: what it is asked for, whatever machine and code answer."""
+    request = job.request
     scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}
     scene |= {} if request.spp is None else {"spp": request.spp}  # so that studies without keep their folders' names
-    parts = {"method": method.name, "recipe": method.digest, "data": training_data(request).changes()}
-    return sha256_of(_asked(request) | scene | parts)
+    parts = {"method": job.method.name, "recipe": job.method.digest, "data": job.data.changes()}
+    return sha256_of(_asked(job) | scene | parts)
 
 
-def _asked(request: FitRequest) -> dict[str, Any]:
+def _asked(job: Job) -> dict[str, Any]:
     """Settings that decide a result; a budget counts, not its spelling."""
-    settings = {key: getattr(request, key) for key in ("seed", "device", "kernels", "protocol")}
-    return settings | {"budget": str(Budget.parse(request.budget))}
+    settings = {key: getattr(job.request, key) for key in ("seed", "device", "kernels", "protocol")}
+    return settings | {"budget": str(job.budget)}

@@ -1,6 +1,6 @@
-"""Evaluation of a fit that chose its training poses: both worlds are aligned, and test views look for their own poses.
+"""Evaluation of fits with refined training poses: the fit's frame is aligned, and test poses are refined to their views.
 
-The fit may have drifted by a similarity, so the undisturbed test poses are carried into its world by the one between true and
+The fit may have drifted by a similarity, so the test poses are transformed to its frame by the one between true and
 refined training poses. What remains of their errors belongs to the cameras rather than to the scene, so each is refined
 to its photograph before it is scored (BARF, §4.1).
 """
@@ -12,25 +12,25 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from invgraphics.core import Camera, Field, Renderer, Rendering, Scene, View
+from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.metrics.poses import PoseErrors, Similarity, pose_errors
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.scores import Score
-from invgraphics.training.localise import Descent, descend
+from invgraphics.training.localise import PoseDescent, refine_pose
 from invgraphics.training.poses import Poses, PosesConfig
 
 
 def protocol_note(method: Method) -> str:
-    """How test poses are treated, in words for a table of the protocol; empty where poses are taken as given."""
-    config = optimised(method)
+    """How test poses are aligned and refined, for a table of the protocol; empty where poses are taken as given."""
+    config = refined_poses(method)
     if config is None:
         return ""
     refined = f", then refined for {config.test_steps} steps to each test photograph" if config.test_steps else ""
     return f"aligned by the similarity between refined and true training poses{refined}"
 
 
-def optimised(method: Method) -> PosesConfig | None:
-    """The settings under which a method refines poses, if it does."""
+def refined_poses(method: Method) -> PosesConfig | None:
+    """The settings of a method's pose refinement; ``None`` where it takes poses as given."""
     training = method.recipe.training
     return training.poses if training is not None and training.poses is not None and training.poses.optimise else None
 
@@ -41,28 +41,23 @@ def training_errors(poses: Poses, scene: Scene) -> PoseErrors:
     return pose_errors(poses().cpu(), poses.reference.cpu(), scene.extent)
 
 
-def into_fit(poses: Poses, scene: Scene) -> Similarity:
-    """From the scene's frame into the one that the fit's cameras have drifted to."""
-    return inverse(training_errors(poses, scene).similarity)
+def world_to_fit(poses: Poses, scene: Scene) -> Similarity:
+    """Similarity from the scene's frame to the frame that the fit's cameras have drifted to."""
+    return training_errors(poses, scene).similarity.inverse()
 
 
-def inverse(similarity: Similarity) -> Similarity:
-    """The way back."""
-    back = similarity.rotation.T
-    return Similarity(1 / similarity.scale, back, -(back @ similarity.translation) / similarity.scale)
-
-
-def carried(camera: Camera, similarity: Similarity) -> Camera:
-    """A camera in another world."""
+def transform_camera(camera: Camera, similarity: Similarity) -> Camera:
+    """The camera after a similarity of the world."""
     return camera.moved(similarity.poses(camera.cam_to_world).to(camera.cam_to_world))
 
 
 @torch.no_grad()
-def scene_of_fit(poses: Poses, scene: Scene) -> Scene:
-    """A scene in the frame that the fit has drifted to, for whoever looks at the fit: training cameras as they were refined,
-    all else carried along. Its ``world_from_local`` leads to the same world as before."""
+def scene_in_fit_frame(poses: Poses, scene: Scene) -> Scene:
+    """The scene in the frame that the fit has drifted to: training cameras as refined, all else transformed by `world_to_fit`.
+
+    Its ``world_from_local`` leads to the same world as before."""
     errors = training_errors(poses, scene)
-    similarity = inverse(errors.similarity)
+    similarity = errors.similarity.inverse()
 
     def moved(view: View, camera: Camera) -> View:
         turn = (camera.cam_to_world @ torch.linalg.inv(view.camera.cam_to_world))[:3, :3]
@@ -77,8 +72,8 @@ def scene_of_fit(poses: Poses, scene: Scene) -> Scene:
     return replace(
         scene,
         train=tuple(moved(view, view.camera.moved(pose.to(view.camera.cam_to_world))) for view, pose in refined),
-        val=tuple(moved(view, carried(view.camera, similarity)) for view in scene.val),
-        test=tuple(moved(view, carried(view.camera, similarity)) for view in scene.test),
+        val=tuple(moved(view, transform_camera(view.camera, similarity)) for view in scene.val),
+        test=tuple(moved(view, transform_camera(view.camera, similarity)) for view in scene.test),
         points=None if points is None else replace(points, position=similarity.points(points.position).to(points.position)),
         mesh=None if mesh is None else replace(mesh, vertices=similarity.points(mesh.vertices).to(mesh.vertices)),
         world_from_local=(scene.world_from_local.double() @ back).to(scene.world_from_local),
@@ -86,29 +81,29 @@ def scene_of_fit(poses: Poses, scene: Scene) -> Scene:
 
 
 class PosedEvaluation:
-    """Stands between a fit with refined poses and its evaluation.
+    """Test cameras, geometry and pose errors of a fit with refined poses, for its evaluation.
 
     Args:
         poses: of the fit.
-        scene: undisturbed.
-        model: fitted field and renderer.
+        scene: as loaded, its poses not degraded.
+        model: fitted.
     """
 
-    def __init__(self, poses: Poses, scene: Scene, model: tuple[Field, Renderer]) -> None:
+    def __init__(self, poses: Poses, scene: Scene, model: Model) -> None:
         self._scene, self._model, self._config = scene, model, poses.config
         self.errors = training_errors(poses, scene)
-        self._into_fit = inverse(self.errors.similarity)
+        self._world_to_fit = self.errors.similarity.inverse()
 
     def camera(self, view: View) -> Camera:
-        """Where a test view's photograph was taken, in the fit's world."""
-        start = carried(view.camera, self._into_fit)
+        """The test view's camera in the fit's frame, refined to its photograph where the settings say so."""
+        start = transform_camera(view.camera, self._world_to_fit)
         if not self._config.test_steps:
             return start
-        descent = Descent(self._config.test_steps)
-        return descend(self._model, replace(view, camera=start), self._scene, descent)
+        descent = PoseDescent(self._config.test_steps)
+        return refine_pose(self._model, replace(view, camera=start), self._scene, descent)
 
-    def as_seen(self, picture: Rendering, used: Camera, view: View) -> Rendering:
-        """A picture's geometry in the scene's frame and units: distances scaled, normals turned with the camera."""
+    def to_scene_frame(self, picture: Rendering, used: Camera, view: View) -> Rendering:
+        """The rendering with depth in the scene's units and normals in the scene's frame."""
         turn = view.camera.cam_to_world[:3, :3] @ used.cam_to_world[:3, :3].T
         normal: Tensor | None = None if picture.normal is None else picture.normal @ turn.T
         return replace(picture, depth=picture.depth * self.errors.scale, normal=normal)

@@ -3,45 +3,28 @@
 from __future__ import annotations
 
 import math
-import re
 import signal
+import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
 from types import FrameType
 
 import torch
 from torch import Tensor
 
 from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
-from invgraphics.errors import InputError
 from invgraphics.experiments.clocks import fit_record
-from invgraphics.experiments.posed import carried, into_fit
+from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import Moment
+from invgraphics.training.budget import Cadence
 from invgraphics.training.fit import Fit
 from invgraphics.training.limits import dead_gaussians
 
 MARKS = (0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Points of the fit at which the monitor looks."""
-
-
-@dataclass(frozen=True)
-class Cadence:
-    """How often a checkpoint is written: every so many steps or seconds."""
-
-    steps: int | None = None
-    seconds: float | None = None
-
-    @staticmethod
-    def parse(text: str) -> Cadence:
-        """Read ``100steps`` or ``30s``."""
-        found = re.fullmatch(r"\s*([0-9]+)\s*(steps?|s)\s*", text)
-        if found is None or int(found.group(1)) == 0:
-            raise InputError(f"'{text}' says no interval for checkpoints.", "Expected something like 100steps or 30s.")
-        amount = int(found.group(1))
-        return Cadence(seconds=float(amount)) if found.group(2) == "s" else Cadence(steps=amount)
 
 
 class Monitor:
@@ -71,15 +54,15 @@ class Monitor:
         background = self._scene.background.to(self._device)
         errors = []
         poses = fit.plan.poses
-        drift = None if poses is None else into_fit(poses, self._scene)
+        drift = None if poses is None else world_to_fit(poses, self._scene)
         for view, flat in zip(self._views, self._pixels, strict=True):
-            camera = view.camera if drift is None else carried(view.camera, drift)
+            camera = view.camera if drift is None else transform_camera(view.camera, drift)
             prediction = self._predict(fit, camera, flat, ctx, background)
             errors.append((prediction.clamp(0, 1).cpu() - view.over(self._scene.background, flat)).square().mean())
         return -10 * math.log10(max(float(torch.stack(errors).mean()), 1e-10))
 
     def _predict(self, fit: Fit, camera: Camera, flat: Tensor, ctx: Context, background: Tensor) -> Tensor:
-        renderer, field = fit.plan.renderer, fit.plan.field
+        renderer, field = fit.plan.model.renderer, fit.plan.model.field
         if isinstance(renderer, RayRenderer):
             pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
             rays: Rays = camera.rays(pixels).to(self._device)
@@ -89,18 +72,32 @@ class Monitor:
 
 
 class Recorder:
-    """Runs a fit and keeps its run folder up to date.
+    """Runs a fit, records its history and keeps its run folder up to date.
 
     Args:
         fit: what to run.
-        folder: where to write.
+        folder: where to write; ``None`` to write nothing.
         cadence: how often to write a checkpoint.
         title: what the progress display says.
         snapshots: how many states of the model to keep, evenly over the fit, besides the first.
+        on_step: is given the fit before its first step and after each one, on no clock.
+
+    Attributes:
+        history: each moment at which the monitor looked.
     """
 
-    def __init__(self, fit: Fit, folder: RunFolder, cadence: Cadence, title: str, snapshots: int = 0) -> None:
+    def __init__(
+        self,
+        fit: Fit,
+        folder: RunFolder | None,
+        cadence: Cadence,
+        title: str,
+        snapshots: int = 0,
+        on_step: Callable[[Fit], None] | None = None,
+    ) -> None:
         self._fit, self._folder, self._cadence, self._title = fit, folder, cadence, title
+        self._on_step = on_step
+        self.history: list[Moment] = []
         self._monitor = Monitor(fit.plan.scene, fit.plan.device)
         self._saved_at = (fit.steps, time.monotonic())
         self._marks = [mark for mark in MARKS if mark > fit.progress]
@@ -114,12 +111,16 @@ class Recorder:
         Raises:
             KeyboardInterrupt: Ctrl-C or SIGTERM came; the run folder holds a checkpoint of the last whole step.
         """
-        before = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._asked_to_stop = False
+        # Only a program's main thread hears signals.
+        numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+        before = {number: signal.signal(number, self._stop) for number in numbers}
         try:
             with Reporter(self._title) as reporter:
                 if self._fit.steps == 0:
                     self._record()
                     self._keep_snapshot(0.0)
+                    self._call()
                 self._fit.run(lambda loss: self._after_step(loss, reporter))
             self._save()
         finally:
@@ -127,6 +128,10 @@ class Recorder:
                 signal.signal(number, handler)
         if self._asked_to_stop:
             raise KeyboardInterrupt
+
+    def _call(self) -> None:
+        if self._on_step is not None:
+            self._on_step(self._fit)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self._asked_to_stop = True
@@ -143,6 +148,7 @@ class Recorder:
             reporter.show(min(fit.progress, 0.999), f"step {fit.steps}, loss {loss:.4f}")
         if self._due():
             self._save()
+        self._call()
         return self._asked_to_stop
 
     def _due(self) -> bool:
@@ -152,14 +158,17 @@ class Recorder:
         return time.monotonic() - moment >= (self._cadence.seconds or 30.0)
 
     def _save(self) -> None:
-        checkpoint.save(self._folder.checkpoint, self._fit.state())
-        self._folder.write(fit_record(self._fit.steps, self._fit.clocks()))
+        if self._folder is not None:
+            checkpoint.save(self._folder.checkpoint, self._fit.state())
+            self._folder.write(fit_record(self._fit.steps, self._fit.clocks()))
         self._saved_at = (self._fit.steps, time.monotonic())
 
     def _keep_snapshot(self, progress: float) -> None:
         """Keep the model, if the fit has come to a moment that is wanted and is not there."""
+        if self._folder is None or not self._snapshots:
+            return
         path = self._folder.snapshot(math.floor(progress * self._snapshots))
-        if self._snapshots and not path.is_file():
+        if not path.is_file():
             path.parent.mkdir(exist_ok=True)
             state = self._fit.state()
             checkpoint.save(path, {part: state[part] for part in ("field", "renderer", "fit")})
@@ -167,15 +176,17 @@ class Recorder:
     def _record(self) -> float:
         fit = self._fit
         psnr = self._monitor.psnr(fit)
-        dead = dead_gaussians(fit.plan.field, [view.camera for view in fit.plan.scene.train])
+        dead = dead_gaussians(fit.plan.model.field, [view.camera for view in fit.plan.scene.train])
         moment = Moment(
             step=fit.steps,
             seconds=round(fit.seconds, 4),
             progress=round(fit.progress, 6),
             psnr=psnr,
             loss=self._loss if math.isfinite(self._loss) else None,
-            primitives=fit.plan.field.primitive_count(),
+            primitives=fit.plan.model.field.primitive_count(),
             dead=None if dead is None else round(dead.share, 6),
         )
-        self._folder.append_history(moment)
+        self.history.append(moment)
+        if self._folder is not None:
+            self._folder.append_history(moment)
         return psnr

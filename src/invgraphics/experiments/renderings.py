@@ -6,12 +6,10 @@ the pictures of one fit differ in (`invgraphics.runs.renderings`).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,111 +20,70 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.evaluate import evaluate_saved
-from invgraphics.experiments.request import FitRequest
-from invgraphics.recipes.recipe import Method, load_method, resolve
+from invgraphics.experiments.job import Job
+from invgraphics.experiments.variants import RendererVariant, with_renderer
+from invgraphics.recipes.recipe import Method
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.renderings import OWN, Difference, Rendering, Renderings
-from invgraphics.text import sha256_of, slug
+from invgraphics.text import sha256_of
 
 FOLDER = "rendered"
 
 
-@dataclass(frozen=True)
-class Eye:
-    """A renderer to look at a fitted field with.
-
-    Attributes:
-        name: as it was asked for, ``METHOD`` or ``METHOD:key=value:key=value`` with keys of the recipe's renderer.
-        table: the resolved ``[renderer]`` of its recipe.
-    """
-
-    name: str
-    table: dict[str, Any]
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the settings."""
-        return sha256_of(self.table)
-
-    @property
-    def folder(self) -> str:
-        """The name as one folder name."""
-        method, *settings = re.split(_SETTING, self.name)
-        return re.sub(r"[^\w.=+-]+", "-", "-".join([slug(method), *settings]))
-
-
-_SETTING = r":(?=[\w.]+=)"
-
-
-def eye_named(name: str) -> Eye:
-    """Read what ``--render-with`` names.
-
-    Raises:
-        InputError: unknown method or setting, or a renderer of several parts whose recipe does not say which.
-    """
-    method, *settings = re.split(_SETTING, name)
-    recipe = load_method(method, None, tuple(f"renderer.{item}" for item in settings))
-    return Eye(name, recipe.table["renderer"])
-
-
-def check_eyes(names: Sequence[str], methods: Iterable[Method], scene: Scene) -> None:
+def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method], scene: Scene) -> None:
     """Refuse renderers that cannot show what the methods fit, before anything is fitted.
 
     Raises:
-        InputError: a renderer is named twice, has parameters of its own, which only a fit could set, or needs what a field
-            does not provide.
+        InputError: a renderer is named twice, has learnt state for which no constants stand in, or needs what a field does
+            not provide.
     """
-    eyes = [eye_named(name) for name in names]
-    if len({eye.folder for eye in eyes}) != len(eyes):
+    if len({variant.folder for variant in variants}) != len(variants):
         raise InputError("A renderer is named twice in --render-with.")
-    for method in methods if eyes else ():
-        for eye in eyes:
+    for method in methods if variants else ():
+        for variant in variants:
             try:
-                _, renderer = build_model(through(method, eye), scene, 0, torch.device("cpu"))
+                model = build_model(with_renderer(method, variant), scene, 0, torch.device("cpu"))
+                if variant.table != method.table["renderer"]:
+                    model.renderer.untrained()
             except InputError as error:
-                raise InputError(f"{method.name} cannot be rendered with {eye.name}: {error.sentence}", error.remedy) from error
-            if renderer.state_dict() and eye.table != method.table["renderer"]:
-                raise InputError(
-                    f"{eye.name} cannot render what {method.name} fits: its renderer learns, so it needs a fit of its own."
-                )
+                sentence = f"{method.name} cannot be rendered with {variant.name}: {error.sentence}"
+                raise InputError(sentence, error.remedy) from error
 
 
-def rendered(folder: RunFolder, request: FitRequest, method: Method) -> bool:
-    """Whether every rendering that ``request`` asks for is there, of the fit that is there."""
-    if not request.render_with:
+def rendered(job: Job) -> bool:
+    """Whether every rendering that a job asks for is there, of the fit that is there."""
+    if not job.variants:
         return True
     try:
-        record = folder.read(Renderings)
+        record = job.folder.read(Renderings)
     except InputError:
         return False
-    return record.identity == _identity(folder, [eye_named(name) for name in request.render_with], method)
+    return record.identity == _identity(job.folder, job.variants, job.method)
 
 
-def render_missing(folder: RunFolder, request: FitRequest, method: Method, scene: Scene) -> None:
-    """Show a finished fit through every renderer that ``request`` names; renderings that are there are kept.
+def render_missing(job: Job, scene: Scene) -> None:
+    """Show a finished fit through every renderer that its job names; renderings that are there are kept.
 
     Args:
-        folder: of the fit.
-        request: what it was asked to do.
-        method: its resolved recipe.
-        scene: the undisturbed scene.
+        job: of the fit.
+        scene: the scene as loaded.
     """
-    if rendered(folder, request, method):
+    if rendered(job):
         return
+    folder, method = job.folder, job.method
     folder.remove(Renderings)
-    eyes = [eye_named(name) for name in request.render_with]
     shown = {}
-    for eye in _with_own(eyes, method):
-        if eye.table == method.table["renderer"]:
-            shown[eye.name] = OWN
+    for variant in _with_own(job.variants, method):
+        if variant.table == method.table["renderer"]:
+            shown[variant.name] = OWN
         else:
-            shown[eye.name] = f"{FOLDER}/{eye.folder}"
-            _render(RunFolder(folder.root / FOLDER / eye.folder), folder, (method, eye), scene, request.protocol)
+            shown[variant.name] = f"{FOLDER}/{variant.folder}"
+            _render(RunFolder(folder.root / FOLDER / variant.folder), folder, (method, variant), scene, job.protocols)
     pictures = {name: _pictures(folder.root / place, scene) for name, place in shown.items()}
     record = Renderings(
-        identity=_identity(folder, eyes, method),
+        identity=_identity(folder, job.variants, method),
         fitted_by=method.name,
         views=tuple(view.name for view in scene.test),
         renderings=tuple(Rendering(renderer=name, run=place) for name, place in shown.items()),
@@ -135,11 +92,13 @@ def render_missing(folder: RunFolder, request: FitRequest, method: Method, scene
     folder.write(record)
 
 
-def _render(folder: RunFolder, fit: RunFolder, model: tuple[Method, Eye], scene: Scene, protocol: str) -> None:
+def _render(
+    folder: RunFolder, fit: RunFolder, model: tuple[Method, RendererVariant], scene: Scene, protocols: Sequence[str]
+) -> None:
     """Make one rendering, unless it is there."""
-    method, eye = model
-    seen = through(method, eye)
-    identity = sha256_of([fit.identity, eye.digest])
+    method, variant = model
+    seen = with_renderer(method, variant)
+    identity = sha256_of([fit.identity, variant.digest])
     if folder.finished and folder.identity == identity:
         return
     folder.create()
@@ -157,30 +116,24 @@ def _render(folder: RunFolder, fit: RunFolder, model: tuple[Method, Eye], scene:
         truth=(up / provenance.truth).as_posix(),
         fitted_run=up.as_posix(),
         fitted_by=method.name,
-        rendered_by=eye.name,
+        rendered_by=variant.name,
     )
     folder.write(changed)
-    for rules in dict.fromkeys([protocol, "default"]):
+    for rules in protocols:
         evaluate_saved(folder, scene, rules)
 
 
-def through(method: Method, eye: Eye) -> Method:
-    """A method with another renderer."""
-    name = f"{method.name} rendered with {eye.name}"
-    return resolve(name, method.preset, method.table | {"renderer": eye.table})
-
-
-def _with_own(eyes: Sequence[Eye], method: Method) -> list[Eye]:
+def _with_own(variants: Sequence[RendererVariant], method: Method) -> list[RendererVariant]:
     """The renderer of the fit, under the name that was asked for if it was, and all others."""
     own = method.table["renderer"]
-    named = [eye for eye in eyes if eye.table == own]
-    others = [eye for eye in eyes if eye.table != own]
-    taken = any(eye.name == method.name for eye in others)
-    return [*(named or [Eye(f"{method.name} as fitted" if taken else method.name, own)]), *others]
+    named = [variant for variant in variants if variant.table == own]
+    others = [variant for variant in variants if variant.table != own]
+    taken = any(variant.name == method.name for variant in others)
+    return [*(named or [RendererVariant(f"{method.name} as fitted" if taken else method.name, own)]), *others]
 
 
-def _identity(folder: RunFolder, eyes: Sequence[Eye], method: Method) -> str:
-    return sha256_of([folder.identity, *([eye.name, eye.digest] for eye in _with_own(eyes, method))])
+def _identity(folder: RunFolder, variants: Sequence[RendererVariant], method: Method) -> str:
+    return sha256_of([folder.identity, *([variant.name, variant.digest] for variant in _with_own(variants, method))])
 
 
 def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:

@@ -12,7 +12,7 @@ from invgraphics.text import slug
 Existing = Literal["refuse", "resume", "reuse"]
 
 DATA = "data."
-"""How the keys begin that change the training data rather than the recipe (`invgraphics.scenes.corrupt.TrainingData`)."""
+"""How the keys begin that change the training data rather than the recipe (`invgraphics.scenes.degrade.TrainingData`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ class FitRequest(Settings):
     """One run.
 
     Attributes:
-        method: ``renderer/recipe`` or the path of a recipe.
+        method: ``renderer/recipe`` or the path of a recipe; changes may follow (see `invgraphics.recipes.recipe.split_name`).
         seed: of initial values and of the fit.
         existing: what to do with a run that is already there: ``refuse``; ``resume`` it, if it is the same; or ``reuse`` what
             is the same and replace what is not.

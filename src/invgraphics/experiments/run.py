@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -18,11 +19,8 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import (
     build_plan,
-    device_of,
-    open_requested,
+    open_with_progress,
     repeatable,
-    requested_method,
-    training_data,
     use_kernels,
 )
 from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average, processor_share
@@ -30,24 +28,22 @@ from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import WITH_PARENT, cores
 from invgraphics.experiments.identity import TruthDigest, identify
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.progress import warn
-from invgraphics.experiments.recorder import Cadence, Monitor, Recorder
-from invgraphics.experiments.renderings import check_eyes, render_missing
+from invgraphics.experiments.recorder import Monitor, Recorder
+from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
-from invgraphics.metrics.protocols import protocol_named
 from invgraphics.recipes.presets import announcements
-from invgraphics.recipes.recipe import Method
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import TRUTH, RunFolder
-from invgraphics.runs.provenance import ImportedFile, LoadAverage, Options, Provenance
+from invgraphics.runs.provenance import LoadAverage, Options, Provenance
 from invgraphics.runs.schema import write_json
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import choices
-from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 
 
@@ -55,57 +51,77 @@ def fit_run(request: FitRequest) -> Path:
     """Make the run that ``request`` describes; returns its folder.
 
     Raises:
+        InputError, KeyboardInterrupt, NumericalError: as `make_run`.
+    """
+    job = Job.of(request)
+    make_run(job)
+    return job.folder.root
+
+
+def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None] | None = None) -> None:
+    """Make a run in its folder; one that is there already is kept, continued or replaced, as the request says.
+
+    Args:
+        job: of the run.
+        scene: that the job names, where it is open already.
+        on_step: is given the fit before its first step and after each one.
+
+    Raises:
         InputError: anything about the request or the folder that cannot be used; nothing has been computed then.
         KeyboardInterrupt: the run was interrupted and holds a checkpoint.
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
-    protocol_named(request.protocol)  # now, not when the fit is done
-    budget, cadence = Budget.parse(request.budget), Cadence.parse(request.checkpoint_every)
-    method = requested_method(request.method, request)
-    data = training_data(request)
-    device = device_of(request.device)
-    folder = RunFolder(Path(request.out))
+    folder, method, request = job.folder, job.method, job.request
     _check_existing(folder, request)
-    repeatable(device)
+    repeatable(job.device)
     with folder.held():
-        scene = open_requested(request)
-        check_eyes(request.render_with, [method], scene)
-        shown = corrupt(scene, data, request.seed)
-        identity = identify(request, method, TruthDigest.of(scene), torch.get_num_threads())
+        scene = scene or open_with_progress(request.scene, job.options)
+        check_variants(job.variants, [method], scene)
+        shown = degrade(scene, job.data, request.seed)
+        identity = identify(job, TruthDigest.of(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
             raise InputError(
                 f"{folder.root} holds another run: its method, scene, budget, seed or code differ.", "Choose another --out."
             )
         if same and folder.finished:
-            render_missing(folder, request, method, scene)
-            return folder.root
+            render_missing(job, scene)
+            return
         use_kernels(request.kernels)
         began_at = load_average()
-        with PeakMemory(device) as memory:
-            fit = Fit(started(build_plan(method, shown, budget, request.seed, device), method, request.scene))
+        with PeakMemory(job.device) as memory:
+            fit = prepare(job, shown)
             if same and folder.resumable:
                 earlier = folder.read(FitRecord)
-                fit.load(checkpoint.load(folder.checkpoint, device), earlier.seconds or 0.0)
+                fit.load(checkpoint.load(folder.checkpoint, job.device), earlier.seconds or 0.0)
                 fit.resume_clocks(asdict(earlier))
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            folder.write(describe(folder, request, method, (scene, shown), identity, device))
-            forecast = _rehearse(folder, fit, method, memory)
+            folder.write(describe(job, (scene, shown), identity))
+            forecast = _warm_up(job, fit, memory)
             if "suspicion" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
-            for sentence in (*announcements([method.choice]), _prediction(request, fit, forecast)):
+            for sentence in (*announcements([method.choice]), _prediction(job, fit, forecast)):
                 print(sentence, file=sys.stderr)
-            Recorder(fit, folder, cadence, f"{method.name} seed {request.seed}", request.snapshots).run()
+            Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots, on_step).run()
         load = LoadAverage(start=began_at, end=load_average())
         spent = replace(
             fit_record(fit.steps, fit.clocks()), peak_memory_bytes=memory.peak_bytes, cores=cores(), load_average=load
         )
         _declare_clocks(folder, spent)
-        _evaluate(folder, scene, fit, request, method, spent)
-        render_missing(folder, request, method, scene)
-    return folder.root
+        _evaluate(job, scene, fit, spent)
+        render_missing(job, scene)
+
+
+def prepare(job: Job, shown: Scene) -> Fit:
+    """The fit of a job before its first step, on the scene as the fit sees it.
+
+    Raises:
+        InputError: method and scene do not go together, or what the method starts from cannot be used.
+    """
+    plan = build_plan(job.method, shown, job.budget, job.request.seed, job.device)
+    return Fit(started(plan, job.method, job.request.scene))
 
 
 def _check_existing(folder: RunFolder, request: FitRequest) -> None:
@@ -117,26 +133,27 @@ def _check_existing(folder: RunFolder, request: FitRequest) -> None:
     folder.create()
 
 
-def _rehearse(folder: RunFolder, fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
+def _warm_up(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
     """Take a step and a look of the monitor that count for nothing; the memory that they needed tells what the fit will need.
 
     Raises:
         InputError: the primitives would need more memory than the machine has.
     """
-    fit.rehearse()
+    fit.warmup_step()
     Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
-    forecast = memory_forecast(fit.plan, method, memory.peak_bytes)
+    folder = job.folder
+    forecast = memory_forecast(fit.plan, job.method, memory.peak_bytes)
     folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
     return forecast
 
 
-def _prediction(request: FitRequest, fit: Fit, memory: MemoryForecast) -> str:
+def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     """What the person is in for, said before the work starts."""
     views = len(fit.plan.scene.test)
-    seconds = expected_seconds(fit.plan.field, fit.plan.renderer, fit.plan.scene, fit.plan.device)
+    seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     scene = fit.plan.scene
-    return f"{request.method} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
+    return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
 
 
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
@@ -146,39 +163,25 @@ def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
         warn(f"The fit {disturbed}. Its times are not to be compared.")
 
 
-def _evaluate(folder: RunFolder, scene: Scene, fit: Fit, request: FitRequest, method: Method, spent: FitRecord) -> None:
-    """Score the fit on the undisturbed scene. The default protocol's scores come last: a run that has them is finished."""
-    folder.write(spent)
-    costs = fit_costs(spent)
-    model = (fit.plan.field, fit.plan.renderer)
-    if request.protocol != "default":
-        evaluate(folder, scene, model, request.protocol, costs, method, fit.plan.poses)
-    evaluate(folder, scene, model, "default", costs, method, fit.plan.poses)
+def _evaluate(job: Job, scene: Scene, fit: Fit, spent: FitRecord) -> None:
+    """Score the fit on the scene as loaded. The default protocol's scores come last: a run that has them is finished."""
+    job.folder.write(spent)
+    for protocol in job.protocols:
+        evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
 
 
-def describe(
-    folder: RunFolder,
-    request: FitRequest,
-    method: Method,
-    scenes: tuple[Scene, Scene],
-    identity: str,
-    device: torch.device,
-    imported: ImportedFile | None = None,
-) -> Provenance:
+def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance:
     """Write recipe, machine and truth, and return what can be known before the fit of where the run comes from.
 
     Args:
-        folder: of the run.
-        request: what was asked for.
-        method: its resolved recipe.
-        scenes: undisturbed, and as the fit sees it.
+        job: of the run.
+        scenes: as loaded, and as the fit sees it.
         identity: of the run.
-        device: where it computes.
-        imported: the file, of a model that was not fitted here.
     """
+    request, method, folder = job.request, job.method, job.folder
     scene, shown = scenes
     folder.write_recipe(method.table)
-    folder.write(environment(device))
+    folder.write(environment(job.device))
     truth = save_truth(scene, Path(request.truth) if request.truth else folder.root / TRUTH)
     red, green, blue = scene.background.tolist()
     return Provenance(
@@ -197,15 +200,14 @@ def describe(
         truth=Path(*_relative(truth, folder.root)).as_posix(),
         background=(red, green, blue),
         colour=scene.colour,
-        data=training_data(request).changes(),
+        data=job.data.changes(),
         notes=shown.notes,
         code_version=code_version(),
         plugins=plugins.brought(method.table, method.name),
         command=request.shell(),
         options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
-        device=str(device),
+        device=str(job.device),
         test_poses=protocol_note(method),
-        imported=imported,
     )
 
 

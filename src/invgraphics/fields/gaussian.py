@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics.core import harmonics
@@ -17,8 +16,7 @@ from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Points, Scene
 from invgraphics.errors import NotComposableError
 from invgraphics.fields.convert import visible_points
-from invgraphics.fields.starting import depth_points, random_points, scene_points, starting_scales
-from invgraphics.fields.transformed import move_gaussians
+from invgraphics.fields.starting import backdrop_points, depth_points, random_points, scene_points, starting_scales
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 """Names of a `GaussianField`'s parameters; the first axis of each is the primitive."""
@@ -35,16 +33,21 @@ class GaussianFieldConfig:
             fitted ``field`` of the run that ``source`` names.
         source: folder of a run of a density field on the same scene; for ``init = "field"``.
         max_init: most points to start from; a random subset if there are more.
+        backdrop: in endless space, Gaussians that start behind the subject besides those, in the colours of opaque training
+            photographs (see `backdrop_points`); for ``init`` ``scene`` and ``random``.
         opacity: opacity at the start.
         scale_factor: multiplies the starting scales.
         isotropic: whether all three axes of a Gaussian stay equal.
     """
+
+    title: ClassVar[str] = "anisotropic 3D Gaussians"
 
     sh_degree: int = 3
     count: int = 10_000
     init: Literal["scene", "random", "depth", "field"] = "scene"
     source: str = ""
     max_init: int = 100_000
+    backdrop: int = 0
     opacity: float = 0.1
     scale_factor: float = 1.0
     isotropic: bool = False
@@ -54,6 +57,8 @@ class GaussianFieldConfig:
             raise ValueError(f"sh_degree must be from 0 to {harmonics.MAX_DEGREE}, not {self.sh_degree}.")
         if self.count < 1 or self.max_init < 1:
             raise ValueError("count and max_init must be at least 1.")
+        if self.backdrop < 0:
+            raise ValueError(f"backdrop must not be negative, not {self.backdrop}.")
         if not 0 < self.opacity < 1:
             raise ValueError(f"opacity must lie between 0 and 1, not be {self.opacity}.")
         if not self.scale_factor > 0:
@@ -62,8 +67,9 @@ class GaussianFieldConfig:
             raise ValueError("init = 'field' needs the folder of a run as 'source', and nothing else does.")
 
     def capped(self, most: int) -> GaussianFieldConfig:
-        """The same, starting with at most ``most`` Gaussians."""
-        return replace(self, count=min(self.count, most), max_init=min(self.max_init, most))
+        """The same, starting with at most ``most`` Gaussians; the backdrop gives way first."""
+        count, max_init = min(self.count, most), min(self.max_init, most)
+        return replace(self, count=count, max_init=max_init, backdrop=min(self.backdrop, most - max(count, max_init)))
 
     def build(self, scene: Scene) -> GaussianField:
         """The Gaussians that a fit of ``scene`` starts from; randomness comes from torch's global generator.
@@ -75,9 +81,10 @@ class GaussianFieldConfig:
         """
         if self.init == "depth":
             return self.from_points(depth_points(scene, self.max_init), scene)
-        if self.init == "scene" and scene.points is not None:
-            return self.from_points(scene_points(scene, self.max_init), scene)
-        points = random_points(scene.bounds, self.count)
+        known = self.init == "scene" and scene.points is not None
+        points = scene_points(scene, self.max_init) if known else random_points(scene.bounds, self.count)
+        if self.init != "field":
+            points = points.joined(backdrop_points(scene, self.backdrop))
         return self.from_points(points, scene)
 
     def converted(self, source: Field, scene: Scene) -> GaussianField:
@@ -180,28 +187,6 @@ class GaussianField(Field):
                 raise ValueError(f"rows of {name} have shape {tuple(old.shape[1:])}, not {tuple(tensor.shape[1:])}.")
             setattr(self, name, nn.Parameter(tensor.detach(), requires_grad=old.requires_grad))
         self.smoothing = self.means.new_zeros(len(self.means))
-
-    @torch.no_grad()
-    def transformed(self, similarity: Float[Tensor, "4 4"]) -> GaussianField:
-        """A copy of this field moved by a similarity, colours included.
-
-        Raises:
-            InputError: the matrix is no similarity.
-        """
-        moved = move_gaussians(self._gaussians(harmonics.count(self.sh_degree)), similarity.to(self.means))
-        tensors = {
-            "means": moved.means,
-            "quaternions": moved.quaternions,
-            "log_scales": moved.scales.log(),
-            "opacity_logits": self.opacity_logits.clone(),
-            "sh_dc": moved.sh[:, :1].clone(),
-            "sh_rest": moved.sh[:, 1:].clone(),
-        }
-        field = GaussianField(tensors, self.isotropic)
-        field.active_degree = self.active_degree
-        # A length: it grows with the scale, which is the cube root of the volume's.
-        field.smoothing = self.smoothing * torch.linalg.det(similarity.to(self.means)[:3, :3]) ** (1 / 3)
-        return field
 
     def _gaussians(self, coefficients: int) -> Gaussians:
         """The Gaussians as stored, without smoothing."""

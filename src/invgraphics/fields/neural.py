@@ -12,23 +12,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize, relu, softplus
+from typing_extensions import override
 
 from invgraphics.config import Slot
 from invgraphics.core import harmonics
 from invgraphics.core.bounds import Bounds, Space
 from invgraphics.core.field import Encoding, Field, Quantity
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies, frequency_width
 from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.mlp import Mlp, truncated_exp
-from invgraphics.kernels.types import HashField
 
 CPU_CHUNK = 8192
 """Samples that go through the networks at once on a CPU: larger activations cost more in page faults than in arithmetic."""
@@ -62,6 +63,8 @@ class NeuralFieldConfig:
         density_per: unit of length of the network's density. ``contracted``: in a contracted space, the box's half-extent after
             contraction along the radius, so that a new field is as thin a fog all the way to infinity as in a box.
     """
+
+    title: ClassVar[str] = "network"
 
     encoding: Annotated[Any, Slot("encodings")] = field(default_factory=FrequencyConfig)
     geometry: Literal["density", "sdf"] = "density"
@@ -195,10 +198,12 @@ class NeuralField(Field):
             features=torch.cat(handed) if Quantity.FEATURES in want else None,
         )
 
-    def hash_field(self, bounds: Bounds) -> HashField | None:
-        """The parts of a plain hash grid over ``bounds``, two features per entry.
+    @override
+    def fused(self, bounds: Bounds) -> FusedNGP | None:
+        """Detached hash grid and networks over ``bounds``.
 
-        ``None`` for other encodings and networks, elsewhere, and while a window is open.
+        ``None`` for other encodings, networks or bounds, for other than two features per entry, and with a coarse-to-fine
+        window.
         """
         config, encoding = self.config, self.encoding
         plain = config.geometry == "density" and config.skip < 0 and config.direction in ("sh", "none")
@@ -211,7 +216,7 @@ class NeuralField(Field):
         geometry, colour = (net.layers() for net in (self.geometry_net, self.colour_net))
         bands = config.direction_degree if config.direction == "sh" else 0
         density = config.density_activation, config.density_bias, bands, self.colour, self._contracted_density
-        return HashField(encoding.table.detach(), encoding.grid, geometry, colour, *density)
+        return FusedNGP(encoding.table.detach(), encoding.grid, geometry, colour, *density)
 
     @property
     def _contracted_density(self) -> float:

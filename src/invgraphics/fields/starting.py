@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from invgraphics.core.bounds import Bounds
@@ -17,6 +17,8 @@ FAR_SHARE = 0.2
 """Share of random points that goes outside the inner box of a contracted space."""
 FAR_REACH = 30.0
 """How far out those go, in half-extents of the box; log-uniformly, so that every shell gets its share."""
+BACKDROP_REACH = (1.5, 10.0)
+"""How far from its camera a backdrop's point lies, over the distance of the subject; log-uniformly."""
 SCALE_RANGE = (1e-5, 0.5)
 """Limits of a starting scale, relative to the scene's radius (or to the distance from its centre, where that is larger)."""
 
@@ -56,6 +58,34 @@ def scene_points(scene: Scene, most: int) -> Points:
     return Points(points.position, srgb_to_linear(points.rgb)) if scene.colour == "linear" else points
 
 
+def backdrop_points(scene: Scene, count: int) -> Points:
+    """``count`` points behind the subject, along the rays of random pixels of the training views and of their colours.
+
+    Structure from motion knows the subject and little of what is behind it. Without Gaussians there, photographs are explained
+    by floaters in front of it instead, which other views do not share. There are none in a box, which holds all there is, nor
+    where photographs are transparent: emptiness is known to be behind the subject then.
+
+    Args:
+        scene: with its training views; the subject is at the centre of its bounds.
+        count: how many, evenly over the views.
+    """
+    if scene.bounds.space == "box" or scene.has_alpha:
+        count = 0
+    views, (least, most) = scene.train, BACKDROP_REACH
+    shares = [count // len(views) + (index < count % len(views)) for index in range(len(views))]
+    positions, colours = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+    for view, share in zip(views, shares, strict=True):
+        counts = torch.ones(view.camera.height, view.camera.width) if view.mask is None else view.mask
+        flat = counts.reshape(-1).nonzero()[:, 0]
+        flat = flat[torch.randperm(len(flat))[:share]]
+        rays = view.camera.rays(_pixels(view, flat))
+        subject = max(float((view.camera.position - scene.bounds.centre).norm()), scene.bounds.radius)
+        distance = subject * least * (most / least) ** torch.rand(len(flat), 1)
+        positions.append(rays.origins + distance * rays.directions)
+        colours.append(view.colour(flat))
+    return Points(torch.cat(positions), torch.cat(colours))
+
+
 def depth_points(scene: Scene, most: int) -> Points:
     """Up to ``most`` surface points that the training views' depth maps show, evenly over the views, pixels at random.
 
@@ -80,9 +110,13 @@ def _seen_points(view: View, most: int) -> Points:
         hit &= view.mask.reshape(-1)
     flat = hit.nonzero()[:, 0]
     flat = flat[torch.randperm(len(flat))[:most]]
-    pixels = torch.stack([flat % view.camera.width, flat // view.camera.width], dim=1) + 0.5
-    rays = view.camera.rays(pixels)
+    rays = view.camera.rays(_pixels(view, flat))
     return Points(rays.origins + depth[flat, None] * rays.directions, view.colour(flat))
+
+
+def _pixels(view: View, flat: Int[Tensor, " n"]) -> Float[Tensor, "n 2"]:
+    """Centres of the pixels with these flat indices."""
+    return torch.stack([flat % view.camera.width, flat // view.camera.width], dim=1) + 0.5
 
 
 def _checked(points: Points, scene: str) -> Points:

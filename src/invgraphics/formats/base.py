@@ -1,4 +1,4 @@
-"""What a format is, and the one way to read and write a file of Gaussians."""
+"""Formats of Gaussian files, and reading and writing by format."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEAD_BYTES = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """What a file of Gaussians holds.
+    """Content of a file of Gaussians.
 
     Attributes:
         gaussians: activated, in the file's own axes and units.
@@ -103,7 +103,7 @@ def write_gaussians(path: Path, name: str, splats: Splats) -> None:
 
 
 def checked(splats: Splats, path: Path) -> Splats:
-    """What both directions rely on: some Gaussians, finite numbers; rotations of length zero become the identity.
+    """Validate: at least one Gaussian, finite numbers; quaternions of length zero become the identity.
 
     Raises:
         InputError: there are no Gaussians, or some are not finite.
@@ -133,7 +133,7 @@ def checked(splats: Splats, path: Path) -> Splats:
 
 
 def cut_off(path: Path, expected: int, present: int) -> InputError:
-    """The complaint about a file that ends too early, in bytes."""
+    """The error for a truncated file, with both sizes in bytes."""
     return InputError(f"'{path}' is cut off: {expected} bytes are expected, {present} are there.", "Copy the file again.")
 
 

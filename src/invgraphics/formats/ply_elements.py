@@ -30,7 +30,7 @@ _END = re.compile(rb"end_header\r?\n")
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says about itself.
+    """Header of a PLY file.
 
     Attributes:
         elements: name -> (number of records, type of one); none from the first element on that has a list.

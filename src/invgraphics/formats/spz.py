@@ -42,7 +42,7 @@ LEVEL = 12
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says about itself."""
+    """Header of an SPZ file."""
 
     version: int
     count: int

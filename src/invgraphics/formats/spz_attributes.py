@@ -44,7 +44,7 @@ def widths(version: int, degree: int) -> dict[str, int]:
 
 
 def fraction_bits(means: Float[Tensor, "n 3"]) -> int:
-    """The most bits after the binary point that leave room for all positions.
+    """Largest number of fractional bits with which all positions fit into 24-bit fixed point.
 
     Raises:
         InputError: a position is too far away for any.

@@ -1,8 +1,8 @@
-"""The hot operations, one function each; which implementation runs is decided in `dispatch`.
+"""The hot operations of hash grids, ray marching, volume rendering and splatting; `dispatch` chooses the implementation.
 
 ``reference`` is plain torch, any dtype, meant to be read; it is the oracle of the others. ``numba`` is float32 on the CPU,
 ``cuda`` float32 on NVIDIA GPUs. All are differentiable where their docstring says so; ``reference`` and ``numba`` are
-deterministic for a given number of threads, ``cuda`` adds up some gradients in any order.
+deterministic for a given number of threads, ``cuda`` accumulates some gradients atomically, in no fixed order.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from torch import Tensor
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.dispatch import choose
 from invgraphics.kernels.dispatch import compiled as compiled
@@ -20,7 +21,7 @@ from invgraphics.kernels.dispatch import in_use as in_use
 from invgraphics.kernels.dispatch import use as use
 from invgraphics.kernels.dispatch import using as using
 from invgraphics.kernels.dispatch import warm_up as warm_up
-from invgraphics.kernels.types import Bins, Footprints, HashField, HashGrid, March, MarchSteps
+from invgraphics.kernels.types import Bins, Footprints, March, MarchSteps
 
 
 def hash_encode(
@@ -49,68 +50,74 @@ def grid_sample(unit: Float[Tensor, "m 3"], grid: Float[Tensor, "x y z c"]) -> F
 def ray_march(
     rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps, start: Float[Tensor, " n"]
 ) -> March:
-    """Walk along rays in steps and keep the intervals whose middle lies in an occupied cell of the unit cube.
+    """Occupancy-grid ray marching: the intervals whose midpoint lies in an occupied cell of the unit cube.
 
     Args:
         rays: with near and far set; marching ends at far.
         occupied: cells of the unit cube (see `Bounds.to_unit`), indexed [x, y, z].
         bounds: the region's map to the unit cube.
         steps: step lengths and the most samples to keep per ray.
-        start: where each ray begins or resumes (``resume`` of an earlier march).
+        start: distance at which each ray begins or resumes (``resume`` of an earlier march).
+
+    Returns:
+        Packed intervals, sorted by ray and distance. Not differentiable.
     """
     return choose("ray_march", rays.origins)(rays, occupied, bounds, steps, start)
 
 
-def hash_march(
+def ngp_march(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
     steps: MarchSteps,
-    field: HashField,
+    field: FusedNGP,
     start: Float[Tensor, " n"],
-    transmittance: float,
+    min_transmittance: float,
 ) -> March:
-    """`ray_march` as far as light reaches in a hash grid: per-ray early termination inside the march.
+    """`ray_march` with early ray termination: densities of the field are evaluated and composited inside the march.
 
     Args:
         rays: with near and far set.
         occupied: as in `ray_march`.
         bounds: as in `ray_march`.
-        steps: step lengths; ``limit`` is of no concern.
-        field: what is there.
-        start: where each ray begins.
-        transmittance: least share of light that must reach a step for it to be kept.
+        steps: step lengths; ``limit`` is ignored.
+        field: density to march through; its colours are not evaluated.
+        start: distance at which each ray begins.
+        min_transmittance: intervals before which the transmittance is below this are left out.
+
+    Returns:
+        Packed intervals, sorted by ray and distance. Not differentiable.
     """
-    return choose("hash_march", rays.origins)(rays, occupied, bounds, steps, field, start, transmittance)
+    return choose("ngp_march", rays.origins)(rays, occupied, bounds, steps, field, start, min_transmittance)
 
 
-def hash_render(
+def ngp_render(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
     steps: MarchSteps,
-    field: HashField,
-    transmittance: float = 0.0,
-    unseen: float = 0.0,
+    field: FusedNGP,
+    min_transmittance: float = 0.0,
+    max_error: float = 0.0,
     width: int = 0,
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-    """Volume rendering of a hash grid and its networks, in one pass. Not differentiable.
+    """Fused volume rendering of an Instant-NGP field: march, encode, evaluate, composite. Not differentiable.
 
     Args:
         rays: with near and far set.
-        occupied: cells of the unit cube that are looked at, as in `ray_march`.
+        occupied: cells of the unit cube in which the field is evaluated, as in `ray_march`.
         bounds: the region's map to the unit cube.
         steps: step lengths.
-        field: what is there.
-        transmittance: a ray may stop when less than this share of its light is left.
-        unseen: most that all samples together that are not asked for their colour may contribute to a ray, in [0, 1].
-        width: of the picture whose pixels the rays are, row by row, 0 if there is none: neighbours are looked at together,
-            which is faster and changes nothing else.
+        field: parameters of the hash grid and its networks.
+        min_transmittance: a ray may terminate once its transmittance is below this.
+        max_error: upper bound, per ray, of the summed weights of samples whose colour is not evaluated, in [0, 1].
+        width: width in pixels of the image whose pixels the rays are, row by row; 0 if they are none. It only orders the work:
+            rays of neighbouring pixels share cells, which is faster.
 
     Returns:
         Sums of w * (radiance, distance), and of w, per ray (see `composite`).
     """
-    return choose("hash_render", rays.origins)(rays, occupied, bounds, steps, field, transmittance, unseen, width)
+    return choose("ngp_render", rays.origins)(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
 
 
 def composite(
@@ -131,7 +138,7 @@ def composite(
 
 
 def splat_project(
-    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, compensate: bool = False
+    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, antialiased: bool = False
 ) -> tuple[Footprints, Float[Tensor, "n 3"]]:
     """EWA projection of 3D Gaussians (Zwicker et al. 2001; 3DGS §4) and their colours towards the camera.
 
@@ -139,12 +146,12 @@ def splat_project(
         gaussians: activated primitives.
         camera: pinhole camera, differentiable in its pose.
         dilation: variance in square pixels added to both screen axes (low-pass filter).
-        compensate: whether opacities are lowered so that the filter keeps a footprint's integral (Mip-Splatting, §4.2).
+        antialiased: opacity compensation: the filter keeps a footprint's integral, not its peak (Mip-Splatting, §4.2).
 
     Returns:
         Conic footprints, culled where the 99% ellipsoid misses the frustum; and rgb = max(0, SH(direction) + 0.5).
     """
-    return choose("splat_project", gaussians.means)(gaussians, camera, dilation, compensate)
+    return choose("splat_project", gaussians.means)(gaussians, camera, dilation, antialiased)
 
 
 def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 0.5) -> tuple[Footprints, Float[Tensor, "n 3"]]:
@@ -162,7 +169,7 @@ def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 
 
 
 def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bins:
-    """Sort footprints by depth and list, per tile, those whose square touches it. Not differentiable."""
+    """Tile intersection and depth sort: per tile, front to back, the footprints whose square overlaps it. No gradient."""
     return choose("splat_bin", footprints.means2d)(footprints, width, height, tile)
 
 
@@ -172,7 +179,7 @@ def splat_rasterise(
     width: int,
     height: int,
     tile: int | None = None,
-    receivers: int = 0,
+    max_grad_splats: int = 0,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """Front-to-back alpha compositing of footprints at pixel centres (3DGS, appendix C).
 
@@ -184,16 +191,16 @@ def splat_rasterise(
         width: image width in pixels.
         height: image height in pixels.
         tile: edge of a tile in pixels (Numba: in fours, 32 at most); ``None`` for the implementation's own.
-        receivers: how many footprints of each pixel, counted from the front, receive its gradient; 0 for all.
+        max_grad_splats: number of footprints of each pixel, counted from the front, that receive gradients; 0 for all.
 
     Returns:
         Sums of w * features and of w per pixel, differentiable in means2d, conics (or homography), opacities and features.
     """
-    return choose("splat_rasterise", footprints.means2d)(footprints, features, width, height, tile, receivers)
+    return choose("splat_rasterise", footprints.means2d)(footprints, features, width, height, tile, max_grad_splats)
 
 
 def splat_median(footprints: Footprints, width: int, height: int, tile: int | None = None) -> Float[Tensor, "h w"]:
-    """Distance along each pixel's ray of the footprint at which transmittance falls to 1/2; inf where it stays above.
+    """Median depth: distance along each pixel's ray of the footprint where transmittance falls to 1/2; inf where it does not.
 
     Not differentiable. Arguments as in `splat_rasterise`.
     """
@@ -201,7 +208,7 @@ def splat_median(footprints: Footprints, width: int, height: int, tile: int | No
 
 
 def ssim(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """Mean SSIM as a loss needs it (Wang et al. 2004; 11x11 Gaussian window, sigma 1.5, zero-padded as in 3DGS).
+    """Mean SSIM, differentiable (Wang et al. 2004; 11x11 Gaussian window, sigma 1.5, zero-padded as in 3DGS).
 
     Values in [0, 1] are assumed (data range 1). Differentiable in ``image``.
     """

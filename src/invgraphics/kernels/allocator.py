@@ -1,4 +1,4 @@
-"""The C library's allocator, told that this process will want the same memory again."""
+"""Memory reuse by the C library's allocator across training steps."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ _LARGEST = {_TRIM_THRESHOLD: 2**31 - 1, _MMAP_THRESHOLD: 2**30}
 
 
 def keep_freed_memory() -> bool:
-    """Let glibc keep what is freed, up to blocks of 1 GB, instead of returning it and asking for it again at every step.
+    """Make glibc keep freed memory, in blocks of up to 1 GB, instead of returning it to the system at every step.
 
     Fresh pages cost a fault each: a sixth of a step of a hash grid of 2^19 entries, whose gradient is 64 MB.
 
     Returns:
-        Whether the allocator agreed; ``False`` on other C libraries, which are left alone.
+        Whether the settings were accepted; ``False`` on other C libraries, which are left as they are.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

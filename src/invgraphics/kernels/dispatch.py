@@ -1,4 +1,4 @@
-"""Which implementation of a kernel runs: chosen by device, dtype and availability, or forced by name."""
+"""Kernel dispatch: the implementation is chosen by device, dtype and availability, or forced by name."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 IMPLEMENTATIONS = ("reference", "numba", "cuda")
-"""Packages beside this file; each exposes the operations it has, under the names of `invgraphics.kernels`."""
+"""Packages beside this file; each exports the operations it implements, under the names of `invgraphics.kernels`."""
 
 DEVICES = {"numba": "cpu", "cuda": "cuda"}
-"""The kind of device that the compiled ones are written for; the reference runs anywhere."""
+"""Device type of each compiled implementation; the reference runs on any."""
 
 _forced: str | None = None
 
@@ -35,8 +35,8 @@ def use(name: str | None) -> None:
             f"There are no '{name}' kernels.{did_you_mean(name, IMPLEMENTATIONS)}",
             f"Known kernels: {', '.join(IMPLEMENTATIONS)}.",
         )
-    if name is not None and why_not(name):
-        raise InputError(f"The {name} kernels cannot be used here: {why_not(name)}.")
+    if name is not None and unavailable_reason(name):
+        raise InputError(f"The {name} kernels cannot be used here: {unavailable_reason(name)}.")
     global _forced  # noqa: PLW0603
     _forced = name
 
@@ -61,17 +61,17 @@ def _module(name: str) -> ModuleType | str:
         return f"{type(error).__name__}: {error}"
 
 
-def why_not(name: str) -> str:
-    """Why an implementation cannot run here; empty if it can."""
+def unavailable_reason(name: str) -> str:
+    """Reason why an implementation is not available on this machine; empty if it is."""
     if name == "cuda" and not torch.cuda.is_available():
         return "torch finds no CUDA device"
     module = _module(name)
     return module if isinstance(module, str) else ""
 
 
-def here() -> tuple[str, ...]:
-    """The implementations that tensors on this machine's CPU can be given to, the plainest first."""
-    return tuple(name for name in IMPLEMENTATIONS if DEVICES.get(name, "cpu") == "cpu" and not why_not(name))
+def cpu_implementations() -> tuple[str, ...]:
+    """Available implementations for CPU tensors, the reference first."""
+    return tuple(name for name in IMPLEMENTATIONS if DEVICES.get(name, "cpu") == "cpu" and not unavailable_reason(name))
 
 
 def choose(operation: str, like: torch.Tensor) -> Any:
@@ -88,23 +88,23 @@ def choose(operation: str, like: torch.Tensor) -> Any:
 
 
 def compiled(operation: str, like: torch.Tensor) -> bool:
-    """Whether `choose` would find something faster than the reference."""
+    """Whether an implementation other than the reference runs ``operation`` for tensors like ``like``."""
     return choose(operation, like) is not getattr(_module("reference"), operation)
 
 
 def _name_for(kind: str) -> str:
-    """What is asked for on a kind of device: what was forced, else what is written for it."""
+    """Implementation selected for a device type: the forced one, else the one compiled for it."""
     return _forced or next((name for name, device in DEVICES.items() if device == kind), "reference")
 
 
 def in_use(device: torch.device | None = None) -> str:
-    """Name of the kernels that float32 tensors on a device (``None``: the CPU) get, for a run's record."""
+    """Name of the implementation of float32 kernels on a device (``None``: the CPU), for a run's record."""
     kind = "cpu" if device is None else device.type
     name = _name_for(kind)
-    return name if DEVICES.get(name) == kind and not why_not(name) else "reference"
+    return name if DEVICES.get(name) == kind and not unavailable_reason(name) else "reference"
 
 
 def warm_up() -> float:
-    """Compile what needs compiling, so that no clock of a fit counts it; returns the seconds it took."""
+    """Compile the kernels ahead of time, so that no fit's clock includes it; returns seconds."""
     module = _module("numba") if in_use() == "numba" else None
     return module.warm_up() if isinstance(module, ModuleType) and hasattr(module, "warm_up") else 0.0

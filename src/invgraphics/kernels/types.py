@@ -1,109 +1,22 @@
-"""What kernels exchange: flat arrays with names."""
+"""Inputs and outputs of the kernels: marches, footprints and tile lists as flat tensors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
 
-import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
-
-from invgraphics.core.bounds import Bounds
-
-
-@dataclass(frozen=True)
-class HashGrid:
-    """Geometry of a multi-resolution hash grid (Instant-NGP, §3).
-
-    Level l has ``resolution[l]`` cells along an edge, its vertices are stored densely while they fit into ``2**log2_size``
-    entries and are hashed beyond. All levels lie behind one another in one table.
-
-    Attributes:
-        levels: number of resolutions.
-        features: features per entry.
-        log2_size: most entries of a level, as a power of two.
-        base: cells along an edge on the coarsest level.
-        finest: cells along an edge on the finest level.
-    """
-
-    levels: int = 16
-    features: int = 2
-    log2_size: int = 17
-    base: int = 16
-    finest: int = 2048
-
-    @property
-    def resolutions(self) -> tuple[int, ...]:
-        """Cells along an edge, per level: a geometric progression from ``base`` to ``finest``."""
-        if self.levels == 1:
-            return (self.base,)
-        growth = np.exp(np.log(self.finest / self.base) / (self.levels - 1))
-        return tuple(int(np.floor(self.base * growth**level + 1e-9)) for level in range(self.levels))
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Entries per level: all (r+1)^3 vertices, or the hash table's size."""
-        return tuple(min((r + 1) ** 3, 2**self.log2_size) for r in self.resolutions)
-
-    @property
-    def offsets(self) -> tuple[int, ...]:
-        """First entry of each level, and the total at the end."""
-        return (0, *(int(total) for total in np.cumsum(self.sizes)))
-
-    @property
-    def entries(self) -> int:
-        """Entries of the whole table."""
-        return self.offsets[-1]
-
-
-@dataclass(frozen=True, eq=False)
-class HashField:
-    """A density and a radiance by two ReLU networks over a hash grid, as a picture needs them (Instant-NGP, §5).
-
-    Attributes:
-        table: features of all levels.
-        grid: geometry of the levels.
-        geometry: weights (outs, ins) and biases of each layer of the network that says the raw density, and after it what it
-            hands to the other one.
-        colour: the same of the network that says the raw radiance, from that and the direction.
-        density: what makes a density of the sum of raw density and ``bias``; ``exp`` stops growing at exp(15).
-        bias: see ``density``.
-        bands: bands of spherical harmonics of the direction that the colour network sees, 0 to 4.
-        colour_space: radiance is the raw one's sigmoid for ``srgb``, its softplus for ``linear``.
-        contracted_density: what densities are multiplied with besides `Bounds.radial_scale`; 0 leaves them as they are.
-    """
-
-    table: Float[Tensor, "entries f"]
-    grid: HashGrid
-    geometry: tuple[tuple[Tensor, Tensor], ...]
-    colour: tuple[tuple[Tensor, Tensor], ...]
-    density: Literal["exp", "softplus", "relu"]
-    bias: float
-    bands: int
-    colour_space: Literal["srgb", "linear"]
-    contracted_density: float = 0.0
-
-
-@runtime_checkable
-class _MaybeHashField(Protocol):
-    def hash_field(self, bounds: Bounds) -> HashField | None: ...
-
-
-def hash_field(field: object, bounds: Bounds) -> HashField | None:
-    """What a field is made of, detached, where its method of this name says that it is a `HashField` over ``bounds``."""
-    return field.hash_field(bounds) if isinstance(field, _MaybeHashField) else None
 
 
 @dataclass(frozen=True)
 class MarchSteps:
-    """How a ray is walked: t grows by ``max(step, cone * t)``, or by what is ``step`` long after contraction.
+    """Step sizes of a ray march: dt = ``max(step, cone * t)``, or uniform dt of length ``step`` in contracted space.
 
     Attributes:
         step: shortest step, local units.
-        cone: growth of the step with distance (0 for bounded scenes, 1/256 in Instant-NGP's unbounded ones).
-        limit: most samples kept per ray in one march.
-        contracted: steps of equal contracted length (see `kernels.reference.march.step_lengths`); ``cone`` must be 0.
+        cone: cone angle, growth of the step with distance (0 for bounded scenes, 1/256 in Instant-NGP's unbounded ones).
+        limit: maximum number of samples per ray in one march.
+        contracted: uniform steps in contracted space (see `kernels.reference.march.step_lengths`); ``cone`` must be 0.
     """
 
     step: float
@@ -114,7 +27,7 @@ class MarchSteps:
 
 @dataclass(frozen=True, eq=False)
 class March:
-    """Sample intervals on n rays, packed by ray then distance, and where each ray would go on.
+    """Sample intervals on n rays, packed by ray then distance, and the distance at which each march can resume.
 
     Attributes:
         ray: ray index of each sample.
@@ -131,7 +44,7 @@ class March:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """n primitives on the screen.
+    """n Gaussians or discs projected to the image plane.
 
     A footprint's response at pixel p is ``opacity * exp(-0.5 q)``. For conics ``q = d^T C d`` with ``d = p - mean``; for flat
     discs ``q = u² + v²`` with ``(u, v) = (a, b) / c`` and ``(a, b, c) = H (x, y, 1)``, where ``homography`` is H, scaled so
@@ -142,26 +55,26 @@ class Footprints:
         conics: inverse 2D covariances (C_xx, C_xy, C_yy), per square pixel.
         opacities: peak alpha, in [0, 1].
         depths: sort key, depth of the centre along the optical axis.
-        planes: distance along the pixel's unit ray of the maximal response, to first order:
-            ``t(p) = planes[0] + planes[1] (x - mean_x) + planes[2] (y - mean_y)``.
+        depth_planes: distance along the pixel's unit ray of the maximal response, to first order:
+            ``t(p) = plane[0] + plane[1] (x - mean_x) + plane[2] (y - mean_y)``.
         radii: half-width in pixels of the square outside which the response is below the smallest visible alpha;
             0 for culled primitives.
         homography: pixel to disc coordinates, where the footprints are discs.
         blur: variance in square pixels of a Gaussian around the centre below which a disc's response never falls (low-pass
             filter, 2DGS §4.2); ``None`` for no filter.
-        pull: zeros, whose gradient after ``backward`` is the sum over pixels of the absolute values of dL/d(means2d) (AbsGS,
-            Ye et al. 2024), where that is wanted. Conics only.
+        absgrad: zeros, whose gradient after ``backward`` is the sum over pixels of |dL/d(means2d)| (AbsGS, Ye et al. 2024);
+            ``None`` where it is not wanted. Conics only.
     """
 
     means2d: Float[Tensor, "n 2"]
     conics: Float[Tensor, "n 3"]
     opacities: Float[Tensor, " n"]
     depths: Float[Tensor, " n"]
-    planes: Float[Tensor, "n 3"]
+    depth_planes: Float[Tensor, "n 3"]
     radii: Float[Tensor, " n"]
     homography: Float[Tensor, "n 3 3"] | None = None
     blur: Float[Tensor, " n"] | None = None
-    pull: Float[Tensor, "n 2"] | None = None
+    absgrad: Float[Tensor, "n 2"] | None = None
 
     def __len__(self) -> int:
         return len(self.means2d)
@@ -169,7 +82,7 @@ class Footprints:
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """Which footprints touch which tile, front to back.
+    """Tile intersections: the footprints that overlap each tile, front to back.
 
     Attributes:
         splats: footprint indices, tile after tile (row by row), each tile sorted by depth (ties by index).
@@ -187,12 +100,12 @@ class Bins:
 
 
 EXP_LIMIT = 15.0
-"""Where an exponential density stops growing (Instant-NGP's source clips its derivative there)."""
+"""Raw density at which an exponential density is clamped (Instant-NGP's source clips its derivative there)."""
 ALPHA_MIN = 1 / 255
 """Responses below this are skipped (3DGS, appendix C)."""
 ALPHA_MAX = 0.99
 """Alpha is clamped here for numerical stability (3DGS, appendix C)."""
-FADE_MIN = 0.005
-"""The low-pass filter's compensation (Mip-Splatting) fades no footprint more than this (3DGS, anti-aliased rasteriser)."""
+COMPENSATION_MIN = 0.005
+"""Lower bound of the low-pass filter's opacity compensation (Mip-Splatting; 3DGS, anti-aliased rasteriser)."""
 TRANSMITTANCE_MIN = 1e-4
 """Compositing of a pixel stops before transmittance falls below this (3DGS, appendix C)."""

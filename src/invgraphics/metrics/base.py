@@ -1,4 +1,4 @@
-"""What a metric is, and what it sees."""
+"""Metrics, and the pair of prediction and truth that they compare."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OPAQUE = 0.5
 
 
 class Skip(Exception):  # noqa: N818 - an outcome, not an error
-    """A metric that cannot be computed for a view; the message says why, for a person."""
+    """Raised where a metric does not apply to a view; the message is the reason in ``skipped``."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""What no method may lose to: the mean of the training images, and the nearest training view, unchanged."""
+"""Trivial baselines: the mean training image, and the training view with the nearest camera."""
 
 from __future__ import annotations
 

@@ -1,50 +1,19 @@
-"""How pictures are measured, as data: our own protocols, and those of the tools whose numbers a paper compares itself with.
+"""Scoring protocols as data: our own, and those of the tools whose numbers a paper compares itself with.
 
-A number such as "31.2 dB" means little without its conventions. Each `Convention` states those of one tool, as read in the
-source file that it names; `invgraphics.metrics.measures` holds the small functions that carry them out. Imports nothing heavy.
+A number such as "31.2 dB" means little without its conventions. Each `Protocol` states one set of them, another tool's as read
+in the source files that it names; `invgraphics.metrics.protocols` carries them out. Imports nothing heavy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
 
 Colour = tuple[float, float, float]
 
 Rounding = Literal["none", "nearest", "down"]
 """What happens to a picture after compositing: floats stay, or bytes by rounding, or bytes by truncation."""
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """What is fixed before one of our own metrics looks at a picture.
-
-    Attributes:
-        name: name in scores and on the command line.
-        quantise: whether both pictures are rounded to 8 bits after compositing, as their PNG files are.
-        background: what transparent pixels are put in front of; ``scene`` is the colour that the data set declares.
-        crop: pixels left out along each border.
-        aggregation: how views are joined: the mean of their values; or, for metrics in dB, the value of the mean error.
-        summary: one line for a table of protocols.
-    """
-
-    name: str
-    quantise: bool = True
-    background: Literal["scene", "white", "black"] = "scene"
-    crop: int = 0
-    aggregation: Literal["mean_of_views", "psnr_of_mean_mse"] = "mean_of_views"
-    summary: str = ""
-
-
-PROTOCOLS = {
-    protocol.name: protocol
-    for protocol in (
-        Protocol("default", summary="8-bit pictures over the scene's background, no crop, mean over views"),
-        Protocol("float", quantise=False, summary="as default, with unrounded pictures"),
-    )
-}
-"""Our own protocols by name; they apply every registered metric."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +39,7 @@ class Ssim:
         edges: ``valid``: windows wholly inside the picture only; or everywhere, and the picture goes on as ``zero``, as
             ``mirror`` (the edge pixel occurs once: dcb|abcd) or as ``reflect`` (twice: cba|abcd).
         data_range: the range L of the values; ``None`` measures it in each pair: the larger max - min of the two pictures.
-        grey: whether the window looks at Rec. 709 luma, instead of at each channel in turn.
+        grey: whether SSIM is computed on Rec. 709 luma, instead of on each channel.
     """
 
     kernel: tuple[float, ...] = ()
@@ -96,44 +65,52 @@ Measure = Psnr | Ssim | Lpips
 
 
 @dataclass(frozen=True)
-class Convention:
-    """How one tool measures.
+class Protocol:
+    """Settings of scoring: background, rounding, masks and crop of both pictures, and the metrics that compare them.
 
-    No tool below crops a picture by default; SSIM's own border is part of its `Ssim`. Pictures are composited in the scene's
-    colour space and measured in display sRGB.
+    No protocol below crops a picture; SSIM's own border is part of its `Ssim`. Pictures are composited in the scene's colour
+    space and measured in display sRGB.
 
     Attributes:
         name: name on the command line and in ``scores.<name>.json``.
         summary: one line for a table.
-        source: the repository, its commit, and the files in which this was read.
-        measures: name in the scores -> what is measured.
+        source: of another tool: the repository, its commit, and the files in which this was read; empty for our own.
+        measures: name in the scores -> what is measured; ``None`` for every registered metric.
         background: what is put behind transparent pixels; ``scene`` is the colour that the data set declares. Photographs
             without alpha have no background to choose.
         prediction: rounding of the prediction; ``none`` needs unrounded predictions.
         truth: rounding of the truth.
         truth_double: whether the truth is composited in double precision. It decides on which side of a whole byte truncation
             falls at the edges of things.
-        masks: pixels that do not count are multiplied by zero in both pictures; or the tool knows no masks.
+        masks: treatment of pixels outside a view's mask: ``excluded`` from every mean, and equal in both pictures, so that
+            windows see no error there; multiplied by ``zero`` in both pictures; or ``unknown`` to the tool.
+        crop: pixels left out along each border.
         widest: the tool's loader scales wider pictures down to this width in pixels; ``None``: it does not.
     """
 
     name: str
     summary: str
-    source: str
-    measures: Mapping[str, Measure] = field(hash=False)
+    source: str = ""
+    measures: Mapping[str, Measure] | None = field(default=None, hash=False)
     background: Literal["scene"] | Colour = "scene"
     prediction: Rounding = "none"
     truth: Rounding = "none"
     truth_double: bool = False
-    masks: Literal["zero", "unknown"] = "unknown"
+    masks: Literal["excluded", "zero", "unknown"] = "unknown"
+    crop: int = 0
     widest: int | None = None
+
+    def record(self) -> dict[str, Any]:
+        """Its settings as plain values for a file; those beyond the common ones only where they say something."""
+        always = ("name", "summary", "background", "prediction", "truth", "masks")
+        return {name: value for name, value in asdict(self).items() if value or name in always}
 
 
 WHITE: Colour = (1.0, 1.0, 1.0)
 BLACK: Colour = (0.0, 0.0, 0.0)
 
 VISER_GREY: Colour = (0.1490, 0.1647, 0.2157)
-"""What splatfacto shows behind a scene when it does not train, unless told another colour."""
+"""Background of splatfacto in evaluation, unless it is configured."""
 
 NGP_KERNEL = (0.120078, 0.233881, 0.292082, 0.233881, 0.120078)
 """The window of instant-ngp's SSIM along one axis."""
@@ -144,8 +121,19 @@ _NERFSTUDIO = "nerfstudio-project/nerfstudio@50e0e3c"
 _TORCHMETRICS = "torchmetrics 1.4.2 or later (functional/image/ssim.py; earlier ones leave SSIM's border out)"
 _SPLATTING_MEASURES: dict[str, Measure] = {"psnr": Psnr(), "ssim": Ssim(edges="zero"), "lpips_vgg": Lpips("vgg", scaled=False)}
 
-_ALL = (
-    Convention(
+_OWN = (
+    Protocol(
+        "default",
+        "8-bit pictures over the scene's background, no crop, mean over views",
+        prediction="nearest",
+        truth="nearest",
+        masks="excluded",
+    ),
+    Protocol("float", "as default, with unrounded pictures", masks="excluded"),
+)
+
+_OTHERS = (
+    Protocol(
         "nerfbaselines",
         "both pictures truncated to bytes over the data set's background; SSIM inside the border; both LPIPS",
         "nerfbaselines/nerfbaselines@cde53bd nerfbaselines/evaluation.py, metrics.py, utils.py (convert_image_dtype)",
@@ -154,7 +142,7 @@ _ALL = (
         truth="down",
         masks="zero",
     ),
-    Convention(
+    Protocol(
         "3dgs-metrics",
         "PNG files over black; SSIM with zeros beyond the border; LPIPS (VGG) of unscaled colours",
         f"{_GAUSSIAN_SPLATTING} metrics.py, render.py, utils/loss_utils.py, {_LOADED_DOWN}",
@@ -165,7 +153,7 @@ _ALL = (
         truth_double=True,
         widest=1600,
     ),
-    Convention(
+    Protocol(
         "3dgs-metrics-white",
         "as 3dgs-metrics with the option -w, as the paper's tables of synthetic scenes were made",
         f"{_GAUSSIAN_SPLATTING} metrics.py, render.py, utils/loss_utils.py, {_LOADED_DOWN}",
@@ -176,7 +164,7 @@ _ALL = (
         truth_double=True,
         widest=1600,
     ),
-    Convention(
+    Protocol(
         "3dgs-train",
         "what train.py prints: unrounded predictions over black, mean of three PSNRs, one for each channel",
         f"{_GAUSSIAN_SPLATTING} train.py (training_report), utils/image_utils.py, {_LOADED_DOWN}",
@@ -186,7 +174,7 @@ _ALL = (
         truth_double=True,
         widest=1600,
     ),
-    Convention(
+    Protocol(
         "multinerf",
         "predictions rounded to 8 bits, truth unrounded, over white; SSIM inside the border",
         "google-research/multinerf@5b4d4f6 eval.py (eval_quantize_metrics), internal/image.py, internal/datasets.py",
@@ -194,27 +182,27 @@ _ALL = (
         background=WHITE,
         prediction="nearest",
     ),
-    Convention(
+    Protocol(
         "nerf-pytorch",
         "unrounded pictures over white (white_bkgd); PSNR only",
         "yenchenlin/nerf-pytorch@63a5a63 run_nerf.py (render_path), run_nerf_helpers.py (mse2psnr)",
         {"psnr": Psnr()},
         background=WHITE,
     ),
-    Convention(
+    Protocol(
         "nerfstudio-nerf",
         "unrounded pictures over the data set's background; SSIM mirrored at the border, its range measured in each pair",
         f"{_NERFSTUDIO} nerfstudio/models/nerfacto.py (likewise vanilla_nerf.py, instant_ngp.py, tensorf.py), {_TORCHMETRICS}",
         {"psnr": Psnr(), "ssim": Ssim(edges="mirror", data_range=None), "lpips": Lpips()},
     ),
-    Convention(
+    Protocol(
         "nerfstudio-splatfacto",
         "unrounded pictures over the viewer's dark grey; SSIM inside the border",
         f"{_NERFSTUDIO} nerfstudio/models/splatfacto.py",
         {"psnr": Psnr(), "ssim": Ssim(), "lpips": Lpips()},
         background=VISER_GREY,
     ),
-    Convention(
+    Protocol(
         "instant-ngp",
         "unrounded pictures over black; SSIM of luma with five taps; PSNR also of the mean error over views",
         "NVlabs/instant-ngp@abe236e scripts/run.py (test_transforms), scripts/common.py (SSIM, compute_error)",
@@ -225,7 +213,7 @@ _ALL = (
         },
         background=BLACK,
     ),
-    Convention(
+    Protocol(
         "gsplat",
         "unrounded pictures over black (its loader drops the truth's alpha channel); SSIM mirrored at the border",
         f"nerfstudio-project/gsplat@90d7b4b examples/simple_trainer.py (eval), examples/datasets/colmap.py, {_TORCHMETRICS}",
@@ -234,5 +222,5 @@ _ALL = (
     ),
 )
 
-CONVENTIONS = {convention.name: convention for convention in _ALL}
-"""The conventions of other tools by name."""
+PROTOCOLS = {protocol.name: protocol for protocol in (*_OWN, *_OTHERS)}
+"""Every protocol by name: our own, which apply every registered metric, then those of other tools."""

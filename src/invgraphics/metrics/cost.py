@@ -1,12 +1,10 @@
-"""What a method costs: memory, time per picture, size."""
+"""Costs of a method: peak memory and model size."""
 
 from __future__ import annotations
 
-import statistics
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 
@@ -20,14 +18,8 @@ SAMPLING_SECONDS = 0.02
 """How often the resident set is read. Shorter peaks can be missed."""
 
 
-def synchronise(device: torch.device | str) -> None:
-    """Wait until ``device`` has finished what was asked of it, so that a clock read next tells the truth."""
-    if torch.device(device).type == "cuda":
-        torch.cuda.synchronize(device)
-
-
 def resident_bytes() -> int:
-    """Memory that this process holds now; where the system does not say (no ``/proc``), the most it has ever held."""
+    """Resident set size of this process in bytes; where there is no ``/proc``, its peak so far."""
     import resource
 
     if STATM.exists():
@@ -37,7 +29,7 @@ def resident_bytes() -> int:
 
 
 class PeakMemory:
-    """Measures, within a ``with`` block, the most memory held above what was held at its start.
+    """Peak memory within a ``with`` block, above that at its start.
 
     On a CPU this is the process's resident set, sampled by a thread; on CUDA, torch's allocator.
 
@@ -83,27 +75,6 @@ class PeakMemory:
             self._read()
 
 
-def median_seconds(work: Callable[[], object], device: torch.device | str, repeats: int = 5, warm_up: int = 1) -> float:
-    """Median wall-clock seconds of ``work()``, after calls that compile, allocate and fill caches.
-
-    Args:
-        work: for instance the rendering of one view.
-        device: waited for before every reading of the clock.
-        repeats: timed calls, >= 1.
-        warm_up: calls before them that do not count.
-    """
-    for _ in range(warm_up):
-        work()
-    seconds = []
-    for _ in range(repeats):
-        synchronise(device)
-        start = time.perf_counter()
-        work()
-        synchronise(device)
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)
-
-
 def model_bytes(modules: Iterable[nn.Module]) -> int:
     """Bytes of all parameters and buffers, shared tensors counted once."""
     tensors = {id(tensor): tensor for module in modules for tensor in (*module.parameters(), *module.buffers())}
@@ -111,6 +82,6 @@ def model_bytes(modules: Iterable[nn.Module]) -> int:
 
 
 def parameter_count(modules: Iterable[nn.Module]) -> int:
-    """Numbers that are optimised, shared parameters counted once."""
+    """Number of trainable parameters, shared ones counted once."""
     parameters = {id(parameter): parameter for module in modules for parameter in module.parameters()}
     return sum(parameter.numel() for parameter in parameters.values() if parameter.requires_grad)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from invgraphics.metrics.base import Metric, Pair, Skip
+from invgraphics.metrics.conventions import Psnr, Ssim
+
+Channel = Float[np.ndarray, "h w"]
 
 PSNR_CAP = 100.0
 """dB of two identical images, whose PSNR would be infinite and spoil every mean."""
@@ -17,37 +21,71 @@ SSIM_SIGMA = 1.5
 SSIM_RADIUS = 5
 """Half-width of the 11 x 11 window that Wang et al. (2004) use."""
 
+K1, K2 = 0.01, 0.03
+"""SSIM's constants, as published and as every tool uses them."""
+
+LUMA = (0.2126, 0.7152, 0.0722)
+"""Rec. 709 weights of red, green and blue, applied to display values as instant-ngp does."""
+
+_PSNR, _SSIM = Psnr(), Ssim()
+
 MS_SSIM_SHORTEST = 161
 """Shortest side for five scales of an 11 x 11 window: (11 - 1) * 2**4 + 1."""
 
 
-def psnr(pair: Pair) -> float:
-    """Peak signal-to-noise ratio, -10 log10(MSE) for colours in [0, 1], over the pixels that count; at most `PSNR_CAP`."""
-    mse = pair.mean_within((pair.image.double() - pair.truth.double()).square().mean(dim=-1))
-    return -10 * math.log10(max(mse, 10 ** (-PSNR_CAP / 10)))
+def psnr(pair: Pair, how: Psnr = _PSNR) -> float:
+    """Peak signal-to-noise ratio in dB, -10 log10(MSE) for colours in [0, 1], over unmasked pixels; at most `PSNR_CAP`."""
+    squared = (pair.image.double() - pair.truth.double()).square()
+    channels = squared.unbind(dim=-1) if how.channels == "apart" else (squared.mean(dim=-1),)
+    values = [-10 * math.log10(max(pair.mean_within(errors), 10 ** (-PSNR_CAP / 10))) for errors in channels]
+    return sum(values) / len(values)
 
 
-def ssim(pair: Pair) -> float:
-    """Structural similarity (Wang et al. 2004): scikit-image with its published settings, channels averaged.
-
-    As in scikit-image, the map's outer 5 pixels, whose windows reach over the edge, are left out of the mean.
-    """
-    from skimage.metrics import structural_similarity
-
-    height, width = pair.pred_alpha.shape
-    if min(height, width) <= 2 * SSIM_RADIUS:
-        raise Skip(f"images of {width}x{height} are smaller than SSIM's 11 x 11 window")
+def ssim(pair: Pair, how: Ssim = _SSIM) -> float:
+    """Mean of the SSIM map (Wang et al. 2004, eq. 13) over the pixels that count and over channels, in double precision."""
+    kernel = np.asarray(how.kernel or gaussian_kernel())
+    radius, (height, width) = len(kernel) // 2, pair.truth.shape[:2]
+    if min(height, width) < len(kernel):
+        raise Skip(f"images of {width}x{height} are smaller than SSIM's {len(kernel)} x {len(kernel)} window")
     image, truth = (values.double().cpu().numpy() for values in (pair.image, pair.truth))
-    settings = {"gaussian_weights": True, "sigma": SSIM_SIGMA, "use_sample_covariance": False, "data_range": 1.0}
-    result: Any = structural_similarity(truth, image, channel_axis=-1, full=True, **settings)
-    mean, per_pixel = result
+    data_range = max(np.ptp(image), np.ptp(truth)) if how.data_range is None else how.data_range
+    if how.grey:
+        image, truth = (values @ np.asarray(LUMA) for values in (image, truth))
+    channels = zip(np.atleast_3d(image).transpose(2, 0, 1), np.atleast_3d(truth).transpose(2, 0, 1), strict=True)
+    constants = ((K1 * data_range) ** 2, (K2 * data_range) ** 2)
+    inner = slice(radius, -radius) if how.edges == "valid" else slice(None)
+    maps = [_similarity(x, y, _blur(kernel, how.edges), constants)[inner, inner] for x, y in channels]
     if pair.mask is None:
-        return float(mean)
-    inner = slice(SSIM_RADIUS, -SSIM_RADIUS)
+        return float(np.mean([values.mean() for values in maps]))
     mask = pair.mask.cpu().numpy()[inner, inner]
     if not mask.any():
         raise Skip("the view's mask leaves no pixel to score")
-    return float(np.mean(per_pixel[inner, inner][mask]))
+    return float(np.mean(np.stack(maps, axis=-1)[mask]))
+
+
+def _similarity(x: Channel, y: Channel, blur: Callable[[Channel], Channel], constants: tuple[float, float]) -> Channel:
+    """SSIM of one channel at every pixel."""
+    mean_x, mean_y = blur(x), blur(y)
+    variances = (blur(x * x) - mean_x * mean_x) + (blur(y * y) - mean_y * mean_y)
+    covariance = blur(x * y) - mean_x * mean_y
+    numerator = (2 * mean_x * mean_y + constants[0]) * (2 * covariance + constants[1])
+    denominator = (mean_x**2 + mean_y**2 + constants[0]) * (variances + constants[1])
+    # Two pictures of one and the same colour have no range of their own: they are equal or not comparable at all.
+    return np.divide(numerator, denominator, out=np.ones_like(numerator), where=denominator != 0)
+
+
+def gaussian_kernel() -> Float[np.ndarray, " taps"]:
+    """The published window along one axis: 11 taps of a Gaussian with sigma 1.5, sum 1."""
+    weights = np.exp(-0.5 / SSIM_SIGMA**2 * np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) ** 2)
+    return weights / weights.sum()
+
+
+def _blur(kernel: np.ndarray, edges: str) -> Callable[[Channel], Channel]:
+    from scipy.ndimage import correlate1d
+
+    # Windows that reach over the edge are dropped afterwards where only whole ones count, so any continuation will do.
+    mode = {"zero": "constant", "mirror": "mirror"}.get(edges, "reflect")
+    return lambda values: correlate1d(correlate1d(values, kernel, axis=0, mode=mode), kernel, axis=1, mode=mode)
 
 
 def ms_ssim(pair: Pair) -> float:

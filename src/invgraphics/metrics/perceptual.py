@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.metrics.base import Metric, Pair, Skip
+from invgraphics.metrics.conventions import Lpips
 from invgraphics.metrics.image import refuse_mask
 
 ALEXNET_FILE = "alexnet-owt-7be5be79.pth"
@@ -24,6 +25,9 @@ BACKBONES = {"alex": ("AlexNet", ALEXNET_FILE), "vgg": ("VGG-16", "vgg16-397923a
 
 LPIPS_SHORTEST = 32
 """The networks' strides leave nothing of smaller images."""
+
+
+_LPIPS = Lpips()
 
 
 def flip_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
@@ -47,7 +51,7 @@ def flip(pair: Pair) -> float:
 
 
 def lpips_weights(net: str = "alex") -> Path:
-    """Where a backbone of LPIPS is looked for: torch's own model cache."""
+    """Path of a backbone's weights in torch's model cache."""
     return Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[net][1]
 
 
@@ -69,39 +73,23 @@ def _lpips_network(net: str = "alex") -> Any:
         raise Skip(f"LPIPS cannot be loaded: {type(error).__name__}: {error}") from error
 
 
-def lpips_distance(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], net: str, scaled: bool = True) -> float:
-    """LPIPS v0.1 (Zhang et al. 2018).
-
-    Args:
-        image: display sRGB in [0, 1].
-        truth: likewise.
-        net: the backbone, a key of `BACKBONES`.
-        scaled: whether colours are scaled to [-1, 1], as the network expects; some tools leave them in [0, 1].
+def lpips(pair: Pair, how: Lpips = _LPIPS) -> float:
+    """Learned perceptual similarity v0.1 (Zhang et al. 2018) of a pair without masked pixels.
 
     Raises:
-        Skip: the network is not on this machine, or the images are too small.
+        Skip: the network is not on this machine, the images are too small, or some pixels do not count.
     """
-    reason = why_no_lpips(net)
-    if reason:
-        raise Skip(reason)
-    height, width = image.shape[:2]
-    if min(height, width) < LPIPS_SHORTEST:
-        raise Skip(f"needs {LPIPS_SHORTEST} pixels along the shorter side, the images are {width}x{height}")
-    pair = (values.float().cpu().permute(2, 0, 1)[None] for values in (image, truth))
-    with torch.no_grad():
-        return float(_lpips_network(net)(*pair, normalize=scaled))
-
-
-def lpips_alex(pair: Pair) -> float:
-    """LPIPS v0.1 with the AlexNet backbone; colours are scaled to [-1, 1] as it expects."""
-    reason = why_no_lpips()
+    reason = why_no_lpips(how.net)
     if reason:
         raise Skip(reason)
     refuse_mask(pair)
-    return lpips_distance(pair.image, pair.truth, "alex")
+    height, width = pair.truth.shape[:2]
+    if min(height, width) < LPIPS_SHORTEST:
+        raise Skip(f"needs {LPIPS_SHORTEST} pixels along the shorter side, the images are {width}x{height}")
+    both = (values.float().cpu().permute(2, 0, 1)[None] for values in (pair.image, pair.truth))
+    with torch.no_grad():
+        return float(_lpips_network(how.net)(*both, normalize=how.scaled))
 
 
 FLIP = Metric("flip", "", False, flip, "LDR-FLIP, mean over pixels, at 67 pixels per degree")
-LPIPS = Metric(
-    "lpips", "", False, lpips_alex, "LPIPS v0.1, AlexNet, inputs in [-1, 1]; an extra that needs weights of your own"
-)
+LPIPS = Metric("lpips", "", False, lpips, "LPIPS v0.1, AlexNet, inputs in [-1, 1]; an extra that needs weights of your own")

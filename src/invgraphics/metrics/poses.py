@@ -1,4 +1,4 @@
-"""How far estimated cameras are from the true ones, after the similarity that no photograph can tell.
+"""Errors of estimated camera poses after alignment by a similarity (the gauge freedom of structure from motion).
 
 Structure from motion and joint optimisation know the world up to a similarity (gauge freedom), so estimated poses are moved by
 the best one first: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns", on the
@@ -36,12 +36,17 @@ class Similarity:
         """As one affine matrix, for `invgraphics.core.transforms`."""
         return rigid(self.scale * self.rotation, self.translation)
 
+    def inverse(self) -> Similarity:
+        """The similarity from the target back to the source."""
+        rotation = self.rotation.T
+        return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
     def points(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Move points."""
+        """Transform points."""
         return transform_points(self.matrix, points.double())
 
     def poses(self, cam_to_world: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
-        """Move cameras: their positions are scaled, their axes stay orthonormal."""
+        """Transform cameras: their positions are scaled, their axes stay orthonormal."""
         moved = cam_to_world.double().clone()
         moved[..., :3, :3] = self.rotation @ moved[..., :3, :3]
         moved[..., :3, 3] = self.points(cam_to_world[..., :3, 3])
@@ -82,7 +87,7 @@ def align_similarity(
     source_rotations: Float[Tensor, "n 3 3"] | None = None,
     target_rotations: Float[Tensor, "n 3 3"] | None = None,
 ) -> Similarity:
-    """The similarity that takes the source's camera centres to the target's with the least sum of squared distances.
+    """Least-squares similarity from the source's camera centres to the target's (Umeyama 1991).
 
     Umeyama's closed form decides alone where the centres span at least a plane. Where either set lies on a line (`THINNEST`)
     and orientations are given, the relative rotations ``target_rotation @ source_rotation.T`` have as much say about the

@@ -1,14 +1,14 @@
-"""Protocols: the conventions under which metrics are computed. Evaluation owns background, quantisation and crops."""
+"""Scoring under a protocol: compositing, rounding, masks and crops; then every metric; then the mean over views."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from invgraphics import plugins
@@ -16,7 +16,11 @@ from invgraphics.core import Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.metrics.base import Metric, Pair, Skip
-from invgraphics.metrics.conventions import CONVENTIONS, PROTOCOLS, Protocol
+from invgraphics.metrics.conventions import PROTOCOLS, Lpips, Measure, Protocol, Psnr, Rounding, Ssim
+from invgraphics.metrics.image import psnr, ssim
+from invgraphics.metrics.perceptual import lpips
+
+Image = Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -35,48 +39,34 @@ class ViewScore:
 
 
 def protocol_named(name: str) -> Protocol:
-    """Look one of our own protocols up.
+    """Look up one of our own protocols.
 
     Raises:
         InputError: unknown name, the known ones are listed; or the name of another tool's, which only rescoring knows.
     """
-    if name in CONVENTIONS:
-        raise InputError(
-            f"'{name}' is the protocol of another tool; a fit is evaluated under our own: {', '.join(PROTOCOLS)}.",
-            f"Score the finished run again: invgraphics rescore RUN --protocol {name}.",
-        )
+    own = [known for known, protocol in PROTOCOLS.items() if not protocol.source]
     if name not in PROTOCOLS:
+        raise InputError(f"There is no protocol '{name}'.{did_you_mean(name, own)}", f"Known protocols: {', '.join(own)}.")
+    if PROTOCOLS[name].source:
         raise InputError(
-            f"There is no protocol '{name}'.{did_you_mean(name, PROTOCOLS)}", f"Known protocols: {', '.join(PROTOCOLS)}."
+            f"'{name}' is the protocol of another tool; a fit is evaluated under our own: {', '.join(own)}.",
+            f"Score the finished run again: invgraphics rescore RUN --protocol {name}.",
         )
     return PROTOCOLS[name]
 
 
-def display_colour(colour: Float[Tensor, "*p 3"], scene: Scene, protocol: Protocol) -> Float[Tensor, "*p 3"]:
-    """Composited colours as the protocol shows them: display sRGB in [0, 1], rounded to 8 bits if it says so."""
-    display = linear_to_srgb(colour) if scene.colour == "linear" else colour.clamp(0, 1)
-    return quantise(display).float() / 255 if protocol.quantise else display
-
-
-def background_of(scene: Scene, protocol: Protocol) -> Float[Tensor, 3]:
-    """The protocol's background, in the scene's colour space."""
-    if protocol.background == "scene":
-        return scene.background
-    return torch.full_like(scene.background, 1.0 if protocol.background == "white" else 0.0)
-
-
 def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) -> Pair:
-    """Put a rendering and its view under a protocol.
+    """Composite, convert to display sRGB, round, mask and crop a rendering and its view: the pair that metrics compare.
 
     Args:
         rendering: prediction of shape (h, w), in the scene's local frame and colour space.
         view: the truth.
-        scene: where both come from.
+        scene: where both come from; its background is used where the protocol says so, and where nothing is transparent.
         protocol: the conventions.
 
     Raises:
         InputError: prediction and truth differ in size, or the crop leaves nothing.
-        Skip: the prediction's colour or alpha is not finite somewhere.
+        Skip: the prediction's colour or alpha is not finite somewhere, or the view has a mask and the protocol knows none.
     """
     height, width = view.image.shape[:2]
     if tuple(rendering.alpha.shape) != (height, width):
@@ -88,12 +78,9 @@ def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) 
     broken = ~(rendering.rgb.isfinite().all(dim=-1) & rendering.alpha.isfinite())
     if broken.any():
         raise Skip(f"the predicted colour or alpha is not finite at {int(broken.sum())} of {broken.numel()} pixels")
-    background = background_of(scene, protocol).to(rendering.rgb)
-    image = display_colour(rendering.over(background), scene, protocol)
-    truth = display_colour(view.over(background.to(view.image.device)), scene, protocol).to(image)
-    mask = None if view.mask is None else view.mask.to(image.device, torch.bool)
+    image, truth, mask = _masked(*_composited(rendering, view, scene, protocol), view, protocol)
     pair = Pair(
-        image=image if mask is None else torch.where(mask[..., None], image, truth),
+        image=image,
         truth=truth,
         pred_alpha=rendering.alpha,
         true_alpha=None if view.alpha is None else view.opacity().to(image),
@@ -106,13 +93,56 @@ def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) 
     return pair.cropped(protocol.crop) if protocol.crop else pair
 
 
+def _composited(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) -> tuple[Image, Image]:
+    """Prediction and truth over the protocol's background, display sRGB in [0, 1], rounded as it says."""
+    background = scene.background
+    if view.alpha is not None and protocol.background != "scene":
+        background = torch.tensor(protocol.background)
+    image = rounded(_display(rendering.over(background.to(rendering.rgb)), scene), protocol.prediction)
+    over = _over_in_double if protocol.truth_double and view.image.dtype == torch.uint8 else View.over
+    colour = over(view, background.to(view.image.device, torch.float32))
+    return image, rounded(_display(colour, scene), protocol.truth).to(image)
+
+
+def _masked(image: Image, truth: Image, view: View, protocol: Protocol) -> tuple[Image, Image, Bool[Tensor, "h w"] | None]:
+    """Both pictures with the view's mask applied, and the mask where means exclude what it leaves out."""
+    if view.mask is None or (protocol.masks != "excluded" and bool(view.mask.all())):
+        return image, truth, None
+    if protocol.masks == "unknown":
+        raise Skip(f"the view has a mask, and {protocol.name} knows no masks")
+    mask = view.mask.to(image.device, torch.bool)
+    if protocol.masks == "zero":
+        return image * mask[..., None], truth * mask[..., None], None
+    return torch.where(mask[..., None], image, truth), truth, mask
+
+
+def _display(colour: Image, scene: Scene) -> Image:
+    return linear_to_srgb(colour) if scene.colour == "linear" else colour.clamp(0, 1)
+
+
+def _over_in_double(view: View, background: Float[Tensor, 3]) -> Image:
+    """`View.over` for bytes, in double precision."""
+    if view.alpha is None:
+        return view.image.double() / 255
+    alpha = view.alpha[..., None].double() / 255
+    return view.image.double() / 255 * alpha + (1 - alpha) * background.double()
+
+
+def rounded(display: Image, rounding: Rounding) -> Image:
+    """Display colours in [0, 1] after an image file of 8 bits, or as they are."""
+    if rounding == "none":
+        return display
+    levels = quantise(display) if rounding == "nearest" else (display.clamp(0, 1) * 255).to(torch.uint8)
+    return levels.float() / 255
+
+
 def score(rendering: Rendering, view: View, scene: Scene, protocol: Protocol, only: Sequence[str] | None = None) -> ViewScore:
-    """Score one view with every registered metric, or with those named in ``only``.
+    """Score one view with every metric of the protocol, or with those named in ``only``.
 
     Raises:
         InputError: an unknown metric in ``only``, or a prediction of the wrong size.
     """
-    wanted = list(plugins.names("metrics")) if only is None else list(only)
+    wanted = list(only if only is not None else plugins.names("metrics") if protocol.measures is None else protocol.measures)
     values: dict[str, float] = {}
     skipped: dict[str, str] = {}
     try:
@@ -121,13 +151,24 @@ def score(rendering: Rendering, view: View, scene: Scene, protocol: Protocol, on
         return ViewScore(view.name, {}, dict.fromkeys(wanted, str(reason)))
     for name in wanted:
         try:
-            values[name] = _value(name, pair)
+            values[name] = _registered(name, pair) if protocol.measures is None else measure(protocol.measures[name], pair)
         except Skip as reason:
             skipped[name] = str(reason)
     return ViewScore(view.name, values, skipped)
 
 
-def _value(name: str, pair: Pair) -> float:
+def measure(how: Measure, pair: Pair) -> float:
+    """Compute PSNR (dB), SSIM or LPIPS of a pair with the given settings.
+
+    Raises:
+        Skip: the pictures are too small, no pixel counts, or LPIPS lacks its weights.
+    """
+    if isinstance(how, Psnr):
+        return psnr(pair, how)
+    return ssim(pair, how) if isinstance(how, Ssim) else lpips(pair, how)
+
+
+def _registered(name: str, pair: Pair) -> float:
     metric = _metric(name)
     try:
         value = float(metric.compute(pair))
@@ -159,27 +200,10 @@ def _metric(name: str) -> Metric:
 def summarise(
     scores: Sequence[ViewScore], protocol: Protocol = PROTOCOLS["default"]
 ) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Join the views into the ``quality`` and the ``skipped`` part of a ``scores.json``, see `join_views`."""
-
-    def joined(name: str, values: list[float]) -> dict[str, Any]:
-        metric = _metric(name)
-        mean = _mean(values, metric.unit, protocol)
-        return {"mean": mean, "unit": metric.unit, "higher_is_better": metric.higher_is_better}
-
-    return join_views(scores, joined)
-
-
-def join_views(
-    scores: Sequence[ViewScore], joined: Callable[[str, list[float]], dict[str, Any]]
-) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Join the views' scores into the ``quality`` and the ``skipped`` part of a ``scores.json``.
+    """Join the views into the ``quality`` and the ``skipped`` part of a ``scores.json``, as the protocol joins them.
 
     A metric that is missing in any view gets no mean: means over different views cannot be compared. Why it is missing, and
     in which view first, goes to ``skipped``.
-
-    Args:
-        scores: of all views.
-        joined: mean, unit and direction of a metric, from its name and its values.
     """
     names = list(dict.fromkeys(name for one in scores for name in (*one.values, *one.skipped)))
     quality: dict[str, dict[str, Any]] = {}
@@ -190,12 +214,19 @@ def join_views(
             reason = missing[0].skipped.get(name, "not computed")
             skipped[name] = reason if len(missing) == len(scores) else f"view {missing[0].view}: {reason}"
             continue
-        values = [one.values[name] for one in scores]
-        quality[name] = {**joined(name, values), "per_view": values}
+        quality[name] = _joined(name, [one.values[name] for one in scores], protocol)
     return quality, skipped
 
 
-def _mean(values: list[float], unit: str, protocol: Protocol) -> float:
-    if protocol.aggregation == "psnr_of_mean_mse" and unit == "dB":
-        return -10 * math.log10(math.fsum(10 ** (-value / 10) for value in values) / len(values))
-    return math.fsum(values) / len(values)
+def _joined(name: str, values: list[float], protocol: Protocol) -> dict[str, Any]:
+    """Mean over views, unit, direction and the views' values of one metric."""
+    mean = math.fsum(values) / len(values)
+    if protocol.measures is None:
+        metric = _metric(name)
+        unit, higher_is_better = metric.unit, metric.higher_is_better
+    else:
+        how = protocol.measures[name]
+        if isinstance(how, Psnr) and how.views == "mean error":
+            mean = -10 * math.log10(math.fsum(10 ** (-value / 10) for value in values) / len(values))
+        unit, higher_is_better = ("dB" if isinstance(how, Psnr) else ""), not isinstance(how, Lpips)
+    return {"mean": mean, "unit": unit, "higher_is_better": higher_is_better, "per_view": values}

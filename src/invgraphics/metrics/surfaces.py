@@ -1,4 +1,4 @@
-"""How far two surfaces are apart, from points on them."""
+"""Accuracy, completeness and Chamfer distance between surfaces, from points sampled on them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class SurfaceDistance:
     """Mean distances between points of two surfaces, in their units.
 
     Attributes:
-        accuracy: from the prediction to the truth: what is there should be right.
-        completeness: from the truth to the prediction: what should be there is.
+        accuracy: mean distance from predicted points to the true surface.
+        completeness: mean distance from true points to the predicted surface.
     """
 
     accuracy: float
@@ -28,20 +28,21 @@ class SurfaceDistance:
 
 
 def surface_distance(
-    predicted: Float[Tensor, "n 3"], true: Float[Tensor, "m 3"], must: Float[Tensor, "k 3"] | None = None
+    predicted: Float[Tensor, "n 3"], true: Float[Tensor, "m 3"], required: Float[Tensor, "k 3"] | None = None
 ) -> SurfaceDistance:
     """Compare points sampled on two surfaces by nearest neighbours.
 
     Args:
         predicted: points of the prediction.
         true: points of the truth, all of it.
-        must: points of the truth that can be asked for, for instance those that were seen; ``None`` for all.
+        required: points of the truth that completeness counts, for instance those in view; ``None`` for all.
     """
     from scipy.spatial import KDTree
 
-    ours, theirs, asked = (points.double().cpu().numpy() for points in (predicted, true, true if must is None else must))
+    required = true if required is None else required
+    ours, theirs, counted = (points.double().cpu().numpy() for points in (predicted, true, required))
     accuracy, _ = KDTree(theirs).query(ours)
-    completeness, _ = KDTree(ours).query(asked)
+    completeness, _ = KDTree(ours).query(counted)
     return SurfaceDistance(float(accuracy.mean()), float(completeness.mean()))
 
 

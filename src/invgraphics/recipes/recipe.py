@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.presets import select_preset
+from invgraphics.recipes.renamed import with_current_names, with_first_names
 from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
@@ -20,12 +22,16 @@ if TYPE_CHECKING:
     from invgraphics.recipes.schema import Recipe
 
 
+PRESET = "preset="
+"""How the change in a method's name begins that chooses a preset."""
+
+
 @dataclass(frozen=True)
 class Method:
     """A recipe ready to be built.
 
     Attributes:
-        name: ``renderer/recipe``, or the path of a user's own TOML file.
+        name: ``renderer/recipe`` or the path of a user's own TOML file, with changes after colons (see `split_name`).
         preset: which preset was laid over the recipe; empty for none.
         recipe: its typed settings.
         table: the same, everything resolved, as plain values; what a run's ``recipe.toml`` holds.
@@ -47,8 +53,8 @@ class Method:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the resolved table."""
-        return sha256_of(self.table)
+        """SHA-256 of the resolved table, the same whatever its keys are called by now."""
+        return sha256_of(with_first_names(self.table))
 
 
 def methods() -> dict[str, str]:
@@ -71,19 +77,44 @@ def load_method(name: str, preset: str | None = None, overrides: Sequence[str] =
     """Read a method's recipe, lay a preset and then overrides over it, and check every key.
 
     Args:
-        name: ``renderer/recipe`` of a built-in or plugged-in method, or the path of a TOML file.
-        preset: one of the recipe's presets; ``None`` takes the one for the budget (see `recipes.presets`).
+        name: ``renderer/recipe`` of a built-in or plugged-in method, or the path of a TOML file; either may have changes after
+            colons (see `split_name`).
+        preset: one of the recipe's presets, unless the name says one; ``None`` takes the one for the budget (see
+            `recipes.presets`).
         overrides: ``dotted.path=value`` items, values as in TOML; bare words are taken as text.
         budget: of the fit; ``None`` counts as a short one.
 
     Raises:
         InputError: unknown method, preset or key, or a value of the wrong type.
     """
-    table = source(name)
-    chosen = select_preset(name, preset, budget, table.pop("presets", {}))
+    return method_from(source(name), name, preset, overrides, budget)
+
+
+def method_from(
+    table: Mapping[str, Any], name: str, preset: str | None = None, overrides: Sequence[str] = (), budget: Budget | None = None
+) -> Method:
+    """A method from a recipe's table as a file holds it, presets included; otherwise as `load_method`.
+
+    Raises:
+        InputError: unknown preset or key, or a value of the wrong type.
+    """
+    table = dict(table)
+    _, named, own = split_name(name)
+    chosen = select_preset(name, preset if named is None else named, budget, table.pop("presets", {}))
     table = merge(table, chosen.table)
-    assign(table, overrides)
+    assign(table, (*overrides, *own))
     return replace(resolve(name, chosen.name, table), preset_choice=chosen.choice, chosen_on=chosen.chosen_on)
+
+
+def split_name(name: str) -> tuple[str, str | None, tuple[str, ...]]:
+    """A method's name without the changes that follow it: recipe, preset (``None`` where none is named), and overrides.
+
+    ``volumetric/hash:field.width=64:batches.rays=2048`` is the recipe with two values changed, ``volumetric/nerf:preset=paper``
+    one of its presets. A comparison can so hold several variants of one recipe, each under a name that makes it again.
+    """
+    recipe, *settings = re.split(r":(?=[\w.]+=)", name)
+    presets = [item.partition("=")[2] for item in settings if item.startswith(PRESET)]
+    return recipe, presets[-1] if presets else None, tuple(item for item in settings if not item.startswith(PRESET))
 
 
 def assign(table: dict[str, Any], items: Sequence[str]) -> None:
@@ -100,15 +131,21 @@ def assign(table: dict[str, Any], items: Sequence[str]) -> None:
 
 
 def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
-    """A method from a complete table, for instance from a run's ``recipe.toml``."""
+    """A method from a complete table, for instance from a run's ``recipe.toml``; keys may have names of earlier versions.
+
+    Raises:
+        InputError: unknown key, a value of the wrong type, or a hook that the field cannot serve.
+    """
     from invgraphics.recipes.schema import Recipe
 
-    recipe = fill(Recipe, table).capped()
+    recipe = fill(Recipe, with_current_names(table)).capped()
+    recipe.check_hooks()
     return Method(name, preset, recipe, to_table(recipe))
 
 
 def source(name: str) -> dict[str, Any]:
-    """The recipe's table as written, presets included."""
+    """The recipe's table as written, presets included; changes that the name itself makes are left out."""
+    name = split_name(name)[0]
     if name.endswith(".toml"):
         path = Path(name)
     else:

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from dataclasses import field as default
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, Self, get_type_hints, runtime_checkable
 
 from invgraphics.config import Slot
 from invgraphics.training.batches import BatchConfig
+from invgraphics.training.hooks import Hook
 from invgraphics.training.optimiser import OptimiserConfig
 from invgraphics.training.poses import TrainingConfig
+
+
+@runtime_checkable
+class CapsPrimitives(Protocol):
+    """A part of a recipe whose number of explicit primitives can be capped."""
+
+    def capped(self, most: int) -> Self:
+        """The same part, making at most ``most`` primitives."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -45,10 +55,31 @@ class Recipe:
             raise ValueError(f"max_primitives must be at least 1, not {self.max_primitives}.")
 
     def capped(self) -> Recipe:
-        """The recipe with ``max_primitives`` handed to every part that makes primitives, which offers a ``capped`` itself."""
-        if self.max_primitives is None:
+        """The recipe with ``max_primitives`` applied to the field and the hooks that make primitives (`CapsPrimitives`)."""
+        most = self.max_primitives
+        if most is None:
             return self
-        return replace(self, field=self._cap(self.field), hooks=tuple(map(self._cap, self.hooks)))
+        field, *hooks = (part.capped(most) if isinstance(part, CapsPrimitives) else part for part in (self.field, *self.hooks))
+        return replace(self, field=field, hooks=tuple(hooks))
 
-    def _cap(self, part: Any) -> Any:
-        return part.capped(self.max_primitives) if hasattr(part, "capped") else part
+    def check_hooks(self) -> None:
+        """Refuse a hook that needs what the field does not have, before anything is built.
+
+        Classes are those with which ``build`` of the configs is annotated; where there is no annotation, the fit checks.
+
+        Raises:
+            InputError: names the hook, what it needs, and the field.
+        """
+        field = _built(self.field)
+        for hook in map(_built, self.hooks):
+            if field is not None and hook is not None and issubclass(hook, Hook):
+                hook.check(field)
+
+
+def _built(config: Any) -> type | None:
+    """The class that a config's ``build`` says it returns; ``None`` where it does not say."""
+    try:
+        result = get_type_hints(type(config).build).get("return")
+    except (AttributeError, NameError, TypeError):  # a name that is imported for type checkers only
+        return None
+    return result if isinstance(result, type) else None

@@ -4,16 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from invgraphics import plugins
 from invgraphics.recipes.recipe import methods, source
-
-FIELD_WORDS = {"neural": "network", "gaussians": "anisotropic 3D Gaussians"}
-ENCODING_WORDS = {"frequency": "frequency encoding", "hash": "multi-resolution hash grid"}
-RENDERER_WORDS = {
-    "volumetric": "volume rendering",
-    "splatting": "splatting",
-    "gaussian_exact": "exact line integrals",
-    "gaussian_sorted": "line integrals in ray order",
-}
 
 
 def matrix() -> tuple[list[str], list[str], dict[tuple[str, str], list[str]]]:
@@ -21,8 +13,7 @@ def matrix() -> tuple[list[str], list[str], dict[tuple[str, str], list[str]]]:
     cells: dict[tuple[str, str], list[str]] = {}
     for name in methods():
         table = source(name)
-        renderer = str(table["renderer"]["type"])
-        cells.setdefault((_field_words(table["field"]), RENDERER_WORDS.get(renderer, renderer)), []).append(name)
+        cells.setdefault((_field_title(table["field"]), _title("renderers", table["renderer"])), []).append(name)
     rows = list(dict.fromkeys(row for row, _ in cells))
     columns = list(dict.fromkeys(column for _, column in cells))
     return rows, columns, cells
@@ -38,8 +29,12 @@ def markdown() -> str:
     return "\n".join(lines)
 
 
-def _field_words(field: dict[str, Any]) -> str:
-    kind = str(field["type"])
-    words = FIELD_WORDS.get(kind, kind)
-    encoding = str(field.get("encoding", {}).get("type", ""))
-    return f"{ENCODING_WORDS.get(encoding, encoding)} + {words}" if encoding else words
+def _field_title(field: dict[str, Any]) -> str:
+    title = _title("fields", field)
+    return f"{_title('encodings', field['encoding'])} + {title}" if "encoding" in field else title
+
+
+def _title(registry: str, part: dict[str, Any]) -> str:
+    """The title that a component's config declares; else its type."""
+    kind = str(part["type"])
+    return str(getattr(plugins.load(registry, kind), "title", kind))

@@ -1,4 +1,4 @@
-"""What every renderer does with the sums of a pixel."""
+"""From a pixel's weighted sums to colour, alpha, depth and normal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SEEN = 0.5
 """A pixel with less alpha than this has no depth and no normal (CONVENTIONS.md)."""
 
 
-def picture(
+def to_rendering(
     rgb: Float[Tensor, "*p 3"],
     alpha: Float[Tensor, "*p"],
     distance: Float[Tensor, "*p"],
@@ -21,14 +21,14 @@ def picture(
     far: Float[Tensor, "*p"],
     directions: Float[Tensor, "*p 3"] | None = None,
 ) -> Rendering:
-    """Turn weighted sums into a picture.
+    """Turn weighted sums into a rendering: depth divided by alpha, normals normalised.
 
     Args:
         rgb: sum of w * radiance.
         alpha: sum of w.
         distance: sum of w * t.
-        normal: sum of w * normal, if wanted.
-        far: depth of pixels that see nothing.
+        normal: sum of w * normal, or ``None``.
+        far: depth of pixels with alpha below `SEEN`.
         directions: unit ray directions, which tell a normal's front from its back; needed where there are normals.
     """
     seen = alpha >= SEEN

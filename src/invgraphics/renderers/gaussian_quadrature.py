@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from invgraphics.core import Rays
-from invgraphics.renderers.gaussian_rays import SURE, Encounters
+from invgraphics.renderers.gaussian_rays import SURE, Intersections
 
 Weights = tuple[Float[Tensor, " p"], Float[Tensor, " p"] | None]
-"""Each Gaussian's share of a ray's light, and the same times the distance from which it comes, where that was asked for."""
+"""Each Gaussian's share of a ray's light; and the same times the distance from which it comes, or ``None``."""
 
 EDGES = (-3.6, -2.7, -1.8, -0.9, 0.0, 0.9, 1.8, 2.7, 3.6)
 """Standard deviations between which a Gaussian is taken for constant while intervals are being placed."""
@@ -29,7 +29,7 @@ def phi(z: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
     return 0.5 * (1 + torch.erf(z / sqrt(2)))
 
 
-def integrate_overlapping(encounters: Encounters, rays: Rays, steps: int, far_too: bool) -> Weights:
+def integrate_overlapping(intersections: Intersections, rays: Rays, steps: int, with_distances: bool) -> Weights:
     """Each Gaussian's share of a ray's light: ``w_i = ∫ T(t) sigma_i(t) dt`` with ``T = exp(-∑_j ∫ sigma_j)``.
 
     On every interval the optical depth of each Gaussian is a difference of error functions. The interval's light,
@@ -37,34 +37,34 @@ def integrate_overlapping(encounters: Encounters, rays: Rays, steps: int, far_to
     of a ray add up to its exact alpha whatever the intervals.
 
     Args:
-        encounters: Gaussians on rays.
+        intersections: Gaussians on rays.
         rays: with near and far.
         steps: intervals of each ray.
-        far_too: whether distances are wanted.
+        with_distances: whether weights times distance are returned too.
 
     Returns:
-        Weights, and weights times distance (``∫ t T sigma_i dt``) or ``None``; differentiable in the encounters.
+        Weights, and weights times distance (``∫ t T sigma_i dt``) or ``None``; differentiable in the intersections.
     """
     places: list[Tensor] = []
     weights: list[Tensor] = []
     distances: list[Tensor] = []
-    for ray, index, there in _in_blocks(encounters, len(rays), steps + 1):
-        t, sigma, depth = (values[index] for values in (encounters.t, encounters.sigma, encounters.depth))
+    for ray, index, there in _in_blocks(intersections, len(rays), steps + 1):
+        t, sigma, depth = (values[index] for values in (intersections.t, intersections.sigma, intersections.depth))
         depth = torch.where(there, depth, 0.0)
         interval = _interval(t, sigma, there, rays.near[ray], rays.far[ray])
-        share, distance = _integrate(t, sigma, depth, place_nodes(t, sigma, depth, interval, steps), far_too)
+        share, distance = _integrate(t, sigma, depth, place_nodes(t, sigma, depth, interval, steps), with_distances)
         places.append(index[there])
         weights.append(share[there])
         distances += [distance[there]] if distance is not None else []
     if not places:
-        return encounters.depth, encounters.depth
+        return intersections.depth, intersections.depth
     back = torch.cat(places).argsort()
-    return torch.cat(weights)[back], torch.cat(distances)[back] if far_too else None
+    return torch.cat(weights)[back], torch.cat(distances)[back] if with_distances else None
 
 
-def _in_blocks(encounters: Encounters, rays: int, nodes: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Rays with about as many Gaussians side by side: rays (n,), places of their encounters (n, k), which of these exist."""
-    counts = torch.bincount(encounters.ray, minlength=rays)
+def _in_blocks(intersections: Intersections, rays: int, nodes: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Rays with about as many Gaussians side by side: rays (n,), places of their intersections (n, k), which of these exist."""
+    counts = torch.bincount(intersections.ray, minlength=rays)
     firsts = counts.cumsum(0) - counts
     order = counts.argsort(descending=True)
     order = order[: int((counts > 0).sum())]
@@ -89,7 +89,7 @@ def _integrate(
     sigma: Float[Tensor, "n k"],
     depth: Float[Tensor, "n k"],
     nodes: Float[Tensor, "n s"],
-    far_too: bool,
+    with_distances: bool,
 ) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k"] | None]:
     # Clamped, because functions of large numbers underflow, and numbers that do are slow.
     z = ((nodes[:, :, None] - t[:, None]) / sigma[:, None]).clamp(-SURE, SURE)
@@ -101,7 +101,7 @@ def _integrate(
     share = torch.where(thin, 1 - total / 2, -torch.expm1(-total) / torch.where(thin, 1.0, total))
     light = torch.exp(-before) * share
     weights = depth * torch.einsum("ns,nsk->nk", light, own)
-    if not far_too:
+    if not with_distances:
         return weights, None
     # ∫ t over a piece of a normal distribution is t* times its mass minus sigma times the difference of densities.
     bell = torch.exp(-0.5 * z.square()).diff(dim=1) / sqrt(2 * pi)

@@ -41,7 +41,7 @@ MOST_TESTED = 1 << 18
 
 @dataclass(frozen=True, eq=False)
 class Primitives:
-    """m Gaussians prepared for rays.
+    """m Gaussians with everything about them that does not depend on the ray.
 
     Attributes:
         means: centres.
@@ -67,8 +67,8 @@ class Primitives:
 
 
 @dataclass(frozen=True, eq=False)
-class Encounters:
-    """p pairs of a ray and a Gaussian on it, packed by ray.
+class Intersections:
+    """p intersections of rays with Gaussians, packed by ray.
 
     Attributes:
         ray: index of the ray, non-decreasing.
@@ -90,8 +90,8 @@ class Encounters:
         return len(self.ray)
 
 
-def prepare(gaussians: Gaussians, opacity: Opacity, smallest: float, origin: Float[Tensor, 3] | None = None) -> Primitives:
-    """Everything about Gaussians that does not depend on the ray.
+def precompute(gaussians: Gaussians, opacity: Opacity, smallest: float, origin: Float[Tensor, 3] | None = None) -> Primitives:
+    """Precompute whitening transforms, strengths and reaches of Gaussians, for any ray.
 
     Args:
         gaussians: activated primitives; opacities count up to `ALPHA_MAX`, as in splatting.
@@ -135,8 +135,8 @@ def mean_inverse_scale(scales: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     return scales.reciprocal().pow(THOMSEN).mean(dim=1).pow(1 / THOMSEN)
 
 
-def encounter(primitives: Primitives, rays: Rays) -> Encounters:
-    """Find and measure the Gaussians on each ray, differentiably in Gaussians and rays."""
+def intersect(primitives: Primitives, rays: Rays) -> Intersections:
+    """Intersect rays with Gaussians within their reach, differentiably in Gaussians and rays."""
     ray, gaussian = _search(primitives, rays)
     table = torch.cat([primitives.means, primitives.whitening.flatten(1), primitives.strength[:, None]], dim=1)
     # index_select has a faster gradient than indexing.
@@ -151,20 +151,20 @@ def encounter(primitives: Primitives, rays: Rays) -> Encounters:
     else:
         seen = (response >= ALPHA_MIN) & (t > rays.near[ray])
         depth = torch.where(seen, -torch.log1p(-response.clamp_max(ALPHA_MAX)), 0.0)
-    return Encounters(ray, gaussian, offset, t, sigma, depth)
+    return Intersections(ray, gaussian, offset, t, sigma, depth)
 
 
-def colours(primitives: Primitives, encounters: Encounters) -> Float[Tensor, "p 3"]:
-    """What each ray sees of its Gaussians: max(0, SH + 0.5) towards the centre, as in splatting."""
+def colours(primitives: Primitives, intersections: Intersections) -> Float[Tensor, "p 3"]:
+    """Colour of each intersection: max(0, SH + 0.5) in the direction of the centre, as in splatting."""
     if primitives.rgb is not None:
-        return primitives.rgb.index_select(0, encounters.gaussian)
-    return _colour(primitives.sh.index_select(0, encounters.gaussian), encounters.offset)
+        return primitives.rgb.index_select(0, intersections.gaussian)
+    return _colour(primitives.sh.index_select(0, intersections.gaussian), intersections.offset)
 
 
-def normals(primitives: Primitives, encounters: Encounters, rays: Rays) -> Float[Tensor, "p 3"]:
-    """The shortest axis of each Gaussian, turned against the ray."""
-    axes = primitives.normals.index_select(0, encounters.gaussian)
-    away = (axes * rays.directions.index_select(0, encounters.ray)).sum(dim=1, keepdim=True) > 0
+def normals(primitives: Primitives, intersections: Intersections, rays: Rays) -> Float[Tensor, "p 3"]:
+    """Normal of each intersection: the Gaussian's shortest axis, turned against the ray."""
+    axes = primitives.normals.index_select(0, intersections.gaussian)
+    away = (axes * rays.directions.index_select(0, intersections.ray)).sum(dim=1, keepdim=True) > 0
     return torch.where(away, -axes, axes)
 
 

@@ -1,4 +1,4 @@
-"""Gaussians seen along rays instead of splatted: composited one after the other, or integrated where they overlap."""
+"""Gaussians ray-traced instead of splatted: composited one after the other, or integrated where they overlap."""
 
 from __future__ import annotations
 
@@ -9,13 +9,25 @@ from typing import ClassVar, Literal
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from invgraphics import kernels
-from invgraphics.core import Camera, Context, Field, Quantity, RayRenderer, Rays, Rendering, Scene, Trace
+from invgraphics.core import Camera, Context, Contributions, Field, Quantity, RayRenderer, Rays, Rendering, Scene, Trace
+from invgraphics.core.contributions import opacities
 from invgraphics.kernels.types import ALPHA_MIN
-from invgraphics.renderers.base import picture
+from invgraphics.renderers.base import to_rendering
+from invgraphics.renderers.gaussian_profile import density_profile, transmittance
 from invgraphics.renderers.gaussian_quadrature import Weights, integrate_overlapping, phi
-from invgraphics.renderers.gaussian_rays import SURE, Encounters, Opacity, Primitives, colours, encounter, normals, prepare
+from invgraphics.renderers.gaussian_rays import (
+    SURE,
+    Intersections,
+    Opacity,
+    Primitives,
+    colours,
+    intersect,
+    normals,
+    precompute,
+)
 
 TILE = 16
 """Edge in pixels of the square whose rays are searched for Gaussians together."""
@@ -33,6 +45,8 @@ class GaussianExactConfig:
         steps: intervals of each ray, placed where alpha and optical depth grow.
         smallest: optical depth below which a Gaussian is left out of a ray.
     """
+
+    title: ClassVar[str] = "exact line integrals"
 
     opacity: Literal["peak", "physical"] = "peak"
     steps: int = 32
@@ -59,6 +73,8 @@ class GaussianSortedConfig:
         smallest: optical depth below which a Gaussian is left out of a ray; ``splat`` leaves out alphas below 1/255.
     """
 
+    title: ClassVar[str] = "line integrals in ray order"
+
     opacity: Opacity = "peak"
     order: Literal["ray", "centre"] = "ray"
     smallest: float = ALPHA_MIN / 4
@@ -72,7 +88,7 @@ class GaussianSortedConfig:
 
 
 class GaussianRays(RayRenderer):
-    """What both ways to see Gaussians along rays have in common."""
+    """Renders Gaussians along rays; a subclass decides how overlapping ones share the light."""
 
     requires: ClassVar[Quantity] = Quantity.GAUSSIANS
 
@@ -82,25 +98,26 @@ class GaussianRays(RayRenderer):
         self._smallest = smallest
 
     @abstractmethod
-    def weigh(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None, far_too: bool) -> Weights:
-        """Share of each Gaussian in its ray's light.
+    def weigh(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool) -> Weights:
+        """Weight of each intersection: its share of the ray's light.
 
         Args:
-            encounters: Gaussians on rays.
+            intersections: Gaussians on rays.
             rays: with near and far.
             axis: along which centres are sorted; ``None`` for each ray's own direction.
-            far_too: whether distances are wanted.
+            with_distances: whether weights times distance are returned too.
         """
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays from any number of cameras."""
-        primitives = prepare(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest)
+        primitives = precompute(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest)
         return self._render(primitives, rays, None, ctx), Trace(rays=len(rays))
 
-    def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
-        """Render every pixel, tile by tile. Depth is left at infinity in training, unless ``ctx.geometry`` asks for it."""
+    @override
+    def render_whole(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
+        """Render every pixel, tile by tile. Depth is left at infinity in training, unless ``ctx.geometry`` is set."""
         gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
-        primitives = prepare(gaussians, self._opacity, self._smallest, camera.position)
+        primitives = precompute(gaussians, self._opacity, self._smallest, camera.position)
         rays, order = camera.rays(), _by_tiles(camera)
         axis = camera.cam_to_world[:3, 2]
         parts = [self._render(primitives, rays[part], axis, ctx) for part in order]
@@ -109,22 +126,36 @@ class GaussianRays(RayRenderer):
         ordered = Rendering(rendering.rgb[place], rendering.alpha[place], rendering.depth[place], normal)
         return ordered.reshape(camera.height, camera.width), Trace(rays=len(rays))
 
+    @override
+    @torch.no_grad()
+    def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
+        """The Gaussians that the pixel's ray intersects; see `Renderer.contributions`."""
+        primitives = precompute(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest, camera.position)
+        rays = _clipped(camera.ray(pixel), ctx)
+        return self._listed(intersect(primitives, rays), primitives, rays, camera.cam_to_world[:3, 2])
+
+    @abstractmethod
+    def _listed(
+        self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
+    ) -> Contributions:
+        """Contributions of one ray's intersections, in the order in which they are composited."""
+
     def _render(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, ctx: Context) -> Rendering:
-        rays = rays.within(rays.near.clamp_min(ctx.bounds.near), rays.far)
-        encounters = encounter(primitives, rays)
+        rays = _clipped(rays, ctx)
+        intersections = intersect(primitives, rays)
         geometry = ctx.geometry or not ctx.training
-        weights, distances = self.weigh(encounters, rays, axis, geometry)
-        values = [weights[:, None], weights[:, None] * colours(primitives, encounters)]
+        weights, distances = self.weigh(intersections, rays, axis, geometry)
+        values = [weights[:, None], weights[:, None] * colours(primitives, intersections)]
         if distances is not None:
             values.append(distances[:, None])
         if ctx.geometry:
-            values.append(weights[:, None] * normals(primitives, encounters, rays))
+            values.append(weights[:, None] * normals(primitives, intersections, rays))
         joined = torch.cat(values, dim=1)
-        sums = joined.new_zeros(len(rays), joined.shape[1]).index_add(0, encounters.ray, joined)
+        sums = joined.new_zeros(len(rays), joined.shape[1]).index_add(0, intersections.ray, joined)
         if not geometry:
             return Rendering(sums[:, 1:4], sums[:, 0], rays.far)
         normal = sums[:, 5:] if ctx.geometry else None
-        return picture(sums[:, 1:4], sums[:, 0], sums[:, 4], normal, rays.far, rays.directions)
+        return to_rendering(sums[:, 1:4], sums[:, 0], sums[:, 4], normal, rays.far, rays.directions)
 
 
 class GaussianExact(GaussianRays):
@@ -134,9 +165,30 @@ class GaussianExact(GaussianRays):
         super().__init__(config.opacity, config.smallest)
         self.config = config
 
-    def weigh(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None, far_too: bool) -> Weights:
+    def weigh(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool) -> Weights:
         """See `integrate_overlapping`; there is no order."""
-        return integrate_overlapping(encounters, rays, self.config.steps, far_too)
+        return integrate_overlapping(intersections, rays, self.config.steps, with_distances)
+
+    def _listed(
+        self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
+    ) -> Contributions:
+        """Nearest first, with the transmittance of the whole mixture."""
+        weight, _ = self.weigh(intersections, rays, axis, False)
+        order = intersections.t.argsort(stable=True)
+        order = order[intersections.depth[order] > 0]
+        t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
+        return Contributions(
+            kind="Gaussians",
+            t=t,
+            begin=t - sigma,
+            end=t + sigma,
+            alpha=-torch.expm1(-depth),
+            transmittance=transmittance(t, t, sigma, depth, rays),
+            weight=weight,
+            rgb=colours(primitives, intersections)[order],
+            counted=torch.ones_like(order, dtype=torch.bool),
+            profile=density_profile(t, sigma, depth, rays),
+        )
 
 
 class GaussianSorted(GaussianRays):
@@ -146,29 +198,56 @@ class GaussianSorted(GaussianRays):
         super().__init__(config.opacity, config.smallest)
         self.config = config
 
-    def weigh(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None, far_too: bool) -> Weights:
+    def weigh(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool) -> Weights:
         """Front to back: alpha_i = 1 - exp(-tau_i), seen through all that come before."""
-        near, far = rays.near[encounters.ray], rays.far[encounters.ray]
-        t, sigma, depth = encounters.t, encounters.sigma, encounters.depth
+        near, far = rays.near[intersections.ray], rays.far[intersections.ray]
+        t, sigma, depth = intersections.t, intersections.sigma, intersections.depth
         if self.config.opacity != "splat":
             start, end = (
                 ((limit - t) / sigma).clamp(-SURE, SURE) for limit in (near, far.minimum((t + SURE * sigma).detach()))
             )
             depth = depth * (phi(end) - phi(start))
-        order = self.order(encounters, rays, axis)
-        ordered, _, _ = kernels.composite(depth[order], t.new_zeros(len(t), 0), encounters.ray, len(rays))
+        order = self.order(intersections, rays, axis)
+        ordered, _, _ = kernels.composite(depth[order], t.new_zeros(len(t), 0), intersections.ray, len(rays))
         weights = ordered[order.argsort()]
-        return weights, weights * t.clamp(near, far) if far_too else None
+        return weights, weights * t.clamp(near, far) if with_distances else None
+
+    def _listed(
+        self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
+    ) -> Contributions:
+        """In the order of compositing; beside them, the same Gaussians as overlapping densities."""
+        weight, _ = self.weigh(intersections, rays, axis, False)
+        order = self.order(intersections, rays, axis)
+        order = order[intersections.depth[order] > 0]  # those below the splats' limit are on the ray all the same
+        t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
+        alpha, reached = opacities(weight)
+        return Contributions(
+            kind="Gaussians",
+            t=t,
+            begin=t - sigma,
+            end=t + sigma,
+            alpha=alpha,
+            transmittance=reached[:-1],
+            weight=weight,
+            rgb=colours(primitives, intersections)[order],
+            counted=torch.ones_like(order, dtype=torch.bool),
+            marched=density_profile(t, sigma, depth, rays),
+        )
 
     @torch.no_grad()
-    def order(self, encounters: Encounters, rays: Rays, axis: Float[Tensor, 3] | None) -> Int[Tensor, " p"]:
-        """Encounters by ray, then front to back."""
-        key = encounters.t
+    def order(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None) -> Int[Tensor, " p"]:
+        """Intersections by ray, then front to back."""
+        key = intersections.t
         if self.config.order == "centre":
-            axes = rays.directions[encounters.ray] if axis is None else axis
-            key = (encounters.offset * axes).sum(dim=1)
+            axes = rays.directions[intersections.ray] if axis is None else axis
+            key = (intersections.offset * axes).sum(dim=1)
         order = key.argsort(stable=True)
-        return order[encounters.ray[order].argsort(stable=True)]
+        return order[intersections.ray[order].argsort(stable=True)]
+
+
+def _clipped(rays: Rays, ctx: Context) -> Rays:
+    """Rays that begin no nearer than the bounds allow."""
+    return rays.within(rays.near.clamp_min(ctx.bounds.near), rays.far)
 
 
 def _check_smallest(smallest: float) -> None:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from invgraphics import kernels
-from invgraphics.core import Bounds, Context, FieldValues, Rays, Sampler, Samples, Scene, Trace
-from invgraphics.core.field import Density, NoGradDensity
+from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.kernels.reference.march import step_lengths
-from invgraphics.kernels.types import March, MarchSteps, hash_field
+from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.samplers import uniform
-from invgraphics.renderers.termination import Look, in_front
+from invgraphics.renderers.termination import visible_samples
 from invgraphics.renderers.visibility import visible_cells
 
 LATE = 0.5
@@ -49,7 +51,7 @@ class OccupancyConfig:
         cells: cells that a refresh looks at after warm-up, half of them drawn from the occupied ones.
         stop: when to leave out samples behind opaque surfaces, at the price of a density look-up.
         transmittance: a ray stops when less than this is left of its light.
-        wave: samples per ray before the first look at the transmittance; each later wave is half as long again.
+        chunk: samples per ray before the transmittance is tested first; each later chunk is half as long again.
     """
 
     resolution: int = 128
@@ -67,7 +69,7 @@ class OccupancyConfig:
     cells: int = 1 << 17
     stop: Literal["always", "evaluation", "never"] = "always"
     transmittance: float = 1e-3
-    wave: int = 16
+    chunk: int = 16
 
     def __post_init__(self) -> None:
         for key in (
@@ -78,7 +80,7 @@ class OccupancyConfig:
             "late_steps",
             "every",
             "cells",
-            "wave",
+            "chunk",
         ):
             value = getattr(self, key)
             if value is not None and value < 1:
@@ -137,30 +139,42 @@ class Occupancy(Sampler):
         self.cone = config.cone or 0.0
         self.length = 2 * bounds.radius / config.steps_per_diagonal
 
-    def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
-        """Samples in occupied cells, in front of what is opaque; with their densities where those were asked for."""
+    @override
+    def untrained(self) -> Occupancy:
+        """The same march with every visible cell occupied, as before a fit."""
+        fresh = copy.deepcopy(self)
+        fresh.ema.zero_()
+        fresh.step.zero_()
+        fresh.occupied.fill_(True)
+        if fresh.visible is not None:
+            fresh.occupied &= fresh.visible
+        return fresh
+
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        """Samples in occupied cells, in front of what is opaque; with their densities, where the field was queried."""
         if self.config.stop == "never" or (self.config.stop == "evaluation" and ctx.training):
             march = self._march(rays, ctx)
             return Samples.on(rays, march.ray, march.t0, march.t1), ()
-        look: Look = lambda samples: FieldValues(density=density(samples))  # noqa: E731
-        if isinstance(density, NoGradDensity) and torch.is_grad_enabled():
-            march = self._march_in_one_pass(rays, density, ctx)
+        want = Quantity.DENSITY
+        if torch.is_grad_enabled():
+            march = self._march_fused(rays, field, ctx)
             if march is not None:
                 return Samples.on(rays, march.ray, march.t0, march.t1), ()
-        elif isinstance(density, NoGradDensity):
+        else:
             # Features are of use to the renderer only where it needs no gradients through them.
-            look = density.look
-        return in_front(rays, self._march(rays, ctx), look, self.config.transmittance, self.config.wave), ()
+            want |= field.provides & Quantity.FEATURES
+        query = partial(field.query_no_grad, want=want)
+        return visible_samples(rays, self._march(rays, ctx), query, self.config.transmittance, self.config.chunk), ()
 
     @torch.no_grad()
-    def _march_in_one_pass(self, rays: Rays, density: NoGradDensity, ctx: Context) -> March | None:
-        """A march that stops by itself, if there is a kernel for what the field is made of and for these steps."""
-        parts, steps = hash_field(density.field, ctx.bounds), self.steps(ctx)
+    def _march_fused(self, rays: Rays, field: Field, ctx: Context) -> March | None:
+        """A march with early termination, where a fused kernel supports the field and these steps; else ``None``."""
+        parts, steps = field.fused(ctx.bounds), self.steps(ctx)
         even = ctx.bounds.space == "box" or steps.contracted
-        if parts is None or not even or steps.cone > 0 or not kernels.compiled("hash_march", parts.table):
+        if parts is None or not even or steps.cone > 0 or not kernels.compiled("ngp_march", parts.table):
             return None
         start = self._start(rays, steps, ctx)
-        return kernels.hash_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
+        return kernels.ngp_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
 
     def steps(self, ctx: Context) -> MarchSteps:
         """How long steps are now."""
@@ -189,13 +203,13 @@ class Occupancy(Sampler):
         return parts[0] if len(parts) == 1 else _joined(parts)
 
     @torch.no_grad()
-    def update(self, density: Density, ctx: Context) -> None:
+    def update(self, field: Field, ctx: Context) -> None:
         """Count a training step; every so often, look at cells again."""
         step = int(self.step)
         self.step += 1
         if step >= self.config.grace and step % self.config.every == 0:
             cells = self._all_cells() if step < self.config.warmup else self._some_cells(ctx)
-            self._refresh(cells, density, ctx)
+            self._refresh(cells, field, ctx)
 
     def _all_cells(self) -> Int[Tensor, " k"]:
         return torch.arange(self.ema.numel(), device=self.ema.device)
@@ -211,11 +225,11 @@ class Occupancy(Sampler):
         device = self.ema.device if ctx.generator is None else ctx.generator.device
         return torch.randint(below, (count,), generator=ctx.generator, device=device).to(self.ema.device)
 
-    def _refresh(self, cells: Int[Tensor, " k"], density: Density, ctx: Context) -> None:
+    def _refresh(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> None:
         """Look at one random point in each of ``cells`` and decide anew which cells are occupied."""
         fresh = torch.full_like(self.ema, -1.0).flatten()
         for part in cells.split(ctx.chunk):
-            thickness = self._thickness(part, density, ctx).to(fresh.dtype)
+            thickness = self._thickness(part, field, ctx).to(fresh.dtype)
             fresh.scatter_reduce_(0, part, thickness, reduce="amax")
         fresh, decay = fresh.view_as(self.ema), self.config.decay_at(ctx.progress)
         self.ema.copy_(torch.where(fresh < 0, self.ema, torch.maximum(self.ema * decay, fresh)))
@@ -225,7 +239,7 @@ class Occupancy(Sampler):
         if self.visible is not None:
             self.occupied &= self.visible
 
-    def _thickness(self, cells: Int[Tensor, " k"], density: Density, ctx: Context) -> Float[Tensor, " k"]:
+    def _thickness(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> Float[Tensor, " k"]:
         """Optical depth of one step at a random point of each cell.
 
         Steps of equal contracted length are taken along the radius. With a cone they grow with the distance from the camera,
@@ -237,9 +251,9 @@ class Occupancy(Sampler):
         position = ctx.bounds.from_unit(unit.to(ctx.bounds.lo.dtype))
         steps = self.steps(replace(ctx, progress=min(ctx.progress, LATE)))
         if steps.contracted:
-            return density(Samples.at(position)) * steps.step / ctx.bounds.radial_scale(position)
+            return field.density_no_grad(Samples.at(position)) * steps.step / ctx.bounds.radial_scale(position)
         distance = (position - ctx.bounds.centre).norm(dim=1)
-        return density(Samples.at(position)) * (steps.cone * distance).clamp_min(steps.step)
+        return field.density_no_grad(Samples.at(position)) * (steps.cone * distance).clamp_min(steps.step)
 
 
 def _joined(parts: list[March]) -> March:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invgraphics import kernels
 from invgraphics.core import FieldValues, Rays, Rendering, Samples, Trace
-from invgraphics.renderers.base import picture
+from invgraphics.renderers.base import to_rendering
 
 
 def integrate(
@@ -33,5 +33,5 @@ def integrate(
         channels.append(values.normal)
     weights, sums, alpha = kernels.composite(optical_depth, torch.cat(channels, dim=1), samples.ray, len(rays))
     normal = None if values.normal is None else sums[:, 4:]
-    rendering = picture(sums[:, :3], alpha, sums[:, 3], normal, rays.far, rays.directions)
+    rendering = to_rendering(sums[:, :3], alpha, sums[:, 3], normal, rays.far, rays.directions)
     return rendering, Trace(samples, values, weights, levels, rays=len(rays))

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from invgraphics import kernels
 from invgraphics.config import Slot
 from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
-from invgraphics.core.field import Density
+from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.errors import NotComposableError
 
 PADDING = 1e-5
@@ -45,8 +46,8 @@ class Stratified(Sampler):
         super().__init__()
         self.config = config
 
-    def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
-        """Samples on every ray that meets the bounds; the density is not asked."""
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        """Samples on every ray that meets the bounds; the field is not queried."""
         hit = hitting(rays)
         knee = far_side(rays[hit], ctx.bounds)
         edges = from_spacing(strata(rays[hit], self.config.count, ctx, knee), ctx.bounds, knee)
@@ -60,8 +61,8 @@ class HierarchicalConfig:
     Attributes:
         coarse: strata of the first pass.
         fine: samples added by the second pass.
-        proposal: a field of its own for the first pass, trained through ``Trace.levels``; ``None`` asks the rendered
-            field's density, without a gradient.
+        proposal: a field of its own for the first pass, trained through ``Trace.levels``; ``None`` takes the
+            rendered field's density, without a gradient.
     """
 
     coarse: int = 64
@@ -87,26 +88,32 @@ class Hierarchical(Sampler):
         self.config = config
         self.proposal = proposal
 
-    def sample(self, rays: Rays, density: Density, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
-        """Samples of the second pass, and the first pass's trace if it has a field of its own to train."""
+    @override
+    def untrained(self) -> Hierarchical:
+        """The rendered field's own density in place of a trained proposal, as NeRF samples."""
+        return self if self.proposal is None else Hierarchical(replace(self.config, proposal=None))
+
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        """Samples of the second pass; and the first pass's trace, in training only if it has a field of its own to train."""
         hit = hitting(rays)
-        spacing, trace = self.first_pass(rays, density, ctx)
+        spacing, trace = self._coarse_pass(rays, field, ctx)
         assert trace.weights is not None
         with torch.no_grad():
             weights = trace.weights.reshape(len(hit), self.config.coarse)
             drawn = invert(spacing, weights + PADDING, quantiles(len(hit), self.config.fine, ctx, like=spacing))
         both = torch.cat([spacing, drawn], dim=1).sort(dim=1).values
         edges = from_spacing(both, ctx.bounds, far_side(rays[hit], ctx.bounds))
-        return pack(rays, hit, edges), () if self.proposal is None else (trace,)
+        hidden = ctx.training and self.proposal is None
+        return pack(rays, hit, edges), () if hidden else (trace,)
 
-    def first_pass(self, rays: Rays, density: Density, ctx: Context) -> tuple[Float[Tensor, "k edges"], Trace]:
-        """Edges of the coarse strata in spacing coordinates, for the rays that meet the bounds, and what they weigh."""
+    def _coarse_pass(self, rays: Rays, field: Field, ctx: Context) -> tuple[Float[Tensor, "k edges"], Trace]:
+        """Edges of the coarse strata in spacing coordinates, for the rays that meet the bounds, and their weights."""
         hit = hitting(rays)
         knee = far_side(rays[hit], ctx.bounds)
         spacing = strata(rays[hit], self.config.coarse, ctx, knee)
         coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds, knee))
         if self.proposal is None:
-            values, sigma = None, density(coarse)
+            values, sigma = None, field.density_no_grad(coarse)
         else:
             values = self.proposal.query(coarse, self.proposal.provides & (Quantity.DENSITY | Quantity.RADIANCE))
             assert values.density is not None
@@ -123,25 +130,6 @@ def hitting(rays: Rays) -> Int[Tensor, " k"]:
 def far_side(rays: Rays, bounds: Bounds) -> Float[Tensor, "k 1"]:
     """Distance at which rays have the bounds' unit ball behind them, wherever they began."""
     return (rays.origins - bounds.centre).norm(dim=1, keepdim=True) + bounds.half.max()
-
-
-def to_spacing(t: Float[Tensor, "*n"], bounds: Bounds, knee: float | Tensor | None = None) -> Float[Tensor, "*n"]:
-    """The coordinate in which strata are equal: distance itself in a box.
-
-    In a contracted space, distance up to ``knee`` (by default the box's radius) and disparity beyond it (nerfacto), both
-    scaled to run over halves of [0, 1].
-    """
-    if bounds.space == "box":
-        return t
-    x = t / (bounds.radius if knee is None else knee)
-    return torch.where(x < 1, x / 2, 1 - 1 / (2 * x.clamp_min(1)))
-
-
-def from_spacing(s: Float[Tensor, "*n"], bounds: Bounds, knee: float | Tensor | None = None) -> Float[Tensor, "*n"]:
-    """Inverse of `to_spacing`."""
-    if bounds.space == "box":
-        return s
-    return torch.where(s < 0.5, 2 * s, 1 / (2 * (1 - s.clamp_min(0.5)))) * (bounds.radius if knee is None else knee)
 
 
 def strata(rays: Rays, count: int, ctx: Context, knee: Float[Tensor, "k 1"] | None = None) -> Float[Tensor, "k edges"]:

@@ -6,14 +6,30 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+from typing_extensions import override
 
 from invgraphics import kernels
-from invgraphics.core import Camera, Context, Field, Gaussians, Quantity, Renderer, Rendering, Scene, Screen, Trace
+from invgraphics.core import (
+    Camera,
+    Context,
+    Contributions,
+    Field,
+    Gaussians,
+    Quantity,
+    Rays,
+    Renderer,
+    Rendering,
+    Scene,
+    Screen,
+    Trace,
+)
 from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.kernels.reference.splat_raster import blending_weights, responses_at, visible_alphas
 from invgraphics.kernels.types import Footprints
-from invgraphics.renderers.base import SEEN, picture
+from invgraphics.renderers.base import SEEN, to_rendering
+from invgraphics.renderers.gaussian_profile import density_profile
 
 
 @dataclass(frozen=True)
@@ -24,33 +40,35 @@ class SplattingConfig:
         shape: ``ellipsoid`` projects to an ellipse, to first order (EWA); ``disc`` drops the shortest axis and meets each
             pixel's ray exactly (2DGS).
         dilation: variance in square pixels added to every footprint (low-pass filter); of the smallest one, for discs.
-        compensate: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
+        antialiased: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
         depth: ``expected`` averages the distances of a pixel's splats by weight; ``median`` takes that of the splat at which
             half of the light is gone. For evaluation: gradients pass through the expected one only.
         normals: ``shortest`` averages the splats' shortest axes; ``depth`` takes the slope of the depth map.
         absolute_gradients: whether density control sees the sum of absolute gradients over pixels (AbsGS), in which opposite
             pulls do not cancel.
-        receivers: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
+        max_grad_splats: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
             limited bandwidth uses 10).
         tile: edge of a tile in pixels (Numba takes 32 at most); ``None`` leaves it to the kernel.
     """
 
+    title: ClassVar[str] = "splatting"
+
     shape: Literal["ellipsoid", "disc"] = "ellipsoid"
     dilation: float = 0.3
-    compensate: bool = False
+    antialiased: bool = False
     depth: Literal["expected", "median"] = "expected"
     normals: Literal["shortest", "depth"] = "shortest"
     absolute_gradients: bool = False
-    receivers: int = 0
+    max_grad_splats: int = 0
     tile: int | None = None
 
     def __post_init__(self) -> None:
-        if self.dilation < 0 or self.receivers < 0:
-            raise ValueError("dilation and receivers must not be negative")
+        if self.dilation < 0 or self.max_grad_splats < 0:
+            raise ValueError("dilation and max_grad_splats must not be negative")
         if self.tile is not None and self.tile < 1:
             raise ValueError(f"tile must be at least 1, not {self.tile}")
-        if self.shape == "disc" and (self.compensate or self.absolute_gradients):
-            raise ValueError("discs know neither 'compensate' nor 'absolute_gradients'")
+        if self.shape == "disc" and (self.antialiased or self.absolute_gradients):
+            raise ValueError("discs know neither 'antialiased' nor 'absolute_gradients'")
 
     def build(self, scene: Scene) -> Splatting:
         """The renderer; it needs nothing from the scene."""
@@ -65,6 +83,7 @@ class Splatting(Renderer):
     def __init__(self, config: SplattingConfig) -> None:
         super().__init__()
         self.config = config
+        self.depth_kind = "median" if config.depth == "median" else "mean"
 
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
         """Render every pixel. Depth is left at infinity in training, unless ``ctx.geometry`` asks for it."""
@@ -77,26 +96,62 @@ class Splatting(Renderer):
             features.append(_normals(gaussians, camera))
         size = camera.width, camera.height
         sums, alpha = kernels.splat_rasterise(
-            footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.receivers
+            footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.max_grad_splats
         )
-        rendering = self._picture(sums, alpha, camera, footprints)
-        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.pull, gaussians.opacities, gaussians.scales)
+        rendering = self._rendering(sums, alpha, camera, footprints)
+        screen = Screen(footprints.means2d, footprints.radii, *size, footprints.absgrad, gaussians.opacities, gaussians.scales)
         return rendering, Trace(screen=screen, rays=alpha.numel())
 
     def project(self, gaussians: Gaussians, camera: Camera) -> tuple[Footprints, Float[Tensor, "n 3"]]:
-        """Footprints, which record what pulls them where something learns, and colours."""
+        """Project Gaussians; retains gradients of means2d in training. Returns footprints and colours."""
         config = self.config
         if config.shape == "disc":
             footprints, rgb = kernels.splat_project_discs(gaussians, camera, config.dilation)
         else:
-            footprints, rgb = kernels.splat_project(gaussians, camera, config.dilation, config.compensate)
+            footprints, rgb = kernels.splat_project(gaussians, camera, config.dilation, config.antialiased)
         if footprints.means2d.requires_grad:
             footprints.means2d.retain_grad()
             if config.absolute_gradients:
-                footprints = replace(footprints, pull=torch.zeros_like(footprints.means2d, requires_grad=True))
+                footprints = replace(footprints, absgrad=torch.zeros_like(footprints.means2d, requires_grad=True))
         return footprints, rgb
 
-    def _picture(
+    @override
+    def for_depth_fusion(self) -> Splatting:
+        """The same splats with median depth and the depth map's normals, which are sharper at edges than means."""
+        return Splatting(replace(self.config, depth="median", normals="depth"))
+
+    @override
+    @torch.no_grad()
+    def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
+        """The splats whose footprints cover the pixel, by the depth of their centres; see `Renderer.contributions`."""
+        gaussians: Gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
+        footprints, rgb = self.project(gaussians, camera)
+        point = camera.focal.new_tensor([pixel]) + 0.5
+        visible = (footprints.radii > 0).nonzero()[:, 0]
+        order = visible[footprints.depths[visible].argsort(stable=True)]
+        alpha = visible_alphas(responses_at(footprints, order, point))[0]
+        order, alpha = order[alpha > 0], alpha[alpha > 0]
+        weight = blending_weights(alpha[None])[0]
+        drawn = int((weight > 0).sum())  # compositing stops when next to no light is left
+        order, alpha, weight = order[:drawn], alpha[:drawn], weight[:drawn]
+        planes = footprints.depth_planes[order]
+        t = planes[:, 0] + ((point - footprints.means2d[order]) * planes[:, 1:]).sum(dim=1)
+        rays = camera.ray(pixel)
+        sigma = torch.zeros_like(t) if self.config.shape == "disc" else _deviations(gaussians, order, rays)
+        return Contributions(
+            kind="splats",
+            t=t,
+            begin=t - sigma,
+            end=t + sigma,
+            alpha=alpha,
+            transmittance=torch.cumprod(torch.nn.functional.pad(1 - alpha, (1, 0), value=1.0), dim=0)[:-1],
+            weight=weight,
+            rgb=rgb[order],
+            counted=torch.ones_like(order, dtype=torch.bool),
+            marched=density_profile(t, sigma, -torch.log1p(-alpha), rays),
+        )
+
+    def _rendering(
         self, sums: Float[Tensor, "h w c"], alpha: Float[Tensor, "h w"], camera: Camera, footprints: Footprints
     ) -> Rendering:
         """Take the pixel sums apart: colour, then three distance coefficients, then the normal, as far as they are there."""
@@ -109,16 +164,22 @@ class Splatting(Renderer):
             median = kernels.splat_median(footprints, camera.width, camera.height, self.config.tile)
             distance = torch.where(torch.isfinite(median), median * alpha, distance)
         if sums.shape[2] == 6:
-            return picture(sums[..., :3], alpha, distance, None, far)
+            return to_rendering(sums[..., :3], alpha, distance, None, far)
         normal, directions = sums[..., 6:], camera.rays().directions.view(*alpha.shape, 3)
         if self.config.normals == "depth":
             normal = _slope(distance / alpha.clamp_min(SEEN), alpha >= SEEN, directions)
-        return picture(sums[..., :3], alpha, distance, normal, far, directions)
+        return to_rendering(sums[..., :3], alpha, distance, normal, far, directions)
+
+
+def _deviations(gaussians: Gaussians, order: Int[Tensor, " k"], rays: Rays) -> Float[Tensor, " k"]:
+    """Standard deviation of some Gaussians along one ray, 1 / |diag(1/s) Rᵀ d|."""
+    axes = quaternion_to_matrix(gaussians.quaternions[order])
+    return ((rays.directions[0] @ axes) / gaussians.scales[order]).norm(dim=1).reciprocal()
 
 
 def _distance_coefficients(footprints: Footprints) -> Float[Tensor, "n 3"]:
-    """`Footprints.planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
-    at_mean, slopes = footprints.planes[:, :1], footprints.planes[:, 1:]
+    """`Footprints.depth_planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
+    at_mean, slopes = footprints.depth_planes[:, :1], footprints.depth_planes[:, 1:]
     return torch.cat([slopes, at_mean - (slopes * footprints.means2d).sum(dim=1, keepdim=True)], dim=1)
 
 

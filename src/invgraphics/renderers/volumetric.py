@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from invgraphics import kernels
 from invgraphics.config import Slot
@@ -24,14 +25,12 @@ from invgraphics.core import (
     Samples,
     Scene,
     Trace,
-    no_grad_density,
 )
-from invgraphics.kernels.types import hash_field
-from invgraphics.renderers.base import picture
+from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.occupancy import Occupancy
 from invgraphics.renderers.quadrature import integrate
 from invgraphics.renderers.samplers import StratifiedConfig
-from invgraphics.renderers.termination import weighty
+from invgraphics.renderers.termination import contributing_samples
 
 UNSEEN = 1e-3
 """Outside the graph, what all samples together that are not asked for their colour may contribute to a ray: a quarter of
@@ -48,6 +47,8 @@ class VolumetricConfig:
             distance over it, local units; 0 leaves them alone. Few pixels see what is near a camera, and each sees it large
             (Philip and Deschaintre 2023, Floaters no more).
     """
+
+    title: ClassVar[str] = "volume rendering"
 
     sampler: Annotated[Any, Slot("samplers")] = field(default_factory=StratifiedConfig)
     gradient_reach: float = 0.0
@@ -73,7 +74,7 @@ class Volumetric(RayRenderer):
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; normals are added when ``ctx.geometry`` asks for them and the field has some."""
-        samples, levels = self.sampler.sample(ctx.bounds.clip(rays), no_grad_density(field), ctx)
+        samples, levels = self.sampler.sample(ctx.bounds.clip(rays), field, ctx)
         want = self.requires | (field.provides & Quantity.NORMAL if ctx.geometry else Quantity.NONE)
         if Quantity.NORMAL in want and samples.density is None and not torch.is_grad_enabled():
             # A normal costs several looks at the density, which few samples deserve.
@@ -88,28 +89,34 @@ class Volumetric(RayRenderer):
             assert values.density is not None
         return integrate(rays, samples, values, values.density * samples.delta, levels)
 
-    def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
-        """See `Renderer.render_image`; where a kernel does all of it in one pass, there is nothing to trace."""
-        rendering = self._at_once(field, camera, ctx)
-        return super().render_image(field, camera, ctx) if rendering is None else (rendering, Trace())
+    @override
+    def render_whole(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace] | None:
+        """Fused inference-only rendering, where a kernel supports field and sampler; its trace is empty."""
+        rendering = self._render_fused(field, camera, ctx)
+        return None if rendering is None else (rendering, Trace())
 
-    def _at_once(self, field: Field, camera: Camera, ctx: Context) -> Rendering | None:
-        """A picture that nobody asks a gradient or normals of, if there is a kernel for the whole of it."""
+    def _render_fused(self, field: Field, camera: Camera, ctx: Context) -> Rendering | None:
+        """A picture without gradients and normals by one kernel, where one supports field and sampler; else ``None``."""
         sampler, normals = self.sampler, ctx.geometry and Quantity.NORMAL in field.provides
         if torch.is_grad_enabled() or ctx.training or normals or not isinstance(sampler, Occupancy):
             return None
-        parts = hash_field(field, ctx.bounds)
-        if parts is None or sampler.config.stop == "never" or not kernels.compiled("hash_render", parts.table):
+        parts = field.fused(ctx.bounds)
+        if parts is None or sampler.config.stop == "never" or not kernels.compiled("ngp_render", parts.table):
             return None
         rays, given = camera.rays(), (sampler.occupied, ctx.bounds, sampler.steps(ctx), parts)
         limits = sampler.config.transmittance, UNSEEN
-        sums, alpha = kernels.hash_render(ctx.bounds.clip(rays), *given, *limits, camera.width)
-        flat = picture(sums[:, :3], alpha, sums[:, 3], None, rays.far)
+        sums, alpha = kernels.ngp_render(ctx.bounds.clip(rays), *given, *limits, camera.width)
+        flat = to_rendering(sums[:, :3], alpha, sums[:, 3], None, rays.far)
         return flat.reshape(camera.height, camera.width)
 
     def update(self, field: Field, ctx: Context) -> None:
-        """Let the sampler refresh what it remembers of the field."""
-        self.sampler.update(no_grad_density(field), ctx)
+        """Refresh the sampler's state."""
+        self.sampler.update(field, ctx)
+
+    @override
+    def untrained(self) -> Volumetric:
+        """The same with the sampler's constants in place of what it has learnt."""
+        return Volumetric(self.sampler.untrained(), self.gradient_reach)
 
 
 def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldValues:
@@ -124,7 +131,7 @@ def _seen(field: Field, samples: Samples, rays: int, want: Quantity, chunk: int)
     """Values of samples whose density is known: what contributes next to nothing is not asked for its colour and stays zero."""
     assert samples.density is not None
     weights, _, _ = kernels.composite(samples.density * samples.delta, samples.density[:, None], samples.ray, rays)
-    seen = weighty(weights, samples.ray, rays, UNSEEN)
+    seen = contributing_samples(weights, samples.ray, rays, UNSEEN)
     found = query(field, samples[seen], want & ~Quantity.DENSITY, chunk)
     values = {entry.name: getattr(found, entry.name) for entry in fields(FieldValues)}
     spread = {

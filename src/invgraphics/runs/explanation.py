@@ -1,4 +1,4 @@
-"""``ray.json``: one pixel's ray, what it meets and what each thing adds. Distances are in local units."""
+"""``ray.json``: one pixel's ray, what it meets and what each thing adds; all lengths in `ExplanationRecord.length_unit`."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Contributions:
         alpha: opacity of each by itself.
         transmittance: share of its light that the others let through.
         weight: share of the pixel's light.
-        density: at the samples, per local unit; ``None`` for Gaussians.
+        density: at the samples, per unit of length; ``None`` for Gaussians.
         red: colour in the scene's colour space; likewise ``green`` and ``blue``.
         green: see ``red``.
         blue: see ``red``.
@@ -82,7 +82,7 @@ class Profile:
 
     Attributes:
         t: distance.
-        density: per local unit; ``None`` where the field has none.
+        density: per unit of length; ``None`` where the field has none.
         transmittance: share of the light from t that reaches the camera.
     """
 
@@ -120,7 +120,9 @@ class ExplanationRecord(Record):
         name: of the view.
         colour: the scene's colour space, ``srgb`` or ``linear``.
         background: of the scene, in that colour space.
-        kind: of the contributions: intervals of a field; splats in the order of the picture; Gaussians met along the ray.
+        kind: of the contributions, in the plural: ``samples`` are intervals of a field; ``splats`` in the order of the picture;
+            ``Gaussians`` met along the ray.
+        length_unit: of all distances and densities: ``world``, the data set's; ``local`` in older files, which lack the key.
         near: where the ray enters the scene's bounds.
         far: where it leaves them.
         space: kind of the bounds, ``box`` or ``contracted``.
@@ -141,7 +143,8 @@ class ExplanationRecord(Record):
     name: str = ""
     colour: Literal["srgb", "linear"]
     background: tuple[float, float, float]
-    kind: Literal["samples", "splats", "gaussians"]
+    kind: str
+    length_unit: Literal["world", "local"] = "local"
     near: float | None = None
     far: float | None = None
     space: str = "box"

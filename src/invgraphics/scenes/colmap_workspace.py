@@ -1,4 +1,4 @@
-"""COLMAP workspaces as people have them: which model to take, and where its photographs are."""
+"""COLMAP workspaces: choice among models, and search for their photographs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the relatives of ``transforms.json`` have in common: frames with OpenGL poses, and intrinsics here or there."""
+"""Reader of ``transforms.json`` and its variants: frames with OpenGL poses, intrinsics per frame or per file."""
 
 from __future__ import annotations
 

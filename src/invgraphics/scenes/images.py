@@ -59,7 +59,7 @@ def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, in
     Raises:
         InputError: the file is missing, no picture, or cut short.
     """
-    with _open(path) as image, _told(path, image):
+    with _open(path) as image, _naming_damaged_file(path, image):
         return image.size[::-1] if _is_turned(image, like) else image.size
 
 
@@ -81,7 +81,7 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
     """
     from PIL import ImageOps
 
-    with _open(path) as image, _told(path, image):
+    with _open(path) as image, _naming_damaged_file(path, image):
         upright = ImageOps.exif_transpose(image) if _is_turned(image, like) or not _is_sideways(image) else image
         if upright.mode.startswith("I"):
             grey = (np.asarray(upright).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
@@ -91,7 +91,7 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
 
 
 @contextmanager
-def _told(path: Path, image: Any) -> Iterator[None]:
+def _naming_damaged_file(path: Path, image: Any) -> Iterator[None]:
     """Say which file it was that could not be decoded; even its EXIF tags may lie behind the pixels."""
     width, height = image.size
     try:
@@ -176,13 +176,13 @@ def match_sizes(photos: Sequence[Photo]) -> list[Photo]:
     result: list[Photo] = []
     first = 1.0
     for photo in photos:
-        said = (photo.camera.width, photo.camera.height)
-        found = image_size(photo.path, like=said)
-        scale = found[0] / said[0]
+        stated = (photo.camera.width, photo.camera.height)
+        found = image_size(photo.path, like=stated)
+        scale = found[0] / stated[0]
         # A rounded-off pixel on either side is no change of shape.
-        if abs(found[1] - scale * said[1]) > 1 + scale:
+        if abs(found[1] - scale * stated[1]) > 1 + scale:
             raise InputError(
-                f"{photo.path} has {found[0]}x{found[1]} pixels, its camera says {said[0]}x{said[1]}.",
+                f"{photo.path} has {found[0]}x{found[1]} pixels, its camera says {stated[0]}x{stated[1]}.",
                 "Pictures may be scaled, but must keep the shape they were calibrated with.",
             )
         first = scale if not result else first
@@ -191,7 +191,7 @@ def match_sizes(photos: Sequence[Photo]) -> list[Photo]:
                 f"{photo.path} has {found[0]}x{found[1]} pixels, which is scaled unlike {photos[0].path.name}.",
                 "All pictures of a set must have the sizes that their cameras say.",
             )
-        result.append(photo if found == said else _rescaled(photo, *found))
+        result.append(photo if found == stated else _rescaled(photo, *found))
     return result
 
 

@@ -1,4 +1,4 @@
-"""A scene in one ``.npz``: the simplest thing a person can write with ``numpy.savez``.
+"""Scenes in one ``.npz`` file, as ``numpy.savez`` writes it.
 
 ============== ============================== =====================================================================
 key            shape                          meaning
@@ -187,3 +187,58 @@ def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shap
     if values.dtype.kind == "f" and np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1:
         return (values * 255 + 0.5).astype(np.uint8)
     raise InputError(f"'{key}' of {path} holds neither bytes nor finite floats in [0, 1].")
+
+
+def save_npz(scene: Scene, path: Path) -> None:
+    """Write a scene as this convention has it, so that `Npz` reads the same scene; points' colours are rounded to bytes.
+
+    Raises:
+        InputError: it holds what the convention does not: no box, validation views, linear or unrounded colours, masks, another
+            background, pictures of several sizes; the sentence says what. Nothing is written then.
+    """
+    if beyond := _beyond(scene):
+        raise InputError(
+            f"The scene '{scene.name}' cannot be kept as a data set: it has {beyond}.",
+            "Write it in a format that `load_scene` reads, and load it from there.",
+        )
+    views = [*scene.train, *scene.test]
+    arrays: dict[str, np.ndarray] = {
+        "images": np.stack([view.image.cpu().numpy() for view in views]),
+        "cam_to_world": np.stack([view.camera.cam_to_world.cpu().numpy() for view in views]),
+        "focal": np.stack([view.camera.focal.cpu().numpy() for view in views]),
+        "centre": np.stack([view.camera.centre.cpu().numpy() for view in views]),
+        "test": np.arange(len(views)) >= len(scene.train),
+        "bounds": torch.stack([scene.bounds.lo, scene.bounds.hi]).cpu().numpy(),
+    }
+    for key in ("alpha", "depth", "normal"):
+        values = [getattr(view, key) for view in views]
+        if all(value is not None for value in values):
+            arrays[key] = np.stack([value.cpu().numpy() for value in values])
+    if scene.points is not None:
+        arrays |= {"points": scene.points.position.cpu().numpy(), "points_rgb": scene.points.rgb.clamp(0, 1).cpu().numpy()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]  # numpy's stub takes keywords for switches
+
+
+def _beyond(scene: Scene) -> str:
+    """What a scene has that the convention cannot hold; empty where there is nothing."""
+    views = [*scene.train, *scene.test]
+    cameras = [view.camera for view in views]
+    mixed = [key for key in ("alpha", "depth", "normal") if len({getattr(view, key) is None for view in views}) > 1]
+    found = {
+        "validation views": bool(scene.val),
+        "no box around it": scene.bounds.space != "box",
+        "a near distance of its own": scene.bounds.near != Bounds.near,
+        "a frame of its own": not torch.equal(scene.world_from_local, torch.eye(4)),
+        "linear colours": scene.colour != "srgb",
+        "colours or an alpha that are not bytes": any(
+            values.dtype != torch.uint8 for view in views for values in (view.image, view.alpha) if values is not None
+        ),
+        "masks": any(view.mask is not None for view in views),
+        "a mesh": scene.mesh is not None,
+        f"{' and '.join(mixed)} for some views only": bool(mixed),
+        "pictures of several sizes": len({(camera.width, camera.height) for camera in cameras}) > 1,
+        "a background other than the default": scene.background.tolist() != [float(scene.has_alpha)] * 3,
+        "poses that are degraded on purpose": any(view.ground_truth_pose is not None for view in views),
+    }
+    return next((what for what, present in found.items() if present), "")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
+from weakref import WeakKeyDictionary
 
 import torch
 
@@ -14,7 +16,18 @@ from invgraphics.core import Scene, View
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions, pose
 
-__all__ = ["Loader", "SceneOptions", "absent_data", "choices", "find_loader", "is_rendered", "open_scene", "validate"]
+__all__ = [
+    "Loader",
+    "SceneOptions",
+    "SceneSource",
+    "absent_data",
+    "choices",
+    "find_loader",
+    "is_rendered",
+    "open_scene",
+    "source_of",
+    "validate",
+]
 
 _SAME_POSE = 1e-6  # entries of two poses that are closer than this are one camera
 
@@ -29,6 +42,27 @@ class Loader(Protocol):
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Read the data set; bad input raises `InputError`."""
         ...
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """What `open_scene` was given, so that another process can open the same scene.
+
+    Attributes:
+        spec: a built-in scene's name or the path of a data set.
+        options: with which it was opened.
+    """
+
+    spec: str
+    options: SceneOptions
+
+
+_SOURCES: WeakKeyDictionary[Scene, SceneSource] = WeakKeyDictionary()
+
+
+def source_of(scene: Scene) -> SceneSource | None:
+    """Where a scene was opened; ``None`` for one that was made in Python, changed copies of an opened one included."""
+    return _SOURCES.get(scene)
 
 
 def open_scene(
@@ -47,10 +81,16 @@ def open_scene(
         InputError: nothing is known by this name, no format fits, or the data cannot be used.
     """
     options = options or SceneOptions()
+    scene = validate(_load(spec, options, progress))
+    _SOURCES[scene] = SceneSource(spec, options)
+    return scene
+
+
+def _load(spec: str, options: SceneOptions, progress: Callable[[int, int, str], None] | None) -> Scene:
     description = _description(spec)
     if description is not None:
         path = _render(description, options, progress)
-        return validate(plugins.load("scenes", "truth")().load(path, options))
+        return plugins.load("scenes", "truth")().load(path, options)
     path = _path(spec)
     if not path.exists():
         if reason := absent_data(spec):
@@ -61,7 +101,7 @@ def open_scene(
         )
     if options.spp is not None:
         raise InputError(f"{path} holds pictures, whose samples per pixel are what they are.", "Leave --spp away.")
-    return validate(find_loader(path).load(path, options))
+    return find_loader(path).load(path, options)
 
 
 def find_loader(path: Path) -> Loader:
@@ -125,11 +165,11 @@ def _description(spec: str) -> str | None:
 
 def _render(description: str, options: SceneOptions, progress: Callable[[int, int, str], None] | None) -> Path:
     from invgraphics.scenes.mitsuba import make
-    from invgraphics.scenes.mitsuba.spec import locate, read
+    from invgraphics.scenes.mitsuba.spec import description_path, read
 
     size = options.size
     if isinstance(size, int):
-        width, height = read(locate(description)).size
+        width, height = read(description_path(description)).size
         size = (round(size * width / max(width, height)), round(size * height / max(width, height)))
     return make(
         description,

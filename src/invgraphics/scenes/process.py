@@ -1,4 +1,4 @@
-"""Long work in a process of its own: progress comes out of it line by line, and whatever ends it becomes one sentence.
+"""Worker processes: progress is reported line by line, and every failure becomes one `InputError`.
 
 A worker prints ``progress DONE TOTAL WHAT`` or ``error JSON`` (sentence and remedy) on its standard output.
 """
@@ -19,13 +19,13 @@ from invgraphics.errors import InputError
 Progress = Callable[[int, int, str], None]
 
 
-def say_progress(done: int, total: int, what: str) -> None:
-    """Called by a worker: how much is done."""
+def write_progress(done: int, total: int, what: str) -> None:
+    """Report a worker's progress on its standard output."""
     print(f"progress {done} {total} {what}", flush=True)
 
 
-def say_error(error: InputError) -> None:
-    """Called by a worker that gives up."""
+def write_error(error: InputError) -> None:
+    """Report a worker's failure on its standard output."""
     print(f"error {json.dumps([error.sentence, error.remedy])}", flush=True)
 
 
@@ -60,7 +60,7 @@ def run_worker(
 
 
 def _follow(process: subprocess.Popen[str], progress: Progress) -> InputError | None:
-    """Pass progress on until the process closes its output; what it said went wrong, if it did."""
+    """Forward progress until the process closes its output; returns the failure that it reported, if any."""
     failure = None
     for line in process.stdout or ():
         word, _, rest = line.rstrip("\n").partition(" ")
@@ -73,7 +73,7 @@ def _follow(process: subprocess.Popen[str], progress: Progress) -> InputError | 
 
 
 def _explain(subject: str, remedy: str, status: int, complaints: IO[str]) -> InputError:
-    """Why a process failed that could not say so itself."""
+    """The failure of a process that reported none: its signal, or the last line of its standard error."""
     if status < 0:
         return InputError(f"{subject}: its process died of {signal.Signals(-status).name}.", remedy)
     complaints.seek(0)

@@ -15,18 +15,18 @@ import torch
 from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import training_data
+from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.executors.base import INTERRUPTED, Executor, Outcome, Resources
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.progress import Reporter
-from invgraphics.experiments.renderings import check_eyes, rendered
+from invgraphics.experiments.renderings import check_variants, rendered
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.study import CellRecord
-from invgraphics.scenes.open import SceneOptions, absent_data, open_scene
+from invgraphics.scenes.open import absent_data
 from invgraphics.studies.analyses import write_analyses
 from invgraphics.studies.cells import Planned, make_plan, select
 from invgraphics.studies.forecast import Cost, Forecast, total, try_method
@@ -34,7 +34,6 @@ from invgraphics.studies.reading import locate, name_of, read_study, with_reques
 from invgraphics.studies.record import CellState, StudyRecorder, summarise_study
 from invgraphics.studies.study import Study
 from invgraphics.text import duration
-from invgraphics.training.budget import Budget
 
 Size = int | tuple[int, int] | None
 """Longest side in pixels, or (width, height)."""
@@ -87,7 +86,7 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
     folder = RunFolder(Path(request.out))
     folder.create()
     with folder.held():
-        record = StudyRecorder(folder, summarise_study(study, name_of(path), request, resources), plan)
+        record = StudyRecorder(folder, summarise_study(study, name_of(path), (request, resources), plan[0].job), plan)
         fits = {planned.id: planned for planned in plan}
         states = {name: _state(planned, request.keep, name in chosen) for name, planned in fits.items()}
         samples, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
@@ -97,9 +96,9 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
         costs = _try_methods(missing, samples)
         missing.sort(key=lambda planned: _expense(planned, study, costs))
-        expected = {planned.id: costs[_kind(planned)].seconds(Budget.parse(planned.fit.budget)) for planned in missing}
+        expected = {planned.id: costs[_kind(planned)].seconds(planned.job.budget) for planned in missing}
         later = sum(state.status in ("later", "skipped") for state in states.values())
-        forecast = total([(costs[_kind(p)], Budget.parse(p.fit.budget)) for p in missing], len(fits), request.jobs, later)
+        forecast = total([(costs[_kind(p)], p.job.budget) for p in missing], len(fits), request.jobs, later)
         _check_disk(forecast, folder.root)
         for sentence in announcements(planned.method.choice for planned in plan):
             print(sentence, file=sys.stderr)
@@ -127,8 +126,8 @@ def _state(planned: Planned, keep: bool, chosen: bool) -> CellState:
 
 
 def _is_kept(planned: Planned) -> bool:
-    run = RunFolder(Path(planned.fit.out))
-    if not run.finished or not rendered(run, planned.fit, planned.method):
+    run = planned.job.folder
+    if not run.finished or not rendered(planned.job):
         return False
     return run.read(Provenance).recipe_sha256 == planned.method.digest
 
@@ -146,7 +145,7 @@ def _kind(planned: Planned) -> tuple[str, str, Size]:
 def _expense(planned: Planned, study: Study, costs: dict[tuple[str, str, Size], Cost]) -> tuple[int, float, int]:
     """Cheap cells come first; of several seeds, the first with all its cells."""
     size = planned.fit.size
-    seconds = costs[_kind(planned)].fit_seconds(Budget.parse(planned.fit.budget))
+    seconds = costs[_kind(planned)].fit_seconds(planned.job.budget)
     return study.seeds.index(planned.cell.seed), seconds, max(size) if isinstance(size, tuple) else size or 0
 
 
@@ -161,22 +160,20 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple
     for place in dict.fromkeys(map(_place, plan)):
         name, size = place
         group = [planned for planned in plan if _place(planned) == place]
-        with Reporter(f"rendering {name}") as reporter:
-            options = SceneOptions(size=size, test_views=group[0].fit.test_views, spp=group[0].fit.spp)
-            scene = open_scene(name, options, lambda done, n, what, r=reporter: r.show(done / max(n, 1), what))
-        for data in dict.fromkeys(training_data(planned.fit) for planned in group):
+        scene = open_with_progress(name, group[0].job.options)
+        for data in dict.fromkeys(planned.job.data for planned in group):
             data.check(scene)
         methods = {planned.method.digest: planned.method for planned in group}.values()
-        check_eyes(group[0].fit.render_with, methods, scene)
+        check_variants(group[0].job.variants, methods, scene)
         truths[place] = TruthDigest.of(scene)
         samples.setdefault(size, scene)
     return samples, truths
 
 
 def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
-    run = RunFolder(Path(planned.fit.out))
-    same = run.finished and run.identity == identify(planned.fit, planned.method, truth, threads)
-    return same and rendered(run, planned.fit, planned.method)
+    run = planned.job.folder
+    same = run.finished and run.identity == identify(planned.job, truth, threads)
+    return same and rendered(planned.job)
 
 
 def _try_methods(missing: Sequence[Planned], samples: dict[Size, Scene]) -> dict[tuple[str, str, Size], Cost]:
@@ -184,7 +181,7 @@ def _try_methods(missing: Sequence[Planned], samples: dict[Size, Scene]) -> dict
     costs: dict[tuple[str, str, Size], Cost] = {}
     for planned in missing:
         if _kind(planned) not in costs:
-            costs[_kind(planned)] = try_method(planned.fit, planned.method, samples[planned.fit.size])
+            costs[_kind(planned)] = try_method(planned.job, samples[planned.fit.size])
     return costs
 
 

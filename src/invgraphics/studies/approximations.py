@@ -125,13 +125,13 @@ def cloud_error(view: float, scale: float) -> float:
 
 def sorting_by_centre() -> Analysis:
     """Two long Gaussians that cross, seen while the camera turns around them."""
-    eyes = {
+    renderers = {
         "sorted by centre": along_rays(),
         "sorted along the ray": along_rays("ray"),
         "integrated": GaussianExact(GaussianExactConfig(steps=64)),
     }
     curves, jumps = [], {}
-    for label, renderer in eyes.items():
+    for label, renderer in renderers.items():
         angles, shares = crossing(renderer)
         curves.append(Curve(label, tuple(angles), tuple(shares)))
         jumps[label] = max(abs(after - before) for before, after in itertools.pairwise(shares))

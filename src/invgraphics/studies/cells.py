@@ -9,17 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import device_of, requested_method, training_data
 from invgraphics.experiments.identity import define
-from invgraphics.experiments.recorder import Cadence
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest, FitRequest
-from invgraphics.metrics.protocols import protocol_named
 from invgraphics.recipes.recipe import Method
 from invgraphics.scenes.open import is_rendered
 from invgraphics.studies.factors import BUDGET, SIZE, in_scope, path_of
 from invgraphics.studies.study import Cell, Study
 from invgraphics.text import slug
-from invgraphics.training.budget import Budget
 
 LONGEST_NAME = 100
 """Characters of a run's folder name, its hash left out."""
@@ -31,18 +28,26 @@ class Planned:
 
     Attributes:
         cell: of the study.
-        fit: the run, in its own folder.
-        method: its resolved recipe.
+        job: the run, in its own folder.
     """
 
     cell: Cell
-    fit: FitRequest
-    method: Method
+    job: Job
+
+    @property
+    def fit(self) -> FitRequest:
+        """The run as it is asked for."""
+        return self.job.request
+
+    @property
+    def method(self) -> Method:
+        """The run's resolved recipe."""
+        return self.job.method
 
     @property
     def id(self) -> str:
         """Name of the run's folder."""
-        return Path(self.fit.out).name
+        return self.job.folder.root.name
 
     @property
     def label(self) -> str:
@@ -58,9 +63,6 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
     Raises:
         InputError: unknown method, key, protocol or device, or a level that does not fit; the sentence names the cell.
     """
-    protocol_named(study.protocol)
-    device_of(request.device)
-    Cadence.parse(request.checkpoint_every)
     methods: dict[tuple[Any, ...], Method] = {}
     folders: dict[str, Path] = {}  # a run that several cells share is named after the first
     plan = []
@@ -69,14 +71,13 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
         fit = fit if is_rendered(fit.scene) else replace(fit, spp=None)
         key = (cell.method, fit.preset, fit.budget, fit.recipe_overrides)
         try:
-            if key not in methods:
-                methods[key] = requested_method(cell.method, fit)
-            training_data(fit)
+            job = Job.of(fit, methods.get(key))
         except InputError as error:
             raise _in_cell(cell, error) from error
-        definition = define(fit, methods[key])
+        methods[key] = job.method
+        definition = define(job)
         folder = folders.setdefault(definition, Path(fit.out) / "runs" / f"{_readable(cell)}-{definition[:10]}")
-        plan.append(Planned(cell, replace(fit, out=str(folder)), methods[key]))
+        plan.append(Planned(cell, replace(job, request=replace(fit, out=str(folder)))))
     return plan
 
 
@@ -91,7 +92,7 @@ def select(plan: list[Planned], request: AblateRequest) -> list[Planned]:
         planned
         for planned in plan
         if (request.cells is None or fnmatchcase(planned.label, request.cells))
-        and (most is None or (Budget.parse(planned.fit.budget).seconds or 0) <= most)
+        and (most is None or (planned.job.budget.seconds or 0) <= most)
     ]
     if not kept:
         remedy = f"A cell's label reads '{plan[0].label}'; a * stands for any characters."

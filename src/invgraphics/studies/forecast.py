@@ -8,14 +8,13 @@ from dataclasses import dataclass
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError, NumericalError
-from invgraphics.experiments.build import build_model, build_plan, device_of, training_data, use_kernels
+from invgraphics.experiments.build import build_model, build_plan, use_kernels
 from invgraphics.experiments.evaluate import expected_seconds
-from invgraphics.experiments.renderings import eye_named, through
-from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.start import CHECKPOINT_COPIES
+from invgraphics.experiments.variants import with_renderer
 from invgraphics.metrics.cost import model_bytes
-from invgraphics.recipes.recipe import Method
-from invgraphics.scenes.corrupt import corrupt
+from invgraphics.scenes.degrade import degrade
 from invgraphics.text import duration
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -81,32 +80,31 @@ class Forecast:
         return f"{runs}; the rest takes about {duration(self.seconds)} and {self.size / 1e9:.2g} GB."
 
 
-def try_method(request: FitRequest, method: Method, scene: Scene) -> Cost:
+def try_method(job: Job, scene: Scene) -> Cost:
     """Measure one method on one scene.
 
     Raises:
         InputError: field, renderer or scene do not go together.
     """
-    device = device_of(request.device)
-    use_kernels(request.kernels)
+    seed, device = job.request.seed, job.device
+    use_kernels(job.request.kernels)
     pixels = sum(view.camera.width * view.camera.height for view in scene.test)
-    shown = corrupt(scene, training_data(request), request.seed)
+    shown = degrade(scene, job.data, seed)
     try:
-        fit = Fit(build_plan(method, shown, Budget.parse(request.budget), request.seed, device))
+        fit = Fit(build_plan(job.method, shown, job.budget, seed, device))
         fit.step()  # the first compiles and allocates
         began = time.perf_counter()
         fit.step()
         step = time.perf_counter() - began
-        evaluation = expected_seconds(fit.plan.field, fit.plan.renderer, scene, device)
-        for name in request.render_with:
-            seen = through(method, eye_named(name))
-            evaluation += expected_seconds(*build_model(seen, scene, request.seed, device), scene, device)
-        size = CHECKPOINT_COPIES * model_bytes((fit.plan.field, fit.plan.renderer))
+        evaluation = expected_seconds(fit.plan.model, scene)
+        for variant in job.variants:
+            evaluation += expected_seconds(build_model(with_renderer(job.method, variant), scene, seed, device), scene)
+        size = CHECKPOINT_COPIES * model_bytes(fit.plan.model.parts.values())
     except InputError:
         raise
     except (NumericalError, MemoryError, RuntimeError):  # its cell will fail with a sentence, and the others go on
         return Cost(0.0, START_SECONDS, 0)
-    return Cost(step, START_SECONDS + evaluation, size + PIXEL_BYTES * pixels * (1 + len(request.render_with)))
+    return Cost(step, START_SECONDS + evaluation, size + PIXEL_BYTES * pixels * (1 + len(job.variants)))
 
 
 def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int, later: int = 0) -> Forecast:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import device_of
 from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.base import Outcome, Resources
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest
-from invgraphics.metrics.protocols import protocol_named
 from invgraphics.runs.folder import RUNS, RunFolder
 from invgraphics.runs.study import CellRecord, Status, StudyRecord
 from invgraphics.studies.cells import Planned
 from invgraphics.studies.study import Study
-from invgraphics.training.budget import Budget
 
 
 @dataclass(frozen=True)
@@ -88,9 +86,8 @@ def _started(cell: CellRecord, state: CellState) -> CellRecord:
 
 def _cell_record(planned: Planned, before: CellRecord | None) -> CellRecord:
     """A cell's record, with what an earlier command knew of its run."""
-    cell, budget = planned.cell, Budget.parse(planned.fit.budget)
-    finished = RunFolder(Path(planned.fit.out)).finished
-    ended = before is not None and (before.status == "failed" or (before.status == "done" and finished))
+    cell, budget = planned.cell, planned.job.budget
+    ended = before is not None and (before.status == "failed" or (before.status == "done" and planned.job.folder.finished))
     return CellRecord(
         id=planned.id,
         label=planned.label,
@@ -110,9 +107,10 @@ def _cell_record(planned: Planned, before: CellRecord | None) -> CellRecord:
     )
 
 
-def summarise_study(study: Study, name: str, request: AblateRequest, resources: Resources) -> StudyRecord:
-    """A study's record, without its cells."""
-    machine = environment(device_of(request.device))
+def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resources], job: Job) -> StudyRecord:
+    """A study's record, without its cells; ``job`` is one of theirs."""
+    request, resources = asked
+    machine = environment(job.device)
     return StudyRecord(
         name=name,
         question=study.question,
@@ -131,7 +129,7 @@ def summarise_study(study: Study, name: str, request: AblateRequest, resources: 
         report=study.report,
         approximations=study.approximations,
         known=study.known,
-        protocol=asdict(protocol_named(study.protocol)),
+        protocol=job.protocol.record(),
         command=request.shell(),
         environment=replace(machine, threads=resources.threads, executor=request.executor, jobs=resources.jobs),
         cells=(),

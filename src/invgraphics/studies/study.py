@@ -1,7 +1,7 @@
 """Studies: a question, factors and their levels as data, and the cells that they expand to. Imports nothing heavy.
 
 A factor's name is the dotted path of what it sets: a key of the recipes (``field.encoding.log2_size``), a key of the training
-data (``data.train_views``, see `invgraphics.scenes.corrupt.TrainingData`), or ``budget``, ``size`` or ``preset``. A factor that
+data (``data.train_views``, see `invgraphics.scenes.degrade.TrainingData`), or ``budget``, ``size`` or ``preset``. A factor that
 only some methods have names them first, ``volumetric/hash:field.encoding.log2_size`` or ``volumetric/*:batches.rays``; cells of
 the other methods carry its base level in the table, and are not multiplied by it.
 """

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from PIL import Image
 from torch import Tensor
 
-from invgraphics.core import Camera, Context, Rendering, Scene, View
+from invgraphics.core import Camera, Contributions, Profile, Rendering, Scene, View
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs.explanation import CSV, PICTURE, TRUTH, DeadPrimitives, ExplanationRecord, Pixel, SamplerPass
 from invgraphics.runs.explanation import Contributions as Columns
 from invgraphics.runs.explanation import Profile as ProfileRecord
 from invgraphics.runs.schema import plain
-from invgraphics.tools.along import Contributions, Profile, along_ray
 from invgraphics.training.limits import dead_gaussians
 
 Split = Literal["test", "train"]
@@ -61,7 +60,7 @@ class Explanation:
 
     Attributes:
         folder: holds the record, the contributions as a table, the picture and the photograph.
-        contributions: in the order in which they are composited.
+        contributions: in the order in which they are composited, world units.
         rendered: colour of the pixel as `render` shows it, in front of the scene's background.
         composited: the same from the contributions.
         record: everything, as in the file.
@@ -82,10 +81,8 @@ def explain(request: ExplainRequest) -> Explanation:
     """
     fitted = open_fitted(request.run, request.scene).in_its_frame()
     view = _view(fitted.scene, request)
-    camera = view.camera.to(fitted.device)
-    ctx = Context(fitted.scene.bounds.to(fitted.device), training=False)
-    found = on_cpu(along_ray(fitted.field, fitted.renderer, camera, request.pixel, ctx))
-    picture = render_view(fitted.field, fitted.renderer, view.camera, fitted.scene, fitted.device, geometry=False)
+    found = in_world_units(fitted.model.contributions(view.camera, request.pixel), fitted.scene.scale)
+    picture = fitted.model.render(view.camera, normals=False)
 
     column, row = request.pixel
     background = fitted.scene.background
@@ -97,19 +94,24 @@ def explain(request: ExplainRequest) -> Explanation:
     return explanation
 
 
-def on_cpu(found: Contributions) -> Contributions:
-    """The same contributions, all tensors on the CPU."""
+def in_world_units(found: Contributions, scale: float) -> Contributions:
+    """Contributions with distances times ``scale``, the world length of one local unit, and densities divided by it."""
 
-    def moved(value: Any) -> Any:
-        if isinstance(value, Tensor):
-            return value.cpu()
-        if isinstance(value, tuple):
-            return tuple(moved(item) for item in value)
-        if hasattr(value, "__dataclass_fields__"):
-            return type(value)(**{name: moved(item) for name, item in vars(value).items()})
-        return value
+    def profile(one: Profile | None) -> Profile | None:
+        if one is None:
+            return None
+        return replace(one, t=one.t * scale, density=None if one.density is None else one.density / scale)
 
-    return moved(found)
+    return replace(
+        found,
+        t=found.t * scale,
+        begin=found.begin * scale,
+        end=found.end * scale,
+        density=None if found.density is None else found.density / scale,
+        profile=profile(found.profile),
+        marched=profile(found.marched),
+        passes=tuple(replace(one, t0=one.t0 * scale, t1=one.t1 * scale) for one in found.passes),
+    )
 
 
 def _view(scene: Scene, request: ExplainRequest) -> View:
@@ -146,10 +148,11 @@ def _record(fitted: Fitted, request: ExplainRequest, view: View, found: Contribu
         colour=scene.colour,
         background=(_rounded(red), _rounded(green), _rounded(blue)),
         kind=found.kind,
-        near=_number(ray.near[0]),
-        far=_number(ray.far[0]),
+        length_unit="world",
+        near=_number(ray.near[0] * scene.scale),
+        far=_number(ray.far[0] * scene.scale),
         space=scene.bounds.space,
-        pixel=_pixel(request, view, found, picture, scene.background),
+        pixel=_pixel(request, view, found, picture, scene),
         contributions=_columns(found),
         dead=_dead(fitted),
         profile=_profile(found.profile),
@@ -158,19 +161,19 @@ def _record(fitted: Fitted, request: ExplainRequest, view: View, found: Contribu
     )
 
 
-def _pixel(request: ExplainRequest, view: View, found: Contributions, picture: Rendering, background: Tensor) -> Pixel:
+def _pixel(request: ExplainRequest, view: View, found: Contributions, picture: Rendering, scene: Scene) -> Pixel:
     """The pixel in the picture, in the photograph, and as the contributions have it."""
-    column, row = request.pixel
+    (column, row), background = request.pixel, scene.background
     return Pixel(
         column=column,
         row=row,
         alpha=_number(found.opacity),
-        depth=_number(picture.depth[row, column]),
+        depth=_number(picture.depth[row, column] * scene.scale),
         expected=_number(found.expected_depth),
         median=_number(found.median_depth),
         true=_row(view.over(background)[row, column]),
         true_alpha=None if view.alpha is None else _number(view.opacity()[row, column]),
-        true_depth=None if view.depth is None else _number(view.depth[row, column]),
+        true_depth=None if view.depth is None else _number(view.depth[row, column] * scene.scale),
         rendered=_row(picture.over(background)[row, column]),
         composited=_row(found.colour + (1 - found.opacity) * background),
     )
@@ -178,7 +181,7 @@ def _pixel(request: ExplainRequest, view: View, found: Contributions, picture: R
 
 def _dead(fitted: Fitted) -> DeadPrimitives | None:
     """Share, number and causes of primitives that no gradient can change; ``None`` for fields without Gaussians."""
-    dead = dead_gaussians(fitted.field, [view.camera for view in fitted.scene.train])
+    dead = dead_gaussians(fitted.model.field, [view.camera for view in fitted.scene.train])
     return None if dead is None else DeadPrimitives(share=_number(dead.share), sentence=dead.sentence())
 
 

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 
 from invgraphics import plugins
-from invgraphics.core import Camera, Context, Field, Gaussians, Quantity, Renderer, Scene, harmonics
+from invgraphics.core import Camera, Context, Field, Gaussians, Quantity, harmonics
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.errors import InputError, NotComposableError
-from invgraphics.experiments.evaluate import render_view
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
-from invgraphics.fields.transformed import move_gaussians
+from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
 from invgraphics.runs.folder import make_parent
 from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_file
@@ -105,7 +104,7 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     Raises:
         InputError: the model has no Gaussians, or they do not fit into the format.
     """
-    if Quantity.GAUSSIANS not in fitted.field.provides:
+    if Quantity.GAUSSIANS not in fitted.model.field.provides:
         raise InputError(
             f"The model of '{request.run}' ({fitted.method.name}) has no Gaussians to write as {request.to}.",
             "Runs of splatting methods have some.",
@@ -113,18 +112,18 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     scene = fitted.scene
     axes = plugins.load("formats", request.to).axes
     with torch.no_grad():
-        local = fitted.field.primitives(Quantity.GAUSSIANS, Context(scene.bounds.to(fitted.device)))
-    placed = on_cpu(move_gaussians(on_cpu(local), file_from_local(scene, axes, request.world).float()))
+        local = fitted.model.field.primitives(Quantity.GAUSSIANS, fitted.model.context())
+    placed = on_cpu(transform_gaussians(on_cpu(local), file_from_local(scene, axes, request.world).float()))
     expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
     placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
     shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
     note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
-    antialiased = getattr(fitted.method.recipe.renderer, "compensate", False)
+    antialiased = getattr(fitted.method.recipe.renderer, "antialiased", False)
     write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)))
 
     _, written = read_gaussians(request.out)
-    back = move_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
-    loss = agreement(local, on_device(back, fitted.device), fitted)
+    back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
+    loss = agreement(local, on_device(back, fitted.model.device), fitted)
     degree = harmonics.degree_of(written.gaussians.sh.shape[1])
     had = harmonics.degree_of(local.sh.shape[1])
     return Exported(
@@ -153,19 +152,17 @@ def agreement(gaussians: Gaussians, others: Gaussians, fitted: Fitted) -> list[f
     psnr = []
     with Reporter("comparing") as reporter:
         for index, view in enumerate(fitted.scene.test):
-            ours, theirs = (
-                shown(each, fitted.renderer, view.camera, fitted.scene, fitted.device) for each in (gaussians, others)
-            )
+            ours, theirs = (shown(each, fitted, view.camera) for each in (gaussians, others))
             error = float((ours - theirs).square().mean())
             psnr.append(-10 * math.log10(error) if error else math.inf)
             reporter.show((index + 1) / len(fitted.scene.test), f"view {index + 1} of {len(fitted.scene.test)}")
     return psnr
 
 
-def shown(gaussians: Gaussians, renderer: Renderer, camera: Camera, scene: Scene, device: torch.device) -> Tensor:
-    """The picture of Gaussians over the scene's background, clipped to [0, 1], shape (height, width, 3)."""
-    picture = render_view(FixedGaussians(gaussians), renderer, camera, scene, device, geometry=False)
-    return picture.over(scene.background).clamp(0, 1)
+def shown(gaussians: Gaussians, fitted: Fitted, camera: Camera) -> Tensor:
+    """Render Gaussians through a run's renderer: colours over the scene's background, in [0, 1], (height, width, 3)."""
+    picture = replace(fitted.model, field=FixedGaussians(gaussians)).render(camera, normals=False)
+    return picture.over(fitted.scene.background).clamp(0, 1)
 
 
 def decibels(values: list[float]) -> str:

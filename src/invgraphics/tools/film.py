@@ -1,29 +1,37 @@
-"""Films of a run: around the scene, by its photographs, or of the fit itself."""
+"""Films of a run: along a camera path, or a time-lapse of the fit."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from types import TracebackType
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 
-from invgraphics.core import Camera, Context, Quantity
+from invgraphics.core import Camera, Quantity, Rendering
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
 from invgraphics.renderers.ellipsoids import draw_ellipsoids
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder, make_parent
+from invgraphics.tools.camera_path import read_camera_path
+from invgraphics.tools.colorize import colorize, depth_range
 from invgraphics.tools.paths import PATHS, Capture, PathName, classify_capture
 
 FilmPath = PathName | Literal["timelapse"]
+Show = Literal["prediction", "depth", "normal"]
 HOLD_SECONDS = 1.5
 """How long a time-lapse shows its last picture."""
+FRAMES = 90
+"""Pictures of a path that has no duration of its own."""
+PROBES, PROBE_SIZE = 8, 96
+"""Frames, and pixels along their longer side, from which the range of depths of a film is taken."""
 
 
 @dataclass(frozen=True)
@@ -33,50 +41,63 @@ class FilmRequest:
     Attributes:
         run: folder of the run.
         out: file to write, ``.mp4``.
-        path: ``orbit``, ``spiral``, ``interpolate`` between photographs, or ``timelapse`` of the fit; ``None`` for the one that
-            suits the capture.
-        frames: pictures of a path; a time-lapse has one for each snapshot.
+        path: ``orbit``, ``spiral``, ``interpolate`` between photographs, or ``timelapse`` of the fit; a file of a camera path;
+            ``None`` for the one that suits the capture.
+        frames: pictures of a path; a time-lapse has one for each snapshot. ``None`` for 90, or as many as a camera path's
+            duration holds.
         rate: pictures per second.
         size: of the pictures, the longest side or (width, height); ``None`` for the run's own.
         view: test view that a time-lapse shows.
         scene: another copy of the run's scene.
+        show: colours, depth, or normals; a time-lapse shows colours.
     """
 
     run: Path
     out: Path
-    path: FilmPath | None = None
-    frames: int = 90
+    path: FilmPath | Path | None = None
+    frames: int | None = None
     rate: int = 15
     size: int | tuple[int, int] | None = None
     view: int = 0
     scene: str | None = None
+    show: Show = "prediction"
 
     def __post_init__(self) -> None:
         if self.out.suffix != ".mp4":
             raise InputError(f"--out cannot be '{self.out}'.", "Expected a file name that ends in .mp4.")
-        if self.frames < 1 or self.rate < 1:
+        if (self.frames is not None and self.frames < 1) or self.rate < 1:
             raise InputError("--frames and --fps must be at least 1.")
+        if self.path == "timelapse" and self.show != "prediction":
+            raise InputError(f"--show {self.show} does not go with --path timelapse.", "A time-lapse shows colours.")
 
 
 def film(request: FilmRequest) -> Path:
     """Render a film; returns its file.
 
     Raises:
-        InputError: the run cannot be opened, or has no snapshots for a time-lapse, or the file cannot be written.
+        InputError: the run or the camera path cannot be opened, there are no snapshots for a time-lapse, or the file cannot be
+            written.
     """
+    saved = read_camera_path(request.path) if isinstance(request.path, Path) else None
     fitted = open_fitted(request.run, request.scene).in_its_frame()
     make_parent(request.out)
     if request.path == "timelapse":
         total, pictures = _timelapse(fitted, request)
+    elif saved is not None:
+        count, like = request.frames or saved.frame_count(request.rate), _sized(fitted.scene.test[0].camera, request.size)
+        cameras = saved.cameras(fitted.scene, count, (like.width, like.height))
+        total, pictures = count, _along(fitted, cameras, request)
     else:
+        assert not isinstance(request.path, Path)
         capture = classify_capture(fitted.scene)
         path = request.path or capture.path
         print(explanation(path, capture), file=sys.stderr)
-        cameras = PATHS[path](fitted.scene, request.frames)
         request = replace(request, path=path)
-        total, pictures = len(cameras), (_picture(fitted, _sized(camera, request.size)) for camera in cameras)
-    with Reporter(f"{request.path} of {request.run}") as reporter:
-        _write(request, _reported(pictures, total, reporter))
+        total = request.frames or FRAMES
+        pictures = _along(fitted, [_sized(camera, request.size) for camera in PATHS[path](fitted.scene, total)], request)
+    with Reporter(f"{request.path} of {request.run}") as reporter, FilmWriter(request.out, request.rate) as writer:
+        for picture in _reported(pictures, total, reporter):
+            writer.add(picture)
     return request.out
 
 
@@ -109,11 +130,10 @@ def _timelapse(fitted: Fitted, request: FilmRequest) -> tuple[int, Iterator[np.n
     def pictures() -> Iterator[np.ndarray]:
         picture = np.zeros((1, 1, 3), np.uint8)
         for path in snapshots:
-            state = checkpoint.load(path, fitted.device)
-            fitted.field.load_state_dict(state.get("field", {}))
-            fitted.renderer.load_state_dict(state.get("renderer", {}))
+            state = checkpoint.load(path, fitted.model.device)
+            fitted.load(state)
             picture = _picture(fitted, camera)
-            if Quantity.GAUSSIANS in fitted.field.provides:
+            if Quantity.GAUSSIANS in fitted.model.field.provides:
                 picture = np.concatenate([picture, _ellipsoids(fitted, camera)], axis=1)
             yield picture
         for _ in range(round(HOLD_SECONDS * request.rate)):
@@ -122,16 +142,34 @@ def _timelapse(fitted: Fitted, request: FilmRequest) -> tuple[int, Iterator[np.n
     return len(snapshots), pictures()
 
 
+def _along(fitted: Fitted, cameras: Sequence[Camera], request: FilmRequest) -> Iterator[np.ndarray]:
+    """The pictures of a path; depth in one range for all, which is printed."""
+    geometry, span = request.show == "normal", None
+
+    def render(camera: Camera) -> Rendering:
+        return fitted.model.render(camera, normals=geometry)
+
+    if request.show == "depth":
+        chosen = [cameras[round(index)] for index in np.linspace(0, len(cameras) - 1, min(PROBES, len(cameras)))]
+        small = [_sized(camera, min(PROBE_SIZE, max(camera.width, camera.height))) for camera in chosen]
+        span = depth_range([render(camera) for camera in small], [fitted.scene] * len(small))
+    for index, camera in enumerate(cameras):
+        seen = colorize(request.show, [render(camera)], [fitted.scene], [None], span)
+        if index == 0 and seen.legend:
+            print(f"{request.show.capitalize()}: {seen.legend}.", file=sys.stderr)
+        yield seen.pictures[0]
+
+
 def _picture(fitted: Fitted, camera: Camera) -> np.ndarray:
     """8-bit display colours over the scene's background."""
-    rendering = render_view(fitted.field, fitted.renderer, camera, fitted.scene, fitted.device, geometry=False)
+    rendering = fitted.model.render(camera, normals=False)
     return display(rendering.over(fitted.scene.background), fitted.scene).numpy()
 
 
 def _ellipsoids(fitted: Fitted, camera: Camera) -> np.ndarray:
-    ctx = Context(fitted.scene.bounds.to(fitted.device))
+    model = fitted.model
     with torch.no_grad():
-        drawn = draw_ellipsoids(fitted.field.primitives(Quantity.GAUSSIANS, ctx), camera.to(fitted.device))
+        drawn = draw_ellipsoids(model.field.primitives(Quantity.GAUSSIANS, model.context()), camera.to(model.device))
     rendering = replace(drawn, rgb=drawn.rgb.cpu(), alpha=drawn.alpha.cpu())
     return display(rendering.over(fitted.scene.background), fitted.scene).numpy()
 
@@ -146,20 +184,37 @@ def _sized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
     return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
-def _write(request: FilmRequest, pictures: Iterator[np.ndarray]) -> None:
-    """Write an H.264 film. Its pictures need even sides: an odd one is continued by its last row or column."""
-    import imageio_ffmpeg
+class FilmWriter:
+    """Writer of an H.264 film; a context manager that removes the file if it is left by an exception.
 
-    writer = None
-    try:
-        for picture in pictures:
-            height, width = picture.shape[:2]
-            even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-            if writer is None:
-                size = (even.shape[1], even.shape[0])
-                writer = imageio_ffmpeg.write_frames(str(request.out), size, fps=request.rate, quality=8, macro_block_size=2)
-                writer.send(None)
-            writer.send(np.ascontiguousarray(even))
-    finally:
-        if writer is not None:
-            writer.close()
+    Pictures need even sides: an odd one is continued by its last row or column.
+
+    Args:
+        out: file to write.
+        rate: pictures per second.
+    """
+
+    def __init__(self, out: Path, rate: int) -> None:
+        self._out, self._rate = out, rate
+        self._writer: Any = None
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append an 8-bit picture (h, w, 3); all have the first one's size."""
+        import imageio_ffmpeg
+
+        height, width = picture.shape[:2]
+        even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        if self._writer is None:
+            size = (even.shape[1], even.shape[0])
+            self._writer = imageio_ffmpeg.write_frames(str(self._out), size, fps=self._rate, quality=8, macro_block_size=2)
+            self._writer.send(None)
+        self._writer.send(np.ascontiguousarray(even))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._writer is not None:
+            self._writer.close()
+        if kind is not None:
+            self._out.unlink(missing_ok=True)

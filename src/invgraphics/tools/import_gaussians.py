@@ -10,20 +10,19 @@ from pathlib import Path
 
 from invgraphics.core import Gaussians, Scene, harmonics
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import build_model, device_of, open_requested, repeatable, use_kernels
+from invgraphics.experiments.build import build_model, open_with_progress, repeatable, use_kernels
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import describe
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
-from invgraphics.fields.transformed import move_gaussians
+from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import Splats, read_gaussians
 from invgraphics.formats.ply import OPACITY_EPS
-from invgraphics.metrics.protocols import protocol_named
-from invgraphics.recipes.recipe import Method, load_method
+from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
-from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import Moment
 from invgraphics.runs.provenance import ImportedFile, Provenance
 from invgraphics.text import sha256_of
@@ -34,30 +33,30 @@ IMPORTED = "imported"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportRequest(FitRequest):
+class ImportRequest:
     """A file to make a run of.
 
     Attributes:
         file: in a format of `invgraphics.formats`.
+        run: the run to make: its scene, method, folder and protocol; nothing is fitted, so that its budget does not count.
         frame: axes of the file, as `core.transforms.axes_to_opencv` reads them; ``None`` for what the file says, else for the
             world's own.
         world: how the axes of the data set's world point, for files that have certain axes.
     """
 
     file: str
+    run: FitRequest
     frame: str | None = None
     world: str = WORLD
-    budget: str = IMPORTED
-    preset: str | None = ""
 
     def shell(self) -> str:
         """The command that makes this run."""
         placed = ["--frame", self.frame] if self.frame else []
         placed += ["--world", self.world] if self.world != WORLD else []
-        given = self.flags()
+        given = self.run.flags()
         where = given.index("--budget")
         del given[where : where + 2]
-        words = ["invgraphics", "import", self.file, "--scene", self.scene, "--method", self.method]
+        words = ["invgraphics", "import", self.file, "--scene", self.run.scene, "--method", self.run.method]
         return shlex.join([*words, *placed, *given])
 
 
@@ -67,38 +66,37 @@ def import_run(request: ImportRequest) -> Path:
     Raises:
         InputError: anything about the request, the file or the scene that cannot be used; nothing has been written then.
     """
-    protocol_named(request.protocol)
-    device = device_of(request.device)
+    job = Job.of(replace(request.run, preset=""))
     name, splats = read_gaussians(Path(request.file))
     splats = replace(splats, gaussians=without_zero_bands(splats.gaussians))
-    method = method_for(request, splats.gaussians)
+    job = replace(job, method=method_for(job.method, request.file, splats.gaussians))
     axes = request.frame or splats.axes
-    folder = RunFolder(Path(request.out))
+    folder = job.folder
     if folder.has(Provenance):
         raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
-    scene = open_requested(request)
-    gaussians = move_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
+    scene = open_with_progress(job.request.scene, job.options)
+    gaussians = transform_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()
-    repeatable(device)
-    use_kernels(request.kernels)
+    repeatable(job.device)
+    use_kernels(job.request.kernels)
     origin = _origin(request, name, splats, axes)
-    if splats.antialiased and not getattr(method.recipe.renderer, "compensate", False):
+    if splats.antialiased and not getattr(job.method.recipe.renderer, "antialiased", False):
         print(
-            "The file says that it was fitted with anti-aliasing; --set renderer.compensate=true shows it so.", file=sys.stderr
+            "The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true shows it so.", file=sys.stderr
         )
     with folder.held():
         folder.clear()
-        identity = _identity(method, scene, origin)
-        folder.write(describe(folder, request, method, (scene, scene), identity, device, origin))
-        field, renderer = build_model(method, scene, request.seed, device)
-        assert isinstance(field, GaussianField)
-        fill(field, gaussians)
-        checkpoint.save(folder.checkpoint, {"field": field.state_dict(), "renderer": renderer.state_dict()})
+        provenance = describe(job, (scene, scene), _identity(job.method, scene, origin))
+        folder.write(replace(provenance, budget=IMPORTED, command=request.shell(), imported=origin))
+        model = build_model(job.method, scene, job.request.seed, job.device)
+        assert isinstance(model.field, GaussianField)
+        fill(model.field, gaussians)
+        checkpoint.save(folder.checkpoint, model.state_dict())
         folder.append_history(Moment(step=0, seconds=0.0, progress=1.0, primitives=len(gaussians)))
         costs: dict[str, float | None] = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}
         folder.write(FitRecord())
-        for rules in dict.fromkeys([request.protocol, "default"]):
-            evaluate(folder, scene, (field, renderer), rules, costs, method)
+        for protocol in job.protocols:
+            evaluate(folder, scene, model, protocol, costs, job.method)
     return folder.root
 
 
@@ -110,19 +108,17 @@ def without_zero_bands(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, sh=sh.contiguous())
 
 
-def method_for(request: ImportRequest, gaussians: Gaussians) -> Method:
-    """The method whose renderer shows the Gaussians, its field made for their SH degree.
+def method_for(method: Method, file: str, gaussians: Gaussians) -> Method:
+    """The method whose renderer shows the Gaussians of a file, its field made for their SH degree.
 
     Raises:
-        InputError: the method is unknown, or is none of Gaussians.
+        InputError: the method is none of Gaussians.
     """
-    method = load_method(request.method, request.preset, request.recipe_overrides)
     if not isinstance(method.recipe.field, GaussianFieldConfig):
-        raise InputError(
-            f"{request.method} fits no Gaussians, which '{request.file}' holds.", "Use --method splatting/gaussians."
-        )
-    own = (f"field.sh_degree={harmonics.degree_of(gaussians.sh.shape[1])}", "field.isotropic=false")
-    return replace(load_method(request.method, request.preset, (*request.recipe_overrides, *own)), preset=IMPORTED)
+        raise InputError(f"{method.name} fits no Gaussians, which '{file}' holds.", "Use --method splatting/gaussians.")
+    degree = harmonics.degree_of(gaussians.sh.shape[1])
+    shape = {"sh_degree": degree, "isotropic": False}
+    return resolve(method.name, IMPORTED, method.table | {"field": method.table["field"] | shape})
 
 
 def fill(field: GaussianField, gaussians: Gaussians) -> None:

@@ -14,15 +14,15 @@ from jaxtyping import UInt8
 from invgraphics.core import Camera, Scene, View
 from invgraphics.core.transforms import apply_similarity, focal_from_fov, se3_exp
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.experiments.posed import carried, into_fit, inverse
+from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.poses import Similarity, rotation_angle
 from invgraphics.runs.folder import make_parent
 from invgraphics.runs.location import Location, PoseError, Start
 from invgraphics.scenes.images import make_view, read_pixels
-from invgraphics.training.localise import Descent, descend, difference
+from invgraphics.training.localise import PoseDescent, photometric_error, refine_pose
 
 COARSEST = 32
 """Longest side in pixels at which all starts are compared."""
@@ -80,12 +80,14 @@ def locate(request: LocateRequest) -> Location:
     make_parent(request.out)
     drift = Similarity(1.0, torch.eye(3).double(), torch.zeros(3).double())
     if fitted.poses is not None:
-        drift = into_fit(fitted.poses, fitted.scene)
+        drift = world_to_fit(fitted.poses, fitted.scene)
     photo = _photo(pixels, request, fitted.scene)
     starts = [replace(photo, camera=photo.camera.moved(pose)) for pose in _starts(request, fitted.scene)]
     with Reporter(f"locate {request.photo.name}") as reporter:
-        found, tried = _search(fitted, [replace(v, camera=carried(v.camera, drift)) for v in starts], request, reporter)
-    return _written(request, fitted, (found, tried), inverse(drift))
+        found, tried = _search(
+            fitted, [replace(v, camera=transform_camera(v.camera, drift)) for v in starts], request, reporter
+        )
+    return _written(request, fitted, (found, tried), drift.inverse())
 
 
 def _photo(pixels: UInt8[np.ndarray, "h w c"], request: LocateRequest, scene: Scene) -> View:
@@ -133,17 +135,17 @@ def _starts(request: LocateRequest, scene: Scene) -> list[torch.Tensor]:
 
 def _search(fitted: Fitted, starts: list[View], request: LocateRequest, reporter: Reporter) -> tuple[View, list[Start]]:
     """The best view after every round; each round keeps half of those it got. Also what became of the starts."""
-    model, scene = (fitted.field, fitted.renderer), fitted.scene
+    model, scene = fitted.model, fitted.scene
     coarse = min(1.0, COARSEST / max(starts[0].camera.width, starts[0].camera.height))
-    losses = [difference(model, view, scene, coarse) for view in starts]
+    losses = [photometric_error(model, view, scene, coarse) for view in starts]
     order = sorted(range(len(starts)), key=losses.__getitem__)[: request.starts]
     kept = [(starts[i], i) for i in order]
     rounds: dict[int, dict[str, float]] = {i: {} for i in order}
     for number, (scale, share, lr, final) in enumerate(LEVELS):
         fine = max(scale, coarse)
-        descent = Descent(max(1, round(request.steps * share)), lr, final, fine)
-        kept = [(replace(view, camera=descend(model, view, scene, descent)), i) for view, i in kept]
-        ranked = sorted((difference(model, view, scene, fine), place) for place, (view, _) in enumerate(kept))
+        descent = PoseDescent(max(1, round(request.steps * share)), lr, final, fine)
+        kept = [(replace(view, camera=refine_pose(model, view, scene, descent)), i) for view, i in kept]
+        ranked = sorted((photometric_error(model, view, scene, fine), place) for place, (view, _) in enumerate(kept))
         for loss, place in ranked:
             rounds[kept[place][1]][f"{fine:g}"] = loss
         kept = [kept[place] for _, place in ranked[: max(1, len(ranked) // 2)]]
@@ -154,8 +156,8 @@ def _search(fitted: Fitted, starts: list[View], request: LocateRequest, reporter
 def _written(request: LocateRequest, fitted: Fitted, result: tuple[View, list[Start]], back: Similarity) -> Location:
     found, tried = result
     scene = fitted.scene
-    loss = difference((fitted.field, fitted.renderer), found, scene)
-    pose = carried(found.camera, back).cam_to_world
+    loss = photometric_error(fitted.model, found, scene)
+    pose = transform_camera(found.camera, back).cam_to_world
     truth, error = _test_view_like(found, scene), None
     if truth is not None:
         turn = rotation_angle(pose[:3, :3], truth.camera.cam_to_world[:3, :3])
@@ -197,7 +199,7 @@ def _draw(path: Path, fitted: Fitted, found: View) -> None:
     from PIL import Image
 
     scene = fitted.scene
-    picture = render_view(fitted.field, fitted.renderer, found.camera, scene, fitted.device, geometry=False)
+    picture = fitted.model.render(found.camera, normals=False)
     photo, shown = (display(colour, scene) for colour in (found.over(scene.background), picture.over(scene.background)))
     gap = ((photo.float() - shown.float()).abs() * 4).clamp(0, 255).to(torch.uint8)
     edge = torch.full((photo.shape[0], 4, 3), 255, dtype=torch.uint8)

@@ -8,13 +8,12 @@ import torch
 
 from invgraphics.core import Quantity, Rendering, Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display, render_view
+from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted
 from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.starting import depth_points
 from invgraphics.formats.mesh_ply import write_mesh
 from invgraphics.metrics.surfaces import points_on, surface_distance
-from invgraphics.renderers.splatting import Splatting
 from invgraphics.tools.export import Exported, ExportRequest
 from invgraphics.tools.surface_extraction import BAND, Surface, default_level, field_surface, fused_surface
 
@@ -33,7 +32,7 @@ def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
         InputError: the model shows no surface, or the file cannot be written.
     """
     scene = fitted.scene
-    if Quantity.SDF in fitted.field.provides or Quantity.DENSITY in fitted.field.provides:
+    if Quantity.SDF in fitted.model.field.provides or Quantity.DENSITY in fitted.model.field.provides:
         surface, how = _cut(fitted, request)
     else:
         surface, how = _fused(fitted, request)
@@ -57,9 +56,9 @@ def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
 
 def _cut(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
     """Marching cubes, and how the surface was found."""
-    bounds = fitted.scene.bounds.to(fitted.device)
-    surface = field_surface(fitted.field, bounds, request.resolution, request.level)
-    if Quantity.SDF in fitted.field.provides:
+    bounds = fitted.model.bounds
+    surface = field_surface(fitted.model.field, bounds, request.resolution, request.level)
+    if Quantity.SDF in fitted.model.field.provides:
         return surface, f"signed distance {request.level or 0:g}, {request.resolution} voxels along the longest edge"
     level = default_level(bounds) if request.level is None else request.level
     return surface, f"density {level:.3g} per local unit, {request.resolution} voxels along the longest edge"
@@ -70,9 +69,7 @@ def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
     if request.level is not None:
         remedy = "Leave --level out: its depth pictures are fused."
         raise InputError(f"The model of '{request.run}' ({fitted.method.name}) has no density with a level.", remedy)
-    renderer, depth = fitted.renderer, "mean"
-    if isinstance(renderer, Splatting):
-        renderer, depth = Splatting(replace(renderer.config, depth="median", normals="depth")), "median"
+    model = replace(fitted.model, renderer=fitted.model.renderer.for_depth_fusion())
     scene = fitted.scene
     count = min(MOST_PICTURES, len(scene.train))
     views = [scene.train[round(index * (len(scene.train) - 1) / max(1, count - 1))] for index in range(count)]
@@ -81,10 +78,11 @@ def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
 
         def render(index: int) -> Rendering:
             reporter.show((index + 1) / count, f"view {index + 1} of {count}")
-            return render_view(fitted.field, renderer, cameras[index], scene, fitted.device)
+            return model.render(cameras[index])
 
         surface = fused_surface(cameras, render, scene.bounds, request.resolution)
-    how = f"{depth} depth of {count} training views, {request.resolution} voxels along the longest edge, band of {BAND:g}"
+    kind = model.renderer.depth_kind
+    how = f"{kind} depth of {count} training views, {request.resolution} voxels along the longest edge, band of {BAND:g}"
     return surface, how
 
 

@@ -26,6 +26,9 @@ ONE_WAY = 30.0
 SPIRAL_TURNS = 2
 """Turns of a spiral, in which it goes once forward and back."""
 
+WRAPPED = 8
+"""Keyframes of a loop repeated at either end: a spline forgets what is farther away."""
+
 PathName = Literal["orbit", "spiral", "interpolate"]
 
 
@@ -132,19 +135,34 @@ def _focus(cameras: Sequence[Camera], otherwise: Float[Tensor, " 3"]) -> Float[T
 
 def interpolate(scene: Scene, frames: int) -> list[Camera]:
     """A closed path by some of the photographs' cameras: positions on a spline, rotations by the shortest turns between."""
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import Rotation, RotationSpline
-
     stops = _tour([view.camera for view in scene.train])
     if len(stops) == 1:
         return stops * frames
-    poses = torch.stack([camera.cam_to_world for camera in (*stops, stops[0])]).double().numpy()
-    times = np.arange(len(poses))
+    poses = torch.stack([camera.cam_to_world for camera in stops]).double().numpy()
     moments = np.linspace(0, len(stops), frames, endpoint=False)
-    positions = CubicSpline(times, poses[:, :3, 3], bc_type="periodic")(moments)
-    rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))(moments).as_matrix()
     lens = scene.test[0].camera
-    return [lens.moved(_pose(r, p)) for r, p in zip(rotations, positions, strict=True)]
+    return [lens.moved(torch.from_numpy(pose).float()) for pose in interpolate_poses(poses, moments, loop=True)]
+
+
+def interpolate_poses(poses: Float[np.ndarray, "k 4 4"], moments: Float[np.ndarray, " m"], loop: bool) -> np.ndarray:
+    """Rigid poses at fractional indices: cubic splines of positions and rotations through every pose.
+
+    Args:
+        poses: at least two.
+        moments: 0 to k - 1, or to k for a loop, whose end is its start.
+        loop: whether the last pose is followed by the first, smoothly.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    count, around = len(poses), WRAPPED if loop else 0
+    times = np.arange(-around, count + around + loop)
+    knots = poses[times % count]  # a loop's neighbours on either side make its seam as smooth as the rest
+    natural = CubicSpline(times, knots[:, :3, 3], bc_type="natural")
+    found = np.tile(np.eye(4), (len(moments), 1, 1))
+    found[:, :3, 3] = natural(moments)
+    found[:, :3, :3] = RotationSpline(times, Rotation.from_matrix(knots[:, :3, :3]))(moments).as_matrix()
+    return found
 
 
 PATHS: dict[PathName, Callable[[Scene, int], list[Camera]]] = {"orbit": orbit, "spiral": spiral, "interpolate": interpolate}
@@ -163,9 +181,3 @@ def _tour(cameras: Sequence[Camera]) -> list[Camera]:
         chosen.remove(nearest)
         order.append(nearest)
     return [cameras[i] for i in order]
-
-
-def _pose(rotation: np.ndarray, position: np.ndarray) -> Float[Tensor, "4 4"]:
-    pose = torch.eye(4)
-    pose[:3, :3], pose[:3, 3] = torch.from_numpy(rotation).float(), torch.from_numpy(position).float()
-    return pose

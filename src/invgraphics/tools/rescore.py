@@ -1,40 +1,38 @@
-"""Scoring saved pictures again, under named conventions: what a run, or another tool's pictures, would be said to reach."""
+"""Score saved pictures again under named protocols: a run's, or another tool's."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import cache
 from typing import Any
 
 from invgraphics.core import Rendering, View
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.experiments.progress import Reporter
-from invgraphics.metrics.conventions import Convention, Protocol
-from invgraphics.metrics.measures import score_under, summarise_under
+from invgraphics.metrics.conventions import PROTOCOLS, Protocol
 from invgraphics.metrics.protocols import ViewScore, score, summarise
 from invgraphics.runs.scores import DEFAULT, ScoredTruth, Scores, quality_of
 from invgraphics.tools.predictions import PictureSet
-from invgraphics.tools.rescoring import KNOWN, Rescored, Rules, background_name, evaluated, labels, scores_of
+from invgraphics.tools.rescoring import Rescored, background_name, evaluated, labels, scores_of
 
 SHARED = ("psnr", "ssim", "lpips")
 """Metrics that are recomputed where a run's own scores hold the others already."""
 
 
-def rules_named(names: str) -> list[Rules]:
+def protocols_named(names: str) -> list[Protocol]:
     """Protocols from a comma-separated list, or from ``all``.
 
     Raises:
         InputError: a name is unknown, or there is none.
     """
-    wanted = list(KNOWN) if names.strip() == "all" else [name.strip() for name in names.split(",") if name.strip()]
-    known = f"Known protocols: {', '.join(KNOWN)}; or all."
+    wanted = list(PROTOCOLS) if names.strip() == "all" else [name.strip() for name in names.split(",") if name.strip()]
+    known = f"Known protocols: {', '.join(PROTOCOLS)}; or all."
     if not wanted:
         raise InputError("No protocol is named.", known)
     for name in wanted:
-        if name not in KNOWN:
-            raise InputError(f"There is no protocol '{name}'.{did_you_mean(name, KNOWN)}", known)
-    return [KNOWN[name] for name in dict.fromkeys(wanted)]
+        if name not in PROTOCOLS:
+            raise InputError(f"There is no protocol '{name}'.{did_you_mean(name, PROTOCOLS)}", known)
+    return [PROTOCOLS[name] for name in dict.fromkeys(wanted)]
 
 
 def check_same_truth(sets: Sequence[PictureSet]) -> None:
@@ -60,19 +58,16 @@ def check_same_truth(sets: Sequence[PictureSet]) -> None:
                 )
 
 
-def why_unsuited(pictures: PictureSet, rules: Rules, allow_8bit: bool = False) -> str:
+def why_unsuited(pictures: PictureSet, protocol: Protocol, allow_8bit: bool = False) -> str:
     """Why these pictures cannot be scored under a protocol, because they lack something; empty if they can.
 
     Args:
         pictures: what is to be scored.
-        rules: the protocol.
+        protocol: how they would be scored.
         allow_8bit: whether 8-bit predictions may stand in for unrounded ones.
     """
-    if isinstance(rules, Protocol):
-        unrounded, background, widest = not rules.quantise, "scene", None
-    else:
-        unrounded, background, widest = rules.prediction == "none", rules.background, rules.widest
-    if unrounded and pictures.eight_bit and not allow_8bit:
+    background, widest = protocol.background, protocol.widest
+    if protocol.prediction == "none" and pictures.eight_bit and not allow_8bit:
         return "needs unrounded predictions, and these are 8-bit pictures (--allow-8bit scores them all the same)"
     if pictures.transparency == "open" and background == "scene" and pictures.background is None:
         return "needs the data set's background: name it with --background"
@@ -85,7 +80,7 @@ def why_unsuited(pictures: PictureSet, rules: Rules, allow_8bit: bool = False) -
     return ""
 
 
-def rescore(sets: Sequence[PictureSet], rules: Sequence[Rules], allow_8bit: bool = False) -> list[Rescored]:
+def rescore(sets: Sequence[PictureSet], protocols: Sequence[Protocol], allow_8bit: bool = False) -> list[Rescored]:
     """Score every set under every protocol.
 
     Raises:
@@ -96,21 +91,17 @@ def rescore(sets: Sequence[PictureSet], rules: Sequence[Rules], allow_8bit: bool
     result = []
     with Reporter("rescoring") as reporter:
         for pictures, label in zip(sets, labels([one.folder for one in sets]), strict=True):
-            lacking = {one.name: why_unsuited(pictures, one, allow_8bit) for one in rules}
-            scores: dict[str, list[ViewScore]] = {one.name: [] for one in rules if not lacking[one.name]}
-            only = {name: SHARED if evaluated(pictures, name) else None for name in scores}
+            lacking = {one.name: why_unsuited(pictures, one, allow_8bit) for one in protocols}
+            scores: dict[str, list[ViewScore]] = {one.name: [] for one in protocols if not lacking[one.name]}
+            only = {name: _metrics(pictures, PROTOCOLS[name]) for name in scores}
             for index in range(len(pictures.names)):
                 truth, predicted = pictures.truth(index), _predictions(pictures, index)
                 for name, views in scores.items():
-                    rules_here = KNOWN[name]
-                    rendering = predicted(_wants_bytes(pictures, truth, rules_here))
-                    if isinstance(rules_here, Convention):
-                        views.append(score_under(rendering, truth, pictures.scene, rules_here))
-                    else:
-                        views.append(score(rendering, truth, pictures.scene, rules_here, only[name]))
+                    rendering = predicted(_wants_bytes(pictures, truth, PROTOCOLS[name]))
+                    views.append(score(rendering, truth, pictures.scene, PROTOCOLS[name], only[name]))
                 done += 1
                 reporter.show(done / total, f"{label}, view {index + 1} of {len(pictures.names)}")
-            tables = {one.name: _scores(pictures, one, scores.get(one.name), lacking[one.name]) for one in rules}
+            tables = {one.name: _scores(pictures, one, scores.get(one.name), lacking[one.name]) for one in protocols}
             result.append(Rescored(pictures, label, tables))
     return result
 
@@ -120,12 +111,17 @@ def _predictions(pictures: PictureSet, index: int) -> Callable[[bool], Rendering
     return cache(lambda exact: _checked(pictures, index, exact))
 
 
-def _wants_bytes(pictures: PictureSet, truth: View, rules: Rules) -> bool:
-    """Whether a protocol looks at the very picture that is saved: rounded, over the scene's background."""
-    if isinstance(rules, Protocol):
-        return rules.quantise
-    same = truth.alpha is None or rules.background in ("scene", pictures.background)
-    return rules.prediction == "nearest" and same
+def _metrics(pictures: PictureSet, protocol: Protocol) -> tuple[str, ...] | None:
+    """Metrics to compute: a protocol's own; of ours, the shared ones where the run has the others; ``None`` for all."""
+    if protocol.measures is not None:
+        return tuple(protocol.measures)
+    return SHARED if evaluated(pictures, protocol.name) else None
+
+
+def _wants_bytes(pictures: PictureSet, truth: View, protocol: Protocol) -> bool:
+    """Whether a protocol scores the very picture that is saved: rounded, over the scene's background."""
+    same = truth.alpha is None or protocol.background in ("scene", pictures.background)
+    return protocol.prediction == "nearest" and same
 
 
 def _checked(pictures: PictureSet, index: int, exact: bool) -> Rendering:
@@ -139,18 +135,14 @@ def _checked(pictures: PictureSet, index: int, exact: bool) -> Rendering:
     return rendering
 
 
-def _scores(pictures: PictureSet, rules: Rules, views: Sequence[ViewScore] | None, lacking: str) -> Scores:
+def _scores(pictures: PictureSet, protocol: Protocol, views: Sequence[ViewScore] | None, lacking: str) -> Scores:
     """Scores of a set of pictures, from those of its views."""
     if views is None:
-        names = SHARED if isinstance(rules, Protocol) else tuple(rules.measures)
-        quality, skipped = {}, dict.fromkeys(names, lacking)
-    elif isinstance(rules, Protocol):
-        quality, skipped = summarise(views, rules)
+        quality, skipped = {}, dict.fromkeys(SHARED if protocol.measures is None else protocol.measures, lacking)
     else:
-        quality, skipped = summarise_under(views, rules)
+        quality, skipped = summarise(views, protocol)
     run, own = pictures.provenance, scores_of(pictures, DEFAULT)
-    stated = asdict(rules)
-    eight_bit = pictures.eight_bit and (stated.get("prediction") == "none" or stated.get("quantise") is False)
+    eight_bit = pictures.eight_bit and protocol.prediction == "none"
     caution = ("Unrounded predictions are wanted; 8-bit pictures stand in for them.",) if eight_bit and not lacking else ()
     truth = ScoredTruth(
         sha256=pictures.sha256, size=pictures.size, background=pictures.background, transparency=pictures.transparency
@@ -160,13 +152,13 @@ def _scores(pictures: PictureSet, rules: Rules, views: Sequence[ViewScore] | Non
         preset="" if run is None else run.preset,
         scene=own.scene if own is not None else "" if run is None else run.scene,
         seed=None if run is None else run.seed,
-        protocol=rules.name,
+        protocol=protocol.name,
         views=pictures.names,
         cost={} if own is None else own.cost,
         quality=quality_of(quality),
         skipped=skipped,
         rescored=True,
-        conventions=stated,
+        conventions=protocol.record(),
         truth=truth,
         notes=(*pictures.notes, *caution),
     )

@@ -1,4 +1,4 @@
-"""What rescoring says: scores files, the table of the same pictures under all protocols, and the spread between them."""
+"""Results of rescoring: scores files, the table of the same pictures under all protocols, and the spread between them."""
 
 from __future__ import annotations
 
@@ -7,15 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from invgraphics.metrics.conventions import CONVENTIONS, PROTOCOLS, Colour, Convention, Protocol
+from invgraphics.metrics.conventions import PROTOCOLS, Colour, Protocol
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.scores import Score, Scores
 from invgraphics.tools.predictions import PictureSet
-
-Rules = Protocol | Convention
-
-KNOWN: dict[str, Rules] = {**PROTOCOLS, **CONVENTIONS}
-"""Every protocol by name, ours first."""
 
 COLUMNS = {"psnr": ("PSNR (dB)", 3), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4), "lpips_vgg": ("LPIPS (VGG)", 4)}
 """Metric -> heading and decimals, in the table's order."""
@@ -94,7 +89,7 @@ def rows_of(rescored: Rescored) -> tuple[list[str], list[list[str]]]:
     rows = []
     for name, scores in rescored.scores.items():
         cells = [_cell(scores.quality.get(key), decimals) for key, (_, decimals) in shown.items()]
-        rows.append([name, *cells, *stated(KNOWN[name])])
+        rows.append([name, *cells, *stated(PROTOCOLS[name])])
     if len(rows) > 1 and shown:
         spread = [f"{spread_of(rescored, key):.{decimals}f}" for key, (_, decimals) in shown.items()]
         rows.append(["spread", *spread, "", "", ""])
@@ -107,14 +102,11 @@ def spread_of(rescored: Rescored, metric: str) -> float:
     return max(values) - min(values)
 
 
-def stated(rules: Rules) -> tuple[str, str, str]:
+def stated(protocol: Protocol) -> tuple[str, str, str]:
     """Background, and the rounding of prediction and truth, in words."""
     words = {"none": "float", "nearest": "8-bit, rounded", "down": "8-bit, truncated"}
-    if isinstance(rules, Protocol):
-        rounding = words["nearest" if rules.quantise else "none"]
-        return rules.background, rounding, rounding
-    background = rules.background if isinstance(rules.background, str) else background_name(rules.background)
-    return background, words[rules.prediction], words[rules.truth]
+    background = protocol.background if isinstance(protocol.background, str) else background_name(protocol.background)
+    return background, words[protocol.prediction], words[protocol.truth]
 
 
 def winners(results: Sequence[Rescored], metric: str) -> str:
@@ -162,7 +154,11 @@ def write_tables(results: Sequence[Rescored], out: Path) -> list[Path]:
         lines += [_markdown(row) for row in (columns, ["---"] * len(columns), *rows)]
         lines += ["", *(f"- {line}" for line in reasons(one)), ""]
     lines += ["## Sources", ""]
-    lines += [f"- {name}: {rules.summary}. {_source(rules)}" for name, rules in KNOWN.items() if name in results[0].scores]
+    lines += [
+        f"- {name}: {protocol.summary}. {_source(protocol)}"
+        for name, protocol in PROTOCOLS.items()
+        if name in results[0].scores
+    ]
     page = out / "rescore.md"
     page.write_text("\n".join(line for line in lines).strip() + "\n", encoding="utf-8")
     return [page, _write_csv(results, out / "rescore.csv")]
@@ -174,7 +170,7 @@ def _write_csv(results: Sequence[Rescored], path: Path) -> Path:
         writer.writerow(["pictures", "protocol", "metric", "mean", "unit", "background", "prediction", "truth", "skipped"])
         for one in results:
             for protocol, scores in one.scores.items():
-                rest = stated(KNOWN[protocol])
+                rest = stated(PROTOCOLS[protocol])
                 for metric, entry in scores.quality.items():
                     writer.writerow([one.label, protocol, metric, repr(entry.mean), entry.unit, *rest, ""])
                 for metric, reason in scores.skipped.items():
@@ -195,5 +191,5 @@ def _markdown(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _source(rules: Rules) -> str:
-    return "Our own." if isinstance(rules, Protocol) else f"Read in {rules.source}."
+def _source(protocol: Protocol) -> str:
+    return f"Read in {protocol.source}." if protocol.source else "Our own."

@@ -1,12 +1,12 @@
-"""Fitting a field by gradient descent through a renderer; losses and hooks are frozen configs with ``build()``."""
+"""Fitting a field by gradient descent through a renderer; losses are callable frozen configs, hooks have a ``build()``."""
 
 LOSSES = {
-    "photometric": "invgraphics.training.losses:PhotometricConfig",
-    "coarse": "invgraphics.training.losses:CoarseConfig",
-    "ssim": "invgraphics.training.losses:SsimConfig",
-    "opacity": "invgraphics.training.splat_losses:OpacityConfig",
-    "scale": "invgraphics.training.splat_losses:ScaleConfig",
-    "distortion": "invgraphics.training.losses:DistortionConfig",
+    "photometric": "invgraphics.training.losses:PhotometricLoss",
+    "coarse": "invgraphics.training.losses:CoarseLoss",
+    "ssim": "invgraphics.training.losses:SsimLoss",
+    "opacity": "invgraphics.training.splat_losses:OpacityLoss",
+    "scale": "invgraphics.training.splat_losses:ScaleLoss",
+    "distortion": "invgraphics.training.losses:DistortionLoss",
 }
 
 HOOKS = {

@@ -1,4 +1,4 @@
-"""What a step looks at: random rays of several views, or one whole view, in front of the step's background."""
+"""Batches of training pixels: random rays of several views or one whole view, over the step's background."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from invgraphics.core.camera import rays_through
 
 @dataclass(frozen=True)
 class BatchConfig:
-    """Size of a step.
+    """Size and image scale of a step's batch.
 
     Attributes:
         rays: rays of a step, for ray renderers. With ``samples`` set it is only the start.
@@ -23,8 +23,8 @@ class BatchConfig:
         samples: target number of samples per step: the ray count follows what is kept (Instant-NGP); 0 keeps ``rays``.
         resolution: image scale of each phase of the fit; the last should be 1.
         until: progress at which each phase but the last ends; one fewer than ``resolution``.
-        opaque: in endless space, opaque photographs are seen in front of a random background too: every ray must end somewhere,
-            and darkness cannot be learnt as emptiness.
+        opaque: whether opaque photographs of an unbounded scene are fitted over a random background too: every ray must then
+            end at a surface, and dark surfaces cannot be learnt as empty space.
     """
 
     rays: int = 1024
@@ -48,19 +48,19 @@ class BatchConfig:
 
 
 class RefinedCameras(Protocol):
-    """Training cameras that are fitted too (`invgraphics.training.poses.Poses`)."""
+    """Training cameras whose poses are optimised (`invgraphics.training.poses.Poses`)."""
 
     def cameras(self, views: Int[Tensor, " k"]) -> list[Camera]:
-        """Of some views, differentiable."""
+        """Cameras of some views, differentiable in their poses."""
         ...
 
     def camera(self, view: int) -> Camera:
-        """Of one view, differentiable."""
+        """Camera of one view, differentiable in its pose."""
         ...
 
 
 class Batches:
-    """Draws what each step compares; all randomness comes from the generator it is given."""
+    """Draws each step's batch; all randomness comes from the generator it is given."""
 
     MAX_RAYS = 1 << 16
 
@@ -79,7 +79,7 @@ class Batches:
         self._small: dict[tuple[int, float], View] = {}
 
     def background(self) -> Float[Tensor, 3]:
-        """Random where photographs are transparent, so that emptiness must be learnt, all methods alike; declared otherwise.
+        """Background of a step: random where photographs have alpha, so that empty space must be learnt; else the scene's.
 
         See `BatchConfig.opaque` for the one exception.
         """
@@ -104,29 +104,29 @@ class Batches:
         if self._refined is None:
             rays = rays_through([view.camera for view in views], which, pixels, chosen[which])
         else:
-            # The cameras are where the parameters are, and so must be what meets them.
+            # The cameras are on the parameters' device, and so must be the pixels.
             which, pixels, chosen = (values.to(self._device) for values in (which, pixels, chosen))
             refined = self._refined.cameras(chosen)
             cameras = [camera.resized(*size_of(view)) for camera, view in zip(refined, views, strict=True)]
             rays = rays_through(cameras, which, pixels, chosen[which])
-        batch = Batch(*_seen(views, flat, background), background)
+        batch = Batch(*_composited(views, flat, background), background)
         return rays.to(self._device), batch.to(self._device)
 
     def _pixels_of(self, view: View, count: int) -> Tensor:
-        """Flat indices of random pixels that count."""
+        """Flat indices of random pixels within the view's mask."""
         if view.mask is None:
             return torch.randint(view.camera.width * view.camera.height, (count,), generator=self._generator)
         valid = view.mask.reshape(-1).nonzero()[:, 0]
         return valid[torch.randint(len(valid), (count,), generator=self._generator)]
 
     def observe(self, rays: int, samples: int) -> None:
-        """Let the ray count follow the samples that ``rays`` rays led to."""
+        """Adapt the number of rays to the target number of samples, given the ``samples`` that ``rays`` rays had."""
         if self._config.samples and samples:
             wanted = self._rays * self._config.samples / samples
             self._rays = int(min(max(0.5 * self._rays + 0.5 * wanted, 128), self.MAX_RAYS))
 
     def image(self, progress: float) -> tuple[Camera, Batch]:
-        """One whole training view; every view comes once before any comes again."""
+        """Camera and batch of one whole training view; views come in random permutations."""
         background = self.background()
         if len(self._order) == 0:
             self._order = torch.randperm(len(self._scene.train), generator=self._generator)
@@ -137,7 +137,7 @@ class Batches:
         return camera.to(self._device), batch.to(self._device)
 
     def _scaled(self, index: int, scale: float) -> View:
-        """A training view at a fraction of its size, area-averaged; kept for the phase, as bytes."""
+        """A training view at an image scale, area-averaged; cached as bytes for the phase."""
         view = self._scene.train[index]
         if scale == 1:
             self._small.clear()
@@ -149,7 +149,7 @@ class Batches:
         return self._small[key]
 
     def state(self) -> dict[str, Tensor]:
-        """What a resumed fit needs."""
+        """Tensors that a resumed fit needs."""
         return {"order": self._order, "rays": torch.tensor(self._rays)}
 
     def load(self, state: dict[str, Tensor]) -> None:
@@ -163,7 +163,7 @@ def size_of(view: View) -> tuple[int, int]:
 
 
 def scaled_view(view: View, width: int, height: int) -> View:
-    """A view at another size, area-averaged without its geometry; bytes stay bytes, and a pixel counts if all of it did."""
+    """A view at another size, area-averaged, without its geometry; masks keep pixels that are wholly inside."""
     alpha = view.opacity()[..., None]
     stacked = torch.cat([view.colour() * alpha, alpha], dim=-1).permute(2, 0, 1)[None]
     shrunk = torch.nn.functional.interpolate(stacked, (height, width), mode="area")[0].permute(1, 2, 0)
@@ -177,10 +177,10 @@ def scaled_view(view: View, width: int, height: int) -> View:
     return replace(view, camera=camera, image=image, alpha=small_alpha, depth=None, normal=None, mask=mask)
 
 
-def _seen(views: list[View], flat: list[Tensor], background: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+def _composited(views: list[View], flat: list[Tensor], background: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Colour in front of the background, and alpha, at pixels of several views, one view after another.
 
-    Views alike are put behind one another before their bytes are converted: the conversions then are few.
+    Views of one format are joined before their bytes are converted, which makes the conversions few.
     """
     kinds = {(view.image.dtype, None if view.alpha is None else view.alpha.dtype) for view in views}
     if len(kinds) > 1:

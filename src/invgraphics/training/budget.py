@@ -1,4 +1,4 @@
-"""How long a fit may take: seconds of optimisation, or steps."""
+"""How long a fit may take, and how often it is saved: seconds or steps."""
 
 from __future__ import annotations
 
@@ -47,3 +47,24 @@ class Budget:
     def __str__(self) -> str:
         parts = ([f"{self.seconds:g} s"] if self.seconds is not None else []) + ([f"{self.steps} steps"] if self.steps else [])
         return " or ".join(parts)
+
+
+@dataclass(frozen=True)
+class Cadence:
+    """How often a checkpoint is written: every so many steps or seconds."""
+
+    steps: int | None = None
+    seconds: float | None = None
+
+    @staticmethod
+    def parse(text: str) -> Cadence:
+        """Read ``100steps`` or ``30s``.
+
+        Raises:
+            InputError: anything else, or nothing between two checkpoints.
+        """
+        found = re.fullmatch(r"\s*([0-9]+)\s*(steps?|s)\s*", text)
+        if found is None or int(found.group(1)) == 0:
+            raise InputError(f"'{text}' says no interval for checkpoints.", "Expected something like 100steps or 30s.")
+        amount = int(found.group(1))
+        return Cadence(seconds=float(amount)) if found.group(2) == "s" else Cadence(steps=amount)

@@ -1,4 +1,4 @@
-"""How much processor time a process got of what it was ready to use: what tells a disturbed clock from serial code."""
+"""Scheduler times of this process: CPU time against time waiting for a core, to tell a loaded machine from serial code."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ TASKS = Path("/proc/self/task")
 """Linux: this process's threads. The ``schedstat`` of each begins with nanoseconds on a core, and nanoseconds ready for one."""
 
 BUSY = 0.1
-"""A thread counts that ran for at least this share of the busiest one's time; the others only wake to look at something."""
+"""A thread is busy if it ran for at least this share of the busiest one's time; others only wake to poll."""
 
 
 class SchedulerTimes:
-    """Seconds in which the busy threads of this process ran, and in which they were ready to but other threads had their cores.
+    """Seconds in which this process's busy threads ran, and in which they were runnable but waited for a core.
 
     A serial stretch of code is neither: its idle threads are not ready. So on a quiet machine the second number stays near
     zero whatever the code does, and a process that always shares its cores with another one waits as long as it runs.

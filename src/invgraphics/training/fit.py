@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from invgraphics.core import Batch, Context, Field, RayRenderer, Renderer, Rendering, Scene, Trace, check
+from invgraphics.core import Batch, Context, Model, RayRenderer, Rendering, Scene, Trace
 from invgraphics.errors import NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
-from invgraphics.kernels.waiting import limit_spinning
+from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.clock import SchedulerTimes
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
 from invgraphics.training.losses import Loss
 from invgraphics.training.optimiser import Optimiser, OptimiserConfig
-from invgraphics.training.poses import Poses, windows
+from invgraphics.training.poses import Poses, coarse_to_fine_encodings
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,8 @@ class Plan:
     """Everything a fit is made of.
 
     Attributes:
-        field: what is fitted.
-        renderer: what it is seen through.
-        scene: what it is compared with.
+        model: field and renderer that are fitted.
+        scene: training views, bounds and background.
         losses: their sum is minimised.
         hooks: called around each step, in order.
         optimiser: parameter groups and Adam's settings.
@@ -42,8 +41,7 @@ class Plan:
         poses: of the training cameras, where they are fitted too.
     """
 
-    field: Field
-    renderer: Renderer
+    model: Model
     scene: Scene
     losses: Sequence[Loss]
     hooks: Sequence[Hook]
@@ -56,20 +54,16 @@ class Plan:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Everything with parameters, by the names that begin theirs."""
-        named: dict[str, nn.Module] = {"field": self.field, "renderer": self.renderer}
-        if self.poses is not None:
-            named["poses"] = self.poses
-        return named
+        """Modules with parameters, by the prefixes of the parameters' names."""
+        return self.model.parts | ({} if self.poses is None else {"poses": self.poses})
 
 
 class Fit:
-    """A fit in progress. `step` advances it; `state` and `load` carry it over an interruption, bit by bit on a CPU."""
+    """A fit in progress: `step` advances it; `state` and `load` resume it after an interruption, bit-exactly on a CPU."""
 
     def __init__(self, plan: Plan) -> None:
-        check(plan.field, plan.renderer)
         for hook in plan.hooks:
-            hook.check(plan.field, plan.renderer)
+            hook.check(plan.model.field)
         keep_freed_memory()
         limit_spinning()
         self.plan = plan
@@ -79,7 +73,7 @@ class Fit:
         self._bounds = plan.scene.bounds.to(plan.device)
         self._generator = torch.Generator().manual_seed(plan.seed)
         self._batches = Batches(plan.batches, plan.scene, self._generator, plan.device, plan.poses)
-        self._windows = [] if plan.poses is None else windows(plan.field, plan.renderer)
+        self._coarse_to_fine = [] if plan.poses is None else coarse_to_fine_encodings(plan.model)
         self._optimiser = self._make_optimiser()
 
     def _make_optimiser(self) -> Optimiser:
@@ -92,6 +86,11 @@ class Fit:
         return Optimiser(self.plan.optimiser, parameters, self.plan.scene.extent)
 
     @property
+    def model(self) -> Model:
+        """What is being fitted, as it is now."""
+        return self.plan.model
+
+    @property
     def progress(self) -> float:
         """Share of the budget that is spent."""
         return self.plan.budget.progress(self.seconds, self.steps)
@@ -101,23 +100,24 @@ class Fit:
         return Context(self._bounds, training=True, progress=self.progress, generator=self._generator)
 
     def step(self) -> float:
-        """One step: draw, render, compare, differentiate, move. Returns the loss.
+        """One optimisation step: draw a batch, render, composite, sum the losses, backpropagate, update. Returns the loss.
 
         Raises:
             NumericalError: the loss is not finite; names the step and the first tensor that is not.
         """
         began, cpu_began = time.perf_counter(), time.process_time()
         plan, ctx = self.plan, self.context()
-        state = FitState(plan.field, plan.renderer, self._optimiser, plan.scene, ctx, self.steps)
+        state = FitState(plan.model.field, plan.model.renderer, self._optimiser, plan.scene, ctx, self.steps)
         self._optimiser.set_progress(ctx.progress)
-        self._open_windows(ctx.progress)
+        self._set_coarse_to_fine(ctx.progress)
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
-        loss = torch.stack([loss(rendering, trace, batch, ctx) for loss in plan.losses]).sum()
+        composited = replace(rendering, rgb=rendering.over(batch.background))
+        loss = torch.stack([loss(composited, trace, batch, ctx) for loss in plan.losses]).sum()
         value = loss.item()
         if not torch.isfinite(loss):
-            raise NumericalError(self._blame(rendering))
+            raise NumericalError(self._first_not_finite(rendering))
         self._optimiser.zero_grad()
         if loss.requires_grad:
             loss.backward()
@@ -127,7 +127,7 @@ class Fit:
         self._optimiser.step()
         for hook in plan.hooks:
             hook.after_step(state)
-        plan.renderer.update(plan.field, ctx)
+        plan.model.renderer.update(plan.model.field, ctx)
         self.steps += 1
         if plan.device.type == "cuda":
             torch.cuda.synchronize(plan.device)
@@ -135,13 +135,13 @@ class Fit:
         self.cpu_seconds += time.process_time() - cpu_began
         return value
 
-    def _open_windows(self, progress: float) -> None:
-        for encoding in self._windows:
+    def _set_coarse_to_fine(self, progress: float) -> None:
+        for encoding in self._coarse_to_fine:
             if encoding.detail is not None and self.plan.poses is not None:
-                encoding.detail.fill_(self.plan.poses.config.detail(progress))
+                encoding.detail.fill_(self.plan.poses.config.alpha(progress))
 
     def _render(self, ctx: Context) -> tuple[Rendering, Trace, Batch]:
-        renderer, fitted = self.plan.renderer, self.plan.field
+        renderer, fitted = self.plan.model.renderer, self.plan.model.field
         if isinstance(renderer, RayRenderer):
             rays, batch = self._batches.rays(ctx.progress)
             rendering, trace = renderer.render_rays(fitted, rays, ctx)
@@ -151,8 +151,8 @@ class Fit:
             rendering, trace = renderer.render_image(fitted, camera, ctx)
         return rendering, trace, batch
 
-    def _blame(self, rendering: Rendering) -> str:
-        """The first tensor that is not finite, in the order in which a reader would look."""
+    def _first_not_finite(self, rendering: Rendering) -> str:
+        """A sentence that names the first tensor that is not finite: parameters first, then the rendering."""
         candidates: dict[str, Tensor] = {
             f"{owner}.{name}": parameter
             for owner, module in self.plan.modules.items()
@@ -163,8 +163,8 @@ class Fit:
         where = broken[0] if broken else "the loss"
         return f"Step {self.steps}: {where} is not finite; the fit stops here."
 
-    def rehearse(self) -> None:
-        """Take one step and undo it, so that compiling and allocating at first use is on no clock."""
+    def warmup_step(self) -> None:
+        """Take one step and restore the state before it, so that compiling and allocating at first use is on no clock."""
         before = {part: {name: value.clone() for name, value in tensors.items()} for part, tensors in self.state().items()}
         clocks, seconds = self.clocks(), self.seconds
         self.step()
@@ -179,18 +179,18 @@ class Fit:
         return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "ran_seconds": ran, "waited_seconds": waited}
 
     def resume_clocks(self, record: Mapping[str, Any]) -> None:
-        """Go on from what `clocks` said, but for ``seconds``, which `load` takes."""
+        """Continue from a record of `clocks`, but for ``seconds``, which `load` takes."""
         self.cpu_seconds = float(record.get("cpu_seconds") or 0.0)
         self._earlier = float(record.get("ran_seconds") or 0.0), float(record.get("waited_seconds") or 0.0)
         self._scheduler = SchedulerTimes()
 
     def run(self, after_step: Callable[[float], bool]) -> None:
-        """Step until the budget is spent or ``after_step(loss)`` says stop (by returning True)."""
+        """Step until the budget is spent or ``after_step(loss)`` returns True."""
         while self.progress < 1 and not after_step(self.step()):
             pass
 
     def state(self) -> dict[str, dict[str, Tensor]]:
-        """Every tensor of the fit, by section. Contains no clock reading."""
+        """Every tensor of the fit, by section; no clock readings."""
         return {
             **{owner: dict(module.state_dict()) for owner, module in self.plan.modules.items()},
             "optimiser": self._optimiser.state(),
@@ -201,7 +201,7 @@ class Fit:
         }
 
     def load(self, state: dict[str, dict[str, Tensor]], seconds: float) -> None:
-        """Go on from a `state`; ``seconds`` is the optimisation time already spent."""
+        """Resume from a `state`; ``seconds`` is the optimisation time already spent."""
         for owner, module in self.plan.modules.items():
             module.load_state_dict(state.get(owner, {}))
         self._optimiser = self._make_optimiser()

@@ -1,17 +1,17 @@
-"""Things that happen between the steps of a fit."""
+"""Hooks: called around each step of a fit. Here their base, and the schedule of spherical-harmonics bands."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, Protocol, cast
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Batch, Context, Field, Renderer, Rendering, Scene, Trace
-from invgraphics.errors import InputError
 from invgraphics.training.optimiser import Optimiser
+from invgraphics.training.requirement import Requirement
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 @dataclass
 class FitState:
-    """What hooks see of a fit.
+    """State of a fit that hooks read and edit.
 
     Attributes:
         field: the field being fitted.
-        renderer: the renderer it is seen through.
+        renderer: the renderer it is fitted through.
         optimiser: its optimiser.
         scene: the scene, for its extent, points and background.
         ctx: context of the current step (progress, generator).
         step: steps done before the current one.
         trace: trace of the current step; ``None`` before rendering.
-        rendering: picture of the current step.
-        batch: what it is compared with.
+        rendering: rendering of the current step, without background.
+        batch: photographs of the current step.
     """
 
     field: Field
@@ -45,22 +45,38 @@ class FitState:
 
 
 class Hook:
-    """Called around each step. A hook that keeps tensors between steps gives them to the checkpoint."""
+    """Called around each step. Tensors that a hook keeps between steps are part of the checkpoint.
 
-    def check(self, field: Field, renderer: Renderer) -> None:
-        """Refuse, with an `InputError`, a field or renderer that this hook cannot serve."""
+    Attributes:
+        name: of its config in recipes, for messages.
+        requires: what it needs of the field; ``None`` for nothing. Checked when a recipe is resolved, where the config's
+            ``build`` is annotated with the hook's class, and again when a fit begins.
+    """
+
+    name: ClassVar[str] = ""
+    requires: ClassVar[Requirement | None] = None
+
+    @classmethod
+    def check(cls, field: Field | type[Field]) -> None:
+        """Refuse a field, or a class of fields, that lacks what the hook requires.
+
+        Raises:
+            InputError: names the hook, what it needs, and the field.
+        """
+        if cls.requires is not None:
+            cls.requires.check(cls.name or cls.__name__, field)
 
     def before_step(self, state: FitState) -> None:
-        """Before anything of the step; ``trace`` and ``batch`` are those of the step before."""
+        """Called before the step's rays are drawn."""
 
     def after_backward(self, state: FitState) -> None:
-        """Gradients are there, parameters not yet moved."""
+        """Called between the backward pass and the optimiser's step."""
 
     def after_step(self, state: FitState) -> None:
-        """Parameters have moved."""
+        """Called after the optimiser's step."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Tensors a resumed fit needs."""
+        """Tensors that a resumed fit needs."""
         return {}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -69,7 +85,7 @@ class Hook:
 
 @dataclass(frozen=True)
 class ShDegreeConfig:
-    """Spherical-harmonics bands are switched on one after another (3DGS adds one each 1000 of 30,000 steps).
+    """Schedule of the spherical-harmonics degree in use: one band more at a time (3DGS: each 1000 of 30,000 steps).
 
     Attributes:
         interval: progress between two bands.
@@ -85,19 +101,30 @@ class ShDegreeConfig:
         if self.steps < 0:
             raise ValueError(f"'steps' must not be negative, not {self.steps}.")
 
-    def build(self) -> Hook:
+    def build(self) -> ShDegree:
         """The hook."""
-        return _ShDegree(self)
+        return ShDegree(self)
 
 
-class _ShDegree(Hook):
+class SphericalHarmonics(Protocol):
+    """The part of a field that `ShDegree` sets: the degree that is stored, and the degree in use."""
+
+    active_degree: int
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the coefficients that are stored."""
+        ...
+
+
+class ShDegree(Hook):
+    """Sets the field's ``active_degree`` before each step."""
+
+    name = "sh_degree"
+    requires = Requirement("spherical harmonics", SphericalHarmonics)
+
     def __init__(self, config: ShDegreeConfig) -> None:
         self._config = config
-
-    @override
-    def check(self, field: Field, renderer: Renderer) -> None:
-        if not hasattr(field, "active_degree") or not hasattr(field, "sh_degree"):
-            raise InputError(f"The hook 'sh_degree' needs spherical harmonics, which {type(field).__name__} has not.")
 
     @override
     def before_step(self, state: FitState) -> None:
@@ -105,8 +132,8 @@ class _ShDegree(Hook):
         passed = state.ctx.progress - config.start
         bands = 0 if passed < 0 else 1 + int(passed / max(config.interval, 1e-9))
         bands = max(bands, state.step // config.steps) if config.steps else bands
-        limit: int = state.field.sh_degree  # type: ignore[assignment]
-        state.field.active_degree = min(bands, limit)  # type: ignore[assignment]
+        field = cast(SphericalHarmonics, state.field)
+        field.active_degree = min(bands, field.sh_degree)
 
 
 def prefixed(hooks: Sequence[Hook]) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""Limits that keep every Gaussian trainable: bounds on opacity and scale, and a count of those that no gradient can change."""
+"""Bounds on opacities and scales that keep gradients of Gaussians alive, and a count of the dead ones."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from invgraphics.core import Camera, Field, Quantity, Renderer
+from invgraphics.core import Camera, Field
 from invgraphics.kernels.types import ALPHA_MIN
-from invgraphics.training.density_control import Splats, check_splats
+from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters
 from invgraphics.training.hooks import FitState, Hook
 
 VANISHING_SLOPE = 2.0**-23
@@ -30,7 +30,7 @@ CHUNK = 1 << 15
 
 @dataclass(frozen=True)
 class LimitsConfig:
-    """Projection of opacities and scales onto intervals in which gradients can move them, after every step.
+    """Clamps opacities and scales, after every step, to intervals in which they have gradients.
 
     Without it, long fits drive logits to where the float32 sigmoid has no slope, and scales to where the rasteriser's low-pass
     filter hides them; density control then copies what can no longer change.
@@ -54,26 +54,25 @@ class LimitsConfig:
                 "'min_opacity' and 'max_opacity' must ascend between 0 and 1, 'min_scale' at 0 or above, 'every' at 1 or above."
             )
 
-    def build(self) -> Hook:
+    def build(self) -> Limits:
         """The hook."""
-        return _Limits(self)
+        return Limits(self)
 
 
-class _Limits(Hook):
-    """Keeps the scale limits between their computations, so that a resumed fit repeats the same steps."""
+class Limits(Hook):
+    """Clamps opacities and scales after each step; the scale limits are kept for fits that are resumed."""
+
+    name = "limits"
+    requires = GAUSSIANS
 
     def __init__(self, config: LimitsConfig) -> None:
         self._config = config
         self._log_limit = torch.zeros(0)
 
     @override
-    def check(self, field: Field, renderer: Renderer) -> None:
-        check_splats("limits", field)
-
-    @override
     @torch.no_grad()
     def after_step(self, state: FitState) -> None:
-        config, field = self._config, cast(Splats, state.field)
+        config, field = self._config, cast(GaussianParameters, state.field)
         field.opacity_logits.clamp_(_logit(config.min_opacity), _logit(config.max_opacity))
         if config.min_scale:
             if len(self._log_limit) != len(field.means) or state.step % config.every == 0:
@@ -95,7 +94,7 @@ def _logit(opacity: float) -> float:
 
 
 def pixel_sizes(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
-    """Edge length of a pixel at each point, in the camera that is nearest in units of its focal length, whatever it faces.
+    """Size of a pixel at each point, local units: the smallest distance over focal length of any camera, in view or not.
 
     A lower bound of what any of the cameras can resolve there, from distances alone.
     """
@@ -117,7 +116,7 @@ DEAD_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class DeadGaussians:
-    """Which of n Gaussians no gradient can change, by cause.
+    """Masks of the Gaussians whose gradients vanish, by cause.
 
     Attributes:
         saturated: opacities whose sigmoid has no slope in float32.
@@ -131,12 +130,12 @@ class DeadGaussians:
 
     @property
     def any(self) -> Bool[Tensor, " n"]:
-        """Dead for one reason or another."""
+        """Gaussians that are dead for any cause."""
         return self.saturated | self.faded | self.collapsed
 
     @property
     def share(self) -> float:
-        """Part of all Gaussians that is dead, in [0, 1]."""
+        """Share of the Gaussians that are dead, in [0, 1]."""
         return float(self.any.float().mean()) if len(self.faded) else 0.0
 
     def sentence(self) -> str:
@@ -148,15 +147,15 @@ class DeadGaussians:
 
 @torch.no_grad()
 def dead_gaussians(field: Field, cameras: Sequence[Camera]) -> DeadGaussians | None:
-    """Gaussians whose position, size, opacity or colour can no longer change; ``None`` for a field without Gaussians.
+    """Find Gaussians whose gradients vanish; ``None`` for a field without Gaussians.
 
     Args:
         field: what is fitted, or was.
         cameras: the training cameras.
     """
-    if Quantity.GAUSSIANS not in field.provides or not hasattr(field, "opacity_logits"):
+    if not GAUSSIANS.met_by(field):
         return None
-    gaussians = cast(Splats, field)
+    gaussians = cast(GaussianParameters, field)
     opacity = gaussians.opacity_logits.float().sigmoid()
     largest = gaussians.log_scales.amax(dim=1).exp()
     return DeadGaussians(

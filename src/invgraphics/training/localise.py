@@ -1,4 +1,4 @@
-"""One photograph's pose, by gradient descent through a scene that is fitted already (iNeRF, Yen-Chen et al. 2021)."""
+"""Pose of one photograph in a fitted scene, by gradient descent on its photometric error (iNeRF, Yen-Chen et al. 2021)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from invgraphics.core import Batch, Camera, Context, Field, RayRenderer, Renderer, Scene, View
+from invgraphics.core import Batch, Camera, Context, Model, RayRenderer, Scene, View
 from invgraphics.training.batches import scaled_view
 from invgraphics.training.poses import motion_about, pivot_depth
 
-Model = tuple[Field, Renderer]
-
 
 @dataclass(frozen=True)
-class Descent:
-    """How a pose is searched for.
+class PoseDescent:
+    """Settings of a descent on a pose.
 
     Attributes:
         steps: of Adam.
@@ -39,30 +37,29 @@ class Descent:
         return self.lr * (self.final / self.lr) ** (step / max(self.steps - 1, 1))
 
 
-def descend(model: Model, view: View, scene: Scene, descent: Descent) -> Camera:
-    """The camera that, starting from the view's, shows what its photograph shows; a rigid motion in its own frame away.
+def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) -> Camera:
+    """Refine a view's camera to its photograph: a rigid motion in the camera's frame that lowers the photometric error.
 
     Args:
-        model: fitted field and renderer; neither is changed.
-        view: photograph, and where the search starts.
+        model: fitted; not changed.
+        view: photograph, and the camera to start from.
         scene: for its bounds, extent and background.
-        descent: how far and how fast. The pixels of all steps are drawn from one fixed seed.
+        descent: steps and learning rates. The pixels of all steps are drawn from one fixed seed.
     """
-    field, renderer = model
-    device = _device(model)
+    device = model.device
     small = _at_scale(view, descent.scale)
     twist = torch.zeros(6, device=device, requires_grad=True)
     reach = torch.tensor([1.0] * 3 + [scene.extent] * 3, device=device)
     adam = torch.optim.Adam([twist], lr=descent.lr)
     generator = torch.Generator().manual_seed(0)
-    ctx = Context(scene.bounds.to(device), training=False)
+    ctx = model.context()
     start = small.camera.to(device)
     pivot = pivot_depth(start, scene)
-    with _fixed(field, renderer):
+    with _frozen(*model.parts.values()):
         for step in range(descent.steps):
             adam.param_groups[0]["lr"] = descent.rate(step)
             camera = start.moved(start.cam_to_world @ motion_about(twist * reach, pivot))
-            colour, target = _compared(model, camera, (small, scene), ctx, (descent.rays, generator))
+            colour, target = _predicted_and_true(model, camera, (small, scene), ctx, (descent.rays, generator))
             loss = (colour - target).square().mean()
             adam.zero_grad()
             loss.backward()
@@ -72,15 +69,12 @@ def descend(model: Model, view: View, scene: Scene, descent: Descent) -> Camera:
         return view.camera.moved(pose.to(view.camera.cam_to_world))
 
 
-@torch.no_grad()
-def difference(model: Model, view: View, scene: Scene, scale: float = 1.0) -> float:
-    """Mean squared difference between a photograph and what its camera shows, colours in front of the scene's background."""
-    field, renderer = model
-    device = _device(model)
+def photometric_error(model: Model, view: View, scene: Scene, scale: float = 1.0) -> float:
+    """Mean squared error between a view's photograph and its camera's rendering, both over the scene's background."""
     small = _at_scale(view, scale)
-    picture, _ = renderer.render_image(field, small.camera.to(device), Context(scene.bounds.to(device)))
+    picture = model.render(small.camera, normals=False)
     counted = torch.ones_like(small.opacity(), dtype=torch.bool) if small.mask is None else small.mask
-    error = (picture.over(scene.background.to(device)).cpu() - small.over(scene.background)).square()
+    error = (picture.over(scene.background) - small.over(scene.background)).square()
     return float(error[counted].mean())
 
 
@@ -89,33 +83,27 @@ def _at_scale(view: View, scale: float) -> View:
     return view if (width, height) == (view.camera.width, view.camera.height) else scaled_view(view, width, height)
 
 
-def _compared(
+def _predicted_and_true(
     model: Model, camera: Camera, truth: tuple[View, Scene], ctx: Context, draw: tuple[int, torch.Generator]
 ) -> tuple[Tensor, Tensor]:
-    """Colours seen and photographed at the pixels of one step."""
-    field, renderer = model
+    """Rendered and true colours at the pixels of one step."""
     view, scene = truth
     background = scene.background.to(camera.focal.device)
     batch = Batch(view.over(scene.background), view.opacity(), background)
     valid = torch.arange(batch.alpha.numel()) if view.mask is None else view.mask.reshape(-1).nonzero()[:, 0]
-    if isinstance(renderer, RayRenderer):
+    if isinstance(model.renderer, RayRenderer):
         flat = valid[torch.randint(len(valid), (min(draw[0], len(valid)),), generator=draw[1])]
         pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
-        picture, _ = renderer.render_rays(field, camera.rays(pixels.to(background)), ctx)
+        picture, _ = model.renderer.render_rays(model.field, camera.rays(pixels.to(background)), ctx)
         return picture.over(background), batch.target.reshape(-1, 3)[flat].to(background)
-    picture, _ = renderer.render_image(field, camera, ctx)
+    picture, _ = model.renderer.render_image(model.field, camera, ctx)
     where = valid.to(background.device)
     return picture.over(background).reshape(-1, 3)[where], batch.target.to(background).reshape(-1, 3)[where]
 
 
-def _device(model: Model) -> torch.device:
-    parameter: Tensor | None = next(model[0].parameters(), None)
-    return torch.device("cpu") if parameter is None else parameter.device
-
-
 @contextmanager
-def _fixed(*modules: nn.Module) -> Iterator[None]:
-    """Without gradients towards the modules' parameters, which saves computing them."""
+def _frozen(*modules: nn.Module) -> Iterator[None]:
+    """Within the block, no gradients of the modules' parameters are computed."""
     learning = [parameter for module in modules for parameter in module.parameters() if parameter.requires_grad]
     for parameter in learning:
         parameter.requires_grad_(False)

@@ -1,34 +1,25 @@
-"""Losses: functions of a rendering, its trace and the batch, each a frozen config with a weight."""
+"""Losses: frozen configs that are called with a rendering, its trace, the batch and the context, and return a scalar."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
-from weakref import WeakKeyDictionary
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from invgraphics import kernels
-from invgraphics.core import Batch, Context, Rendering, Trace
+from invgraphics.core import Batch, Bounds, Context, Rendering, Trace
 from invgraphics.core.compositing import over
+from invgraphics.renderers.samplers import to_spacing
 
 Loss = Callable[[Rendering, Trace, Batch, Context], Tensor]
+"""A term of the objective. The rendering's ``rgb`` is in front of ``batch.background`` already, composited once per step by
+`invgraphics.training.fit.Fit`; its ``alpha`` is still that of the scene alone."""
 
 Distance = Literal["mse", "l1", "huber"]
-
-_pictures: WeakKeyDictionary[Rendering, tuple[Tensor, Tensor]] = WeakKeyDictionary()
-
-
-def picture_of(rendering: Rendering, batch: Batch) -> Float[Tensor, "*p 3"]:
-    """The rendering in front of its batch's background; made once for all losses of a step."""
-    background, picture = _pictures.get(rendering, (None, batch.background))
-    if background is not batch.background:
-        picture = rendering.over(batch.background)
-        _pictures[rendering] = batch.background, picture
-    return picture
 
 
 def distance(kind: Distance, prediction: Float[Tensor, "*p 3"], target: Float[Tensor, "*p 3"]) -> Float[Tensor, ""]:
@@ -42,8 +33,8 @@ def distance(kind: Distance, prediction: Float[Tensor, "*p 3"], target: Float[Te
 
 
 @dataclass(frozen=True)
-class PhotometricConfig:
-    """Colour difference between the picture, in front of the batch's background, and the photograph.
+class PhotometricLoss:
+    """Colour difference between the composited rendering and the photograph.
 
     Attributes:
         weight: factor.
@@ -53,18 +44,14 @@ class PhotometricConfig:
     weight: float = 1.0
     distance: Distance = "mse"
 
-    def build(self) -> Loss:
-        """The loss as a function."""
-
-        def loss(rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Tensor:
-            return self.weight * distance(self.distance, picture_of(rendering, batch), batch.target)
-
-        return loss
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted loss."""
+        return self.weight * distance(self.distance, rendering.rgb, batch.target)
 
 
 @dataclass(frozen=True)
-class CoarseConfig:
-    """NeRF's second term: the colour difference of every earlier level that knows its own radiance.
+class CoarseLoss:
+    """NeRF's second term: the squared colour difference of every earlier level that has radiance of its own.
 
     Attributes:
         weight: factor.
@@ -72,26 +59,22 @@ class CoarseConfig:
 
     weight: float = 1.0
 
-    def build(self) -> Loss:
-        """The loss as a function."""
-
-        def loss(rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Tensor:
-            total = batch.target.new_zeros(())
-            for level in trace.levels:
-                if level.weights is None or level.samples is None or level.values is None or level.values.radiance is None:
-                    continue
-                weighted = torch.cat([level.weights[:, None] * level.values.radiance, level.weights[:, None]], dim=1)
-                sums = weighted.new_zeros(len(batch.target), 4).index_add(0, level.samples.ray, weighted)
-                colour = over(sums[:, :3], sums[:, 3], batch.background)
-                total = total + (colour - batch.target).square().mean()
-            return self.weight * total
-
-        return loss
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted sum over levels."""
+        total = batch.target.new_zeros(())
+        for level in trace.levels:
+            if level.weights is None or level.samples is None or level.values is None or level.values.radiance is None:
+                continue
+            weighted = torch.cat([level.weights[:, None] * level.values.radiance, level.weights[:, None]], dim=1)
+            sums = weighted.new_zeros(len(batch.target), 4).index_add(0, level.samples.ray, weighted)
+            colour = over(sums[:, :3], sums[:, 3], batch.background)
+            total = total + (colour - batch.target).square().mean()
+        return self.weight * total
 
 
 @dataclass(frozen=True)
-class SsimConfig:
-    """1 - SSIM between picture and photograph (3DGS, equation 7); needs whole images.
+class SsimLoss:
+    """1 - SSIM between the composited rendering and the photograph (3DGS, equation 7); needs whole images.
 
     Attributes:
         weight: factor; 3DGS uses 0.2 beside 0.8 times ``l1``.
@@ -99,20 +82,16 @@ class SsimConfig:
 
     weight: float = 0.2
 
-    def build(self) -> Loss:
-        """The loss as a function."""
-
-        def loss(rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Tensor:
-            return self.weight * (1 - kernels.ssim(picture_of(rendering, batch), batch.target))
-
-        return loss
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted loss."""
+        return self.weight * (1 - kernels.ssim(rendering.rgb, batch.target))
 
 
 @dataclass(frozen=True)
-class DistortionConfig:
-    """Mip-NeRF 360's distortion (equation 15): gathers a ray's weight in one place, against floaters.
+class DistortionLoss:
+    """Mip-NeRF 360's distortion (equation 15): the mean distance between two points of a ray, drawn by its weights.
 
-    Distances are normalised per ray to [0, 1] over its interval (linear in disparity when contracted).
+    It gathers a ray's weight in one place, against floaters. Distances are normalised, see `normalised_distance`.
 
     Attributes:
         weight: factor; mip-NeRF 360 uses 0.01, nerfacto 0.002.
@@ -120,27 +99,33 @@ class DistortionConfig:
 
     weight: float = 0.01
 
-    def build(self) -> Loss:
-        """The loss as a function."""
-
-        def loss(rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Tensor:
-            samples, weights = trace.samples, trace.weights
-            if samples is None or weights is None or len(samples) == 0:
-                return batch.target.new_zeros(())
-            scale = ctx.bounds.radius
-            s0, s1 = ((t / (t + scale)) for t in (samples.t0, samples.t1))
-            middle = (s0 + s1) / 2
-            # sum_ij w_i w_j |m_i - m_j| in O(m) with per-ray prefix sums (Sun et al. 2022, DVGO v2, equation 11).
-            before = _prefix(weights, samples.ray)
-            before_middle = _prefix(weights * middle, samples.ray)
-            pairs = 2 * weights * (middle * before - before_middle)
-            selves = weights.square() * (s1 - s0) / 3
-            return self.weight * (pairs + selves).sum() / max(trace.rays, 1)
-
-        return loss
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean over rays; 0 for renderers without samples."""
+        samples, weights = trace.samples, trace.weights
+        if samples is None or weights is None or len(samples) == 0:
+            return batch.target.new_zeros(())
+        s0, s1 = (normalised_distance(t, ctx.bounds) for t in (samples.t0, samples.t1))
+        middle = (s0 + s1) / 2
+        # Σ_ij w_i w_j |m_i - m_j| in O(m) with per-ray prefix sums (Sun et al. 2022, DVGO v2, equation 11).
+        before = _prefix(weights, samples.ray)
+        before_middle = _prefix(weights * middle, samples.ray)
+        pairs = 2 * weights * (middle * before - before_middle)
+        within = weights.square() * (s1 - s0) / 3
+        return self.weight * (pairs + within).sum() / max(trace.rays, 1)
 
 
-def _prefix(values: Float[Tensor, " m"], ray: Tensor) -> Float[Tensor, " m"]:
+def normalised_distance(t: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:
+    """Distance along a ray in the spacing of the samplers' strata, in units of the longest interval that a ray can have.
+
+    In a box that is distance over the box's diagonal. In a contracted space it is mip-NeRF 360's s (equation 11) with
+    nerfacto's spacing: distance up to the bounds' radius and disparity beyond, each over half of [0, 1]. One scale serves all
+    rays, so a gap between two surfaces costs the same in the middle of a box as near a corner, where rays are short.
+    """
+    s = to_spacing(t, bounds)
+    return s / (2 * bounds.radius) if bounds.space == "box" else s
+
+
+def _prefix(values: Float[Tensor, " m"], ray: Int[Tensor, " m"]) -> Float[Tensor, " m"]:
     """Exclusive running sum within each ray of packed samples."""
     total = values.double().cumsum(0)
     exclusive = total - values

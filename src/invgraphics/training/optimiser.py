@@ -66,7 +66,7 @@ class OptimiserConfig:
 
 
 class Optimiser:
-    """Steps all parameters of a field and a renderer; rows of a parameter can be chosen anew (density control)."""
+    """Adam over the parameters of a field, a renderer and poses; follows changes of a parameter's rows (density control)."""
 
     def __init__(self, config: OptimiserConfig, parameters: dict[str, nn.Parameter], extent: float) -> None:
         self._config = config
@@ -107,15 +107,15 @@ class Optimiser:
         return self.rates()[self._group_of(name)]
 
     def zero_grad(self) -> None:
-        """Forget all gradients."""
+        """Drop all gradients."""
         self._adam.zero_grad(set_to_none=True)
 
     def step(self) -> None:
         """One Adam step."""
         self._adam.step()
 
-    def rechoose(self, name: str, parameter: nn.Parameter, rows: Int[Tensor, " k"], fresh: int) -> None:
-        """Follow a parameter whose rows were chosen anew: ``rows`` of the old one, then ``fresh`` rows without history."""
+    def reindex_rows(self, name: str, parameter: nn.Parameter, rows: Int[Tensor, " k"], new: int) -> None:
+        """Replace a parameter by one of other rows: moments of the old one's ``rows``, then zeros for ``new`` rows."""
         old = self._names[name]
         for group in self._adam.param_groups:
             group["params"] = [parameter if other is old else other for other in group["params"]]
@@ -124,10 +124,10 @@ class Optimiser:
         if state:
             for key in ("exp_avg", "exp_avg_sq"):
                 kept = state[key][rows]
-                state[key] = torch.cat([kept, kept.new_zeros(fresh, *kept.shape[1:])])
+                state[key] = torch.cat([kept, kept.new_zeros(new, *kept.shape[1:])])
             self._adam.state[parameter] = state
 
-    def forget(self, name: str, rows: Int[Tensor, " k"] | None = None) -> None:
+    def reset_moments(self, name: str, rows: Int[Tensor, " k"] | None = None) -> None:
         """Zero the moments of a parameter (after an opacity reset), or of some of its rows."""
         for key, value in self._adam.state.get(self._names[name], {}).items():
             if key != "step":

@@ -1,7 +1,7 @@
-"""Cameras that are fitted together with the scene (BARF, Lin et al. 2021): a small rigid motion per training view.
+"""Camera poses optimised together with the scene (BARF, Lin et al. 2021): a small rigid motion per training view.
 
 Photographs know the world only up to a similarity: moving all cameras and the scene together changes no picture (the gauge).
-No view is held fixed to decide it. The fit may drift along with its cameras; whoever compares aligns first, see
+No view is held fixed to decide it. The fit may drift along with its cameras, so comparisons align first, see
 `invgraphics.metrics.poses`.
 """
 
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from invgraphics.core import Camera, Field, Renderer, Scene
+from invgraphics.core import Camera, Model, Scene
 from invgraphics.core.transforms import se3_exp
 from invgraphics.fields.encodings.window import Windowed
 from invgraphics.training.batches import BatchConfig
@@ -65,27 +65,27 @@ class PosesConfig:
         if not self.resolution or not all(0 < scale <= 1 for scale in self.resolution):
             raise ValueError("'resolution' must hold scales in (0, 1].")
 
-    def detail(self, progress: float) -> float:
-        """How far the window over the encodings' levels is open, from 0 to 1."""
+    def alpha(self, progress: float) -> float:
+        """Coarse-to-fine parameter of the encodings: share of the levels in use, from 0 to 1 (BARF, equation 14)."""
         start, end = self.window
         return min(max((progress - start) / max(end - start, 1e-9), 0.0), 1.0)
 
-    def optimiser(self, config: OptimiserConfig, seen: float) -> OptimiserConfig:
+    def optimiser(self, config: OptimiserConfig, view_share: float) -> OptimiserConfig:
         """The recipe's optimiser with two more groups, for rotations and translations.
 
         Args:
             config: the recipe's.
-            seen: share of the views that a step sees, in (0, 1].
+            view_share: share of the training views in one step's batch, in (0, 1].
         """
-        more = seen**-0.5
+        factor = view_share**-0.5
         own = {
             "pose_rotations": GroupConfig(
-                "poses.rotation", more * self.rotation_lr, more * self.rotation_final, warmup=self.rotation_warmup
+                "poses.rotation", factor * self.rotation_lr, factor * self.rotation_final, warmup=self.rotation_warmup
             ),
             "pose_translations": GroupConfig(
                 "poses.translation",
-                more * self.translation_lr,
-                more * self.translation_final,
+                factor * self.translation_lr,
+                factor * self.translation_final,
                 warmup=self.translation_warmup,
                 per_extent=True,
             ),
@@ -93,7 +93,7 @@ class PosesConfig:
         return replace(config, groups=config.groups | own)
 
     def batches(self, config: BatchConfig) -> BatchConfig:
-        """The recipe's batches, with the image scales where it has none of its own."""
+        """The recipe's batches, with this schedule of image scales where they have none."""
         if config.until or len(self.resolution) == 1:
             return config
         start, end = self.window
@@ -104,7 +104,7 @@ class PosesConfig:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """What else a fit finds out, besides the scene.
+    """Options for optimising camera poses along with the scene.
 
     Attributes:
         poses: the training cameras' poses; ``None`` takes them as they are given.
@@ -114,10 +114,10 @@ class TrainingConfig:
 
 
 class Poses(nn.Module):
-    """Poses of n training views: as given, then a rigid motion in the camera's frame, which starts at none.
+    """Poses of n training views: the given ones times a rigid motion in the camera's frame, initially the identity.
 
-    The motion turns about the point of the optical axis that is level with the scene's centre. About the camera's own centre a
-    turn would look almost like a shift, and descent would creep along the valley between the two.
+    The motion rotates about the point of the optical axis that is level with the scene's centre. A rotation about the camera's
+    own centre would be almost collinear with a translation, and descent slow along the valley between the two.
 
     Attributes:
         config: settings.
@@ -158,7 +158,7 @@ class Poses(nn.Module):
 
     @staticmethod
     def restored(config: PosesConfig, state: Mapping[str, Tensor]) -> Poses:
-        """Poses from a checkpoint; without lenses, so they can be asked for matrices but not for cameras.
+        """Poses from a checkpoint; without intrinsics, so `forward` works but `cameras` does not.
 
         Raises:
             RuntimeError: the state is that of something else.
@@ -187,7 +187,7 @@ class Poses(nn.Module):
 
 
 def make_poses(config: TrainingConfig | None, scene: Scene) -> Poses | None:
-    """The poses that a recipe wants fitted, of a scene's training views."""
+    """The training views' poses as parameters; ``None`` where the recipe takes them as given."""
     chosen = None if config is None else config.poses
     return Poses.of(chosen, scene) if chosen is not None and chosen.optimise else None
 
@@ -199,7 +199,7 @@ def pivot_depth(camera: Camera, scene: Scene) -> Float[Tensor, ""]:
 
 
 def motion_about(twist: Float[Tensor, "*n 6"], depth: Float[Tensor, "*n"]) -> Float[Tensor, "*n 4 4"]:
-    """Rigid motions of cameras in their own frames, whose rotations leave the points at ``depth`` on the optical axes fixed."""
+    """Rigid motions in the cameras' frames from twists; they rotate about the points at ``depth`` on the optical axes."""
     motion = se3_exp(twist)
     zero = torch.zeros_like(depth)
     pivot = torch.stack([zero, zero, depth], dim=-1)[..., None]
@@ -208,6 +208,6 @@ def motion_about(twist: Float[Tensor, "*n 6"], depth: Float[Tensor, "*n"]) -> Fl
     return motion + kept - turned
 
 
-def windows(field: Field, renderer: Renderer) -> list[Windowed]:
-    """All encodings that can hold levels back."""
-    return [module for part in (field, renderer) for module in part.modules() if isinstance(module, Windowed)]
+def coarse_to_fine_encodings(model: Model) -> list[Windowed]:
+    """Encodings of the model whose finer levels can be faded in."""
+    return [module for part in model.parts.values() for module in part.modules() if isinstance(module, Windowed)]

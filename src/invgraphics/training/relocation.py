@@ -1,4 +1,4 @@
-"""Gaussians as samples of a Markov chain: relocated where they are dead, moved by noise (3DGS-MCMC, Kheradmand et al. 2024)."""
+"""Relocation of dead Gaussians, growth under a cap, and Langevin noise (3DGS-MCMC, Kheradmand et al. 2024)."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from typing_extensions import override
 
-from invgraphics.core import Field, Renderer
 from invgraphics.core.transforms import quaternion_to_matrix
-from invgraphics.training.density_control import Splats, check_splats, paced_limit
+from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters, cap_at
 from invgraphics.training.hooks import FitState, Hook
 
 MOST_COPIES = 51
 """Most Gaussians that take the place of one at once (the authors' code)."""
 LARGEST_OPACITY = 1 - 1e-6
 GATE_SLOPE = 100.0
-"""Steepness of the sigmoid that lets noise through to transparent Gaussians only."""
+"""Steepness of the sigmoid in opacity that keeps noise to transparent Gaussians."""
 NEGLIGIBLE = 1e-4
-"""Noise is not drawn for Gaussians whose gate is below this."""
+"""Value of that sigmoid below which no noise is drawn."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class RelocationConfig:
         dead: opacity up to which a Gaussian counts as dead.
         growth: most new Gaussians of a round, as a share of those there are, until there are ``max_primitives``.
         max_primitives: cap.
-        pace: progress, from ``start`` on, over which the cap itself rises from the first number, by equal factors; 0 for none.
+        cap_ramp: progress, from ``start`` on, over which the cap rises from the first number, by equal factors; 0 for at once.
         noise: standard deviation of the noise on means, per learning rate and covariance; 0 for none.
     """
 
@@ -45,34 +44,33 @@ class RelocationConfig:
     dead: float = 0.005
     growth: float = 0.05
     max_primitives: int = 1_000_000
-    pace: float = 0.0
+    cap_ramp: float = 0.0
     noise: float = 5e5
 
     def __post_init__(self) -> None:
         if self.every < 1 or self.max_primitives < 1:
             raise ValueError("'every' and 'max_primitives' must be at least 1.")
-        if not 0 < self.dead < 1 or min(self.growth, self.noise, self.pace) < 0:
-            raise ValueError("'dead' must lie between 0 and 1, 'growth', 'noise' and 'pace' must not be negative.")
+        if not 0 < self.dead < 1 or min(self.growth, self.noise, self.cap_ramp) < 0:
+            raise ValueError("'dead' must lie between 0 and 1, 'growth', 'noise' and 'cap_ramp' must not be negative.")
 
     def capped(self, most: int) -> RelocationConfig:
         """The same, growing to at most ``most`` Gaussians."""
         return replace(self, max_primitives=most)
 
-    def build(self) -> Hook:
+    def build(self) -> Relocation:
         """The hook."""
-        return _Relocation(self)
+        return Relocation(self)
 
 
-class _Relocation(Hook):
-    """Keeps the number of Gaussians that growth began with."""
+class Relocation(Hook):
+    """Relocates dead Gaussians, adds new ones up to the cap, and perturbs the means."""
+
+    name = "relocation"
+    requires = GAUSSIANS
 
     def __init__(self, config: RelocationConfig) -> None:
         self._config = config
         self._first = 0
-
-    @override
-    def check(self, field: Field, renderer: Renderer) -> None:
-        check_splats("relocation", field)
 
     @override
     @torch.no_grad()
@@ -82,21 +80,21 @@ class _Relocation(Hook):
             self._relocate(state)
             self._grow(state)
         if config.noise:
-            _shake(state, config.noise * state.optimiser.rate_of("field.means"), config.dead)
+            _perturb(state, config.noise * state.optimiser.rate_of("field.means"), config.dead)
 
     def _relocate(self, state: FitState) -> None:
-        """Move dead Gaussians onto living ones."""
-        opacities = torch.sigmoid(cast(Splats, state.field).opacity_logits)
+        """Move dead Gaussians to living ones, drawn by opacity."""
+        opacities = torch.sigmoid(cast(GaussianParameters, state.field).opacity_logits)
         dead = (opacities <= self._config.dead).nonzero()[:, 0]
         if 0 < len(dead) < len(opacities):
             chances = torch.where(opacities <= self._config.dead, 0.0, opacities)
             self._copy(state, _draw(chances, len(dead), state), dead)
 
     def _grow(self, state: FitState) -> None:
-        opacities = torch.sigmoid(cast(Splats, state.field).opacity_logits)
+        opacities = torch.sigmoid(cast(GaussianParameters, state.field).opacity_logits)
         config, n = self._config, len(opacities)
         self._first = self._first or n
-        limit = paced_limit(self._first, config.max_primitives, state.ctx.progress - config.start, config.pace)
+        limit = cap_at(self._first, config.max_primitives, state.ctx.progress - config.start, config.cap_ramp)
         added = min(limit, int(n * (1 + config.growth))) - n
         if added > 0:
             self._copy(state, _draw(opacities, added, state), torch.arange(n, n + added, device=opacities.device))
@@ -110,33 +108,35 @@ class _Relocation(Hook):
         self._first = int(state["first"])
 
     def _copy(self, state: FitState, source: Int[Tensor, " k"], target: Int[Tensor, " k"]) -> None:
-        """Put copies of ``source`` into the rows ``target``, which may lie behind the last, and share out what is seen."""
+        """Copy rows ``source`` to rows ``target``, which may lie behind the last, with opacities and scales by equation 9."""
         field = state.field
         old = {name: parameter.detach() for name, parameter in field.named_parameters()}
         n, total = len(old["means"]), max(len(old["means"]), int(target.max()) + 1)
         new = {name: torch.cat([values, values.new_zeros(total - n, *values.shape[1:])]) for name, values in old.items()}
         parents, copies = torch.unique(source, return_counts=True)
-        opacity, shrink = shared_out(torch.sigmoid(old["opacity_logits"][parents]), copies + 1)
+        opacity, shrink = relocated_opacity(torch.sigmoid(old["opacity_logits"][parents]), copies + 1)
         new["opacity_logits"][parents] = torch.logit(opacity.clamp(self._config.dead, LARGEST_OPACITY))
         new["log_scales"][parents] += shrink.log()[:, None]
         for values in new.values():
             values[target] = values[source]
-        cast(Splats, field).replace(new)
+        cast(GaussianParameters, field).replace(new)
         rows = torch.arange(n, device=source.device)
         for name, parameter in field.named_parameters():
-            state.optimiser.rechoose(f"field.{name}", cast(nn.Parameter, parameter), rows, total - n)
-            state.optimiser.forget(f"field.{name}", torch.cat([parents, target]))
+            state.optimiser.reindex_rows(f"field.{name}", cast(nn.Parameter, parameter), rows, total - n)
+            state.optimiser.reset_moments(f"field.{name}", torch.cat([parents, target]))
 
 
 def _draw(chances: Float[Tensor, " n"], count: int, state: FitState) -> Int[Tensor, " k"]:
-    """Rows drawn with replacement by their chances; on the CPU, where the fit's generator lives."""
+    """Multinomial sample of rows with replacement; on the CPU, where the fit's generator lives."""
     cumulated = chances.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=state.ctx.generator, dtype=torch.float64) * cumulated[-1]
     return torch.searchsorted(cumulated, draws, right=True).clamp_max(len(chances) - 1).to(chances.device)
 
 
-def shared_out(opacity: Float[Tensor, " n"], copies: Int[Tensor, " n"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Opacity of each of N Gaussians in one place that look like one of ``opacity``, and the factor on their scales.
+def relocated_opacity(
+    opacity: Float[Tensor, " n"], copies: Int[Tensor, " n"]
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Opacity of each of N coinciding Gaussians that render like one of ``opacity``, and the factor on their scales.
 
     ``(1 - o')^N = 1 - o`` at the centre, and the scale keeps the integral of alpha over a line through it. The paper's double
     sum over i and k is written as one, over j with the binomials of N.
@@ -154,9 +154,9 @@ def shared_out(opacity: Float[Tensor, " n"], copies: Int[Tensor, " n"]) -> tuple
     return each.to(opacity), (wide / total).to(opacity)
 
 
-def _shake(state: FitState, strength: float, dead: float) -> None:
-    """Langevin noise on the means, in the shape of each Gaussian, for nearly transparent ones only."""
-    field = cast(Splats, state.field)
+def _perturb(state: FitState, strength: float, dead: float) -> None:
+    """Add Langevin noise with each Gaussian's covariance to the means of nearly transparent Gaussians (equation 8)."""
+    field = cast(GaussianParameters, state.field)
     gate = torch.sigmoid(GATE_SLOPE * (dead - torch.sigmoid(field.opacity_logits)))
     rows = (gate > NEGLIGIBLE).nonzero()[:, 0]
     if len(rows) == 0:

@@ -1,4 +1,4 @@
-"""The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, §4.1): no Gaussian is finer than what a photograph can show."""
+"""The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, §4.1): a low-pass filter at the training views' sampling rate."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from invgraphics.core import Camera, Field, Renderer
-from invgraphics.errors import InputError
+from invgraphics.core import Camera
 from invgraphics.training.hooks import FitState, Hook
+from invgraphics.training.requirement import Requirement
 
 CHUNK = 4096
 """Points that are projected into all cameras at once: few enough for the cache."""
@@ -39,26 +39,26 @@ class SmoothingConfig:
         if self.every < 1 or not self.variance > 0 or not self.near > 0:
             raise ValueError("'every' must be at least 1, 'variance' and 'near' must be positive.")
 
-    def build(self) -> Hook:
+    def build(self) -> Smoothing:
         """The hook."""
-        return _Smoothing(self)
+        return Smoothing(self)
 
 
-class _Smoothed(Protocol):
+class SmoothedGaussians(Protocol):
+    """The part of a field of n Gaussians that `Smoothing` reads and sets."""
+
     means: Float[Tensor, "n 3"]
     smoothing: Float[Tensor, " n"]
 
 
-class _Smoothing(Hook):
-    """Keeps nothing itself: the filter is saved with the field."""
+class Smoothing(Hook):
+    """Sets the field's ``smoothing``, which is saved with the field."""
+
+    name = "smoothing"
+    requires = Requirement("Gaussians", SmoothedGaussians)
 
     def __init__(self, config: SmoothingConfig) -> None:
         self._config = config
-
-    @override
-    def check(self, field: Field, renderer: Renderer) -> None:
-        if not hasattr(field, "smoothing"):
-            raise InputError(f"The hook 'smoothing' needs Gaussians, which {type(field).__name__} does not have.")
 
     @override
     def before_step(self, state: FitState) -> None:
@@ -70,7 +70,7 @@ class _Smoothing(Hook):
 
     @torch.no_grad()
     def _refresh(self, state: FitState, due: bool) -> None:
-        field, config = cast(_Smoothed, state.field), self._config
+        field, config = cast(SmoothedGaussians, state.field), self._config
         # A filter is positive everywhere; zeros are what a change in number leaves behind.
         if due or not bool(field.smoothing.any()):
             cameras = [view.camera for view in state.scene.train]
@@ -79,9 +79,9 @@ class _Smoothing(Hook):
 
 
 def pixel_distances(points: Float[Tensor, "n 3"], cameras: Sequence[Camera], margin: float, near: float) -> Float[Tensor, " n"]:
-    """Distance between neighbouring pixels' rays at each point, in the camera that sees it most finely.
+    """Sampling interval at each point: depth over focal length in the camera with the highest sampling rate there.
 
-    Points that no camera sees get the largest distance of those that are seen; 0 if none is.
+    Points in no camera's view get the largest interval of those in view; 0 if none is.
     """
     cameras = [camera.to(points.device) for camera in cameras]
     world_to_cam = torch.stack([camera.world_to_cam[:3] for camera in cameras]).to(points)

@@ -1,1 +1,1 @@
-"""A window into fitted runs, in a browser: any renderer's picture at the browser's camera (``invgraphics view``)."""
+"""Interactive viewer of fitted runs in a browser, through viser (``invgraphics view``)."""

@@ -1,4 +1,4 @@
-"""What stands beside the picture: choices, and what is known about the runs."""
+"""Control panel of one browser: outputs, layout, overlays, and status of the runs."""
 
 from __future__ import annotations
 
@@ -7,52 +7,58 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from invgraphics.viewer.colouring import SHOWN
-from invgraphics.viewer.painting import LAYOUTS, Painted
-from invgraphics.viewer.subject import Subject
+from invgraphics.tools.colorize import OUTPUTS
+from invgraphics.viewer.loaded_run import LoadedRun
+from invgraphics.viewer.progressive import LAYOUTS, Frame
 
-ANYWHERE = "anywhere"
-"""The name, among those of the views, of a camera that belongs to no photograph."""
+FREE_CAMERA = "free camera"
+"""Entry of the view list for a camera that is at no photograph."""
 SMALLEST, LARGEST = 64, 2048
-"""Pixels along a picture's longest side that can be chosen."""
+"""Range of the resolution limit, pixels along the longer side."""
 
 BACKGROUNDS = {"the scene's": None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-"""What can be put behind predictions; scores keep the scene's own."""
+"""Name -> colour behind predictions; scores keep the scene's own."""
 
-Answer = Callable[[], Awaitable[None]]
+Callback = Callable[[], Awaitable[None]]
 
 
 @dataclass(frozen=True)
-class Answers:
-    """What to do when a person has changed something: the picture's content, the camera's place, what the browser draws; or
-    wants the picture as a file."""
+class Callbacks:
+    """Coroutines called on user input.
 
-    picture: Answer
-    place: Answer
-    drawn: Answer
-    saved: Answer
+    Attributes:
+        output: what is rendered has changed.
+        view: a photograph was chosen.
+        overlays: what the browser draws itself has changed.
+        save: the current image is wanted as a file.
+    """
+
+    output: Callback
+    view: Callback
+    overlays: Callback
+    save: Callback
 
 
 class Controls:
-    """The controls of one browser.
+    """The control panel of one browser.
 
     Args:
         gui: viser's interface of that browser.
-        subjects: one or two runs.
+        runs: one or two runs.
         views: names of the photographs to choose from.
-        longest: most pixels along a picture's longest side, at the start.
-        answers: what to call.
+        max_size: initial limit of the longer side, pixels.
+        callbacks: called on user input.
     """
 
-    def __init__(self, gui: Any, subjects: Sequence[Subject], views: Sequence[str], longest: int, answers: Answers) -> None:
-        self._subjects = subjects
-        self.shown = gui.add_dropdown(
-            "Show", SHOWN, hint="Truth and error are known at photographs only; choosing them goes to the nearest one."
+    def __init__(self, gui: Any, runs: Sequence[LoadedRun], views: Sequence[str], max_size: int, callbacks: Callbacks) -> None:
+        self._runs = runs
+        self.output = gui.add_dropdown(
+            "Show", OUTPUTS, hint="Truth and error are known at photographs only; choosing them goes to the nearest one."
         )
-        self.view = gui.add_dropdown("View", (ANYWHERE, *views), hint="Puts the camera where a photograph was taken.")
-        several = len(subjects) > 1
+        self.view = gui.add_dropdown("View", (FREE_CAMERA, *views), hint="Puts the camera where a photograph was taken.")
+        several = len(runs) > 1
         self.layout = gui.add_dropdown("Runs", LAYOUTS if several else ("first",), visible=several)
-        self.share = gui.add_slider("Split at", 0.0, 1.0, 0.01, 0.5, visible=several)
+        self.split = gui.add_slider("Split at", 0.0, 1.0, 0.01, 0.5, visible=several)
         self.background = gui.add_dropdown(
             "Background", tuple(BACKGROUNDS), hint="Behind predictions. Scores and errors keep the scene's own."
         )
@@ -60,60 +66,66 @@ class Controls:
         self.splats = gui.add_checkbox(
             "Splats drawn by the browser",
             False,
-            visible=subjects[0].has_gaussians,
+            visible=runs[0].has_gaussians,
             hint="Smooth while moving. Colours without view dependence; the run's own renderer is not used.",
         )
-        top = max(LARGEST, longest)
-        self.longest = gui.add_slider(
-            "Most pixels", min(SMALLEST, longest), top, 1, longest, hint="Along the longer side, when the camera rests."
+        top = max(LARGEST, max_size)
+        self.max_size = gui.add_slider(
+            "Most pixels", min(SMALLEST, max_size), top, 1, max_size, hint="Along the longer side, when the camera rests."
         )
         save = gui.add_button("Save picture", hint="The picture as it is now, as a PNG file, without the browser's drawings.")
         self._status = gui.add_html("")
         self._facts = gui.add_html("")
-        self.tell_facts()
-        for handle in (self.shown, self.layout, self.share, self.longest, self.background):
-            _answer(handle, answers.picture)
+        self.update_summary()
+        for handle in (self.output, self.layout, self.split, self.max_size, self.background):
+            on_change(handle, callbacks.output)
 
         async def saved(_: Any) -> None:
-            await answers.saved()
+            await callbacks.save()
 
         save.on_click(saved)
-        _answer(self.view, answers.place)
+        on_change(self.view, callbacks.view)
         for handle in (self.cameras, self.splats):
-            _answer(handle, answers.drawn)
+            on_change(handle, callbacks.overlays)
 
-    def tell_facts(self) -> None:
-        """Show what is known about the runs, as of now."""
-        self._facts.content = "".join(_facts_of(subject) for subject in self._subjects)
+    def update_summary(self) -> None:
+        """Update name, training progress and scores of the runs."""
+        self._facts.content = "".join(_facts_of(run) for run in self._runs)
 
-    def tell(self, painted: Painted, note: str = "") -> None:
-        """Show what is known about the picture."""
-        width, height = painted.size
-        took = f" in {painted.seconds:.2f} s" if painted.seconds else ""
-        lines = [f"{width} × {height} pixels{took}{'' if painted.finest else ', getting finer'}"]
-        if painted.psnr:
-            lines.append("PSNR of this view: " + ", ".join(f"{value:.2f} dB" for value in painted.psnr))
-        self.say(*lines, painted.legend, note)
+    def show_frame(self, frame: Frame, note: str = "") -> None:
+        """Show size, render time, PSNR and legend of a frame."""
+        width, height = frame.size
+        took = f" in {frame.seconds:.2f} s" if frame.seconds else ""
+        lines = [f"{width} × {height} pixels{took}{'' if frame.final else ', getting finer'}"]
+        if frame.psnr:
+            lines.append("PSNR of this view: " + ", ".join(f"{value:.2f} dB" for value in frame.psnr))
+        self.show_status(*lines, frame.legend, note)
 
-    def say(self, *lines: str) -> None:
-        """Show lines of text in place of what is known about the picture."""
-        self._status.content = _block("".join(f"<div>{escape(line)}</div>" for line in lines if line))
+    def show_status(self, *lines: str) -> None:
+        """Replace the status by lines of text."""
+        self._status.content = status_block("".join(f"<div>{escape(line)}</div>" for line in lines if line))
 
 
-def _answer(handle: Any, answer: Answer) -> None:
-    """Call ``answer`` when a person changes a control, not when the program does."""
+def on_change(handle: Any, callback: Callback) -> None:
+    """Register ``callback`` for changes by the user, not by the program."""
 
     async def changed(event: Any) -> None:
         if event.client is not None:
-            await answer()
+            await callback()
 
     handle.on_update(changed)
 
 
-def _facts_of(subject: Subject) -> str:
-    rows = "".join(f"<div>{escape(name)}: {escape(value)}</div>" for name, value in subject.facts().items())
-    return _block(f"<div><b>{escape(subject.name)}</b></div>{rows}")
+def _facts_of(run: LoadedRun) -> str:
+    rows = "".join(f"<div>{escape(name)}: {escape(value)}</div>" for name, value in run.summary().items())
+    return status_block(f"<div><b>{escape(run.name)}</b></div>{rows}")
 
 
-def _block(content: str) -> str:
+def status_block(content: str) -> str:
+    """HTML of small text in the control panel."""
     return f'<div style="padding:0.2em 0.75em 0.5em;font-size:0.8rem;line-height:1.4">{content}</div>'
+
+
+def jump_notice(output: str, view: str) -> str:
+    """The reason why choosing an output has moved the camera."""
+    return f"Moved to the nearest photograph, {view}: the {output} is known at photographs only."

@@ -1,4 +1,4 @@
-"""The web server of the viewer, and its life. Imports viser, so it is imported by `viewer.view` when that is there."""
+"""Web server of the viewer. Imports viser, so `viewer.launch` imports it only where that is installed."""
 
 from __future__ import annotations
 
@@ -16,30 +16,31 @@ import viser
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.viewer.cameras import Mount
-from invgraphics.viewer.drawn import Photographs
-from invgraphics.viewer.painting import Painter
-from invgraphics.viewer.session import Session, Stage
-from invgraphics.viewer.subject import POLL, Subject
-from invgraphics.viewer.worker import Job, Worker
+from invgraphics.viewer.cameras import LetterboxedView
+from invgraphics.viewer.loaded_run import POLL, LoadedRun
+from invgraphics.viewer.overlays import CameraFrustums
+from invgraphics.viewer.progressive import ProgressiveRenderer
+from invgraphics.viewer.render_thread import RenderThread, Task
+from invgraphics.viewer.session import Session
+from invgraphics.viewer.shared_state import SharedState
 
 UP = (0.0, 0.0, 1.0)
-"""The local frame's upward direction, unless the photographs say otherwise."""
-AGREES = 0.5
-"""Cosine of the angle up to which they do not."""
+"""Default up direction of the local frame."""
+UP_AGREEMENT = 0.5
+"""Cosine of the angle to the photographs' mean up direction above which the default is kept."""
 
 
 class LocalServer(viser.ViserServer):
-    """Viser's server, that no browser can ask to open this machine to the internet."""
+    """Viser's server without share URLs: no browser can open this machine to the internet."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Nothing is shared."""
+        """Return no URL."""
         return None
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where the viewer listens.
+class Address:
+    """Address and port of the server.
 
     Attributes:
         host: address to listen at; a loopback address is reachable from this machine only.
@@ -51,34 +52,34 @@ class Place:
 
 
 class Viewer:
-    """A running viewer; ends with its context.
+    """A running viewer; a context manager that stops it.
 
     Args:
-        subjects: one run, or two of one scene.
-        place: where to listen.
-        view: test view at which browsers start.
-        longest: most pixels along a picture's longest side, at the start.
+        runs: one run, or two of one scene.
+        address: of the server.
+        view: initial test view.
+        max_size: initial limit of the longer side, pixels.
     """
 
-    def __init__(self, subjects: Sequence[Subject], place: Place, view: int, longest: int) -> None:
-        self._subjects = subjects
-        scene, views = subjects[0].scene, subjects[0].views()
-        self._worker = Worker(self._complain)
-        self._stage = Stage(Painter(subjects), self._worker, views, Photographs(views, scene), view, longest)
+    def __init__(self, runs: Sequence[LoadedRun], address: Address, view: int, max_size: int) -> None:
+        self._runs = runs
+        scene, views = runs[0].scene, runs[0].views()
+        self._worker = RenderThread(self._report_error)
+        self._shared = SharedState(ProgressiveRenderer(runs), self._worker, views, CameraFrustums(views, scene), view, max_size)
         self._sessions: dict[int, Session] = {}
-        with redirect_stdout(io.StringIO()):  # it announces itself; we say where it is
-            self._server = LocalServer(place.host, place.port, label=" | ".join(s.name for s in subjects), verbose=False)
-        if place.port and self._server.get_port() != place.port:  # it takes the next one, unasked
+        with redirect_stdout(io.StringIO()):  # the command prints the address itself
+            self._server = LocalServer(address.host, address.port, label=" | ".join(s.name for s in runs), verbose=False)
+        if address.port and self._server.get_port() != address.port:  # viser falls back to the next port
             self.stop()
-            raise port_taken(place)
-        self._arrange(scene)
-        self._server.on_client_connect(self._came)
-        self._server.on_client_disconnect(self._went)
+            raise port_in_use(address)
+        self._configure_scene(scene)
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._disconnected)
         self._worker.start()
 
     @property
     def port(self) -> int:
-        """The port that it listens at."""
+        """The port in use."""
         return self._server.get_port()
 
     def __enter__(self) -> Self:
@@ -88,67 +89,67 @@ class Viewer:
         self.stop()
 
     def stop(self) -> None:
-        """End the server and the thread that renders."""
+        """Stop the server and the render thread."""
         self._worker.stop()
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def watch(self, live: bool) -> None:
-        """Wait for the end of the process; if ``live``, load every checkpoint that a fit writes meanwhile."""
+    def serve(self, live: bool) -> None:
+        """Block until interrupted; if ``live``, reload every new checkpoint."""
         while True:
             time.sleep(POLL)
             if live:
-                self.look_for_news()
+                self.reload_if_changed()
 
-    def look_for_news(self) -> None:
-        """Load and show the newest checkpoints, if there are any that are not shown."""
-        if any(subject.changed() for subject in self._subjects):
-            self._worker.submit("news", self._reload())
+    def reload_if_changed(self) -> None:
+        """Reload the runs whose checkpoint or scores have changed on disk."""
+        if any(run.has_update() for run in self._runs):
+            self._worker.submit("reload", self._reload())
 
-    def _reload(self) -> Job:
-        for subject in self._subjects:
-            if subject.changed():
-                subject.refresh()
+    def _reload(self) -> Task:
+        for run in self._runs:
+            if run.has_update():
+                run.reload()
         for session in tuple(self._sessions.values()):
-            session.renew()
+            session.refresh()
         yield 0.0
 
-    def _arrange(self, scene: Scene) -> None:
+    def _configure_scene(self, scene: Scene) -> None:
         server = self._server
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction(upward(scene))
-        camera = scene.test[self._stage.start].camera
+        camera = scene.test[self._shared.start].camera
         first = server.initial_camera  # also where "Reset view" leads
         first.position = camera.position.double().numpy()
         first.look_at = (camera.position + camera.cam_to_world[:3, 2] * scene.bounds.radius).double().numpy()
-        first.fov = Mount.of(camera, camera.width / camera.height).fov
+        first.fov = LetterboxedView.fit(camera, camera.width / camera.height).fov
 
-    async def _came(self, client: viser.ClientHandle) -> None:
-        self._sessions[client.client_id] = Session(client, self._stage)
+    async def _connected(self, client: viser.ClientHandle) -> None:
+        self._sessions[client.client_id] = Session(client, self._shared)
 
-    async def _went(self, client: viser.ClientHandle) -> None:
+    async def _disconnected(self, client: viser.ClientHandle) -> None:
         session = self._sessions.pop(client.client_id, None)
         if session is not None:
-            session.end()
+            session.close()
 
-    def _complain(self, key: Hashable, error: Exception) -> None:
+    def _report_error(self, key: Hashable, error: Exception) -> None:
         sentence = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         print(f"The viewer: {sentence}", file=sys.stderr, flush=True)
         for session in tuple(self._sessions.values()):
-            session.complain(sentence)
+            session.show_error(sentence)
 
 
 def upward(scene: Scene) -> tuple[float, float, float]:
-    """The direction around which browsers turn: +z of the local frame, or the photographs' own, if that is another."""
+    """Up direction of the orbit controls: +z of the local frame, or the photographs' mean up direction if that disagrees."""
     ups = -torch.stack([view.camera.cam_to_world[:3, 1] for view in scene.train])
     mean = torch.nn.functional.normalize(ups.mean(dim=0), dim=0)
-    if float(mean @ torch.tensor(UP)) >= AGREES:
+    if float(mean @ torch.tensor(UP)) >= UP_AGREEMENT:
         return UP
     x, y, z = mean.tolist()
     return x, y, z
 
 
-def port_taken(place: Place) -> InputError:
-    """What to say about a port that is in use."""
-    return InputError(f"Port {place.port} at {place.host} is in use.", "Choose another --port, or 0 for any that is free.")
+def port_in_use(address: Address) -> InputError:
+    """The error for a port that is in use."""
+    return InputError(f"Port {address.port} at {address.host} is in use.", "Choose another --port, or 0 for any that is free.")

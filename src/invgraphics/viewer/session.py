@@ -1,258 +1,289 @@
-"""One browser: its controls, where it stands, and what it sees."""
+"""Session of one browser: camera, control panel and overlays; requests frames when they change."""
 
 from __future__ import annotations
 
 import io
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
-from invgraphics.core import Scene, View
+from invgraphics.core import Scene
 from invgraphics.experiments.evaluate import display
-from invgraphics.viewer.cameras import Gaze, Mount, limited, quaternion
-from invgraphics.viewer.colouring import OF_VIEWS
-from invgraphics.viewer.controls import ANYWHERE, BACKGROUNDS, Answers, Controls
-from invgraphics.viewer.drawn import Photographs, draw_splats
-from invgraphics.viewer.painting import Order, Painted, Painter
-from invgraphics.viewer.worker import Job, Worker
+from invgraphics.tools.camera_path import CameraPath, Keyframe
+from invgraphics.tools.colorize import NEEDS_TRUTH
+from invgraphics.viewer.cameras import (
+    LetterboxedView,
+    ViewerCamera,
+    fov_and_aspect,
+    limit_size,
+    nearest_view,
+    rotation_quaternion,
+)
+from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Controls, jump_notice, on_change
+from invgraphics.viewer.crop import crop_note
+from invgraphics.viewer.crop_panel import CropPanel
+from invgraphics.viewer.film_export import RATE, FilmLook, export_film, film_cameras
+from invgraphics.viewer.loaded_run import LoadedRun
+from invgraphics.viewer.overlays import Overlays
+from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
+from invgraphics.viewer.progressive import Frame, RenderRequest
+from invgraphics.viewer.render_thread import Task
+from invgraphics.viewer.shared_state import SharedState
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
 
 NEAR_ENOUGH = 1e-3
-"""How far from a photograph's camera a browser may be to count as standing there: radians, and of the scene's extent."""
+"""How far from a photograph's camera a browser may be to count as at it: radians, and of the scene's extent."""
 ARRIVAL = 10.0
-"""Seconds within which a browser that is sent to a photograph gets there."""
+"""Seconds that a browser has to reach a photograph it was sent to."""
 
 RENDERING = "Rendering …"
-"""Said until there is a first picture of something else than before."""
-
-
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """What all browsers share.
-
-    Attributes:
-        painter: of the runs.
-        worker: the thread that renders.
-        views: names and views to choose from.
-        photographs: the same as cameras to draw.
-        start: number of the view at which a browser starts.
-        longest: most pixels along a picture's longest side, at the start.
-    """
-
-    painter: Painter
-    worker: Worker
-    views: Sequence[tuple[str, View]]
-    photographs: Photographs
-    start: int
-    longest: int
+"""Status until the first frame after a change."""
 
 
 class Session:
-    """What happens in one browser. Called by viser's event loop, except where a method says that the rendering thread does."""
+    """Session of one browser. Methods run in viser's event loop, except where the render thread is named."""
 
-    def __init__(self, client: ClientHandle, stage: Stage) -> None:
-        self._client, self._stage = client, stage
-        names = [name for name, _ in stage.views]
-        answers = Answers(self._ask_again, self._go, self._draw, self._save)
-        self._controls = Controls(client.gui, stage.painter.subjects, names, stage.longest, answers)
-        self._standing: int | None = None
+    def __init__(self, client: ClientHandle, shared: SharedState) -> None:
+        self._client, self._shared = client, shared
+        names = [name for name, _ in shared.views]
+        callbacks = Callbacks(self._output_changed, self._view_chosen, self._overlays_changed, self._save_image)
+        self._controls = Controls(client.gui, shared.renderer.runs, names, shared.max_size, callbacks)
+        self._crop = CropPanel(client.gui, client.scene, self._scene)
+        for handle in (self._crop.enabled, *self._crop.axes):
+            on_change(handle, self._crop_changed)
+        path = PathCallbacks(self._keyframe, self._move_to, self._export, self._stop_export, self._download)
+        self._path = PathPanel(client.gui, client.scene, self._scene, path)
+        self._view_index: int | None = None
         self._arrived, self._deadline = False, 0.0
-        self._asked: tuple[int | None, float] | None = None
-        self._frusta: dict[int, Any] = {}
-        self._splats: Any = None
-        self._gone = False
-        self._why = ""
-        self._painted: Painted | None = None
-        client.camera.on_update(self._moved)
-        self.stand(stage.start)
+        self._requested: tuple[int | None, float] | None = None
+        self._overlays = Overlays(client.scene, shared.renderer.runs[0], shared.frustums, self._frustum_clicked)
+        self._closed = False
+        self._notice = ""
+        self._frame: Frame | None = None
+        client.camera.on_update(self._camera_changed)
+        self.go_to_view(shared.start)
 
-    def end(self) -> None:
-        """The browser has gone."""
-        self._gone = True
-        for what in ("picture", "drawn"):
-            self._stage.worker.forget((what, self._client.client_id))
+    def close(self) -> None:
+        """Cancel the tasks of a browser that has disconnected."""
+        self._closed = True
+        self._path.close()
+        for what in ("frame", "overlays", "film"):
+            self._shared.thread.cancel((what, self._client.client_id))
 
-    def stand(self, index: int) -> None:
-        """Go to where a photograph was taken."""
-        name, view = self._stage.views[index]
-        self._standing, self._arrived, self._deadline = index, False, time.monotonic() + ARRIVAL
+    def go_to_view(self, index: int) -> None:
+        """Move the camera to a photograph's."""
+        name, view = self._shared.views[index]
+        self._view_index, self._arrived, self._deadline = index, False, time.monotonic() + ARRIVAL
         self._controls.view.value = name
-        pose, camera = view.camera.cam_to_world, self._client.camera
-        position, forward = pose[:3, 3].double(), pose[:3, 2].double()
+        self._set_camera(view.camera.cam_to_world, self._letterbox().fov)
+        self._submit("overlays", self._update_overlays())
+        self._controls.show_status(RENDERING)
+        self._request_frame()
+
+    def _set_camera(self, pose: Float[Tensor, "4 4"], fov: float) -> None:
+        """Send the browser a camera; it turns around the point ahead that is nearest to the scene's centre."""
+        camera, position, forward = self._client.camera, pose[:3, 3].double(), pose[:3, 2].double()
         reach = float((self._scene.bounds.centre.double() - position) @ forward)
         turning = position + forward * (reach if reach > 0 else self._scene.bounds.radius)
         with self._client.atomic():
             camera.position = position.numpy()
-            camera.wxyz = np.array(quaternion(pose))
+            camera.wxyz = np.array(rotation_quaternion(pose))
             camera.look_at = turning.numpy()
-            camera.fov = self._mount().fov
-        self._submit("drawn", self._drawing())
-        self._controls.say(RENDERING)
-        self._ask()
+            camera.fov = fov
 
-    def renew(self) -> None:
-        """Show a model that has changed; called by the rendering thread."""
-        self._controls.tell_facts()
-        if self._splats is not None:
-            self._splats.remove()
-            self._splats = None
-        self._submit("drawn", self._drawing())
-        self._ask(resting=True)
+    def refresh(self) -> None:
+        """Show a reloaded model; called by the render thread."""
+        self._controls.update_summary()
+        self._overlays.remove_splats()
+        self._submit("overlays", self._update_overlays())
+        self._request_frame(skip_coarse=True)
 
-    def complain(self, sentence: str) -> None:
-        """Show what went wrong; called by the rendering thread."""
-        if not self._gone:
+    def show_error(self, sentence: str) -> None:
+        """Show an error as a notification; called by the render thread."""
+        if not self._closed:
             self._client.add_notification("The picture could not be made", sentence, color="red")
 
     @property
-    def _scene(self) -> Scene:
-        return self._stage.painter.subjects[0].scene
+    def _runs(self) -> tuple[LoadedRun, ...]:
+        return self._shared.renderer.runs
 
     @property
-    def _gaze(self) -> Gaze:
+    def _scene(self) -> Scene:
+        return self._runs[0].scene
+
+    @property
+    def _camera(self) -> ViewerCamera:
         camera = self._client.camera
-        return Gaze.of(tuple(camera.wxyz), tuple(camera.position), camera.fov, camera.aspect)
+        return ViewerCamera.from_viser(tuple(camera.wxyz), tuple(camera.position), camera.fov, camera.aspect)
 
     @property
     def _window(self) -> tuple[int, int]:
         return self._client.camera.image_width, self._client.camera.image_height
 
     @property
-    def _mounted(self) -> tuple[int | None, float]:
-        """What the picture of a photograph's camera depends on: which one it is, and the window's shape."""
-        return self._standing, round(self._client.camera.aspect, 2)
+    def _letterboxed(self) -> tuple[int | None, float]:
+        """What the image at a photograph depends on: its index and the window's aspect."""
+        return self._view_index, round(self._client.camera.aspect, 2)
 
-    def _mount(self) -> Mount:
-        """How the photograph at which the browser stands lies in its window."""
-        assert self._standing is not None
-        photograph = self._stage.views[self._standing][1].camera
-        return Mount.of(limited(photograph, int(self._controls.longest.value)), self._client.camera.aspect)
+    def _letterbox(self) -> LetterboxedView:
+        """The current photograph letterboxed into the window."""
+        assert self._view_index is not None
+        photograph = self._shared.views[self._view_index][1].camera
+        return LetterboxedView.fit(limit_size(photograph, int(self._controls.max_size.value)), self._client.camera.aspect)
 
-    async def _moved(self, _: CameraHandle) -> None:
-        if self._standing is not None:
-            pose = self._stage.views[self._standing][1].camera.cam_to_world
-            there = self._gaze.sees_from(pose, NEAR_ENOUGH * self._scene.extent, NEAR_ENOUGH)
+    async def _camera_changed(self, _: CameraHandle) -> None:
+        if self._view_index is not None:
+            pose = self._shared.views[self._view_index][1].camera.cam_to_world
+            there = self._camera.is_at(pose, NEAR_ENOUGH * self._scene.extent, NEAR_ENOUGH)
             self._arrived = self._arrived or there
             if not there and (self._arrived or time.monotonic() > self._deadline):
-                self._standing, self._why = None, ""
-                self._controls.view.value = ANYWHERE
-                self._submit("drawn", self._drawing())
-            elif self._asked == self._mounted:
-                return  # the same picture
+                self._view_index, self._notice = None, ""
+                self._controls.view.value = FREE_CAMERA
+                self._submit("overlays", self._update_overlays())
+            elif self._requested == self._letterboxed:
+                return  # unchanged
             else:
-                self._client.camera.fov = self._mount().fov
-        self._ask()
+                self._client.camera.fov = self._letterbox().fov
+        self._request_frame()
 
-    async def _go(self) -> None:
-        name, self._why = self._controls.view.value, ""
-        if name != ANYWHERE:
-            self.stand([each for each, _ in self._stage.views].index(name))
+    async def _view_chosen(self) -> None:
+        name, self._notice = self._controls.view.value, ""
+        if name != FREE_CAMERA:
+            self.go_to_view([each for each, _ in self._shared.views].index(name))
             return
-        self._standing = None
-        self._submit("drawn", self._drawing())
-        self._ask()
+        self._view_index = None
+        self._submit("overlays", self._update_overlays())
+        self._request_frame()
 
-    async def _ask_again(self) -> None:
-        if self._controls.shown.value in OF_VIEWS and self._standing is None:
-            index = nearest([view for _, view in self._stage.views], self._gaze, self._scene.extent)
-            self._why = jump_words(self._controls.shown.value, self._stage.views[index][0])
-            self.stand(index)
+    async def _output_changed(self) -> None:
+        if self._controls.output.value in NEEDS_TRUTH and self._view_index is None:
+            index = nearest_view([view for _, view in self._shared.views], self._camera, self._scene.extent)
+            self._notice = jump_notice(self._controls.output.value, self._shared.views[index][0])
+            self.go_to_view(index)
         else:
-            self._submit("drawn", self._drawing())
-            self._controls.say(RENDERING)
-            self._ask()
+            self._submit("overlays", self._update_overlays())
+            self._controls.show_status(RENDERING)
+            self._request_frame()
 
-    async def _draw(self) -> None:
-        self._submit("drawn", self._drawing())
-        self._controls.say(RENDERING)
-        self._ask()
+    async def _overlays_changed(self) -> None:
+        self._submit("overlays", self._update_overlays())
+        self._controls.show_status(RENDERING)
+        self._request_frame()
 
-    async def _save(self) -> None:
-        """Send the picture as a file."""
-        if self._painted is None:
+    async def _save_image(self) -> None:
+        """Send the current image as a PNG file."""
+        if self._frame is None:
             return
         content = io.BytesIO()
-        Image.fromarray(self._painted.picture).save(content, format="PNG")
-        self._client.send_file_download(
-            f"{self._scene.name}-{self._controls.shown.value}.png", content.getvalue(), save_immediately=True
+        Image.fromarray(self._frame.image).save(content, format="PNG")
+        self._download(f"{self._scene.name}-{self._controls.output.value}.png", content.getvalue())
+
+    def _download(self, name: str, content: bytes) -> None:
+        self._client.send_file_download(name, content, save_immediately=True)
+
+    async def _crop_changed(self) -> None:
+        self._crop.draw()
+        self._request_frame()
+
+    def _keyframe(self) -> Keyframe:
+        """The current camera; at a photograph with the photograph's field of view, not the window's."""
+        fov = self._camera.fov
+        if self._view_index is not None:
+            fov = fov_and_aspect(self._shared.views[self._view_index][1].camera)[0]
+        return Keyframe.from_local(self._camera.pose, fov, self._scene)
+
+    def _move_to(self, keyframe: Keyframe) -> None:
+        """Move the camera to a keyframe."""
+        self._view_index, self._notice = None, ""
+        self._controls.view.value = FREE_CAMERA
+        pose = keyframe.local_pose(self._scene)
+        self._set_camera(pose, keyframe.fov)
+
+    def _export(self, path: CameraPath) -> None:
+        """Render a film of the path in the render thread and send it to the browser."""
+        run = self._runs[-1 if self._controls.layout.value == "second" else 0]
+        output, box = self._controls.output.value, self._crop.box
+        look = FilmLook(
+            "prediction" if output in NEEDS_TRUTH else output,
+            BACKGROUNDS[self._controls.background.value],
+            None if box is None else run.crop_to_local(box, self._scene),
         )
+        cameras = film_cameras(path, run, int(self._controls.max_size.value))
+        count = len(cameras)
 
-    def _submit(self, what: str, job: Job) -> None:
-        self._stage.worker.submit((what, self._client.client_id), job)
+        def on_progress(done: int) -> None:
+            if not self._closed and (done == 1 or done % RATE == 0):
+                self._path.show_status(f"Exporting: frame {done} of {count}")
 
-    def _ask(self, resting: bool = False) -> None:
-        """Order a picture of what is to be seen now."""
-        controls, standing = self._controls, self._standing
-        self._asked = self._mounted
+        def on_film(content: bytes) -> None:
+            if not self._closed:
+                self._download(f"{self._scene.name}-path.mp4", content)
+                self._path.show_status(f"Film of {count} frames, {RATE} a second, sent to the browser.", exporting=False)
+
+        self._submit("film", export_film(run, cameras, look, on_progress, on_film))
+
+    def _stop_export(self) -> None:
+        self._shared.thread.cancel(("film", self._client.client_id))
+
+    def _submit(self, what: str, task: Task) -> None:
+        self._shared.thread.submit((what, self._client.client_id), task)
+
+    def _request_frame(self, skip_coarse: bool = False) -> None:
+        """Submit a render request for the current camera and controls."""
+        controls, view_index = self._controls, self._view_index
+        self._requested = self._letterboxed
         if controls.splats.value:
-            self._submit("picture", self._backdrop())
+            self._submit("frame", self._clear_background())
             return
-        shown = controls.shown.value
-        order = Order(
-            gaze=self._gaze,
+        output = controls.output.value
+        request = RenderRequest(
+            camera=self._camera,
             window=self._window,
-            shown="prediction" if standing is None and shown in OF_VIEWS else shown,
-            view=None if standing is None else self._stage.views[standing][1],
+            output="prediction" if view_index is None and output in NEEDS_TRUTH else output,
+            view=None if view_index is None else self._shared.views[view_index][1],
             layout=controls.layout.value,
-            share=float(controls.share.value),
-            longest=int(controls.longest.value),
-            resting=resting,
+            split=float(controls.split.value),
+            max_size=int(controls.max_size.value),
+            skip_coarse=skip_coarse,
             background=BACKGROUNDS[controls.background.value],
+            crop=self._crop.box,
         )
-        note = self._why if order.shown == shown else f"This is the prediction: the {shown} is known at photographs only."
+        note = (
+            self._notice if request.output == output else f"This is the prediction: the {output} is known at photographs only."
+        )
 
-        def deliver(painted: Painted) -> None:
-            if self._gone:
+        if request.crop is not None:
+            runs = {"first": self._runs[:1], "second": self._runs[-1:]}.get(request.layout, self._runs)
+            note = " ".join(filter(None, (note, *dict.fromkeys(crop_note(run.fitted.model.renderer) for run in runs))))
+
+        def on_frame(frame: Frame) -> None:
+            if self._closed:
                 return
-            self._painted = painted
-            self._client.scene.set_background_image(painted.picture, format="png" if painted.finest else "jpeg")
-            controls.tell(painted, note)
+            self._frame = frame
+            self._client.scene.set_background_image(frame.image, format="png" if frame.final else "jpeg")
+            controls.show_frame(frame, note)
 
-        self._submit("picture", self._stage.painter.paint(order, deliver))
+        self._submit("frame", self._shared.renderer.render(request, on_frame))
 
-    def _backdrop(self) -> Job:
-        """Nothing but the scene's background, before which the browser draws."""
+    def _clear_background(self) -> Task:
+        """Clear the image to the scene's background, behind splats drawn by the browser."""
         plain = display(self._scene.background.expand(2, 2, 3), self._scene)
         self._client.scene.set_background_image(plain.numpy(), format="png")
-        self._controls.say("Drawn by the browser: colours without view dependence.")
+        self._controls.show_status("Drawn by the browser: colours without view dependence.")
         yield 0.0
 
-    def _drawing(self) -> Iterator[float]:
-        """Make what the browser draws fit the controls, piece by piece, in the rendering thread."""
-        if self._controls.splats.value and self._splats is None:
-            self._splats = draw_splats(self._stage.painter.subjects[0], self._client.scene)
-        if self._splats is not None:
-            self._splats.visible = self._controls.splats.value
-        for index in range(len(self._stage.photographs)):
-            wanted = self._controls.cameras.value and index != self._standing and self._controls.layout.value != "side by side"
-            if index not in self._frusta and wanted:
-                self._frusta[index] = self._stage.photographs.draw(index, self._client.scene, self._chooser(index))
-                yield 0.0
-            elif index in self._frusta and self._frusta[index].visible != wanted:
-                self._frusta[index].visible = wanted
+    def _update_overlays(self) -> Iterator[float]:
+        """Bring the overlays in line with the controls; runs in the render thread."""
+        controls = self._controls
+        frustums = controls.cameras.value and controls.layout.value != "side by side"
+        yield from self._overlays.update(controls.splats.value, frustums, self._view_index)
 
-    def _chooser(self, index: int) -> Any:
-        async def choose() -> None:
-            self.stand(index)
-
-        return choose
-
-
-def jump_words(shown: str, view: str) -> str:
-    """Why choosing to see something has moved the camera."""
-    return f"Moved to the nearest photograph, {view}: the {shown} is known at photographs only."
-
-
-def nearest(views: Sequence[View], gaze: Gaze, extent: float) -> int:
-    """Number of the view whose camera is most like a browser's: distance in scene extents and angle in radians, added."""
-    poses = torch.stack([view.camera.cam_to_world for view in views])
-    distance = (poses[:, :3, 3] - gaze.pose[:3, 3]).norm(dim=1) / extent
-    angle = (poses[:, :3, 2] @ gaze.pose[:3, 2]).clamp(-1, 1).acos()
-    return int((distance + angle).argmin())
+    async def _frustum_clicked(self, index: int) -> None:
+        self.go_to_view(index)

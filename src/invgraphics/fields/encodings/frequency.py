@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,6 +20,8 @@ class FrequencyConfig:
         octaves: number of frequencies L; the highest has period 2^(2 - L) of the scene's half-extent.
         include_input: whether the coordinates themselves come first.
     """
+
+    title: ClassVar[str] = "frequency encoding"
 
     octaves: int = 10
     include_input: bool = True

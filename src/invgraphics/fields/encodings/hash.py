@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics import kernels
+from invgraphics.core.ngp import HashGrid
 from invgraphics.fields.encodings.window import Windowed
-from invgraphics.kernels.types import HashGrid
 
 INITIAL_RANGE = 1e-4
 """Table entries start uniformly within +- this (Instant-NGP, §4)."""
@@ -20,22 +21,10 @@ COARSE_LEVELS = 2
 
 
 @dataclass(frozen=True)
-class HashConfig:
-    """A pyramid of feature grids whose finer levels share a hash table each.
+class HashConfig(HashGrid):
+    """A hash grid as a recipe's encoding: `HashGrid` with its limits."""
 
-    Attributes:
-        levels: number of resolutions L.
-        features: features per entry F.
-        log2_size: most entries of a level T, as a power of two.
-        base: cells along an edge on the coarsest level.
-        finest: cells along an edge on the finest level.
-    """
-
-    levels: int = 16
-    features: int = 2
-    log2_size: int = 17
-    base: int = 16
-    finest: int = 2048
+    title: ClassVar[str] = "multi-resolution hash grid"
 
     def __post_init__(self) -> None:
         if self.levels < 1 or self.features < 1:
@@ -47,7 +36,7 @@ class HashConfig:
 
     def build(self) -> HashEncoding:
         """The encoding, its table drawn from torch's global generator."""
-        return HashEncoding(HashGrid(self.levels, self.features, self.log2_size, self.base, self.finest))
+        return HashEncoding(self)
 
 
 class HashEncoding(Windowed):

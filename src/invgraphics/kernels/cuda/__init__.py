@@ -1,7 +1,7 @@
 """Float32 kernels for NVIDIA GPUs: Triton for packed samples, gsplat (where it is installed) for splats.
 
-What is not here runs on the reference, whose plain torch works on any device. Gradients of hash tables are summed by atomic
-additions, whose order the GPU decides: repeating a run gives close, not equal, bits.
+Other operations fall back to the reference, which runs on any device. Gradients of hash tables are accumulated atomically, in
+no fixed order: repeated runs agree to rounding, not bitwise.
 """
 
 from importlib.util import find_spec

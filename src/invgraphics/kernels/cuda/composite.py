@@ -1,4 +1,4 @@
-"""Emission-absorption along packed rays in Triton. Each program owns a ray, so every sum has one writer and a fixed order."""
+"""Volume rendering of packed samples in Triton. Each program owns a ray, so every sum has one writer and a fixed order."""
 
 # pyright: reportMissingImports=false
 
@@ -18,11 +18,11 @@ from invgraphics.kernels.reference.composite import OPAQUE
 _OPAQUE = tl.constexpr(OPAQUE)
 
 SIZE = 32
-"""Samples that a program takes at once: one per lane of a warp."""
+"""Samples per iteration of a program: one per lane of a warp."""
 
 
 @triton.jit
-def _absorbed(tau):
+def _alpha(tau):
     """``1 - exp(-tau)`` without cancellation."""
     # Five terms of the series are exact to 2e-8 where they are used.
     series = tau * (1 - tau / 2 * (1 - tau / 3 * (1 - tau / 4 * (1 - tau / 5))))
@@ -37,56 +37,58 @@ def accumulate(
     ray = tl.program_id(0).to(tl.int64)
     begin, end = tl.load(first + ray), tl.load(first + ray + 1)
     lane, column = tl.arange(0, SIZE), tl.arange(0, WIDTH)
-    total, passed, covered = tl.zeros((WIDTH,), tl.float32), 0.0, 0.0
+    total, optical, opacity = tl.zeros((WIDTH,), tl.float32), 0.0, 0.0
     for start in range(begin, end, SIZE):
         sample = start + lane
-        there = sample < end
-        tau = tl.minimum(tl.load(depth + sample, mask=there, other=0.0), _OPAQUE)
-        # What lies in front is summed by itself: taking a large tau away from a running sum would leave no digits.
-        nearer = tl.minimum(tl.load(depth + sample - 1, mask=there & (lane > 0), other=0.0), _OPAQUE)
-        before = passed + tl.cumsum(nearer, axis=0)
-        weight = tl.exp(-before) * _absorbed(tau)
-        wanted = there[:, None] & (column < width)[None, :]
-        values = tl.load(channels + sample[:, None] * width + column[None, :], mask=wanted, other=0.0)
+        in_range = sample < end
+        tau = tl.minimum(tl.load(depth + sample, mask=in_range, other=0.0), _OPAQUE)
+        # An exclusive scan of its own: subtracting a large tau from an inclusive one would cancel all digits.
+        nearer = tl.minimum(tl.load(depth + sample - 1, mask=in_range & (lane > 0), other=0.0), _OPAQUE)
+        before = optical + tl.cumsum(nearer, axis=0)
+        weight = tl.exp(-before) * _alpha(tau)
+        valid = in_range[:, None] & (column < width)[None, :]
+        values = tl.load(channels + sample[:, None] * width + column[None, :], mask=valid, other=0.0)
         total += tl.sum(weight[:, None] * values, axis=0)
-        covered += tl.sum(weight, axis=0)
-        passed += tl.sum(tau, axis=0)
-        tl.store(weights + sample, weight, mask=there)
-        tl.store(after + sample, tl.exp(-(before + tau)), mask=there)
+        opacity += tl.sum(weight, axis=0)
+        optical += tl.sum(tau, axis=0)
+        tl.store(weights + sample, weight, mask=in_range)
+        tl.store(after + sample, tl.exp(-(before + tau)), mask=in_range)
     tl.store(sums + ray * width + column, total, mask=column < width)
-    tl.store(alpha + ray, covered)
+    tl.store(alpha + ray, opacity)
 
 
 @triton.jit
-def accumulate_back(
-    channels, first, weights, after, to_weights, to_sums, to_alpha, to_depth, to_channels, width,
+def accumulate_backward(
+    channels, first, weights, after, grad_weights, grad_sums, grad_alpha, grad_depth, grad_channels, width,
     WIDTH: tl.constexpr, SIZE: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of one ray, from its far end to its near one."""
+    """Gradients of one ray's optical depths and channels, back to front."""
     ray = tl.program_id(0).to(tl.int64)
     begin, end = tl.load(first + ray), tl.load(first + ray + 1)
     lane, column = tl.arange(0, SIZE), tl.arange(0, WIDTH)
-    pull = tl.load(to_sums + ray * width + column, mask=column < width, other=0.0)
-    cover = tl.load(to_alpha + ray)
+    grad_sum = tl.load(grad_sums + ray * width + column, mask=column < width, other=0.0)
+    grad_opacity = tl.load(grad_alpha + ray)
     behind = 0.0
     for turn in range((end - begin + SIZE - 1) // SIZE):
         sample = end - (turn + 1) * SIZE + lane
-        there = sample >= begin
-        wanted = there[:, None] & (column < width)[None, :]
-        weight = tl.load(weights + sample, mask=there, other=0.0)
-        values = tl.load(channels + sample[:, None] * width + column[None, :], mask=wanted, other=0.0)
-        gain = tl.load(to_weights + sample, mask=there, other=0.0) + cover + tl.sum(pull[None, :] * values, axis=1)
-        share = tl.where(there, weight * gain, 0.0)
-        # A denser sample takes from the light that passes it and hides what is behind.
+        in_range = sample >= begin
+        valid = in_range[:, None] & (column < width)[None, :]
+        weight = tl.load(weights + sample, mask=in_range, other=0.0)
+        values = tl.load(channels + sample[:, None] * width + column[None, :], mask=valid, other=0.0)
+        grad_weight = (
+            tl.load(grad_weights + sample, mask=in_range, other=0.0) + grad_opacity + tl.sum(grad_sum[None, :] * values, axis=1)
+        )
+        share = tl.where(in_range, weight * grad_weight, 0.0)
+        # A denser sample contributes more itself and attenuates what is behind.
         hidden = behind + tl.sum(share, axis=0) - tl.cumsum(share, axis=0)
-        passed = tl.load(after + sample, mask=there, other=0.0)
-        tl.store(to_depth + sample, passed * gain - hidden, mask=there)
-        tl.store(to_channels + sample[:, None] * width + column[None, :], weight[:, None] * pull[None, :], mask=wanted)
+        transmitted = tl.load(after + sample, mask=in_range, other=0.0)
+        tl.store(grad_depth + sample, transmitted * grad_weight - hidden, mask=in_range)
+        tl.store(grad_channels + sample[:, None] * width + column[None, :], weight[:, None] * grad_sum[None, :], mask=valid)
         behind += tl.sum(share, axis=0)
 
 
 class _Composite(torch.autograd.Function):
-    """Differentiable in optical depths and channels."""
+    """Differentiable in transmitted depths and channels."""
 
     @staticmethod
     def forward(ctx: Any, optical_depth: Tensor, channels: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -105,15 +107,15 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         channels, first, weights, after = ctx.saved_tensors
-        received = (gradient.contiguous() for gradient in grad_outputs)
-        to_depth, to_channels = torch.empty_like(weights), torch.empty_like(channels)
+        cotangents = (gradient.contiguous() for gradient in grad_outputs)
+        grad_depth, grad_channels = torch.empty_like(weights), torch.empty_like(channels)
         rays = len(first) - 1
         if rays:
             with on_device_of(channels):
-                accumulate_back[(rays,)](
-                    channels, first, weights, after, *received, to_depth, to_channels, *ctx.sizes, num_warps=1
+                accumulate_backward[(rays,)](
+                    channels, first, weights, after, *cotangents, grad_depth, grad_channels, *ctx.sizes, num_warps=1
                 )
-        return to_depth, to_channels, None, None
+        return grad_depth, grad_channels, None, None
 
 
 def composite(

@@ -1,6 +1,6 @@
-"""Multi-resolution hash encoding in Triton: positions and indices as in `invgraphics.kernels.reference.hash`.
+"""Multi-resolution hash encoding in Triton, forward and backward (definition: `invgraphics.kernels.reference.hash`).
 
-A program takes a block of points through one level, so that the programs that run together read the same level's entries.
+A program encodes a block of points on one level, so that concurrent programs read the same level's entries.
 """
 
 # pyright: reportMissingImports=false
@@ -16,21 +16,21 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
 from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of, once_differentiable
 from invgraphics.kernels.reference.hash import PRIMES
-from invgraphics.kernels.types import HashGrid
 
 BLOCK = 256
-"""Points of one program."""
+"""Points per program."""
 
 _PRIME_Y, _PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
 
 
 @triton.jit
-def _axis(unit, point, axis: tl.constexpr, there, edge):
+def _axis(unit, point, axis: tl.constexpr, in_range, edge):
     """Lower vertex along one axis, the fraction beyond it, and 1 where the position was not clamped."""
-    coordinate = tl.load(unit + 3 * point + axis, mask=there, other=0.0)
+    coordinate = tl.load(unit + 3 * point + axis, mask=in_range, other=0.0)
     inside = (coordinate >= 0.0) & (coordinate <= 1.0)
     position = tl.minimum(tl.maximum(coordinate, 0.0), 1.0) * edge.to(tl.float32)
     # The last vertex belongs to the last cell, so that it needs no neighbour beyond.
@@ -51,74 +51,74 @@ def encode(unit, table, levels, out, points, count, FEATURES: tl.constexpr, WIDT
     """Features of one level at a block of points. ``levels`` holds cells, offsets and masks, ``count`` of each."""
     level = tl.program_id(1)
     point = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
-    there, column = point < points, tl.arange(0, WIDTH)
+    in_range, column = point < points, tl.arange(0, WIDTH)
     edge, offset, mask = tl.load(levels + level), tl.load(levels + count + level), tl.load(levels + 2 * count + level)
-    x, fx, _ = _axis(unit, point, 0, there, edge)
-    y, fy, _ = _axis(unit, point, 1, there, edge)
-    z, fz, _ = _axis(unit, point, 2, there, edge)
-    wanted = there[:, None] & (column < FEATURES)[None, :]
+    x, fx, _ = _axis(unit, point, 0, in_range, edge)
+    y, fy, _ = _axis(unit, point, 1, in_range, edge)
+    z, fz, _ = _axis(unit, point, 2, in_range, edge)
+    valid = in_range[:, None] & (column < FEATURES)[None, :]
     total = tl.zeros((SIZE, WIDTH), tl.float32)
     for corner in tl.static_range(8):
         i, j, k = corner % 2, corner // 2 % 2, corner // 4
         weight = (fx if i else 1.0 - fx) * (fy if j else 1.0 - fy) * (fz if k else 1.0 - fz)
         row = (offset + _entry(x + i, y + j, z + k, edge, mask)).to(tl.int64) * FEATURES
-        total += weight[:, None] * tl.load(table + row[:, None] + column[None, :], mask=wanted, other=0.0)
-    tl.store(out + (point * count + level)[:, None] * FEATURES + column[None, :], total, mask=wanted)
+        total += weight[:, None] * tl.load(table + row[:, None] + column[None, :], mask=valid, other=0.0)
+    tl.store(out + (point * count + level)[:, None] * FEATURES + column[None, :], total, mask=valid)
 
 
 @triton.jit
-def encode_back(
-    unit, gradient, levels, to_table, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr
+def encode_backward(
+    unit, gradient, levels, grad_table, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr
 ):
-    """Gradient along one level of the table, added atomically by all blocks of points."""
+    """Gradient of one level of the table, accumulated atomically over blocks of points."""
     level = tl.program_id(1)
     point = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
-    there, column = point < points, tl.arange(0, WIDTH)
+    in_range, column = point < points, tl.arange(0, WIDTH)
     edge, offset, mask = tl.load(levels + level), tl.load(levels + count + level), tl.load(levels + 2 * count + level)
-    x, fx, _ = _axis(unit, point, 0, there, edge)
-    y, fy, _ = _axis(unit, point, 1, there, edge)
-    z, fz, _ = _axis(unit, point, 2, there, edge)
-    wanted = there[:, None] & (column < FEATURES)[None, :]
-    given = tl.load(gradient + (point * count + level)[:, None] * FEATURES + column[None, :], mask=wanted, other=0.0)
+    x, fx, _ = _axis(unit, point, 0, in_range, edge)
+    y, fy, _ = _axis(unit, point, 1, in_range, edge)
+    z, fz, _ = _axis(unit, point, 2, in_range, edge)
+    valid = in_range[:, None] & (column < FEATURES)[None, :]
+    cotangent = tl.load(gradient + (point * count + level)[:, None] * FEATURES + column[None, :], mask=valid, other=0.0)
     for corner in tl.static_range(8):
         i, j, k = corner % 2, corner // 2 % 2, corner // 4
         weight = (fx if i else 1.0 - fx) * (fy if j else 1.0 - fy) * (fz if k else 1.0 - fz)
         row = (offset + _entry(x + i, y + j, z + k, edge, mask)).to(tl.int64) * FEATURES
-        tl.atomic_add(to_table + row[:, None] + column[None, :], weight[:, None] * given, mask=wanted)
+        tl.atomic_add(grad_table + row[:, None] + column[None, :], weight[:, None] * cotangent, mask=valid)
 
 
 @triton.jit
-def locate_back(
-    unit, table, gradient, levels, to_unit, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr
+def position_gradient(
+    unit, table, gradient, levels, grad_unit, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr
 ):
-    """Gradient along the positions, all levels; zero along the axes on which a position was clamped."""
+    """Gradient of the positions, summed over levels; zero on axes on which a position was clamped."""
     point = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
-    there, column = point < points, tl.arange(0, WIDTH)
-    wanted = there[:, None] & (column < FEATURES)[None, :]
+    in_range, column = point < points, tl.arange(0, WIDTH)
+    valid = in_range[:, None] & (column < FEATURES)[None, :]
     along_x, along_y, along_z = (tl.zeros((SIZE,), tl.float32) for _ in tl.static_range(3))
     for level in range(count):
         edge, offset, mask = tl.load(levels + level), tl.load(levels + count + level), tl.load(levels + 2 * count + level)
-        x, fx, in_x = _axis(unit, point, 0, there, edge)
-        y, fy, in_y = _axis(unit, point, 1, there, edge)
-        z, fz, in_z = _axis(unit, point, 2, there, edge)
-        given = tl.load(gradient + (point * count + level)[:, None] * FEATURES + column[None, :], mask=wanted, other=0.0)
+        x, fx, in_x = _axis(unit, point, 0, in_range, edge)
+        y, fy, in_y = _axis(unit, point, 1, in_range, edge)
+        z, fz, in_z = _axis(unit, point, 2, in_range, edge)
+        cotangent = tl.load(gradient + (point * count + level)[:, None] * FEATURES + column[None, :], mask=valid, other=0.0)
         for corner in tl.static_range(8):
             i, j, k = corner % 2, corner // 2 % 2, corner // 4
             wx, wy, wz = fx if i else 1.0 - fx, fy if j else 1.0 - fy, fz if k else 1.0 - fz
             row = (offset + _entry(x + i, y + j, z + k, edge, mask)).to(tl.int64) * FEATURES
-            value = tl.load(table + row[:, None] + column[None, :], mask=wanted, other=0.0)
-            pull = tl.sum(value * given, axis=1) * edge.to(tl.float32)
-            along_x += pull * wy * wz * in_x * (2 * i - 1)
-            along_y += pull * wx * wz * in_y * (2 * j - 1)
-            along_z += pull * wx * wy * in_z * (2 * k - 1)
-    tl.store(to_unit + 3 * point, along_x, mask=there)
-    tl.store(to_unit + 3 * point + 1, along_y, mask=there)
-    tl.store(to_unit + 3 * point + 2, along_z, mask=there)
+            value = tl.load(table + row[:, None] + column[None, :], mask=valid, other=0.0)
+            slope = tl.sum(value * cotangent, axis=1) * edge.to(tl.float32)
+            along_x += slope * wy * wz * in_x * (2 * i - 1)
+            along_y += slope * wx * wz * in_y * (2 * j - 1)
+            along_z += slope * wx * wy * in_z * (2 * k - 1)
+    tl.store(grad_unit + 3 * point, along_x, mask=in_range)
+    tl.store(grad_unit + 3 * point + 1, along_y, mask=in_range)
+    tl.store(grad_unit + 3 * point + 2, along_z, mask=in_range)
 
 
 @cache
 def _levels(grid: HashGrid, device: torch.device) -> Tensor:
-    """Cells along an edge, first entries, and masks of the hash (0 where all vertices are stored), behind one another."""
+    """Cells along an edge, first entries, and hash masks (0 on dense levels), concatenated."""
     masks = [2**grid.log2_size - 1 if (r + 1) ** 3 > 2**grid.log2_size else 0 for r in grid.resolutions]
     return torch.tensor([*grid.resolutions, *grid.offsets[:-1], *masks], dtype=torch.int32, device=device)
 
@@ -143,23 +143,25 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         unit, table = ctx.saved_tensors
         gradient = grad_outputs[0].contiguous()
-        to_unit = _Slope.apply(unit, table, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
-        to_table = _Scatter.apply(unit, gradient, table.shape, ctx.grid) if ctx.needs_input_grad[1] else None
-        return to_unit, to_table, None
+        grad_unit = _PositionGradient.apply(unit, table, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
+        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if ctx.needs_input_grad[1] else None
+        return grad_unit, grad_table, None
 
 
-class _Slope(torch.autograd.Function):
-    """Gradient along the positions; its own derivatives in table and cotangent are left to the reference."""
+class _PositionGradient(torch.autograd.Function):
+    """Gradient of the positions; its own derivatives in table and cotangent are left to the reference."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, table: Tensor, gradient: Tensor, grid: HashGrid) -> Tensor:
         ctx.save_for_backward(unit, table, gradient)
-        ctx.grid, to_unit, features = grid, torch.zeros_like(unit), table.shape[1]
+        ctx.grid, grad_unit, features = grid, torch.zeros_like(unit), table.shape[1]
         if len(unit):
             sizes = (len(unit), grid.levels, features, at_least_2(features), BLOCK)
             with on_device_of(table):
-                locate_back[(blocks(len(unit), BLOCK),)](unit, table, gradient, _levels(grid, table.device), to_unit, *sizes)
-        return to_unit
+                position_gradient[(blocks(len(unit), BLOCK),)](
+                    unit, table, gradient, _levels(grid, table.device), grad_unit, *sizes
+                )
+        return grad_unit
 
     @staticmethod
     @once_differentiable
@@ -169,22 +171,22 @@ class _Slope(torch.autograd.Function):
             table, gradient = table.requires_grad_(), gradient.requires_grad_()
             _, jacobian = reference.hash_encode(unit, table, ctx.grid, jacobian=True)
             assert jacobian is not None
-            to_unit = torch.einsum("mfa,mf->ma", jacobian, gradient)
-            return None, *torch.autograd.grad(to_unit, [table, gradient], grad_outputs[0]), None
+            grad_unit = torch.einsum("mfa,mf->ma", jacobian, gradient)
+            return None, *torch.autograd.grad(grad_unit, [table, gradient], grad_outputs[0]), None
 
 
-class _Scatter(torch.autograd.Function):
-    """Gradient along the table; nothing needs its derivative, so it has none."""
+class _TableGradient(torch.autograd.Function):
+    """Gradient of the table; not differentiable again."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, gradient: Tensor, shape: torch.Size, grid: HashGrid) -> Tensor:
-        to_table, features = gradient.new_zeros(shape), shape[1]
+        grad_table, features = gradient.new_zeros(shape), shape[1]
         if len(unit):
             sizes = (len(unit), grid.levels, features, at_least_2(features), BLOCK)
             with on_device_of(gradient):
                 along = blocks(len(unit), BLOCK)
-                encode_back[(along, grid.levels)](unit, gradient, _levels(grid, unit.device), to_table, *sizes)
-        return to_table
+                encode_backward[(along, grid.levels)](unit, gradient, _levels(grid, unit.device), grad_table, *sizes)
+        return grad_table
 
 
 def hash_encode(

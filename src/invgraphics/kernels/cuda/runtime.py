@@ -1,4 +1,4 @@
-"""How Triton kernels are launched here."""
+"""Launch helpers of Triton kernels."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ once_differentiable: Any = torch.autograd.function.once_differentiable
 
 
 def on_device_of(tensor: torch.Tensor) -> AbstractContextManager[Any]:
-    """Makes a tensor's GPU the current one, onto which Triton launches; nothing where Triton's interpreter runs on a CPU."""
+    """Context in which a tensor's GPU is current, as Triton launches need; a no-op for its interpreter on a CPU."""
     return torch.cuda.device(tensor.device) if tensor.is_cuda else nullcontext()
 
 
 def blocks(count: int, size: int) -> int:
-    """How many blocks of ``size`` hold ``count`` items."""
+    """Number of blocks of ``size`` that hold ``count`` items."""
     return -(-count // size)
 
 
 def at_least_2(count: int) -> int:
-    """The power of two that Triton needs as the length of a row of ``count`` columns."""
+    """Power of two, at least 2, that pads ``count`` columns for Triton."""
     return max(2, 1 << (count - 1).bit_length())

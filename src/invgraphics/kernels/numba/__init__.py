@@ -1,14 +1,14 @@
 """Float32 kernels for the CPU, compiled by Numba at first use and cached on disk.
 
-`runtime` holds the compiler settings; the operations are those of `invgraphics.kernels`. What a kernel does not cover goes to
-the reference: discs, lenses that are being optimised, gradients through `Footprints.planes`, the Jacobian of the hash encoding,
-pictures of hash grids with other than two features per entry.
+`runtime` holds the compiler settings; the operations are those of `invgraphics.kernels`. Cases without a compiled kernel fall
+back to the reference: discs, optimised intrinsics, gradients through `Footprints.depth_planes`, the Jacobian of the hash
+encoding, fused rendering of hash grids with other than two features per entry.
 """
 
 from invgraphics.kernels.numba.hash.encode import hash_encode as hash_encode
 from invgraphics.kernels.numba.hash.grid import grid_sample as grid_sample
-from invgraphics.kernels.numba.ngp.march import hash_march as hash_march
-from invgraphics.kernels.numba.ngp.render import hash_render as hash_render
+from invgraphics.kernels.numba.ngp.march import ngp_march as ngp_march
+from invgraphics.kernels.numba.ngp.render import ngp_render as ngp_render
 from invgraphics.kernels.numba.rays.composite import composite as composite
 from invgraphics.kernels.numba.rays.march import ray_march as ray_march
 from invgraphics.kernels.numba.splat.binning import splat_bin as splat_bin

@@ -19,9 +19,9 @@ _HALF, _TWO, _THREE, _FOUR, _SIX = (np.float32(value) for value in (0.5, 2, 3, 4
 
 @inlined
 def harmonics(d, out, at):
-    """Write all 16 functions at the unit direction ``d`` to the flat ``out``: function k to ``at + k LANES``.
+    """Evaluate all 16 functions at the unit direction ``d``; function k goes to ``out[at + k LANES]``.
 
-    All of them whatever the degree: a branch would keep the loop over primitives out of vector registers.
+    All of them whatever the degree: a branch would prevent vectorisation over primitives.
     """
     x, y, z = d
     xx, yy, zz = x * x, y * y, z * z
@@ -40,7 +40,7 @@ def harmonics(d, out, at):
 
 @inlined
 def harmonics_gradient(d, g, at):
-    """Gradient along ``d`` of the sum of ``g[at + k LANES]`` times function k, k from 0 to 15."""
+    """Gradient in ``d`` of the sum of ``g[at + k LANES]`` times function k, k from 0 to 15."""
     x, y, z = d
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     g1, g2, g3, g4, g5 = g[at + _1], g[at + _2], g[at + _3], g[at + _4], g[at + _5]

@@ -1,4 +1,4 @@
-"""How Numba is set up here: compiler flags, where compilation happens, threads and scratch memory."""
+"""Numba runtime: compiler flags, compilation in helper processes, threads, scratch memory and fast math functions."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if nb.config.DISABLE_JIT:  # type: ignore[attr-defined]
     raise ImportError("NUMBA_DISABLE_JIT is set")
 
 PACKAGE = __name__.rpartition(".")[0]
-PARTS = ("splats", "samples")
-"""Functions of `warming` that together call every kernel; each takes about as long to compile."""
+WARMUP, PARTS = f"{PACKAGE}.warmup", ("splats", "samples")
+"""Module and its functions that together call every kernel; the functions take equally long to compile."""
 
 FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """LLVM's fast-math without ``nnan`` and ``ninf``: comparisons must sort out NaN and infinity, not assume them away."""
@@ -34,7 +34,7 @@ _Decorator = Callable[[Callable[..., Any]], Any]
 
 
 def _njit(**options: Any) -> _Decorator:
-    """Numba's decorator; division by zero gives infinity, as it does in NumPy, and no C wrapper is made."""
+    """`numba.njit` with NumPy's division by zero (infinity) and without a C wrapper."""
     return partial(nb.njit, error_model="numpy", no_cfunc_wrapper=True, **options)
 
 
@@ -43,10 +43,9 @@ class _NotCachedError(Exception):
 
 
 class _Compiler(event.Listener):
-    """Has kernels compiled, all at once, by processes that end afterwards; Numba's event comes when its cache has no match.
+    """On a cache miss, has all kernels compiled by short-lived helper processes that fill the cache on disk.
 
-    What those could not provide (they cannot start, the cache cannot be written, they do not know these types) is compiled
-    here.
+    What they cannot provide (they cannot start, the cache is not writable, other argument types) is compiled in this process.
     """
 
     def __init__(self) -> None:
@@ -67,15 +66,15 @@ class _Compiler(event.Listener):
             if not self.here:
                 print("compiling kernels, once, less than a minute", file=sys.stderr, flush=True)
                 with contextlib.suppress(OSError):
-                    # The compiler knows one thread only: two processes share the work.
-                    for process in [_warming(part) for part in PARTS]:
+                    # Compilation is single-threaded: two processes share it.
+                    for process in [_start_warmup(part) for part in PARTS]:
                         process.wait()
                 self.here = True
 
 
-def _warming(part: str) -> subprocess.Popen[bytes]:
-    """A process that runs, and so compiles, one of the `PARTS`."""
-    code = f"from {PACKAGE} import runtime, warming; runtime.compile_here(); warming.{part}()"
+def _start_warmup(part: str) -> subprocess.Popen[bytes]:
+    """Start a helper process that runs, and so compiles, one of the `PARTS`."""
+    code = f"import {__name__} as runtime, {WARMUP} as warmup; runtime.compile_here(); warmup.{part}()"
     return subprocess.Popen([sys.executable, "-P", "-c", code], stderr=subprocess.DEVNULL)
 
 
@@ -84,7 +83,7 @@ event.register("numba:compile", _compiler)
 
 
 def _cached(**options: Any) -> _Decorator:
-    """`_njit` for what Python calls: machine code always comes from the cache on disk, which another process fills.
+    """`_njit` for kernels called from Python: machine code always comes from the cache on disk, filled by a helper process.
 
     A kernel that is compiled and one that is loaded are not the same bits: the loop's body is optimised on its own, and
     again with the function around it. The process that compiles runs the first version, all later ones the second.
@@ -101,7 +100,7 @@ def _cached(**options: Any) -> _Decorator:
                 _compiler.run()
                 return load(signature)
 
-        # Those of others, who borrow these decorators, are unknown to `warming`.
+        # Kernels of other packages that use these decorators are unknown to `warmup`.
         if function.__module__.startswith(PACKAGE):
             kernel.compile = compile_or_load
             _compiler.kernels.add(kernel)
@@ -115,12 +114,12 @@ parallel = _cached(parallel=True, fastmath=FASTMATH)
 serial = _cached(fastmath=FASTMATH)
 """Decorator of kernels that one thread runs."""
 inlined = _njit(fastmath=FASTMATH, forceinline=True, no_cpython_wrapper=True)
-"""Decorator of functions that kernels call; they are cached as part of those."""
+"""Decorator of device functions, inlined into the kernels that call them and cached as part of those."""
 ordered = _njit(fastmath=FASTMATH - {"reassoc"}, forceinline=True, no_cpython_wrapper=True)
-"""`inlined`, with sums added up as they are written: rearranged, they become one chain whose links wait for each other."""
+"""`inlined` without reassociation: rearranged sums become one dependency chain."""
 exact_parallel = _cached(parallel=True, fastmath=False)
 exact = _njit(fastmath=False, forceinline=True, no_cpython_wrapper=True)
-"""`parallel` and `inlined` in plain IEEE arithmetic; what does not say so inherits the flags of what calls it."""
+"""`parallel` and `inlined` in plain IEEE arithmetic; an inlined function without flags inherits its caller's."""
 
 # Both packages type these in ways that no checker can follow.
 prange: Any = nb.prange
@@ -131,19 +130,19 @@ _torch_threads = torch.get_num_threads()
 nb.set_num_threads(nb.get_num_threads())
 torch.set_num_threads(_torch_threads)
 
-# A signed index carries a test for wrap-around that keeps LLVM from vectorising: hot loops index with this type.
+# Signed indices are tested for wrap-around, which keeps LLVM from vectorising: hot loops index with this type.
 index = np.uintp
 
 LANES = index(16)
-"""What hot loops handle at once, side by side in one flat scratch array: one or two vector registers of float32."""
+"""SIMD width of the kernels: one or two vector registers of float32."""
 GROUP = int(LANES)
-"""`LANES` for arithmetic with signed numbers, which Numba would turn into floats."""
+"""`LANES` as a signed integer: Numba turns mixed signed and unsigned arithmetic into floats."""
 
 
 def threads() -> int:
-    """Number of jobs to split work into: torch's thread count, which Numba is told to use as well.
+    """Number of jobs to split work into: torch's thread count, which is set for Numba as well.
 
-    Work is split in a fixed way, so results repeat bit by bit for the same number of threads.
+    Work is split statically, so results are bitwise reproducible for a given number of threads.
     """
     count = max(1, min(torch.get_num_threads(), int(nb.config.NUMBA_NUM_THREADS)))  # type: ignore[attr-defined]
     if nb.get_num_threads() != count:
@@ -157,7 +156,7 @@ def array(tensor: torch.Tensor) -> np.ndarray:
 
 
 class _Scratch(threading.local):
-    """Buffers that live between calls, one set per Python thread."""
+    """Reusable buffers, one set per Python thread."""
 
     def __init__(self) -> None:
         self.buffers: dict[tuple[str, np.dtype], np.ndarray] = {}
@@ -167,7 +166,7 @@ _scratch = _Scratch()
 
 
 def scratch(name: str, size: int, dtype: Any = np.float32) -> np.ndarray:
-    """An uninitialised flat buffer, kept for the next call: fresh memory costs page faults.
+    """An uninitialised flat buffer, reused by the next call with this name: fresh memory costs page faults.
 
     Its content survives only until the next call with the same name, so nothing that a backward pass needs may be in it.
     """
@@ -179,19 +178,19 @@ def scratch(name: str, size: int, dtype: Any = np.float32) -> np.ndarray:
 
 
 def compile_here() -> None:
-    """Compile in this process from now on."""
+    """Compile in this process from now on, without helper processes."""
     _compiler.here = True
 
 
 @inlined
-def share(count: int, jobs: int, job: int) -> int:
-    """First of ``count`` items that belongs to ``job`` when they are split evenly; job ``jobs`` starts at the end."""
+def job_start(count: int, jobs: int, job: int) -> int:
+    """First of ``count`` evenly split items of ``job``; job ``jobs`` starts at the end."""
     return count * job // jobs
 
 
 @serial
 def split_by_work(work: np.ndarray, jobs: int, first: np.ndarray) -> None:
-    """Cut consecutive items into ``jobs`` runs of about equal work; run j is ``first[j] .. first[j + 1] - 1``."""
+    """Partition consecutive items into ``jobs`` ranges of about equal work; range j is ``first[j] .. first[j + 1] - 1``."""
     total = work.sum() + len(work)
     done, job = 0, 1
     first[0] = 0
@@ -205,7 +204,7 @@ def split_by_work(work: np.ndarray, jobs: int, first: np.ndarray) -> None:
 
 @inlined
 def exp2_fraction(f):
-    """``2**f - 1`` for f in [-1/2, 1/2], a number or a register of them: minimax, relative error of ``2**f`` 9.1e-8."""
+    """``2**f - 1`` for f in [-1/2, 1/2], scalar or SIMD register: minimax polynomial, relative error of ``2**f`` 9.1e-8."""
     p = np.float32(0.00132647272)
     p = p * f + np.float32(0.00967151281)
     p = p * f + np.float32(0.0555073374)
@@ -235,7 +234,7 @@ def exp2(x):
 
 @inlined
 def log2(x):
-    """The binary logarithm of a positive normal number, to 1e-7 relative; LLVM vectorises this, and not NumPy's."""
+    """Binary logarithm of a positive normal number, relative error 1e-7; vectorisable, unlike NumPy's."""
     bits = np.float32(x).view(np.int32)
     # x = m 2^whole with m in [sqrt(1/2), sqrt(2)).
     whole = (bits - np.int32(0x3F3504F3)) >> np.int32(23)

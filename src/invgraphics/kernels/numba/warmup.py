@@ -1,4 +1,4 @@
-"""Compile everything ahead of its first use."""
+"""Ahead-of-time compilation: calls that compile every kernel."""
 
 from __future__ import annotations
 
@@ -10,25 +10,23 @@ import torch
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.hash.grid import grid_sample
-from invgraphics.kernels.numba.ngp.march import hash_march
-from invgraphics.kernels.numba.ngp.render import hash_render
+from invgraphics.kernels.numba.ngp.march import ngp_march
+from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.rays.composite import composite
 from invgraphics.kernels.numba.rays.march import ray_march
 from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
-from invgraphics.kernels.types import HashField, HashGrid, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 
 def warm_up() -> float:
-    """Run every kernel forward and backward on tiny input, which has it compiled; returns the seconds it took.
-
-    Next to none when everything was cached.
-    """
+    """Run every kernel forward and backward on tiny input, which compiles it; returns seconds, about 0 when all is cached."""
     began = perf_counter()
     samples()
     splats()
@@ -36,7 +34,7 @@ def warm_up() -> float:
 
 
 def splats() -> None:
-    """The kernels of the splatter."""
+    """Compile the kernels of Gaussian splatting."""
     pose = torch.eye(4).requires_grad_()
     camera = Camera(pose, torch.full((2,), 8.0), torch.full((2,), 4.0), 8, 8)
     shapes = ((4, 3), (4, 4), (4, 3), (4,), (4, 1, 3))
@@ -44,32 +42,32 @@ def splats() -> None:
     footprints, rgb = splat_project(gaussians, camera)
     splat_bin(footprints, 8, 8, 4)
     splat_median(footprints, 8, 8)
-    # The backward walk is compiled anew for each setting of its two switches.
-    for pull in (None, torch.zeros(4, 2, requires_grad=True)):
-        for receivers in (0, 1):
-            image, alpha = splat_rasterise(replace(footprints, pull=pull), rgb, 8, 8, receivers=receivers)
+    # The backward pass is specialised for each setting of its two switches.
+    for absgrad in (None, torch.zeros(4, 2, requires_grad=True)):
+        for max_grad_splats in (0, 1):
+            image, alpha = splat_rasterise(replace(footprints, absgrad=absgrad), rgb, 8, 8, max_grad_splats=max_grad_splats)
             (image.sum() + alpha.sum()).backward(retain_graph=True)
 
 
 def samples() -> None:
-    """The kernels of ray renderers, and SSIM."""
+    """Compile the kernels of volume rendering, and SSIM."""
     image = torch.zeros(8, 8, 3).requires_grad_()
     ssim(image, torch.zeros_like(image)).backward()
     unit = torch.full((2, 3), 0.4).requires_grad_()
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)
-    (slope,) = torch.autograd.grad(features.sum(), unit, create_graph=True)
+    (gradient,) = torch.autograd.grad(features.sum(), unit, create_graph=True)
     values = grid_sample(unit, torch.zeros(2, 2, 2, 1).requires_grad_())
     ray = torch.zeros(2, dtype=torch.int64)
     _, sums, alpha = composite(values[:, 0], features, ray, 1)
-    (sums.sum() + alpha.sum() + slope.sum()).backward()
+    (sums.sum() + alpha.sum() + gradient.sum()).backward()
     bounds = Bounds(torch.zeros(3), torch.ones(3))
     rays = bounds.clip(Rays.make(torch.full((2, 3), 0.1), torch.full((2, 3), 3**-0.5)))
     everywhere = torch.ones(2, 2, 2, dtype=torch.bool)
     ray_march(rays, everywhere, bounds, MarchSteps(0.1), rays.near)
     layer = torch.zeros(16, 4), torch.zeros(16)
-    field = HashField(
+    field = FusedNGP(
         torch.zeros(levels.entries, 2), levels, (layer,), ((torch.zeros(3, 16), torch.zeros(3)),), "exp", 0.0, 1, "srgb"
     )
-    hash_march(rays, everywhere, bounds, MarchSteps(0.1), field, rays.near, 0.5)
-    hash_render(rays, everywhere, bounds, MarchSteps(0.1), field)
+    ngp_march(rays, everywhere, bounds, MarchSteps(0.1), field, rays.near, 0.5)
+    ngp_render(rays, everywhere, bounds, MarchSteps(0.1), field)

@@ -3,9 +3,9 @@
 from invgraphics.kernels.reference.composite import composite as composite
 from invgraphics.kernels.reference.grid import grid_sample as grid_sample
 from invgraphics.kernels.reference.hash import hash_encode as hash_encode
-from invgraphics.kernels.reference.hash_field import hash_march as hash_march
-from invgraphics.kernels.reference.hash_field import hash_render as hash_render
 from invgraphics.kernels.reference.march import ray_march as ray_march
+from invgraphics.kernels.reference.ngp import ngp_march as ngp_march
+from invgraphics.kernels.reference.ngp import ngp_render as ngp_render
 from invgraphics.kernels.reference.splat_discs import splat_project_discs as splat_project_discs
 from invgraphics.kernels.reference.splat_project import splat_project as splat_project
 from invgraphics.kernels.reference.splat_raster import splat_bin as splat_bin

@@ -1,4 +1,4 @@
-"""The emission-absorption sum of volume rendering, over packed rays."""
+"""Volume-rendering quadrature (emission-absorption) over packed samples, plain torch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 OPAQUE = 1e3
-"""Optical depths are cut here: exp(-1000) is 0 even in float64, and an infinite density would poison later rays' sums."""
+"""Optical depths are clamped here: exp(-1000) is 0 even in float64, and an infinite density would spoil later rays' sums."""
 
 
 def composite(
@@ -22,10 +22,10 @@ def composite(
 
 
 def transmittance(tau: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int) -> Float[Tensor, " m"]:
-    """Share of each ray's light that reaches its samples, from their optical depths in float64, `OPAQUE` at most.
+    """Transmittance before each sample, exp(-sum of nearer optical depths); depths in float64, at most `OPAQUE`.
 
-    One running sum over all samples, from which each ray's own start is taken away: the difference of two large float32 sums
-    would have lost the digits that a late ray needs.
+    One running sum over all samples, minus its value at each ray's start: in float32 the difference of two large sums would
+    lose the digits that late rays need.
     """
     running = torch.cat([tau.new_zeros(1), tau.cumsum(0)])[:-1]
     counts = torch.bincount(ray, minlength=rays)

@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import embedding
 
+from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels.reference.grid import locate
-from invgraphics.kernels.types import HashGrid
 
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the spatial hash, one per axis (Instant-NGP, equation 4)."""

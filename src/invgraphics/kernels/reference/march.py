@@ -1,4 +1,4 @@
-"""Walking along rays through an occupancy grid."""
+"""Occupancy-grid ray marching in blocks of steps, plain torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from invgraphics.core.rays import Rays
 from invgraphics.kernels.types import March, MarchSteps
 
 BLOCK = 64
-"""Steps that are tested at once, which bounds memory to rays x BLOCK positions."""
+"""Steps that are tested together, which bounds memory to rays x BLOCK positions."""
 
 
 @torch.no_grad()
@@ -20,29 +20,29 @@ def ray_march(
 ) -> March:
     """See `invgraphics.kernels.ray_march`.
 
-    The walk visits the lattice ``start + k * step``, or with a cone or contracted steps t, t + dt, ... where dt are the
-    `step_lengths`; the last interval is cut at ``far``, which must be finite. ``resume`` is the end of the last interval looked
-    at.
+    The march visits the lattice ``start + k * step``, or with a cone or contracted steps t, t + dt, ... where dt are the
+    `step_lengths`; the last interval is cut at ``far``, which must be finite. ``resume`` is the end of the last interval
+    tested.
     """
-    done = 0
-    resume, room = start.clone(), torch.full_like(start, steps.limit, dtype=torch.int64)
+    first = 0
+    resume, remaining = start.clone(), torch.full_like(start, steps.limit, dtype=torch.int64)
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
-    walking = torch.nonzero((start < rays.far) & (room > 0))[:, 0]
-    while len(walking):
-        edges = _edges(rays[walking], start[walking], resume[walking], (bounds, steps), done)
-        done += BLOCK
+    active = torch.nonzero((start < rays.far) & (remaining > 0))[:, 0]
+    while len(active):
+        edges = _edges(rays[active], start[active], resume[active], (bounds, steps), first)
+        first += BLOCK
         t0, t1 = edges[:, :-1], edges[:, 1:]
-        unit = bounds.to_unit(rays[walking].at((t0 + t1) / 2))
+        unit = bounds.to_unit(rays[active].at((t0 + t1) / 2))
         keep = (t1 > t0) & _look_up(occupied, unit)
-        # A ray that has kept all it may stops where its last kept interval ends.
-        keep &= keep.cumsum(dim=1) <= room[walking, None]
+        # A ray that reaches its sample limit stops where its last kept interval ends.
+        keep &= keep.cumsum(dim=1) <= remaining[active, None]
         row, column = torch.nonzero(keep, as_tuple=True)
-        kept.append((walking[row], t0[row, column], t1[row, column]))
+        kept.append((active[row], t0[row, column], t1[row, column]))
 
-        room[walking] -= keep.sum(dim=1)
+        remaining[active] -= keep.sum(dim=1)
         last = (keep * torch.arange(1, BLOCK + 1, device=keep.device)).amax(dim=1, keepdim=True)
-        resume[walking] = torch.where(room[walking] > 0, edges[:, -1], edges.gather(1, last)[:, 0])
-        walking = walking[(resume[walking] < rays.far[walking]) & (room[walking] > 0)]
+        resume[active] = torch.where(remaining[active] > 0, edges[:, -1], edges.gather(1, last)[:, 0])
+        active = active[(resume[active] < rays.far[active]) & (remaining[active] > 0)]
     return _packed(kept, resume)
 
 
@@ -64,13 +64,13 @@ def step_lengths(rays: Rays, t: Float[Tensor, " n"], bounds: Bounds, steps: Marc
 
 
 def _edges(
-    rays: Rays, start: Float[Tensor, " k"], t: Float[Tensor, " k"], walk: tuple[Bounds, MarchSteps], done: int
+    rays: Rays, start: Float[Tensor, " k"], t: Float[Tensor, " k"], setup: tuple[Bounds, MarchSteps], first: int
 ) -> Float[Tensor, "k edges"]:
-    """The next BLOCK + 1 interval ends of rays that are at ``t`` after ``done`` steps; those beyond ``far`` fall onto it."""
-    (bounds, steps), far = walk, rays.far
+    """The next BLOCK + 1 interval ends of rays that are at ``t`` after ``first`` steps; those beyond ``far`` fall onto it."""
+    (bounds, steps), far = setup, rays.far
     if steps.cone == 0 and not steps.contracted:
-        # Counted from the start, not added up, so that a walk may leap over steps and still meet the same lattice.
-        count = torch.arange(done, done + BLOCK + 1, dtype=t.dtype, device=t.device)
+        # Counted from the start, not added up, so that skipping steps leaves the lattice unchanged.
+        count = torch.arange(first, first + BLOCK + 1, dtype=t.dtype, device=t.device)
         return torch.minimum(start[:, None] + count * steps.step, far[:, None])
     edges = [t]
     for _ in range(BLOCK):

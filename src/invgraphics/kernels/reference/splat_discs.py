@@ -9,7 +9,14 @@ from torch import Tensor
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.core.transforms import quaternion_to_matrix
-from invgraphics.kernels.reference.splat_project import colours, in_camera, jacobian, meets_image, planes_of, visible_reach
+from invgraphics.kernels.reference.splat_project import (
+    colours,
+    depth_planes_of,
+    in_camera,
+    jacobian,
+    meets_image,
+    visible_reach,
+)
 from invgraphics.kernels.types import Footprints
 
 
@@ -24,7 +31,7 @@ def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 
     longest = gaussians.scales.argsort(dim=1, descending=True)[:, :2]
     axes = axes.gather(2, longest[:, None, :].expand(-1, 3, 2))
     means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]
-    # The centre's column is written with its screen position, so that a loss's pull on it can be read there.
+    # The centre's column is written with its screen position, so that the screen-space gradient arrives at it.
     centre = mean[:, 2:] * torch.nn.functional.pad(means2d, (0, 1), value=1.0)
     matrix = torch.cat([homogeneous(axes, camera), centre[:, :, None]], dim=2)
     with torch.no_grad():
@@ -32,13 +39,13 @@ def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 
         weights = torch.stack([reach.square(), reach.square(), -torch.ones_like(reach)], dim=1)
         radius = torch.maximum(half_width(matrix, weights, means2d, camera), reach * dilation**0.5)
         visible = in_front & meets_image(means2d, radius[:, None].expand(-1, 2), camera)
-    planes = planes_of(mean, jacobian(mean, camera) @ torch.nn.functional.pad(axes, (0, 1)), dilation)
+    depth_planes = depth_planes_of(mean, jacobian(mean, camera) @ torch.nn.functional.pad(axes, (0, 1)), dilation)
     footprints = Footprints(
         means2d=means2d,
         conics=torch.zeros_like(mean),
         opacities=gaussians.opacities,
         depths=mean[:, 2],
-        planes=planes,
+        depth_planes=depth_planes,
         radii=torch.where(visible, radius, 0.0),
         homography=_inverse(matrix),
         blur=torch.full_like(means2d[:, 0], dilation) if dilation else None,
@@ -75,7 +82,7 @@ def half_width(
         matrix: M, the axes and the centre in homogeneous pixels.
         weights: squared reach along each axis, and -1 for the centre.
         means2d: the centre's image, in pixels.
-        camera: whose picture it is.
+        camera: camera that projects them.
     """
     dual = (matrix * weights[:, None, :]) @ matrix.transpose(1, 2)
     bounded = dual[:, 2, 2] < 0

@@ -10,7 +10,7 @@ from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.core.harmonics import colour
 from invgraphics.core.transforms import quaternion_to_matrix
-from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN, Footprints
+from invgraphics.kernels.types import ALPHA_MIN, COMPENSATION_MIN, Footprints
 
 NEAR = 0.01
 """Primitives whose centre is nearer than this along the optical axis are culled, local units (as in gsplat)."""
@@ -21,7 +21,7 @@ ILL_CONDITIONED = 1e-4
 
 
 def splat_project(
-    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, compensate: bool = False
+    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, antialiased: bool = False
 ) -> tuple[Footprints, Float[Tensor, "n 3"]]:
     """See `invgraphics.kernels.splat_project`.
 
@@ -33,7 +33,7 @@ def splat_project(
     a = jacobian(mean, camera) @ factor
 
     xx, xy, yy, det = _covariance(a, dilation)
-    opacities = gaussians.opacities * _fades(a, det) if compensate else gaussians.opacities
+    opacities = gaussians.opacities * _compensations(a, det) if antialiased else gaussians.opacities
     conics = torch.stack([yy / det, -xy / det, xx / det], dim=1)
     means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]
     with torch.no_grad():
@@ -42,7 +42,9 @@ def splat_project(
         box = reach[:, None] * torch.stack([xx, yy], dim=1).sqrt()
         visible = in_front & meets_image(means2d, box, camera)
         radii = torch.where(visible, reach * largest.sqrt(), 0.0)
-    return Footprints(means2d, conics, opacities, mean[:, 2], planes_of(mean, a, dilation), radii), colours(gaussians, camera)
+    return Footprints(means2d, conics, opacities, mean[:, 2], depth_planes_of(mean, a, dilation), radii), colours(
+        gaussians, camera
+    )
 
 
 def in_camera(gaussians: Gaussians, camera: Camera) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
@@ -97,10 +99,10 @@ def _covariance(a: Float[Tensor, "n 3 3"], dilation: float) -> tuple[Tensor, Ten
     return xx + dilation, xy, yy + dilation, det.clamp_min(torch.finfo(det.dtype).tiny)
 
 
-def _fades(a: Float[Tensor, "n 3 3"], det: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Factor that gives a filtered footprint, of covariance determinant ``det``, the integral it had unfiltered."""
+def _compensations(a: Float[Tensor, "n 3 3"], det: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Opacity compensation that keeps the integral of a filtered footprint of covariance determinant ``det``."""
     *_, area = _covariance(a, 0.0)
-    return (area / det).clamp_min(FADE_MIN**2).sqrt()
+    return (area / det).clamp_min(COMPENSATION_MIN**2).sqrt()
 
 
 def meets_image(means2d: Float[Tensor, "n 2"], box: Float[Tensor, "n 2"], camera: Camera) -> Bool[Tensor, " n"]:
@@ -113,7 +115,7 @@ def meets_image(means2d: Float[Tensor, "n 2"], box: Float[Tensor, "n 2"], camera
     return overlaps.all(dim=1)
 
 
-def planes_of(mean: Float[Tensor, "n 3"], a: Float[Tensor, "n 3 3"], dilation: float) -> Float[Tensor, "n 3"]:
+def depth_planes_of(mean: Float[Tensor, "n 3"], a: Float[Tensor, "n 3 3"], dilation: float) -> Float[Tensor, "n 3"]:
     """Distance of the maximal response along each pixel's ray, as an affine function of the pixel.
 
     In (x, y, distance) the primitive is a Gaussian, and for given (x, y) its density peaks at the conditional mean

@@ -52,14 +52,14 @@ def splat_rasterise(
     width: int,
     height: int,
     tile: int | None = None,
-    receivers: int = 0,
+    max_grad_splats: int = 0,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """See `invgraphics.kernels.splat_rasterise`."""
     # Alpha is one more feature, the sum of w * 1.
     columns = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
 
     def paint(splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p c"]:
-        return _composite(responses_at(footprints, splats, pixels), columns[splats], receivers)
+        return _composite(responses_at(footprints, splats, pixels), columns[splats], max_grad_splats)
 
     image = over_tiles(footprints, (width, height), tile or TILE, paint)
     return image[..., :-1], image[..., -1]
@@ -72,7 +72,7 @@ def splat_median(footprints: Footprints, width: int, height: int, tile: int | No
     def paint(splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p 1"]:
         after = torch.cumprod(1 - visible_alphas(responses_at(footprints, splats, pixels)), dim=1)
         offset = pixels[:, None] - footprints.means2d[splats]
-        distance = footprints.planes[splats, 0] + (offset * footprints.planes[splats, 1:]).sum(dim=2)
+        distance = footprints.depth_planes[splats, 0] + (offset * footprints.depth_planes[splats, 1:]).sum(dim=2)
         # A last column, which every pixel reaches, stands for those that stay transparent.
         crossed = torch.nn.functional.pad(after <= 0.5, (0, 1), value=True)
         return torch.nn.functional.pad(distance, (0, 1), value=torch.inf).gather(1, crossed.int().argmax(dim=1, keepdim=True))
@@ -83,10 +83,10 @@ def splat_median(footprints: Footprints, width: int, height: int, tile: int | No
 def over_tiles(
     footprints: Footprints, size: tuple[int, int], tile: int, paint: Callable[[Tensor, Tensor], Tensor]
 ) -> Float[Tensor, "h w c"]:
-    """Ask ``paint`` for every tile of a ``size = (width, height)`` picture.
+    """Assemble a ``size = (width, height)`` image from ``paint``, called for every tile.
 
     Args:
-        footprints: what is drawn.
+        footprints: projected primitives.
         size: width and height in pixels.
         tile: edge of a tile in pixels.
         paint: gets the tile's splats (k,), front to back, and its pixel centres (p, 2); gives (p, c).
@@ -109,7 +109,7 @@ def over_tiles(
 
 
 class _GatherAbsolute(torch.autograd.Function):
-    """Passes offsets (p, k, 2) on, and gives each footprint's probe (k, 2) the sum over pixels of their absolute gradients."""
+    """Identity on offsets (p, k, 2) whose backward gives ``probe`` (k, 2) their absolute gradients, summed over pixels."""
 
     @staticmethod
     def forward(ctx: Any, offset: Tensor, probe: Tensor) -> Tensor:
@@ -123,8 +123,8 @@ class _GatherAbsolute(torch.autograd.Function):
 def responses_at(footprints: Footprints, splats: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p k"]:
     """``opacity * exp(-q / 2)`` of each splat at each pixel centre."""
     offset = pixels[:, None] - footprints.means2d[splats]
-    if footprints.pull is not None:
-        offset = _GatherAbsolute.apply(offset, footprints.pull[splats])
+    if footprints.absgrad is not None:
+        offset = _GatherAbsolute.apply(offset, footprints.absgrad[splats])
     if footprints.homography is None:
         dx, dy = offset.unbind(dim=2)
         xx, xy, yy = footprints.conics[splats].unbind(dim=1)
@@ -141,22 +141,22 @@ def responses_at(footprints: Footprints, splats: Int[Tensor, " k"], pixels: Floa
 
 
 def visible_alphas(responses: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-    """Responses below the visible are skipped, those near 1 clamped."""
+    """Alpha of each response: 0 below `ALPHA_MIN`, clamped at `ALPHA_MAX`."""
     return torch.where(responses < ALPHA_MIN, 0.0, responses.clamp_max(ALPHA_MAX))
 
 
-def _composite(responses: Float[Tensor, "p k"], features: Float[Tensor, "k c"], receivers: int) -> Float[Tensor, "p c"]:
+def _composite(responses: Float[Tensor, "p k"], features: Float[Tensor, "k c"], max_grad_splats: int) -> Float[Tensor, "p c"]:
     """Blend splats front to back: sum over i of T_i alpha_i f_i, T_i = product over j < i of (1 - alpha_j)."""
     alpha = visible_alphas(responses)
-    if not receivers:
+    if not max_grad_splats:
         return blending_weights(alpha) @ features
-    receives = torch.cumsum(alpha > 0, dim=1) <= receivers
+    receives = torch.cumsum(alpha > 0, dim=1) <= max_grad_splats
     weights = blending_weights(torch.where(receives, alpha, alpha.detach()))
     return torch.where(receives, weights, 0.0) @ features + torch.where(receives, 0.0, weights) @ features.detach()
 
 
 def blending_weights(alpha: Float[Tensor, "p k"]) -> Float[Tensor, "p k"]:
-    """T_i alpha_i. The transmittance never grows again, so once it would fall too low all later splats are left out as well."""
+    """Compositing weights T_i alpha_i; 0 from the splat on that would lower transmittance below `TRANSMITTANCE_MIN`."""
     after = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     return torch.where(after < TRANSMITTANCE_MIN, 0.0, alpha * before)

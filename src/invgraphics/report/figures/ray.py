@@ -34,7 +34,6 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Of sRGB's primaries; tells dark swatches from light ones."""
 CELLS = 900
 """Cells of a colour strip."""
-NOUNS = {"samples": "samples", "splats": "splats", "gaussians": "Gaussians"}
 
 
 def draw_ray(folder: Path) -> Path:
@@ -66,7 +65,7 @@ def draw_ray(folder: Path) -> Path:
         _depths((strip, main, below), ray)
         for axes in (strip, main, below):
             axes.tick_params(labelbottom=False, bottom=False)
-        total.set_xlabel("distance along the ray (local units)")
+        total.set_xlabel(f"distance along the ray ({ray.record.length_unit} units)")
         _pictures(figure, grid[:, 1].subgridspec(2, 1), ray, folder)
         figure.suptitle(_title(ray), x=0.01, ha="left", fontsize=14, fontweight="bold")
         png = folder / f"{FIGURE}.png"
@@ -78,7 +77,7 @@ def draw_ray(folder: Path) -> Path:
 def _title(ray: Ray) -> str:
     record, pixel = ray.record, ray.record.pixel
     where = f"{record.scene}, {record.split} view {record.view}, pixel ({pixel.column}, {pixel.row})"
-    return f"{record.method} on {where}: {len(ray.rgb)} {NOUNS[record.kind]}"
+    return f"{record.method} on {where}: {len(ray.rgb)} {record.kind}"
 
 
 def _set_span(axes: Axes, low: float, high: float) -> None:
@@ -214,7 +213,8 @@ def _densities(axes: Axes, ray: Ray) -> None:
         axes.set_ylim(0, 1.08 * max(float(curve["density"].max()), 1e-9))
     if ray.record.kind == "samples" and "density" in ray.columns:
         axes.plot(ray.columns["t"], ray.columns["density"], ".", color=DENSITY, markersize=4)
-    axes.set_ylabel("density" if ray.record.kind != "splats" else "density\nif marched")
+    unit = f"\nper {ray.record.length_unit} unit"
+    axes.set_ylabel(f"density{unit}" if ray.record.kind != "splats" else f"density{unit}\nif marched")
 
 
 def _depths(panels: tuple[Axes, ...], ray: Ray) -> None:

@@ -260,11 +260,11 @@ def _depth_layer(shown: Sequence[_Shown], truth: Arrays, index: int, folder: Fol
     def save(arrays: Arrays, mask: Bool[ndarray, "h w"], path: Path) -> None:
         save_scalar(path, (arrays["depth"] - low) / span, mask, DEPTH_COLOURS)
 
-    note = "Distance along the ray, one range for all; blank where opacity is below one half."
+    note = "Distance along the ray in world units, one range for all; blank where opacity is below one half."
     bar = gradient(DEPTH_COLOURS)
     truth_picture, pictures = _maps(shown, truth, "depth", (folder, target), save)
     methods = _with_methods(shown, _captioned(shown, pictures, ("depth_abs_rel",), index))
-    return Layer("depth", "Depth", note, bar, f"{low:.2f}", f"{high:.2f} units", truth_picture, methods)
+    return Layer("depth", "Depth", note, bar, f"{low:.2f}", f"{high:.2f} world units", truth_picture, methods)
 
 
 def _normal_layer(shown: Sequence[_Shown], truth: Arrays, index: int, folder: Folder, target: Path) -> Layer:

@@ -28,7 +28,7 @@ from invgraphics.scenes.mitsuba import folder as folders
 from invgraphics.scenes.mitsuba.gbuffer import trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job, Source
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
-from invgraphics.scenes.process import say_error, say_progress
+from invgraphics.scenes.process import write_error, write_progress
 
 
 def main(folder: Path) -> None:
@@ -45,8 +45,8 @@ def main(folder: Path) -> None:
     parent = os.getppid()
     for done, (split, index, camera) in enumerate(_views(job)):
         if os.getppid() != parent:
-            sys.exit("nobody waits for these pictures any more")
-        say_progress(done, job.total, f"{split} {index:04d}")
+            sys.exit("the parent process has ended")
+        write_progress(done, job.total, f"{split} {index:04d}")
         if not folders.view_paths(folder, split, index)[1].exists():
             gbuffer = trace_fog(model.fog, camera) if model.fog else trace(scene, camera)
             linear, half_psnr = mean_picture(folders.view_paths(large, split, index)[1], job)
@@ -87,8 +87,8 @@ if __name__ == "__main__":
     try:
         main(Path(sys.argv[1]))
     except InputError as error:
-        say_error(error)
+        write_error(error)
         sys.exit(1)
     except OSError as error:
-        say_error(cache.unwritable(Path(sys.argv[1]), error))
+        write_error(cache.unwritable(Path(sys.argv[1]), error))
         sys.exit(1)

@@ -1,4 +1,4 @@
-"""Where rendered scenes are kept, when one is whole, and how two processes that want the same one wait for each other."""
+"""Cache of rendered scenes: location, completeness, and a lock between processes that render the same one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def root() -> Path:
 
 
 def unwritable(folder: Path, error: OSError) -> InputError:
-    """What to tell a person whose cache cannot be written."""
+    """The error for a cache folder that cannot be written."""
     return InputError(f"{folder} cannot be written: {error.strerror or error}.", f"Set {VARIABLE} to a folder with free space.")
 
 
@@ -55,7 +55,7 @@ def read_truth(folder: Path) -> dict[str, Any] | None:
 
 @contextmanager
 def locked(folder: Path, waiting: Callable[[], None]) -> Iterator[None]:
-    """Hold the right to make ``folder``; whoever comes second is told and waits. The system frees it when a process dies."""
+    """Hold an exclusive lock on ``folder``; a second process waits. The system releases it when a process dies."""
     try:
         file = folder.with_name(f"{folder.name}.lock").open("w")
     except OSError as error:

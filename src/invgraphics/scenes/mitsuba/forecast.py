@@ -1,4 +1,4 @@
-"""How long a rendering will take, from the time of its first view."""
+"""Forecast of a rendering's duration from the time of its first view."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SETTLED_SECONDS = 5.0
 
 
 class RenderingForecast:
-    """Passes progress on, and says once how long the views that are left will take.
+    """Forwards progress, and reports once how long the remaining views will take.
 
     Args:
         job: what is rendered.
@@ -46,12 +46,12 @@ class RenderingForecast:
         self._view = ""
         self._began = 0.0
         self._timed = 0
-        self._said = self._pending == 0
+        self._reported = self._pending == 0
 
     def __call__(self, done: int, total: int, what: str) -> None:
         """Take a line of progress: ``what`` begins now, and what was before it is finished."""
         now = self._clock()
-        if not self._said and self._view in self._left:
+        if not self._reported and self._view in self._left:
             self._finish(self._view, now - self._began)
         self._view, self._began = what, now
         self._progress(done, total, what)
@@ -61,7 +61,7 @@ class RenderingForecast:
         self._timed += 1
         if self._timed == 1 and seconds < SETTLED_SECONDS and self._left:
             return
-        self._said = True
+        self._reported = True
         left = seconds * sum(self._left.values()) / samples
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         width, height = self._job.size

@@ -1,4 +1,4 @@
-"""What the parent process asks the rendering process for, and the hash under which the answer is kept."""
+"""Rendering jobs, and the hash that is their key in the cache."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.config import fill, to_table
-from invgraphics.scenes.mitsuba.spec import Counts, Samples, SceneSpec
+from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel, SceneSpec
 from invgraphics.text import sha256_of
 
 # The sources that decide pixels, relative to the package; the rest (caching, messages) does not.
@@ -32,7 +32,7 @@ class Source:
 
     size: tuple[int, int]
     views: Counts
-    samples: Samples
+    samples: SamplesPerPixel
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Job:
     spec: SceneSpec
     size: tuple[int, int]
     views: Counts
-    samples: Samples
+    samples: SamplesPerPixel
     seed: int
     variant: str
     source: Source | None = None

@@ -1,4 +1,4 @@
-"""Whether the cache holds a larger rendering of a scene, whose pictures can be averaged instead of rendering smaller ones."""
+"""Find a larger cached rendering of a scene whose pictures can be area-averaged instead of rendering smaller ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from invgraphics.scenes.mitsuba import cache
 from invgraphics.scenes.mitsuba.job import Job, Source
 from invgraphics.scenes.mitsuba.rig import SPLITS
-from invgraphics.scenes.mitsuba.spec import Counts, Samples
+from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel
 
 
 def averaged(job: Job) -> Job | None:
@@ -30,7 +30,7 @@ def _preference(job: Job) -> tuple[bool, bool, int]:
     return not made, width % job.size[0] != 0 or height % job.size[1] != 0, width * height
 
 
-def _sources(job: Job) -> Iterator[tuple[Source, Samples]]:
+def _sources(job: Job) -> Iterator[tuple[Source, SamplesPerPixel]]:
     """Larger renderings of the same scene that serve, with the samples per pixel that their averages have."""
     for folder in sorted(cache.root().glob(f"*/{cache.TRUTH}")):
         truth = cache.read_truth(folder.parent)
@@ -51,7 +51,7 @@ def _source_of(truth: Mapping[str, Any]) -> Source | None:
     try:
         width, height = truth["size"]
         views = Counts(**{split: len(truth["cameras"][split]) for split in SPLITS})
-        return Source((width, height), views, Samples(**truth["samples_per_pixel"]))
+        return Source((width, height), views, SamplesPerPixel(**truth["samples_per_pixel"]))
     except (KeyError, TypeError, ValueError):
         return None
 
@@ -61,10 +61,10 @@ def _is_larger(source: Source, job: Job) -> bool:
     return width > new_width and width * new_height == height * new_width
 
 
-def _effective(source: Source, size: tuple[int, int]) -> Samples:
+def _effective(source: Source, size: tuple[int, int]) -> SamplesPerPixel:
     """Samples per averaged pixel."""
     pixels, new_pixels = math.prod(source.size), math.prod(size)
     train, val, half = (
         count * pixels // new_pixels for count in (source.samples.train, source.samples.val, source.samples.test // 2)
     )
-    return Samples(train, val, 2 * half)
+    return SamplesPerPixel(train, val, 2 * half)

@@ -82,7 +82,7 @@ def _version(path: Path) -> int:
 
 
 def _probe(library: str) -> str | None:
-    """Why ``library`` does not work, or ``None``."""
+    """Reason why ``library`` fails its test, or ``None``."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _PROBE], env={**os.environ, VARIABLE: library}, capture_output=True, timeout=60, check=False

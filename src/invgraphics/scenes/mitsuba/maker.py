@@ -1,4 +1,4 @@
-"""`make`: the one door to the rendered scenes. Looks in the cache, and has what is missing rendered by a process of its own."""
+"""`make`: a built-in scene's rendered truth, from the cache or else from a rendering process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from invgraphics.scenes.mitsuba import cache, llvm
 from invgraphics.scenes.mitsuba.forecast import RenderingForecast
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.larger import averaged
-from invgraphics.scenes.mitsuba.spec import Counts, locate, read
+from invgraphics.scenes.mitsuba.spec import Counts, description_path, read
 from invgraphics.scenes.process import Progress, run_worker
 
 
@@ -60,7 +60,7 @@ def make(
 
 
 def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int | None], spp: int | None, seed: int) -> Job:
-    spec = read(locate(name))
+    spec = read(description_path(name))
     limits = (
         ("The size", size and min(size), 8),
         ("The number of training views", views[0], 1),

@@ -1,4 +1,4 @@
-"""What a ``scene.toml`` says: the schema of a scene description."""
+"""Schema and reader of a scene description, ``scene.toml``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Samples:
+class SamplesPerPixel:
     """Samples per pixel of each split; those of ``test`` are taken in two independent halves."""
 
     train: int = 256
@@ -30,10 +30,10 @@ class Samples:
         if min(self.train, self.val) < 1 or self.test < 2 or self.test % 2:
             raise ValueError("samples per pixel must be positive, and even for the test views")
 
-    def scaled(self, train: int) -> Samples:
+    def scaled(self, train: int) -> SamplesPerPixel:
         """The same proportions for another number of samples per training pixel."""
         factor = train / self.train
-        return Samples(train, max(1, round(self.val * factor)), 2 * max(1, round(self.test * factor / 2)))
+        return SamplesPerPixel(train, max(1, round(self.val * factor)), 2 * max(1, round(self.test * factor / 2)))
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class SceneSpec:
     rig: dict[str, Any]
     size: tuple[int, int] = (128, 128)
     views: Counts = Counts()
-    samples: Samples = Samples()
+    samples: SamplesPerPixel = SamplesPerPixel()
     background: Vector | None = None
     depth: int = 8
     seed: int = 0
@@ -98,7 +98,7 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in data.find("scenes").glob(f"*/{FILE}")))
 
 
-def locate(name: str) -> Path:
+def description_path(name: str) -> Path:
     """The description of a built-in scene, or of one's own: the path of a ``scene.toml`` or of its folder.
 
     Raises:

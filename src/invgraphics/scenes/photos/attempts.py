@@ -1,4 +1,4 @@
-"""Strategies tried in turn until one passes the checks; the best is kept, and each leaves a line in the report."""
+"""Reconstruction by one strategy after another until the checks pass; the best is kept, and each gets a row in the report."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from invgraphics.scenes.photos.consistency import check_consistency
 from invgraphics.scenes.photos.mapping import Matched, reconstruct
+from invgraphics.scenes.photos.outlier_cameras import remove_outlier_cameras
 from invgraphics.scenes.photos.quality import enough, hopeless
 from invgraphics.scenes.photos.strategies import Strategy, strategies
-from invgraphics.scenes.photos.strays import remove_strays
-from invgraphics.scenes.photos.suspicion import examine
 from invgraphics.scenes.process import Progress
 
 Reconstruct = Callable[[Strategy, Matched, Progress], list[Any]]
@@ -19,20 +19,20 @@ Reconstruct = Callable[[Strategy, Matched, Progress], list[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """What one strategy came to.
+    """Result of one strategy.
 
     Attributes:
         strategy: that was followed.
-        pieces: ``pycolmap.Reconstruction`` objects, the largest first, strays removed from it.
-        strays: why each stray photograph was left out of the largest piece, by its own name.
-        suspicion: see `invgraphics.scenes.photos.suspicion.examine`; ``None`` where nothing was placed.
+        pieces: ``pycolmap.Reconstruction`` objects, the largest first, without its outlier cameras.
+        outliers: photograph -> why its camera was removed from the largest piece.
+        consistency: see `invgraphics.scenes.photos.consistency.check_consistency`; ``None`` where nothing was placed.
         seconds: that it took.
     """
 
     strategy: Strategy
     pieces: list[Any]
-    strays: dict[str, str]
-    suspicion: dict[str, Any] | None
+    outliers: dict[str, str]
+    consistency: dict[str, Any] | None
     seconds: float
 
     @property
@@ -42,30 +42,30 @@ class Attempt:
 
     def passes(self, count: int) -> bool:
         """Whether enough of ``count`` photographs are placed and nothing is suspicious."""
-        return self.suspicion is not None and not self.suspicion["suspicious"] and enough(self.registered, count)
+        return self.consistency is not None and not self.consistency["suspicious"] and enough(self.registered, count)
 
     def rank(self, count: int) -> tuple[bool, float]:
         """Sorting key, best last: whether it passes, then the share of all verified matches that the poses explain."""
-        return self.passes(count), self.suspicion["support"] if self.suspicion is not None else -1.0
+        return self.passes(count), self.consistency["support"] if self.consistency is not None else -1.0
 
     def row(self, kept: bool) -> dict[str, Any]:
-        """For the report."""
+        """Its figures for the report."""
         figures: dict[str, Any] = {"outcome": "nothing placed"}
-        if self.suspicion is not None:
+        if self.consistency is not None:
             model = self.pieces[0]
-            points, explained = model.num_points3D(), 100 * self.suspicion["support"]
-            verdict = "suspicious" if self.suspicion["suspicious"] else "not suspicious"
+            points, explained = model.num_points3D(), 100 * self.consistency["support"]
+            verdict = "suspicious" if self.consistency["suspicious"] else "not suspicious"
             figures = {
                 "outcome": f"{self.registered} placed, {points} points, {explained:.0f} % of the matches explained, {verdict}",
                 "points": points,
                 "track_length": float(model.compute_mean_track_length()),
                 "reprojection_error_px": float(model.compute_mean_reprojection_error()),
-                **{key: value for key, value in self.suspicion.items() if key not in ("worst", "sentence")},
+                **{key: value for key, value in self.consistency.items() if key not in ("worst", "sentence")},
             }
         return {
             "strategy": self.strategy.name,
             "registered": self.registered,
-            "strays": len(self.strays),
+            "outlier_cameras": len(self.outliers),
             **figures,
             "seconds": round(self.seconds, 2),
             "kept": kept,
@@ -99,11 +99,11 @@ def _attempt(strategy: Strategy, matched: Matched, progress: Progress, place: Re
     since = time.perf_counter()
     pieces = place(strategy, matched, progress)
     progress(1, 1, "checking poses against the matches")
-    strays, suspicion = {}, None
+    outliers, consistency = {}, None
     if pieces:
-        strays = remove_strays(pieces[0], matched.photos)
-        suspicion = examine(pieces[0], matched.photos, matched.evidence)
-    return Attempt(strategy, pieces, strays, suspicion, time.perf_counter() - since)
+        outliers = remove_outlier_cameras(pieces[0], matched.photos)
+        consistency = check_consistency(pieces[0], matched.photos, matched.evidence)
+    return Attempt(strategy, pieces, outliers, consistency, time.perf_counter() - since)
 
 
 def _share(progress: Progress, before: int) -> Progress:
@@ -119,7 +119,7 @@ def _share(progress: Progress, before: int) -> Progress:
 
 
 def choice(rows: Sequence[dict[str, Any]]) -> str:
-    """A sentence on what was kept, after what."""
+    """A sentence that names the kept strategy and the outcomes of the others."""
     kept = next(row for row in rows if row["kept"])
     if len(rows) == 1:
         return kept["strategy"]

@@ -1,4 +1,4 @@
-"""What a person asks for, and the hash that tells whether a folder already holds the answer."""
+"""Settings of a photo import, and the hash that is its key."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`reconstruct`: has a folder of photographs turned into a scene by a process of its own, once."""
+"""`reconstruct`: turn a folder of photographs into a scene, in a worker process, once."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Hold the right to fill ``out``; the system frees it when a process dies."""
+    """Hold an exclusive lock on ``out``; the system releases it when a process dies."""
     with (out / WORK / LOCK).open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

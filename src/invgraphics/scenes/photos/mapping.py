@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.scenes.photos.job import DATABASE, PhotoJob
-from invgraphics.scenes.photos.pairs import Evidence
+from invgraphics.scenes.photos.pairs import VerifiedMatches
 from invgraphics.scenes.photos.prepare import PHOTOS, Prepared
 from invgraphics.scenes.photos.sfm import Verification, match, reset_cameras
 from invgraphics.scenes.photos.strategies import Strategy
@@ -23,10 +23,10 @@ _SMALLEST_MODEL = 3
 
 @dataclass(frozen=True)
 class Matched:
-    """What every strategy starts from.
+    """Features and verified matches that every strategy starts from.
 
     Attributes:
-        job: what was asked for.
+        job: settings of the import.
         photos: the working copies.
         evidence: verified pairs.
         work: folder of the data base; its features and matches stay as they are.
@@ -34,7 +34,7 @@ class Matched:
 
     job: PhotoJob
     photos: Sequence[Prepared]
-    evidence: Evidence
+    evidence: VerifiedMatches
     work: Path
 
 

@@ -1,4 +1,4 @@
-"""What later readers of an imported scene are told about its poses."""
+"""Notes of an imported scene on how its poses were found, and on what contradicts them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from invgraphics.scenes.photos.maker import read_quality
 
 
 def pose_notes(folder: Path) -> dict[str, str]:
-    """Notes of a `Scene` on how its poses were found: ``poses`` names the strategy, ``suspicion`` what contradicts them.
+    """Notes of a `Scene`: ``poses`` names the strategy, ``suspicion`` the failed consistency check where there is one.
 
     Empty where ``folder`` holds no finished import.
     """

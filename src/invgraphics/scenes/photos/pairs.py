@@ -1,4 +1,4 @@
-"""What is known about pairs of photographs: the verified matches in COLMAP's data base, as arrays."""
+"""Geometrically verified matches between pairs of photographs, read from COLMAP's database as arrays."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from invgraphics.scenes.photos.prepare import Prepared
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """Two photographs that show the same thing, as far as their matches tell.
+class MatchedPair:
+    """Verified matches between two photographs.
 
     Attributes:
         first: index of one photograph.
         second: index of the other.
-        points: matched places in both, pixels.
+        points: image positions of the matches in both, pixels.
     """
 
     first: int
@@ -32,13 +32,13 @@ class Pair:
 
     @property
     def motion(self) -> float:
-        """Median distance in pixels between the places of a match."""
+        """Median displacement of the matches, pixels."""
         return float(np.median(np.linalg.norm(self.points[0] - self.points[1], axis=1)))
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What features and matches there are, before any pose.
+class VerifiedMatches:
+    """Features and verified matches of a set of photographs.
 
     Attributes:
         features: number in each photograph.
@@ -46,15 +46,15 @@ class Evidence:
     """
 
     features: tuple[int, ...]
-    pairs: tuple[Pair, ...]
+    pairs: tuple[MatchedPair, ...]
 
     def partners(self, index: int) -> int:
-        """Photographs that one photograph overlaps with."""
+        """Number of photographs that one photograph has verified matches with."""
         return sum(index in (pair.first, pair.second) for pair in self.pairs)
 
 
-def read_evidence(path: Path, photos: Sequence[Prepared]) -> Evidence:
-    """Read the data base."""
+def read_verified_matches(path: Path, photos: Sequence[Prepared]) -> VerifiedMatches:
+    """Read features and verified matches from a COLMAP database."""
     from invgraphics.scenes.colmap_library import pycolmap
 
     with pycolmap.Database.open(path) as database:
@@ -66,8 +66,10 @@ def read_evidence(path: Path, photos: Sequence[Prepared]) -> Evidence:
         for first, second, geometry in _verified(database):
             i, j = index[first], index[second]
             matches = np.asarray(geometry.inlier_matches)
-            pairs.append(Pair(i, j, (places[i][matches[:, 0]], places[j][matches[:, 1]])))
-    return Evidence(tuple(len(place) for place in places), tuple(sorted(pairs, key=lambda pair: (pair.first, pair.second))))
+            pairs.append(MatchedPair(i, j, (places[i][matches[:, 0]], places[j][matches[:, 1]])))
+    return VerifiedMatches(
+        tuple(len(place) for place in places), tuple(sorted(pairs, key=lambda pair: (pair.first, pair.second)))
+    )
 
 
 def _verified(database: Any) -> list[tuple[int, int, Any]]:

@@ -1,4 +1,4 @@
-"""Whether the cameras of a reconstruction can be those of photographs: focal length, distortion, and distances between them."""
+"""Plausibility of a reconstruction's cameras: focal length, distortion, and baseline over depth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _RADII = 64
 
 
 def spread(model: Any) -> float:
-    """Diagonal of the box of the cameras over the median distance from the points to the cameras that observe them."""
+    """Diagonal of the cameras' bounding box over the median distance from points to the cameras that observe them."""
     images = [image for image in model.images.values() if image.has_pose]
     centres = {image.image_id: np.asarray(image.projection_center()) for image in images}
     distances = [
@@ -28,7 +28,7 @@ def spread(model: Any) -> float:
 
 
 def implausible(model: Any) -> list[str]:
-    """What no real camera or walk has, in words; empty where all is plausible."""
+    """Implausible focal lengths, distortions and baselines, in words; empty where there are none."""
     reasons: dict[str, None] = {}
     used = {image.camera_id for image in model.images.values() if image.has_pose}
     for camera in (model.cameras[number] for number in sorted(used)):
@@ -43,7 +43,7 @@ def implausible(model: Any) -> list[str]:
 
 
 def folds(camera: Any) -> bool:
-    """Whether a lens of perspective type takes two directions within the picture to one pixel: its radius does not grow."""
+    """Whether a perspective lens's distorted radius stops growing within the image, so that two directions share a pixel."""
     if "FISHEYE" in camera.model_name:
         return False
     centre = np.array([camera.principal_point_x, camera.principal_point_y])

@@ -1,4 +1,4 @@
-"""Top view of a reconstruction: points in their colours, cameras as the way they look."""
+"""Top view of a reconstruction: coloured points, and cameras with their viewing directions."""
 
 from __future__ import annotations
 

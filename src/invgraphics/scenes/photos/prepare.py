@@ -173,7 +173,7 @@ def _focal_share(path: Path) -> float | None:
 
 
 def _register_decoders() -> None:
-    """HEIC needs a plug-in of Pillow; people who installed it expect it to be used."""
+    """Register Pillow's HEIC plug-in where it is installed."""
     try:
         from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -249,7 +249,7 @@ def _reason(name: str, error: InputError) -> str:
 
 
 def _check(job: PhotoJob, photos: list[Prepared], skipped: dict[str, str]) -> None:
-    """Refuse what no reconstruction can come of."""
+    """Refuse photographs that no reconstruction is possible from."""
     if len(photos) < 2:
         _refuse(job.path, photos, skipped)
     sizes = {(photo.width, photo.height) for photo in photos}

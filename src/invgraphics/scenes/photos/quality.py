@@ -1,4 +1,4 @@
-"""How well the photographs could be put together, and why some or all could not."""
+"""Figures of a reconstruction, and why photographs were not registered."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from invgraphics.scenes.photos.pairs import Evidence
+from invgraphics.scenes.photos.pairs import VerifiedMatches
 from invgraphics.scenes.photos.prepare import ADVICE, Prepared
 
 LEAST, SHARE = 3, 0.5
@@ -52,15 +52,17 @@ NOTHING: dict[str, Any] = {
 """`describe` where no two photographs could be placed."""
 
 
-def unplaced(photos: Sequence[Prepared], evidence: Evidence, placed: set[str], strays: Mapping[str, str]) -> dict[str, str]:
-    """Why each photograph that has no pose has none, by its own name."""
+def unplaced(
+    photos: Sequence[Prepared], evidence: VerifiedMatches, placed: set[str], outliers: Mapping[str, str]
+) -> dict[str, str]:
+    """Photograph -> why it has no pose."""
     reasons = {}
     for index, photo in enumerate(photos):
         if photo.name in placed:
             continue
         features, partners = evidence.features[index], evidence.partners(index)
-        if photo.source in strays:
-            reasons[photo.source] = strays[photo.source]
+        if photo.source in outliers:
+            reasons[photo.source] = outliers[photo.source]
         elif features < FEW_FEATURES:
             reasons[photo.source] = f"only {features} features: blurred, or it shows something bare"
         elif not partners:
@@ -75,8 +77,8 @@ def enough(registered: int, count: int) -> bool:
     return registered >= max(LEAST, SHARE * count)
 
 
-def hopeless(photos: Sequence[Prepared], evidence: Evidence) -> tuple[str, str] | None:
-    """Why no strategy can place these photographs, and what to do; ``None`` where one may."""
+def hopeless(photos: Sequence[Prepared], evidence: VerifiedMatches) -> tuple[str, str] | None:
+    """Why no strategy can register these photographs, and a remedy; ``None`` where one may."""
     longest = max(max(photo.width, photo.height) for photo in photos)
     features = float(np.median(evidence.features))
     motions = [pair.motion for pair in evidence.pairs]
@@ -91,8 +93,8 @@ def hopeless(photos: Sequence[Prepared], evidence: Evidence) -> tuple[str, str] 
     return None
 
 
-def refusal(photos: Sequence[Prepared], evidence: Evidence, registered: int) -> tuple[str, str] | None:
-    """What to tell a person when too few photographs could be placed, and what to do; ``None`` where enough could."""
+def refusal(photos: Sequence[Prepared], evidence: VerifiedMatches, registered: int) -> tuple[str, str] | None:
+    """Why too few photographs were registered, and a remedy; ``None`` where there are enough."""
     if enough(registered, len(photos)):
         return None
     what = f"Only {registered} of {len(photos)} photographs could be placed" if registered else "No photograph could be placed"

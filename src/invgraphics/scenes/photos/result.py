@@ -1,4 +1,4 @@
-"""The scene that is left behind: straight pictures, and the COLMAP model of the pinholes that took them."""
+"""Output of a photo import: undistorted pictures and the COLMAP model of their pinhole cameras."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
 
 
 def bend(lens: Lens) -> float:
-    """The largest distance in pixels between where a point of the picture's border is and where a pinhole would have it."""
+    """Largest displacement in pixels by the lens distortion along the picture's border."""
     if lens.is_pinhole():
         return 0.0
     camera = lens.colmap()
@@ -78,7 +78,7 @@ def _write_picture(source: Path, target: Path, lens: Lens | None) -> None:
 
 
 def _move_points(image: Any, camera: Any, straight: Straight) -> None:
-    """The features of a picture, where its straightened copy shows them."""
+    """Move a picture's features to where its undistorted copy shows them."""
     if image.num_points2D() == 0:
         return
     plane = camera.cam_from_img(np.array([point.xy for point in image.points2D]))

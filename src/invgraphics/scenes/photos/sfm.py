@@ -1,4 +1,4 @@
-"""Features and matches with pycolmap; a stage that was interrupted goes on where it stopped."""
+"""Feature extraction and matching with pycolmap; interrupted stages resume."""
 
 from __future__ import annotations
 

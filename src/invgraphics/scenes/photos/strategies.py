@@ -1,4 +1,4 @@
-"""Ways from the same features and matches to poses, in the order in which they are tried.
+"""Reconstruction strategies on the same features and matches, in the order in which they are tried.
 
 Each answers a known weakness of the one before. The incremental mapper stands or falls with its first pair and with the focal
 length that it guesses for photographs without EXIF; the global mapper averages rotations over all pairs instead. Focal lengths
@@ -38,7 +38,7 @@ class Strategy:
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Its name in reports."""
         words = [f"{self.mapper} mapper", f"{self.lens} lens"]
         words += ["focal length from the view graph"] if self.calibrated else []
         words += [f"initial pair at {self.initial_angle:.0f}° or more"] if self.initial_angle != INITIAL_ANGLE else []

@@ -19,35 +19,35 @@ from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, SCHEMA, TOP_VIEW, PhotoJob
 from invgraphics.scenes.photos.maker import JOB, RESULT
 from invgraphics.scenes.photos.mapping import Matched
-from invgraphics.scenes.photos.pairs import read_evidence
+from invgraphics.scenes.photos.pairs import read_verified_matches
 from invgraphics.scenes.photos.plot import top_view
 from invgraphics.scenes.photos.prepare import PREPARED, Preparation, prepare
 from invgraphics.scenes.photos.quality import NOTHING, describe, refusal, unplaced
 from invgraphics.scenes.photos.result import write_scene
-from invgraphics.scenes.process import say_error, say_progress
+from invgraphics.scenes.process import write_error, write_progress
 
 STEPS = {"read": 10, "features": 20, "matches": 35, "poses": 27, "pictures": 8}
 """Stages in their order, and about how many per cent of the time each takes."""
 
 
 class Clock:
-    """Turns the progress of one stage into that of the whole, and keeps the time each took."""
+    """Maps the progress of stages to that of the whole, and records their seconds."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._stage, self._since = "", time.perf_counter()
 
     def start(self, stage: str) -> None:
-        """The stage before is over."""
+        """Begin a stage."""
         now = time.perf_counter()
         if self._stage:
             self.seconds[self._stage] = round(now - self._since, 2)
         self._stage, self._since = stage, now
 
     def show(self, done: int, total: int, what: str) -> None:
-        """Say how far the present stage is."""
+        """Report the progress of the present stage."""
         before = sum(share for stage, share in STEPS.items() if list(STEPS).index(stage) < list(STEPS).index(self._stage))
-        say_progress(round(before + STEPS[self._stage] * done / max(total, 1)), 100, what)
+        write_progress(round(before + STEPS[self._stage] * done / max(total, 1)), 100, what)
 
 
 def main(work: Path) -> None:
@@ -70,7 +70,7 @@ def main(work: Path) -> None:
     wanted = sfm.pairs(len(preparation.photos), job.matching)
     sfm.match(wanted, preparation.photos, work / DATABASE, clock.show, sfm.Verification(job.seed))
     clock.start("poses")
-    evidence = read_evidence(work / DATABASE, preparation.photos)
+    evidence = read_verified_matches(work / DATABASE, preparation.photos)
     matched = Matched(job, preparation.photos, evidence, work)
     best, attempts = try_strategies(matched, clock.show)
     quality = _finish(matched, preparation.skipped, best, result, clock) | {"choice": choice(attempts), "attempts": attempts}
@@ -90,7 +90,7 @@ def _prepared(job: PhotoJob, work: Path, clock: Clock) -> Preparation:
 
 
 def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Path, clock: Clock) -> dict[str, Any]:
-    """Write down the largest piece of the best attempt, and return the report."""
+    """Write the largest piece of the best attempt; returns the report."""
     job, photos = matched.job, matched.photos
     figures, bend = NOTHING, 0.0
     if best.pieces:
@@ -108,11 +108,11 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         **figures,
         "bend_px": bend,
         "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],
-        "suspicion": best.suspicion,
+        "suspicion": best.consistency,
         "usable": refused is None,
         "refusal": refused,
         "skipped": skipped,
-        "unplaced": unplaced(photos, matched.evidence, {camera["name"] for camera in figures["cameras"]}, best.strays),
+        "unplaced": unplaced(photos, matched.evidence, {camera["name"] for camera in figures["cameras"]}, best.outliers),
         "seconds": clock.seconds,
     }
 
@@ -121,8 +121,8 @@ if __name__ == "__main__":
     try:
         main(Path(sys.argv[1]))
     except InputError as error:
-        say_error(error)
+        write_error(error)
         sys.exit(1)
     except OSError as error:
-        say_error(InputError(f"{sys.argv[1]} cannot be written: {error.strerror or error}.", "Choose another --out."))
+        write_error(InputError(f"{sys.argv[1]} cannot be written: {error.strerror or error}.", "Choose another --out."))
         sys.exit(1)

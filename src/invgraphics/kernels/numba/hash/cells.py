@@ -1,4 +1,4 @@
-"""Where a position lies in a level of a hash grid: cells, entries and weights, for the kernels to inline."""
+"""Trilinear cells of a hash grid: corner entries, weights, interpolation and its transpose, inlined into the kernels."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from invgraphics.kernels.numba.simd.instructions import fma, prefetch_pair
 from invgraphics.kernels.reference.hash import PRIMES
 
 CHUNK = 4096
-"""Points that are taken through a level before the next one, so that the level's entries stay in the cache."""
+"""Points processed per level before the next one, so that the level's entries stay in the cache."""
 BLOCK = 128
-"""Points whose entries and weights are found together, several at a time in vector registers, before the table is read."""
+"""Points whose entries and weights are computed together, vectorised, before the table is read."""
 
 _PRIME_Y, _PRIME_Z = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
@@ -20,8 +20,8 @@ _V1, _V2, _V3, _V4, _V5, _V6, _V7 = (index(BLOCK * vertex) for vertex in range(1
 
 
 @inlined
-def axis(coordinate, cells):
-    """Lower vertex along one axis and the fraction beyond it, which is rounded only once: fine levels leave it few digits."""
+def axis_cell(coordinate, cells):
+    """Lower vertex along one axis and the fraction beyond it, rounded only once: fine levels leave it few digits."""
     inside = min(coordinate if coordinate > ZERO else ZERO, ONE)
     edge = np.float32(cells)
     # Through signed 32-bit integers: processors convert nothing else quickly. The last vertex belongs to the last cell.
@@ -33,12 +33,12 @@ def axis(coordinate, cells):
     return np.uint32(lower), fraction
 
 
-# Numba widens what two 32-bit integers make to 64 bits; every step says that it stays narrow, or vectors hold half as many.
+# Numba widens 32-bit integer arithmetic to 64 bits; every step casts back, or vectors hold half as many values.
 
 
 @inlined
-def _stored(x, y, z, cells):
-    """Entries of the 8 vertices of a cell (x fastest) on a level that holds them all."""
+def _dense_entries(x, y, z, cells):
+    """Entries of the 8 corners of a cell (x fastest) on a dense level."""
     edge = _u32(cells + 1)
     plane = _u32(edge * edge)
     a = _u32(x + _u32(edge * y) + _u32(plane * z))
@@ -47,8 +47,8 @@ def _stored(x, y, z, cells):
 
 
 @inlined
-def _hashed(x, y, z, mask):
-    """Entries of the 8 vertices of a cell (x fastest) on a level whose vertices share entries."""
+def _hashed_entries(x, y, z, mask):
+    """Entries of the 8 corners of a cell (x fastest) on a hashed level."""
     y0, z0, u = _u32(y * _PRIME_Y), _u32(z * _PRIME_Z), _u32(x + _NEXT)
     y1, z1 = _u32(y0 + _PRIME_Y), _u32(z0 + _PRIME_Z)
     a, b, c, d = _u32(y0 ^ z0), _u32(y1 ^ z0), _u32(y0 ^ z1), _u32(y1 ^ z1)
@@ -59,18 +59,18 @@ def _hashed(x, y, z, mask):
 
 
 @inlined
-def corners(point, cells, mask):
-    """Entries of the 8 vertices around a position (x fastest), and the fractions; ``mask`` is 0 on dense levels."""
-    x, fx = axis(point[0], cells)
-    y, fy = axis(point[1], cells)
-    z, fz = axis(point[2], cells)
-    entries = _stored(x, y, z, cells) if mask == 0 else _hashed(x, y, z, _u32(mask))
+def cell_corners(point, cells, mask):
+    """Entries of the 8 corners around a position (x fastest), and the fractions; ``mask`` is 0 on dense levels."""
+    x, fx = axis_cell(point[0], cells)
+    y, fy = axis_cell(point[1], cells)
+    z, fz = axis_cell(point[2], cells)
+    entries = _dense_entries(x, y, z, cells) if mask == 0 else _hashed_entries(x, y, z, _u32(mask))
     return entries, (fx, fy, fz)
 
 
 @inlined
-def rows_of(e, offset, width):
-    """Where the entries' features begin in the flat table."""
+def feature_rows(e, offset, width):
+    """Offsets of the entries' features in the flat table."""
     return (
         (offset + e[0]) * width, (offset + e[1]) * width, (offset + e[2]) * width, (offset + e[3]) * width,
         (offset + e[4]) * width, (offset + e[5]) * width, (offset + e[6]) * width, (offset + e[7]) * width,
@@ -78,8 +78,8 @@ def rows_of(e, offset, width):
 
 
 @inlined
-def weights_of(f):
-    """Trilinear weights of the 8 vertices (x fastest)."""
+def trilinear_weights(f):
+    """Trilinear weights of the 8 corners (x fastest)."""
     x, y, z = f
     p, q = ONE - x, ONE - y
     low, high = ONE - z, z
@@ -88,14 +88,14 @@ def weights_of(f):
 
 
 @inlined
-def _put(values, n, v):
+def _store_corners(values, n, v):
     values[n], values[n + _V1], values[n + _V2], values[n + _V3] = v[0], v[1], v[2], v[3]
     values[n + _V4], values[n + _V5], values[n + _V6], values[n + _V7] = v[4], v[5], v[6], v[7]
 
 
 @inlined
-def _from(offset, e):
-    """The level's entries, counted from the beginning of the table."""
+def _table_entries(offset, e):
+    """Entries of a level as entries of the whole table."""
     return (
         _u32(offset + e[0]), _u32(offset + e[1]), _u32(offset + e[2]), _u32(offset + e[3]),
         _u32(offset + e[4]), _u32(offset + e[5]), _u32(offset + e[6]), _u32(offset + e[7]),
@@ -103,33 +103,41 @@ def _from(offset, e):
 
 
 @inlined
-def locate(x, y, z, block, level, entries, weights):
-    """Entries and weights of the vertices around the points of a block: vertex by vertex, `BLOCK` points each.
+def locate_block(x, y, z, block, level, entries, weights):
+    """Entries and weights of the corners around the points of a block: corner-major, `BLOCK` points each.
 
     ``block`` is the first point and the number of points, ``level`` the cells along an edge, the first entry and the mask.
     """
     first, count = block
     cells, offset, mask = level[0], _u32(level[1]), _u32(level[2])
-    # One loop for each kind of level, so that neither holds a branch.
+    # One loop per kind of level: branches would prevent vectorisation.
     if mask == 0:
         for number in range(count):
             n = index(number)
-            (i, a), (j, b), (k, c) = axis(x[first + n], cells), axis(y[first + n], cells), axis(z[first + n], cells)
-            _put(entries, n, _from(offset, _stored(i, j, k, cells)))
-            _put(weights, n, weights_of((a, b, c)))
+            (i, a), (j, b), (k, c) = (
+                axis_cell(x[first + n], cells),
+                axis_cell(y[first + n], cells),
+                axis_cell(z[first + n], cells),
+            )
+            _store_corners(entries, n, _table_entries(offset, _dense_entries(i, j, k, cells)))
+            _store_corners(weights, n, trilinear_weights((a, b, c)))
     else:
         for number in range(count):
             n = index(number)
-            (i, a), (j, b), (k, c) = axis(x[first + n], cells), axis(y[first + n], cells), axis(z[first + n], cells)
-            _put(entries, n, _from(offset, _hashed(i, j, k, mask)))
-            _put(weights, n, weights_of((a, b, c)))
+            (i, a), (j, b), (k, c) = (
+                axis_cell(x[first + n], cells),
+                axis_cell(y[first + n], cells),
+                axis_cell(z[first + n], cells),
+            )
+            _store_corners(entries, n, _table_entries(offset, _hashed_entries(i, j, k, mask)))
+            _store_corners(weights, n, trilinear_weights((a, b, c)))
 
 
 @inlined
-def ask_for(table, entries, count):
-    """Have the entries of so many points of a block fetched, which a processor foresees only a few points ahead.
+def prefetch_entries(table, entries, count):
+    """Prefetch the entries of the first ``count`` points of a block: out-of-order execution looks only a few points ahead.
 
-    Of two vertices that are neighbours along x, one is asked for: their entries nearly always share a cache line.
+    Of two corners that are neighbours along x, one suffices: their entries nearly always share a cache line.
     """
     for vertex in range(0, 8, 2):
         for number in range(count):
@@ -137,8 +145,8 @@ def ask_for(table, entries, count):
 
 
 @inlined
-def at_vertices(values, n):
-    """The 8 numbers of the block's n-th point."""
+def load_corners(values, n):
+    """Load the 8 corner values of the block's n-th point."""
     return (
         values[n], values[n + _V1], values[n + _V2], values[n + _V3],
         values[n + _V4], values[n + _V5], values[n + _V6], values[n + _V7],
@@ -146,21 +154,21 @@ def at_vertices(values, n):
 
 
 @ordered
-def blend(table, r, w, k):
-    """Weighted sum of the vertices' k-th features."""
+def interpolate(table, r, w, k):
+    """Trilinear interpolation of the k-th feature."""
     a, b = w[0] * table[r[0] + k] + w[1] * table[r[1] + k], w[2] * table[r[2] + k] + w[3] * table[r[3] + k]
     c, d = w[4] * table[r[4] + k] + w[5] * table[r[5] + k], w[6] * table[r[6] + k] + w[7] * table[r[7] + k]
     return (a + b) + (c + d)
 
 
 @inlined
-def spread(to_table, r, w, k, g):
-    """Add a gradient to the vertices' k-th features."""
-    to_table[r[0] + k] += w[0] * g
-    to_table[r[1] + k] += w[1] * g
-    to_table[r[2] + k] += w[2] * g
-    to_table[r[3] + k] += w[3] * g
-    to_table[r[4] + k] += w[4] * g
-    to_table[r[5] + k] += w[5] * g
-    to_table[r[6] + k] += w[6] * g
-    to_table[r[7] + k] += w[7] * g
+def scatter_add(grad_table, r, w, k, g):
+    """Transpose of `interpolate`: add a gradient to the corners' k-th features."""
+    grad_table[r[0] + k] += w[0] * g
+    grad_table[r[1] + k] += w[1] * g
+    grad_table[r[2] + k] += w[2] * g
+    grad_table[r[3] + k] += w[3] * g
+    grad_table[r[4] + k] += w[4] * g
+    grad_table[r[5] + k] += w[5] * g
+    grad_table[r[6] + k] += w[6] * g
+    grad_table[r[7] + k] += w[7] * g

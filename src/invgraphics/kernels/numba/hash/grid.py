@@ -1,4 +1,4 @@
-"""Trilinear interpolation in a dense grid (definition: `invgraphics.kernels.reference.grid`)."""
+"""Trilinear interpolation in a dense grid, forward and backward (definition: `invgraphics.kernels.reference.grid`)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.kernels.numba.hash.cells import axis, weights_of
-from invgraphics.kernels.numba.hash.jacobian import slopes
-from invgraphics.kernels.numba.runtime import array, index, inlined, once_differentiable, parallel, prange, share, threads
+from invgraphics.kernels.numba.hash.cells import axis_cell, trilinear_weights
+from invgraphics.kernels.numba.hash.jacobian import trilinear_gradient
+from invgraphics.kernels.numba.runtime import array, index, inlined, job_start, once_differentiable, parallel, prange, threads
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
@@ -19,16 +19,16 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 @inlined
 def _locate(point, shape):
     """Lower vertex, the steps to its upper neighbours (0 on an axis with a single vertex) and the fractions."""
-    x, fx = axis(point[0], shape[0] - 1)
-    y, fy = axis(point[1], shape[1] - 1)
-    z, fz = axis(point[2], shape[2] - 1)
+    x, fx = axis_cell(point[0], shape[0] - 1)
+    y, fy = axis_cell(point[1], shape[1] - 1)
+    z, fz = axis_cell(point[2], shape[2] - 1)
     step_x, step_y, step_z = index(min(shape[0] - 1, 1)), index(min(shape[1] - 1, 1)), index(min(shape[2] - 1, 1))
     return (x, y, z), (step_x, step_y, step_z), (fx, fy, fz)
 
 
 @inlined
 def _rows(lower, step, shape):
-    """Rows of the flattened grid that hold the 8 vertices, x fastest."""
+    """Rows of the flattened grid that hold the 8 corners, x fastest."""
     sy, sz = index(shape[1]), index(shape[2])
     x0, x1 = lower[0] * sy, (lower[0] + step[0]) * sy
     y0, y1 = lower[1], lower[1] + step[1]
@@ -41,10 +41,10 @@ def _rows(lower, step, shape):
 def sample(unit, grid, shape, jobs, out):
     """Interpolate the flattened grid (vertices, channels) at each point."""
     for job in prange(jobs):
-        for number in range(share(len(unit), jobs, job), share(len(unit), jobs, job + 1)):
+        for number in range(job_start(len(unit), jobs, job), job_start(len(unit), jobs, job + 1)):
             i = index(number)
             lower, step, f = _locate(unit[i], shape)
-            r, w = _rows(lower, step, shape), weights_of(f)
+            r, w = _rows(lower, step, shape), trilinear_weights(f)
             for channel in range(grid.shape[1]):
                 k = index(channel)
                 low = w[0] * grid[r[0], k] + w[1] * grid[r[1], k] + w[2] * grid[r[2], k] + w[3] * grid[r[3], k]
@@ -53,41 +53,41 @@ def sample(unit, grid, shape, jobs, out):
 
 
 @inlined
-def _add(to_grid, row, weight, gradient, i):
+def _add(grad_grid, row, weight, gradient, i):
     for channel in range(gradient.shape[1]):
         k = index(channel)
-        to_grid[row, k] += weight * gradient[i, k]
+        grad_grid[row, k] += weight * gradient[i, k]
 
 
 @parallel
-def sample_back(unit, gradient, shape, jobs, to_grid):
-    """Gradient along the flattened grid. Each job owns a slab of vertices along x and adds what falls into it, in order."""
+def sample_backward(unit, gradient, shape, jobs, grad_grid):
+    """Gradient of the flattened grid. Each job owns a slab of vertices along x and accumulates its points in order."""
     layer = shape[1] * shape[2]
     for job in prange(jobs):
-        first, end = index(share(shape[0], jobs, job)), index(share(shape[0], jobs, job + 1))
-        to_grid[first * index(layer) : end * index(layer)] = _ZERO
+        first, end = index(job_start(shape[0], jobs, job)), index(job_start(shape[0], jobs, job + 1))
+        grad_grid[first * index(layer) : end * index(layer)] = _ZERO
         for number in range(len(unit)):
             i = index(number)
             lower, step, f = _locate(unit[i], shape)
             if lower[0] + index(1) >= first and lower[0] < end:
-                r, w = _rows(lower, step, shape), weights_of(f)
+                r, w = _rows(lower, step, shape), trilinear_weights(f)
                 if first <= lower[0] < end:
-                    _add(to_grid, r[0], w[0], gradient, i)
-                    _add(to_grid, r[2], w[2], gradient, i)
-                    _add(to_grid, r[4], w[4], gradient, i)
-                    _add(to_grid, r[6], w[6], gradient, i)
+                    _add(grad_grid, r[0], w[0], gradient, i)
+                    _add(grad_grid, r[2], w[2], gradient, i)
+                    _add(grad_grid, r[4], w[4], gradient, i)
+                    _add(grad_grid, r[6], w[6], gradient, i)
                 if first <= lower[0] + step[0] < end:
-                    _add(to_grid, r[1], w[1], gradient, i)
-                    _add(to_grid, r[3], w[3], gradient, i)
-                    _add(to_grid, r[5], w[5], gradient, i)
-                    _add(to_grid, r[7], w[7], gradient, i)
+                    _add(grad_grid, r[1], w[1], gradient, i)
+                    _add(grad_grid, r[3], w[3], gradient, i)
+                    _add(grad_grid, r[5], w[5], gradient, i)
+                    _add(grad_grid, r[7], w[7], gradient, i)
 
 
 @parallel
-def locate_back(unit, grid, gradient, shape, jobs, to_unit):
-    """Gradient along the positions; zero along the axes on which a position was clamped."""
+def position_gradient(unit, grid, gradient, shape, jobs, grad_unit):
+    """Gradient of the positions; zero on axes on which a position was clamped."""
     for job in prange(jobs):
-        for number in range(share(len(unit), jobs, job), share(len(unit), jobs, job + 1)):
+        for number in range(job_start(len(unit), jobs, job), job_start(len(unit), jobs, job + 1)):
             i = index(number)
             lower, step, f = _locate(unit[i], shape)
             r = _rows(lower, step, shape)
@@ -98,13 +98,13 @@ def locate_back(unit, grid, gradient, shape, jobs, to_unit):
                     grid[r[0], k], grid[r[1], k], grid[r[2], k], grid[r[3], k],
                     grid[r[4], k], grid[r[5], k], grid[r[6], k], grid[r[7], k],
                 )  # fmt: skip
-                sx, sy, sz = slopes(v, f)
+                sx, sy, sz = trilinear_gradient(v, f)
                 g = gradient[i, k]
                 x, y, z = x + g * sx, y + g * sy, z + g * sz
-            to_unit[i, 0], to_unit[i, 1], to_unit[i, 2] = x, y, z
+            grad_unit[i, 0], grad_unit[i, 1], grad_unit[i, 2] = x, y, z
             for a in range(3):
                 inside = unit[i, a] >= _ZERO and unit[i, a] <= _ONE
-                to_unit[i, a] = to_unit[i, a] * np.float32(shape[a] - 1) if inside else _ZERO
+                grad_unit[i, a] = grad_unit[i, a] * np.float32(shape[a] - 1) if inside else _ZERO
 
 
 class _Sample(torch.autograd.Function):
@@ -123,14 +123,14 @@ class _Sample(torch.autograd.Function):
         (gradient,) = grad_outputs
         unit, grid = ctx.saved_tensors
         points, received, shape = array(unit), array(gradient), tuple(grid.shape[:3])
-        to_unit = to_grid = None
+        grad_unit = grad_grid = None
         if ctx.needs_input_grad[0]:
-            to_unit = torch.empty(unit.shape)
-            locate_back(points, _flat(grid), received, shape, threads(), to_unit.numpy())
+            grad_unit = torch.empty(unit.shape)
+            position_gradient(points, _flat(grid), received, shape, threads(), grad_unit.numpy())
         if ctx.needs_input_grad[1]:
-            to_grid = torch.empty(grid.shape)
-            sample_back(points, received, shape, threads(), to_grid.numpy().reshape(-1, grid.shape[3]))
-        return to_unit, to_grid
+            grad_grid = torch.empty(grid.shape)
+            sample_backward(points, received, shape, threads(), grad_grid.numpy().reshape(-1, grid.shape[3]))
+        return grad_unit, grad_grid
 
 
 def _flat(grid: Tensor) -> np.ndarray:

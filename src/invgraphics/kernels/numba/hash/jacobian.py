@@ -1,16 +1,16 @@
-"""Derivatives of the hash encoding along positions, and what a loss on those needs."""
+"""Position derivatives of the hash encoding: vector-Jacobian product, Jacobian-vector product, and the latter's backward."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.hash.cells import CHUNK, ONE, ZERO, blend, corners, rows_of, spread
-from invgraphics.kernels.numba.runtime import index, inlined, parallel, prange, share
+from invgraphics.kernels.numba.hash.cells import CHUNK, ONE, ZERO, cell_corners, feature_rows, interpolate, scatter_add
+from invgraphics.kernels.numba.runtime import index, inlined, job_start, parallel, prange
 
 
 @inlined
-def slopes(v, f):
-    """Derivatives along the fractions of the trilinear interpolant of the 8 values ``v``."""
+def trilinear_gradient(v, f):
+    """Gradient of the trilinear interpolant of the 8 values ``v`` with respect to the fractions ``f``."""
     x, y, z = f
     p, q, r = ONE - x, ONE - y, ONE - z
     along_x = q * r * (v[1] - v[0]) + y * r * (v[3] - v[2]) + q * z * (v[5] - v[4]) + y * z * (v[7] - v[6])
@@ -28,36 +28,36 @@ def _vertex_values(table, r, k):
 
 
 @parallel
-def locate_back(unit, table, gradient, width, cells, offsets, masks, jobs, to_unit):
-    """Gradient along the positions; zero along the axes on which a position was clamped."""
+def position_gradient(unit, table, gradient, width, cells, offsets, masks, jobs, grad_unit):
+    """Gradient of the positions (vector-Jacobian product); zero on axes on which a position was clamped."""
     for job in prange(jobs):
-        begin, end = share(len(unit), jobs, job), share(len(unit), jobs, job + 1)
+        begin, end = job_start(len(unit), jobs, job), job_start(len(unit), jobs, job + 1)
         for chunk in range(begin, end, CHUNK):
-            to_unit[chunk : min(chunk + CHUNK, end)] = ZERO
+            grad_unit[chunk : min(chunk + CHUNK, end)] = ZERO
             for level in range(len(cells)):
                 offset, mask, edge = index(offsets[level]), masks[level], cells[level]
                 scale, column = np.float32(edge), index(level) * width
                 for number in range(chunk, min(chunk + CHUNK, end)):
                     i = index(number)
-                    entries, f = corners(unit[i], edge, mask)
-                    r = rows_of(entries, offset, width)
+                    entries, f = cell_corners(unit[i], edge, mask)
+                    r = feature_rows(entries, offset, width)
                     for feature in range(width):
                         k = index(feature)
-                        x, y, z = slopes(_vertex_values(table, r, k), f)
+                        x, y, z = trilinear_gradient(_vertex_values(table, r, k), f)
                         g = gradient[i, column + k] * scale
-                        to_unit[i, 0] += g * x
-                        to_unit[i, 1] += g * y
-                        to_unit[i, 2] += g * z
+                        grad_unit[i, 0] += g * x
+                        grad_unit[i, 1] += g * y
+                        grad_unit[i, 2] += g * z
             for number in range(chunk, min(chunk + CHUNK, end)):
                 for a in range(3):
                     coordinate = unit[number, a]
                     if not (coordinate >= ZERO and coordinate <= ONE):
-                        to_unit[number, a] = ZERO
+                        grad_unit[number, a] = ZERO
 
 
 @inlined
-def rise_of(f, v, scale):
-    """Derivatives of the trilinear weights in the direction ``v``: `weights_of`, differentiated."""
+def weights_jvp(f, v, scale):
+    """Jacobian-vector product of `trilinear_weights`: derivatives of the weights in the direction ``v``."""
     x, y, z = f
     p, q, r = ONE - x, ONE - y, ONE - z
     along_x, along_y, along_z = v[0] * scale, v[1] * scale, v[2] * scale
@@ -68,35 +68,35 @@ def rise_of(f, v, scale):
 
 
 @parallel
-def rise(unit, table, along, width, cells, offsets, masks, jobs, out):
-    """Derivative of all levels' features in the direction ``along`` of each point."""
+def encode_jvp(unit, table, along, width, cells, offsets, masks, jobs, out):
+    """Jacobian-vector product of the encoding: derivative of all features in the direction ``along`` of each point."""
     for job in prange(jobs):
-        begin, end = share(len(unit), jobs, job), share(len(unit), jobs, job + 1)
+        begin, end = job_start(len(unit), jobs, job), job_start(len(unit), jobs, job + 1)
         for chunk in range(begin, end, CHUNK):
             for level in range(len(cells)):
                 offset, mask, edge = index(offsets[level]), masks[level], cells[level]
                 column = index(level) * width
                 for number in range(chunk, min(chunk + CHUNK, end)):
                     i = index(number)
-                    entries, f = corners(unit[i], edge, mask)
-                    w, r = rise_of(f, along[i], np.float32(edge)), rows_of(entries, offset, width)
+                    entries, f = cell_corners(unit[i], edge, mask)
+                    w, r = weights_jvp(f, along[i], np.float32(edge)), feature_rows(entries, offset, width)
                     for feature in range(width):
                         k = index(feature)
-                        out[i, column + k] = blend(table, r, w, k)
+                        out[i, column + k] = interpolate(table, r, w, k)
 
 
 @parallel
-def rise_back(unit, gradient, along, width, cells, offsets, masks, jobs, to_table):
-    """Gradient along the table of `rise`, for which ``gradient`` is the cotangent; levels are shared as in `encode_back`."""
+def encode_jvp_backward(unit, gradient, along, width, cells, offsets, masks, jobs, grad_table):
+    """Gradient of the table through `encode_jvp`, whose cotangent is ``gradient``; jobs own levels as in `encode_backward`."""
     for job in prange(jobs):
         for level in range(job, len(cells), jobs):
             offset, mask, edge = index(offsets[level]), masks[level], cells[level]
             column = index(level) * width
-            to_table[offset * width : index(offsets[level + 1]) * width] = ZERO
+            grad_table[offset * width : index(offsets[level + 1]) * width] = ZERO
             for number in range(len(unit)):
                 i = index(number)
-                entries, f = corners(unit[i], edge, mask)
-                w, r = rise_of(f, along[i], np.float32(edge)), rows_of(entries, offset, width)
+                entries, f = cell_corners(unit[i], edge, mask)
+                w, r = weights_jvp(f, along[i], np.float32(edge)), feature_rows(entries, offset, width)
                 for feature in range(width):
                     k = index(feature)
-                    spread(to_table, r, w, k, gradient[i, column + k])
+                    scatter_add(grad_table, r, w, k, gradient[i, column + k])

@@ -1,1 +1,1 @@
-"""Fused ray marching of a hash grid with small networks."""
+"""Fused marching and rendering of Instant-NGP fields: a hash grid with small MLPs."""

@@ -1,4 +1,4 @@
-"""A layer of a small network for 32 points at once: four outputs of all points stay in registers until they are complete."""
+"""Dense layer of a small MLP for 32 points at a time: accumulators of four outputs stay in registers."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels.numba.runtime import LANES, array, index, inlined
-from invgraphics.kernels.numba.simd.lanes import load, spread, store
+from invgraphics.kernels.numba.simd.lanes import broadcast, load, store
 
 POINTS = LANES + LANES
-"""Points of a call: feature after feature, ``POINTS`` values each."""
-TOGETHER = 4
-"""Outputs that are summed side by side; their number is filled up to a multiple of it."""
+"""Batch size: arrays are feature-major, ``POINTS`` values per feature."""
+TILE = 4
+"""Outputs accumulated together; their number is padded to a multiple of it."""
 
-_FOUR, _1, _2, _3 = index(TOGETHER), index(1), index(2), index(3)
+_FOUR, _1, _2, _3 = index(TILE), index(1), index(2), index(3)
 _ZERO = np.float32(0.0)
 
 
 def padded(outputs: int) -> int:
-    """Outputs of a layer as `dense` computes them."""
-    return -(-outputs // TOGETHER) * TOGETHER
+    """Number of outputs of a layer, padded for `dense`."""
+    return -(-outputs // TILE) * TILE
 
 
-def packed_layer(weight: Float[Tensor, "outs ins"], bias: Float[Tensor, " outs"]) -> np.ndarray:
-    """A layer as `dense` reads it: of each `TOGETHER` outputs the biases, then the weights input by input."""
+def pack_layer(weight: Float[Tensor, "outs ins"], bias: Float[Tensor, " outs"]) -> np.ndarray:
+    """Weights and biases in the layout of `dense`: per `TILE` outputs the biases, then the weights input by input."""
     outputs, inputs = weight.shape
     rows = np.zeros((padded(outputs), 1 + inputs), np.float32)
     rows[:outputs, 0], rows[:outputs, 1:] = array(bias), array(weight)
-    return rows.reshape(-1, TOGETHER, 1 + inputs).transpose(0, 2, 1).reshape(-1)
+    return rows.reshape(-1, TILE, 1 + inputs).transpose(0, 2, 1).reshape(-1)
 
 
 @inlined
@@ -47,7 +47,7 @@ def _put(y, row, left, right, rectified):
 def dense(layer, at, x, y, sizes, rectified):
     """Apply a layer to `POINTS` points: ``y = W x + b``, or 0 where that is negative and ``rectified``.
 
-    ``layer`` is a flat array in which the layer begins at ``at`` (see `packed_layer`), ``x`` and ``y`` are flat arrays,
+    ``layer`` is a flat array in which the layer begins at ``at`` (see `pack_layer`), ``x`` and ``y`` are flat arrays,
     ``sizes`` the numbers of inputs and of padded outputs (uint64). All numbers are float32.
     """
     inputs, outputs = sizes
@@ -55,7 +55,7 @@ def dense(layer, at, x, y, sizes, rectified):
         first = index(block) * _FOUR
         place = at + first * (inputs + _1)
         p, q, r, s = _four(layer, place)
-        p0, q0, r0, s0 = spread(p), spread(q), spread(r), spread(s)
+        p0, q0, r0, s0 = broadcast(p), broadcast(q), broadcast(r), broadcast(s)
         p1, q1, r1, s1 = p0, q0, r0, s0
         for k in range(inputs):
             place += _FOUR

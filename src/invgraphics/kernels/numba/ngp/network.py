@@ -1,25 +1,28 @@
-"""A hash grid and its networks as kernels ask them: densities and colours of `POINTS` positions at once."""
+"""Hash encoding and MLP inference for `POINTS` positions at a time, inlined into the fused kernels.
+
+Arrays are flat and feature-major: `POINTS` values of the first feature, then of the second.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from torch import Tensor
 
-from invgraphics.kernels.numba.hash.cells import ask_for, at_vertices, locate
-from invgraphics.kernels.numba.ngp.dense import POINTS, dense, packed_layer, padded
+from invgraphics.kernels.numba.hash.cells import load_corners, locate_block, prefetch_entries
+from invgraphics.kernels.numba.ngp.dense import POINTS, dense, pack_layer, padded
 from invgraphics.kernels.numba.runtime import exp2, index, inlined, log2
-from invgraphics.kernels.numba.simd.instructions import blend_pair
+from invgraphics.kernels.numba.simd.instructions import interpolate_pair
 from invgraphics.kernels.types import EXP_LIMIT
 
 ACTIVATIONS = ("exp", "softplus", "relu")
-"""Of densities, by the numbers that kernels know them by."""
+"""Density activations, by the index that is passed to kernels."""
 _EXP, _SOFTPLUS = 0, 1
 
 _ZERO, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0.0, 1.0, 2.0, 4.0))
 _LOG2E, _LN2 = np.float32(1 / np.log(2.0)), np.float32(np.log(2.0))
 _MOST = np.float32(EXP_LIMIT)
 _LARGEST = np.float32(80.0)
-"""Beyond this exp(-x) is nothing beside 1, and stays within float32."""
+"""Beyond this exp(-x) is negligible beside 1; clamping keeps it within float32."""
 
 
 @inlined
@@ -35,8 +38,8 @@ def sigmoid(x):
 
 
 @inlined
-def density_of(raw, activation):
-    """The density that a network's output stands for; ``activation`` is one of `ACTIVATIONS`, by number."""
+def activate_density(raw, activation):
+    """Density from a raw network output; ``activation`` is an index of `ACTIVATIONS`."""
     if activation == _EXP:
         return exp2(min(raw, _MOST) * _LOG2E)
     return softplus(raw) if activation == _SOFTPLUS else max(raw, _ZERO)
@@ -46,44 +49,44 @@ def density_of(raw, activation):
 def radial_scale(points, p):
     """`Bounds.radial_scale` at position ``p`` in the unit cube of a contracted space: (2 - |y|)², y after contraction."""
     x, y, z = _FOUR * points[0, p] - _TWO, _FOUR * points[1, p] - _TWO, _FOUR * points[2, p] - _TWO
-    left = min(_TWO - np.sqrt(x * x + y * y + z * z), _ONE)
-    return left * left
+    remaining = min(_TWO - np.sqrt(x * x + y * y + z * z), _ONE)
+    return remaining * remaining
 
 
 @inlined
 def encode(table, levels, points, entries, weights, out):
-    """Features of `POINTS` positions, feature after feature; ``entries`` and ``weights`` have room for two levels.
+    """Hash encoding of `POINTS` positions, feature-major; ``entries`` and ``weights`` are scratch for two levels.
 
-    A level's entries are asked for before those of the level before it are read.
+    Software pipelining: a level's entries are prefetched before those of the previous level are read.
     """
     cells, offsets, masks = levels
     for number in range(len(cells) + 1):
         if number < len(cells):
             level, place = (cells[number], offsets[number], masks[number]), number % 2
-            locate(points[0], points[1], points[2], (index(0), np.int64(POINTS)), level, entries[place], weights[place])
-            ask_for(table, entries[place], POINTS)
+            locate_block(points[0], points[1], points[2], (index(0), np.int64(POINTS)), level, entries[place], weights[place])
+            prefetch_entries(table, entries[place], POINTS)
         if number > 0:
             column, place = index(2 * (number - 1)) * POINTS, (number - 1) % 2
             for point in range(POINTS):
                 n = index(point)
-                low, high = blend_pair(table, at_vertices(entries[place], n), at_vertices(weights[place], n))
+                low, high = interpolate_pair(table, load_corners(entries[place], n), load_corners(weights[place], n))
                 out[column + n], out[column + POINTS + n] = low, high
 
 
 @inlined
-def outputs_of(network, x, odd, even):
-    """The outputs of `POINTS` inputs; layers write to ``odd`` and ``even`` in turn."""
+def mlp(network, x, ping, pong):
+    """Outputs of an MLP for `POINTS` inputs; layers write to ``ping`` and ``pong`` in turn."""
     layers, sizes = network
-    at, last, source, target = index(0), len(sizes) - 1, x, odd
+    at, last, source, target = index(0), len(sizes) - 1, x, ping
     for number in range(len(sizes)):
         size = index(sizes[number, 0]), index(sizes[number, 1])
         dense(layers, at, source, target, size, number < last)
         at += (size[0] + index(1)) * size[1]
-        source, target = target, even if number % 2 == 0 else odd
+        source, target = target, pong if number % 2 == 0 else ping
     return source
 
 
-def packed_network(layers: tuple[tuple[Tensor, Tensor], ...]) -> tuple[np.ndarray, np.ndarray]:
-    """A network as kernels read it: its layers, and their inputs and padded outputs."""
+def pack_network(layers: tuple[tuple[Tensor, Tensor], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Layers of an MLP in the kernels' layout: packed weights, and per layer the numbers of inputs and padded outputs."""
     sizes = np.array([(weight.shape[1], padded(len(weight))) for weight, _ in layers], np.int64)
-    return np.concatenate([packed_layer(weight, bias) for weight, bias in layers]), sizes
+    return np.concatenate([pack_layer(weight, bias) for weight, bias in layers]), sizes

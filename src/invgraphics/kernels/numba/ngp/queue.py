@@ -1,8 +1,8 @@
-"""Many rays under way at once: what pictures of hash grids in one pass and marches that stop have in common.
+"""A queue of rays in flight: fused rendering and early-terminated marching evaluate one interval of `POINTS` rays at a time.
 
-A job keeps `POINTS` rays in as many places and looks at the next occupied step of all of them. A ray that has met something
-opaque, or has left, makes room for another one at once. Rays whose steps are used up wait until there are `LANES` of them, or
-are joined by new ones, and walk on together.
+A job keeps one ray in each of `POINTS` batch lanes and evaluates the next occupied interval of all of them. A ray that has
+terminated or has left the volume is replaced at once. Rays that have used up their buffered intervals wait until `LANES` of
+them can be marched on together, filled up with new rays.
 """
 
 from __future__ import annotations
@@ -13,113 +13,123 @@ import numpy as np
 
 from invgraphics.kernels.numba.harmonics import harmonics
 from invgraphics.kernels.numba.ngp.dense import POINTS
-from invgraphics.kernels.numba.rays.traversal import MARKS, NUMBERS, marks_of, no_ray, set_marks, set_ray, to_unit, walk_rays
+from invgraphics.kernels.numba.rays.traversal import (
+    RAY_FLOATS,
+    STATE_FLOATS,
+    idle_lane,
+    march_rays,
+    read_state,
+    set_ray,
+    set_state,
+    to_unit,
+)
 from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined
 from invgraphics.kernels.numba.simd.lanes import load, store
 
 AHEAD = 16
-"""Occupied steps of a ray that are found at once."""
+"""Occupied intervals of a ray that are marched ahead and buffered."""
 ROW = AHEAD + 1
-"""A walk writes one more, of no meaning."""
+"""Size of a slot's buffer: a march writes one interval more, of no meaning."""
 EDGE = 8
-"""Of a block of pixels whose rays a job takes at once."""
+"""Edge in pixels of the image blocks that are scheduled to a job."""
 BLOCK = EDGE * EDGE
 SLOTS = int(POINTS) + 4 * GROUP
-"""Room for rays under way. When `LANES` of them are to walk, none is ready for a place, and fewer than twice as many wait."""
-READY, WAITING, WALKING, UNUSED, TAKEN = range(5)
-"""Lists of slots, and the number of rays that have been taken from the deal."""
+"""Rays in flight. When `LANES` of them are marched, none is ready for a batch lane, and fewer than twice as many wait."""
+READY, WAITING, MARCHING, FREE, SCHEDULED = range(5)
+"""Lists of slots by status, and the index in ``counts`` of the number of rays scheduled so far."""
 
 _ZERO, _HALF = np.float32(0.0), np.float32(0.5)
-_ROOM = np.float32(AHEAD)
+_LIMIT = np.float32(AHEAD)
 _1, _2, _3, _4, _5 = (POINTS * index(k) for k in range(1, 6))
 
 
-class Way(NamedTuple):
-    """Rays of a job that are under way, and lists of them.
+class RayQueue(NamedTuple):
+    """Rays in flight of one job, kept in slots, and lists of slots by status.
 
     Attributes:
-        slots: where the ray of each place is kept, -1 for none.
-        middles: of the places' steps, distances.
-        lines: of the places' rays, origins and directions, number after number.
-        which: number of a slot's ray.
-        t0: begins of the steps found, `ROW` for each slot.
-        t1: their ends.
-        kept: how many there are.
-        done: how many have been looked at.
-        steps: how many of all steps have been walked.
-        resume: where the walk goes on.
-        light: what is left of it.
-        missed: weight that was left out of the ray's picture.
-        views: harmonics of the ray's direction.
-        lists: slots by what they wait for.
-        counts: lengths of the lists, and number of rays that have been taken from the deal.
-        walkers: `walking.NUMBERS` of each ray that walks.
-        marks: `walking.MARKS` of each.
+        slots: slot of the ray in each batch lane, -1 for none.
+        midpoints: distance of the midpoint of each batch lane's interval.
+        lane_rays: origins and directions of the batch lanes' rays, structure of arrays.
+        ray_index: index of each slot's ray.
+        t0: starts of buffered intervals, `ROW` for each slot.
+        t1: ends of buffered intervals.
+        buffered: number of buffered intervals of each slot.
+        consumed: number of those that have been evaluated.
+        steps: lattice index of each slot's next step.
+        resume: distance at which each slot's march resumes.
+        transmittance: of each slot's ray, float64.
+        error: summed weight of the samples of each slot whose colour was not evaluated.
+        harmonics: spherical harmonics of each slot's direction (see `harmonics_offset`).
+        lists: slots by status.
+        counts: lengths of the lists, and number of rays scheduled.
+        march_rays: `traversal.RAY_FLOATS` of each ray that is being marched.
+        march_state: `traversal.STATE_FLOATS` of each.
     """
 
     slots: np.ndarray
-    middles: np.ndarray
-    lines: np.ndarray
-    which: np.ndarray
+    midpoints: np.ndarray
+    lane_rays: np.ndarray
+    ray_index: np.ndarray
     t0: np.ndarray
     t1: np.ndarray
-    kept: np.ndarray
-    done: np.ndarray
+    buffered: np.ndarray
+    consumed: np.ndarray
     steps: np.ndarray
     resume: np.ndarray
-    light: np.ndarray
-    missed: np.ndarray
-    views: np.ndarray
+    transmittance: np.ndarray
+    error: np.ndarray
+    harmonics: np.ndarray
     lists: np.ndarray
     counts: np.ndarray
-    walkers: np.ndarray
-    marks: np.ndarray
+    march_rays: np.ndarray
+    march_state: np.ndarray
 
 
 @inlined
-def no_rays():
-    """`POINTS` places, all without a ray."""
-    way = Way(
+def empty_queue():
+    """A queue without rays: all slots free, all batch lanes idle."""
+    queue = RayQueue(
         np.full(POINTS, -1, np.int64), np.zeros(POINTS, np.float32), np.zeros(6 * POINTS, np.float32),
         np.zeros(SLOTS, np.int64),
         # One row more, for lanes that have no ray.
         np.zeros((SLOTS + 1) * ROW, np.float32), np.zeros((SLOTS + 1) * ROW, np.float32),
         np.zeros(SLOTS, np.int64), np.zeros(SLOTS, np.int64),
         np.zeros(SLOTS, np.float32), np.zeros(SLOTS, np.float32), np.zeros(SLOTS, np.float64), np.zeros(SLOTS, np.float32),
-        np.zeros(16 * SLOTS, np.float32), np.zeros((UNUSED + 1, SLOTS), np.int64), np.zeros(TAKEN + 1, np.int64),
-        np.zeros(NUMBERS * GROUP, np.float32), np.zeros(MARKS * GROUP, np.float32),
+        np.zeros(16 * SLOTS, np.float32), np.zeros((FREE + 1, SLOTS), np.int64), np.zeros(SCHEDULED + 1, np.int64),
+        np.zeros(RAY_FLOATS * GROUP, np.float32), np.zeros(STATE_FLOATS * GROUP, np.float32),
     )  # fmt: skip
     for s in range(SLOTS):
-        _put(way, UNUSED, s)
-    return way
+        _push(queue, FREE, s)
+    return queue
 
 
 @inlined
-def _put(way, name, s):
-    way.lists[name, way.counts[name]] = s
-    way.counts[name] += 1
+def _push(queue, status, s):
+    queue.lists[status, queue.counts[status]] = s
+    queue.counts[status] += 1
 
 
 @inlined
-def _take(way, name):
-    way.counts[name] -= 1
-    return way.lists[name, way.counts[name]]
+def _pop(queue, status):
+    queue.counts[status] -= 1
+    return queue.lists[status, queue.counts[status]]
 
 
 @inlined
-def _next_ray(way, deal, count):
-    """Number of the next ray of the deal, -1 where there is none.
+def _next_ray(queue, schedule, count):
+    """Index of the next ray of a job's schedule, -1 at its end.
 
-    Jobs take blocks of a picture in turn, `EDGE` by `EDGE` pixels: neighbours meet the same cells and entries, and walk alike.
+    Jobs take blocks of the image in turn, `EDGE` by `EDGE` pixels: rays of neighbouring pixels meet the same cells and entries,
+    and march alike.
     """
-    job, jobs, width = deal
+    job, jobs, width = schedule
     across = (width + EDGE - 1) // EDGE
     while True:
-        block, pixel = way.counts[TAKEN] // BLOCK * jobs + job, way.counts[TAKEN] % BLOCK
+        block, pixel = queue.counts[SCHEDULED] // BLOCK * jobs + job, queue.counts[SCHEDULED] % BLOCK
         down = block // across
         if down * EDGE * width >= count:
             return -1
-        way.counts[TAKEN] += 1
+        queue.counts[SCHEDULED] += 1
         column = (block - down * across) * EDGE + pixel % EDGE
         r = (down * EDGE + pixel // EDGE) * width + column
         if column < width and r < count:
@@ -127,101 +137,101 @@ def _next_ray(way, deal, count):
 
 
 @inlined
-def _start(way, deal, start):
-    """Take a new ray; returns its slot, -1 where there is none left or no room."""
-    r = _next_ray(way, deal, len(start)) if way.counts[UNUSED] > 0 else -1
+def _start_ray(queue, schedule, start):
+    """Move the next scheduled ray into a free slot; returns the slot, -1 where no ray or no slot is left."""
+    r = _next_ray(queue, schedule, len(start)) if queue.counts[FREE] > 0 else -1
     if r < 0:
         return -1
-    s = _take(way, UNUSED)
-    way.which[s], way.kept[s], way.steps[s], way.resume[s] = r, 0, _ZERO, start[r]
-    way.light[s], way.missed[s] = 1.0, _ZERO
+    s = _pop(queue, FREE)
+    queue.ray_index[s], queue.buffered[s], queue.steps[s], queue.resume[s] = r, 0, _ZERO, start[r]
+    queue.transmittance[s], queue.error[s] = 1.0, _ZERO
     return s
 
 
 @inlined
-def view_of(s):
-    """Where the harmonics of slot ``s`` begin; they follow one another after `LANES` numbers."""
+def harmonics_offset(s):
+    """Offset of the first spherical harmonic of slot ``s``; the others follow `LANES` numbers apart."""
     return (index(s) // LANES) * index(16) * LANES + index(s) % LANES
 
 
 @inlined
-def _gather(deal, rays, way):
-    """Let `LANES` rays get ready to walk: new ones, which are neighbours, unless enough others wait; returns how many."""
+def _fill_march_lanes(schedule, rays, queue):
+    """Load up to `LANES` rays for marching: new ones, which are neighbours, unless enough others wait; returns how many."""
     origins, directions, start, far = rays
-    n, enough = 0, way.counts[WAITING] >= GROUP
+    n, enough = 0, queue.counts[WAITING] >= GROUP
     for lane in range(GROUP):
-        s = -1 if enough else _start(way, deal, start)
-        if s < 0 and way.counts[WAITING] > 0:
-            s = _take(way, WAITING)
+        s = -1 if enough else _start_ray(queue, schedule, start)
+        if s < 0 and queue.counts[WAITING] > 0:
+            s = _pop(queue, WAITING)
         if s < 0:
-            # The other lanes stand still, and write to a row of their own.
-            no_ray(way.walkers, way.marks, lane, SLOTS * ROW)
+            # Idle lanes write to a row of their own.
+            idle_lane(queue.march_rays, queue.march_state, lane, SLOTS * ROW)
             continue
-        r, n = way.which[s], n + 1
-        way.lists[WALKING, lane] = s
+        r, n = queue.ray_index[s], n + 1
+        queue.lists[MARCHING, lane] = s
         # The lattice is counted from the ray's start, so that these are the very steps of an ordinary march.
-        set_ray(way.walkers, lane, origins, directions, r, start[r], far[r])
-        set_marks(way.marks, lane, s * ROW, way.steps[s], way.resume[s])
+        set_ray(queue.march_rays, lane, origins, directions, r, start[r], far[r])
+        set_state(queue.march_state, lane, s * ROW, queue.steps[s], queue.resume[s])
     return n
 
 
 @inlined
-def _walk_on(deal, rays, space, way):
-    """Find the next occupied steps of a few rays; whether there were any rays."""
-    n = _gather(deal, rays, way)
+def _march_ahead(schedule, rays, setup, queue):
+    """Buffer the next occupied intervals of up to `LANES` rays; returns whether there were any rays."""
+    n = _fill_march_lanes(schedule, rays, queue)
     if n > 0:
-        walk_rays(way.walkers, way.marks, _ROOM, space, way.t0, way.t1)
+        march_rays(queue.march_rays, queue.march_state, _LIMIT, setup, queue.t0, queue.t1)
     for lane in range(n):
-        s = way.lists[WALKING, lane]
-        new = way.kept[s] == 0
-        way.kept[s], way.steps[s], way.resume[s] = marks_of(way.marks, lane)
-        way.done[s] = 0
-        if way.kept[s] > 0:
-            r = way.which[s]
+        s = queue.lists[MARCHING, lane]
+        new = queue.buffered[s] == 0
+        queue.buffered[s], queue.steps[s], queue.resume[s] = read_state(queue.march_state, lane)
+        queue.consumed[s] = 0
+        if queue.buffered[s] > 0:
+            r = queue.ray_index[s]
             if new:
-                harmonics((rays[1][r, 0], rays[1][r, 1], rays[1][r, 2]), way.views, view_of(s))
-            _put(way, READY, s)
+                harmonics((rays[1][r, 0], rays[1][r, 1], rays[1][r, 2]), queue.harmonics, harmonics_offset(s))
+            _push(queue, READY, s)
         else:
-            _put(way, UNUSED, s)
+            _push(queue, FREE, s)
     return n > 0
 
 
 @inlined
-def _seat(p, deal, rays, space, way):
-    """Give place ``p`` another ray, one that has steps to look at; whether there is one."""
+def _assign_lane(p, schedule, rays, setup, queue):
+    """Assign the next ready ray to batch lane ``p``; returns whether there is one."""
     origins, directions, _, far = rays
-    s = way.slots[p]
+    s = queue.slots[p]
     if s >= 0:
-        _put(way, WAITING if way.resume[s] < far[way.which[s]] else UNUSED, s)
-        way.slots[p] = -1
-    while way.counts[READY] == 0:
-        if not _walk_on(deal, rays, space, way):
+        _push(queue, WAITING if queue.resume[s] < far[queue.ray_index[s]] else FREE, s)
+        queue.slots[p] = -1
+    while queue.counts[READY] == 0:
+        if not _march_ahead(schedule, rays, setup, queue):
             return False
-    s = _take(way, READY)
-    way.slots[p] = s
+    s = _pop(queue, READY)
+    queue.slots[p] = s
     for axis in range(3):
-        way.lines[index(axis) * POINTS + index(p)] = origins[way.which[s], axis]
-        way.lines[index(3 + axis) * POINTS + index(p)] = directions[way.which[s], axis]
+        queue.lane_rays[index(axis) * POINTS + index(p)] = origins[queue.ray_index[s], axis]
+        queue.lane_rays[index(3 + axis) * POINTS + index(p)] = directions[queue.ray_index[s], axis]
     return True
 
 
 @inlined
-def fill(deal, rays, space, way, points):
-    """Give every place the next occupied step of a ray, in the unit cube; whether any has one."""
+def next_samples(schedule, rays, setup, queue, points):
+    """Write the next sample position of every batch lane, in the unit cube, to ``points``; returns whether there are any."""
     busy = False
     for p in range(POINTS):
-        s = way.slots[p]
-        if (s >= 0 and way.done[s] < way.kept[s]) or _seat(p, deal, rays, space, way):
-            begin, end = step_of(way, way.slots[p])
-            way.middles[p] = (begin + end) * _HALF
+        s = queue.slots[p]
+        if (s >= 0 and queue.consumed[s] < queue.buffered[s]) or _assign_lane(p, schedule, rays, setup, queue):
+            begin, end = current_interval(queue, queue.slots[p])
+            queue.midpoints[p] = (begin + end) * _HALF
             busy = True
-    box, contracted = space[0], space[3]
+    box, contracted = setup[0], setup[3]
     for part in range(POINTS // LANES):
         at = index(part) * LANES
-        t = load(way.middles, at)
-        x = load(way.lines, at) + t * load(way.lines, at + _3)
-        y = load(way.lines, at + _1) + t * load(way.lines, at + _4)
-        z = load(way.lines, at + _2) + t * load(way.lines, at + _5)
+        t = load(queue.midpoints, at)
+        x = load(queue.lane_rays, at) + t * load(queue.lane_rays, at + _3)
+        y = load(queue.lane_rays, at + _1) + t * load(queue.lane_rays, at + _4)
+        z = load(queue.lane_rays, at + _2) + t * load(queue.lane_rays, at + _5)
         x, y, z = to_unit(box, contracted, x, y, z)
         store(points, at, x)
         store(points, at + _1, y)
@@ -230,13 +240,13 @@ def fill(deal, rays, space, way, points):
 
 
 @inlined
-def step_of(way, s):
-    """The step that the ray of slot ``s`` looks at, its begin and end."""
-    at = s * ROW + way.done[s]
-    return way.t0[at], way.t1[at]
+def current_interval(queue, s):
+    """Start and end of the interval that the ray of slot ``s`` is at."""
+    at = s * ROW + queue.consumed[s]
+    return queue.t0[at], queue.t1[at]
 
 
 @inlined
-def stop(way, s, far):
-    """Let the ray of slot ``s`` go no farther."""
-    way.done[s], way.resume[s] = way.kept[s], far[way.which[s]]
+def terminate(queue, s, far):
+    """Terminate the ray of slot ``s``."""
+    queue.consumed[s], queue.resume[s] = queue.buffered[s], far[queue.ray_index[s]]

@@ -1,7 +1,7 @@
-"""Pictures of a hash grid in one pass: walking, looking up, networks and compositing.
+"""Volume rendering of an Instant-NGP field in one fused pass: march, encode, evaluate, shade, composite.
 
-Colours are asked for `POINTS` at a time, like densities, but only where they count. Nothing is written to memory but the
-picture.
+Densities and colours are evaluated `POINTS` at a time; samples enter the colour network only if their weight exceeds the error
+budget. No intermediate result is written to memory. Judged by `invgraphics.kernels.reference.ngp`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.hash.cells import BLOCK
@@ -19,141 +20,143 @@ from invgraphics.kernels.numba.hash.encode import levels_of
 from invgraphics.kernels.numba.ngp.dense import POINTS
 from invgraphics.kernels.numba.ngp.network import (
     ACTIVATIONS,
-    density_of,
+    activate_density,
     encode,
-    outputs_of,
-    packed_network,
+    mlp,
+    pack_network,
     radial_scale,
     sigmoid,
     softplus,
 )
-from invgraphics.kernels.numba.ngp.queue import EDGE, fill, no_rays, step_of, stop, view_of
-from invgraphics.kernels.numba.rays.composite import absorb
-from invgraphics.kernels.numba.rays.march import surroundings
+from invgraphics.kernels.numba.ngp.queue import EDGE, current_interval, empty_queue, harmonics_offset, next_samples, terminate
+from invgraphics.kernels.numba.rays.composite import interval_alpha
+from invgraphics.kernels.numba.rays.march import traversal_setup
 from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, parallel, prange, threads
-from invgraphics.kernels.types import HashField, MarchSteps
+from invgraphics.kernels.types import MarchSteps
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
 @inlined
-def _meet(s, said, scale, way, far, settings, sums, alpha):
-    """Composite the step of slot ``s``, of which ``said`` was said; returns its colour's weight, 0 if nobody will miss it.
+def _composite_sample(s, raw, scale, queue, far, settings, sums, alpha):
+    """Composite the sample of slot ``s``; return the weight of its colour, 0 below the error budget.
 
-    ``scale`` is what the density is multiplied with.
+    ``scale`` multiplies the density of ``raw``.
     """
-    activation, bias, _, _, opaque, unseen, _ = settings
-    r = way.which[s]
-    begin, end = step_of(way, s)
-    way.done[s] += 1
-    passed, opacity = absorb(density_of(said + bias, activation) * scale * (end - begin))
-    weight = np.float32(way.light[s]) * opacity
-    way.light[s] *= passed
+    activation, bias, _, _, min_transmittance, max_error, _ = settings
+    r = queue.ray_index[s]
+    begin, end = current_interval(queue, s)
+    queue.consumed[s] += 1
+    transmitted, alpha_i = interval_alpha(activate_density(raw + bias, activation) * scale * (end - begin))
+    weight = np.float32(queue.transmittance[s]) * alpha_i
+    queue.transmittance[s] *= transmitted
     alpha[r] += weight
     sums[r, 3] += weight * ((begin + end) * _HALF)
-    if way.light[s] < opaque:
-        stop(way, s, far)
-    if way.missed[s] + weight <= unseen:
-        way.missed[s] += weight
+    if queue.transmittance[s] < min_transmittance:
+        terminate(queue, s, far)
+    if queue.error[s] + weight <= max_error:
+        queue.error[s] += weight
         weight = _ZERO
     return weight
 
 
 @inlined
-def _ask(p, s, said, views, waiting, handed, harmonic, asked):
-    """Put what the colour network wants to know of place ``p``, whose ray is in slot ``s``, at the end of the queue."""
-    for k in range(handed):
-        asked[index(k) * POINTS + index(waiting)] = said[index(1 + k) * POINTS + index(p)]
-    for k in range(harmonic):
-        asked[index(handed + k) * POINTS + index(waiting)] = views[view_of(s) + index(k) * LANES]
+def _enqueue_sample(p, s, raw, harmonics, queued, latents, bands_squared, colour_inputs):
+    """Append the colour network's inputs of batch lane ``p``, whose ray is in slot ``s``, to column ``queued``."""
+    for k in range(latents):
+        colour_inputs[index(k) * POINTS + index(queued)] = raw[index(1 + k) * POINTS + index(p)]
+    for k in range(bands_squared):
+        colour_inputs[index(latents + k) * POINTS + index(queued)] = harmonics[harmonics_offset(s) + index(k) * LANES]
 
 
 @inlined
-def _answer(network, asked, odd, even, whose, weights, count, linear, sums):
-    """Add the colours of the first ``count`` places of the queue to their rays."""
-    raw = outputs_of(network, asked, odd, even)
+def _shade_queue(network, colour_inputs, ping, pong, sample_rays, weights, count, linear, sums):
+    """Evaluate the colour network and add the weighted colours of the first ``count`` samples to their rays."""
+    raw = mlp(network, colour_inputs, ping, pong)
     for n in range(count):
-        r = whose[n]
+        r = sample_rays[n]
         for channel in range(3):
             value = raw[index(channel) * POINTS + index(n)]
             sums[r, channel] += weights[n] * (softplus(value) if linear else sigmoid(value))
 
 
 @parallel
-def render(rays, space, table, levels, geometry, colour, widest, settings, width, jobs, sums, alpha):
-    """Sums of w * (radiance, distance) and of w for every ray; both hold zeros.
+def render(rays, setup, table, levels, density_net, colour_net, widest, settings, width, jobs, sums, alpha):
+    """Sums of w * (radiance, distance) and of w for every ray; both outputs hold zeros before.
 
     Args:
-        rays: their origins, directions, starts and ends.
-        space: see `march.surroundings`.
+        rays: origins, directions, starts and ends.
+        setup: see `march.traversal_setup`.
         table: features, flat.
         levels: see `levels_of`.
-        geometry: layers of the density's network as `packed_network`, and their inputs and padded outputs.
-        colour: the same of the radiance's.
-        widest: most inputs or outputs of any layer.
-        settings: activation, bias, whether radiance is linear, bands, least transmittance, most weight of a ray to leave out,
-            `HashField.contracted_density`.
-        width: pixels of a row of the picture.
+        density_net: layers and sizes as `pack_network` returns them.
+        colour_net: the same of the colour network.
+        widest: largest number of inputs or outputs of any layer.
+        settings: density activation, bias, whether radiance is linear, bands, minimum transmittance, error budget,
+            `FusedNGP.contracted_density`.
+        width: image width in pixels.
         jobs: number of jobs.
         sums: output (n, 4).
         alpha: output (n,).
     """
-    linear, harmonic = settings[2], settings[3] * settings[3]
-    handed = colour[1][0, 0] - harmonic
+    linear, bands_squared = settings[2], settings[3] * settings[3]
+    latents = colour_net[1][0, 0] - bands_squared
     for job in prange(jobs):
-        entries, shares = np.empty((2, 8 * BLOCK), np.uint32), np.empty((2, 8 * BLOCK), np.float32)
-        points, room = np.zeros((3, POINTS), np.float32), widest * POINTS
-        x, asked = np.zeros(room, np.float32), np.zeros(room, np.float32)
-        odd, even = np.zeros(room, np.float32), np.zeros(room, np.float32)
-        odd_colour, even_colour = np.zeros(room, np.float32), np.zeros(room, np.float32)
-        whose, weights, waiting = np.zeros(POINTS, np.int64), np.zeros(POINTS, np.float32), 0
-        way = no_rays()
-        while fill((job, jobs, width), rays, space, way, points):
-            encode(table, levels, points, entries, shares, x)
-            said = outputs_of(geometry, x, odd, even)
+        entries, encoding_weights = np.empty((2, 8 * BLOCK), np.uint32), np.empty((2, 8 * BLOCK), np.float32)
+        points, size = np.zeros((3, POINTS), np.float32), widest * POINTS
+        x, colour_inputs = np.zeros(size, np.float32), np.zeros(size, np.float32)
+        ping, pong = np.zeros(size, np.float32), np.zeros(size, np.float32)
+        ping_colour, pong_colour = np.zeros(size, np.float32), np.zeros(size, np.float32)
+        sample_rays, weights, queued = np.zeros(POINTS, np.int64), np.zeros(POINTS, np.float32), 0
+        queue = empty_queue()
+        while next_samples((job, jobs, width), rays, setup, queue, points):
+            encode(table, levels, points, entries, encoding_weights, x)
+            raw = mlp(density_net, x, ping, pong)
             for p in range(POINTS):
-                s = way.slots[p]
+                s = queue.slots[p]
                 scale = settings[6] * radial_scale(points, p) if settings[6] > _ZERO else _ONE
-                weight = _meet(s, said[p], scale, way, rays[3], settings, sums, alpha) if s >= 0 else _ZERO
+                weight = _composite_sample(s, raw[p], scale, queue, rays[3], settings, sums, alpha) if s >= 0 else _ZERO
                 if weight > _ZERO:
-                    _ask(p, s, said, way.views, waiting, handed, harmonic, asked)
-                    whose[waiting], weights[waiting] = way.which[s], weight
-                    waiting += 1
-                    if waiting == POINTS:
-                        _answer(colour, asked, odd_colour, even_colour, whose, weights, waiting, linear, sums)
-                        waiting = 0
-        _answer(colour, asked, odd_colour, even_colour, whose, weights, waiting, linear, sums)
+                    _enqueue_sample(p, s, raw, queue.harmonics, queued, latents, bands_squared, colour_inputs)
+                    sample_rays[queued], weights[queued] = queue.ray_index[s], weight
+                    queued += 1
+                    if queued == POINTS:
+                        _shade_queue(
+                            colour_net, colour_inputs, ping_colour, pong_colour, sample_rays, weights, queued, linear, sums
+                        )
+                        queued = 0
+        _shade_queue(colour_net, colour_inputs, ping_colour, pong_colour, sample_rays, weights, queued, linear, sums)
 
 
 @torch.no_grad()
-def hash_render(
+def ngp_render(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
     steps: MarchSteps,
-    field: HashField,
-    transmittance: float = 0.0,
-    unseen: float = 0.0,
+    field: FusedNGP,
+    min_transmittance: float = 0.0,
+    max_error: float = 0.0,
     width: int = 0,
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-    """See `invgraphics.kernels.hash_render`; what has other than two features per entry is left to the reference."""
+    """See `invgraphics.kernels.ngp_render`; other than two features per entry are left to the reference."""
     if field.table.shape[1] != 2:
-        return reference.hash_render(rays, occupied, bounds, steps, field, transmittance, unseen, width)
-    lines = tuple(array(part) for part in (rays.origins, rays.directions, rays.near, rays.far))
-    geometry, colour = packed_network(field.geometry), packed_network(field.colour)
+        return reference.ngp_render(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
+    batch_rays = tuple(array(part) for part in (rays.origins, rays.directions, rays.near, rays.far))
+    density_net, colour_net = pack_network(field.density_net), pack_network(field.colour_net)
     settings = (
-        ACTIVATIONS.index(field.density),
-        np.float32(field.bias),
+        ACTIVATIONS.index(field.density_activation),
+        np.float32(field.density_bias),
         field.colour_space == "linear",
-        field.bands,
-        float(transmittance),
-        np.float32(unseen),
+        field.sh_bands,
+        float(min_transmittance),
+        np.float32(max_error),
         np.float32(field.contracted_density),
     )
-    widest = int(max(geometry[1].max(), colour[1].max()))
+    widest = int(max(density_net[1].max(), colour_net[1].max()))
     sums, alpha = torch.zeros(len(rays), 4), torch.zeros(len(rays))
-    model = array(field.table).reshape(-1), levels_of(field.grid), geometry, colour, widest
-    space, outputs = surroundings(occupied, bounds, steps), (sums.numpy(), alpha.numpy())
-    # Rays of no picture are taken in order, as if rows were as wide as blocks.
-    render(lines, space, *model, settings, width or EDGE, threads(), *outputs)
+    model = array(field.table).reshape(-1), levels_of(field.grid), density_net, colour_net, widest
+    setup, outputs = traversal_setup(occupied, bounds, steps), (sums.numpy(), alpha.numpy())
+    # Rays that are no image are scheduled in order, as an image as wide as one block.
+    render(batch_rays, setup, *model, settings, width or EDGE, threads(), *outputs)
     return sums, alpha

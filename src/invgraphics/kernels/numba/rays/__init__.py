@@ -1,1 +1,1 @@
-"""Occupancy-grid marching and compositing."""
+"""Occupancy-grid ray marching and volume-rendering compositing."""

@@ -1,4 +1,4 @@
-"""Emission-absorption along packed rays. Each job takes whole rays, so every sum has one writer and a fixed order."""
+"""Volume rendering of packed samples, forward and backward. Each job owns whole rays, so every sum has a fixed order."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from invgraphics.kernels.numba.runtime import (
     array,
     index,
     inlined,
+    job_start,
     once_differentiable,
     parallel,
     power_minus_one,
     prange,
-    share,
     threads,
 )
 from invgraphics.kernels.reference.composite import OPAQUE
@@ -27,20 +27,20 @@ _ZERO = np.float32(0.0)
 
 
 @inlined
-def absorb(optical_depth):
-    """Transmittance of one interval (float64, so that products of many stay exact) and its complement."""
+def interval_alpha(optical_depth):
+    """Transmittance of one interval (float64, so that products of many stay exact) and alpha, its complement."""
     loss, scale = power_minus_one(-min(optical_depth, _OPAQUE) * _LOG2E)
     if scale == np.float32(1.0):
         # Nearly transparent: 1 - exp(-tau) without cancellation.
         return 1.0 + np.float64(loss), -loss
-    passed = (loss + np.float32(1.0)) * scale
-    return np.float64(passed), np.float32(1.0) - passed
+    transmitted = (loss + np.float32(1.0)) * scale
+    return np.float64(transmitted), np.float32(1.0) - transmitted
 
 
 @inlined
 def _first_sample(ray, jobs, job):
-    """First sample of a job: an even share, moved on to the beginning of a ray."""
-    first = share(len(ray), jobs, job)
+    """First sample of a job: an even split, moved on to the beginning of a ray."""
+    first = job_start(len(ray), jobs, job)
     while 0 < first < len(ray) and ray[first] == ray[first - 1]:
         first += 1
     return first
@@ -48,7 +48,7 @@ def _first_sample(ray, jobs, job):
 
 @parallel
 def accumulate(optical_depth, channels, ray, jobs, weights, after, sums, alpha):
-    """Weights, transmittance behind each sample, and the sums per ray (which hold zeros)."""
+    """Weights, transmittance behind each sample, and weighted sums per ray (``sums`` and ``alpha`` hold zeros before)."""
     width = channels.shape[1]
     for job in prange(jobs):
         transmittance, current = 1.0, np.int64(-1)
@@ -57,9 +57,9 @@ def accumulate(optical_depth, channels, ray, jobs, weights, after, sums, alpha):
             if ray[i] != current:
                 transmittance, current = 1.0, ray[i]
             r = index(current)
-            passed, opacity = absorb(optical_depth[i])
-            weight = np.float32(transmittance) * opacity
-            transmittance *= passed
+            transmitted, alpha_i = interval_alpha(optical_depth[i])
+            weight = np.float32(transmittance) * alpha_i
+            transmittance *= transmitted
             weights[i], after[i] = weight, np.float32(transmittance)
             alpha[r] += weight
             for k in range(width):
@@ -67,8 +67,8 @@ def accumulate(optical_depth, channels, ray, jobs, weights, after, sums, alpha):
 
 
 @parallel
-def accumulate_back(channels, ray, weights, after, jobs, to_weights, to_sums, to_alpha, to_depth, to_channels):
-    """Gradients along optical depths and channels, from the far end of each ray to its near end."""
+def accumulate_backward(channels, ray, weights, after, jobs, grad_weights, grad_sums, grad_alpha, grad_depth, grad_channels):
+    """Gradients of optical depths and channels, back to front."""
     width = channels.shape[1]
     for job in prange(jobs):
         first, end = _first_sample(ray, jobs, job), _first_sample(ray, jobs, job + 1)
@@ -79,14 +79,14 @@ def accumulate_back(channels, ray, weights, after, jobs, to_weights, to_sums, to
                 behind, current = 0.0, ray[i]
             r = index(current)
             weight = weights[i]
-            gain = to_weights[i] + to_alpha[r]
+            grad_weight = grad_weights[i] + grad_alpha[r]
             for number in range(width):
                 k = index(number)
-                gain += to_sums[r, k] * channels[i, k]
-                to_channels[i, k] = weight * to_sums[r, k]
-            # A denser sample takes from the light that passes it and hides what is behind.
-            to_depth[i] = after[i] * gain - np.float32(behind)
-            behind += weight * gain
+                grad_weight += grad_sums[r, k] * channels[i, k]
+                grad_channels[i, k] = weight * grad_sums[r, k]
+            # A denser sample contributes more itself and attenuates what is behind.
+            grad_depth[i] = after[i] * grad_weight - np.float32(behind)
+            behind += weight * grad_weight
 
 
 class _Composite(torch.autograd.Function):
@@ -106,16 +106,16 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        to_weights, to_sums, to_alpha = grad_outputs
+        grad_weights, grad_sums, grad_alpha = grad_outputs
         channels, ray, weights, after = ctx.saved_tensors
         shapes = (weights.shape, (ctx.rays, channels.shape[1]), (ctx.rays,))
-        given = (to_weights, to_sums, to_alpha)
-        # A gradient that nobody asked for counts as zero.
+        given = (grad_weights, grad_sums, grad_alpha)
+        # Missing gradients are zero.
         received = [array(torch.zeros(shape) if g is None else g) for shape, g in zip(shapes, given, strict=True)]
-        to_depth, to_channels = torch.empty(weights.shape), torch.empty(channels.shape)
+        grad_depth, grad_channels = torch.empty(weights.shape), torch.empty(channels.shape)
         kept = (array(x) for x in (channels, ray.long(), weights, after))
-        accumulate_back(*kept, threads(), *received, to_depth.numpy(), to_channels.numpy())
-        return to_depth, to_channels, None, None
+        accumulate_backward(*kept, threads(), *received, grad_depth.numpy(), grad_channels.numpy())
+        return grad_depth, grad_channels, None, None
 
 
 def composite(

@@ -1,8 +1,8 @@
-"""Walking along rays through an occupancy grid, `LANES` of them side by side.
+"""Occupancy-grid traversal of `LANES` rays at a time in SIMD registers, with empty-space skipping.
 
 In plain IEEE arithmetic, operation for operation what `invgraphics.kernels.reference.march` does in float32, so that both keep
-the same intervals; but empty space is leapt over: a cell at a time near what is occupied, many blocks of cells farther away.
-Numbers of steps and cells are whole numbers in float32, which holds all of them up to 2^24.
+the same intervals; but empty space is skipped, cell by cell near occupied cells, many blocks of cells at once farther away.
+Step and cell indices are whole numbers in float32, which is exact up to 2^24.
 """
 
 from __future__ import annotations
@@ -10,26 +10,26 @@ from __future__ import annotations
 import numpy as np
 
 from invgraphics.kernels.numba.runtime import LANES, exact, index
-from invgraphics.kernels.numba.simd.lanes import any_of, load, look_up, put, spread, store, where
+from invgraphics.kernels.numba.simd.lanes import any_of, broadcast, gather_int8, load, scatter, store, where
 
 MARGIN = np.float32(1e-2)
-"""Share of a step by which a leap over an empty cell ends early, so that rounding never leaps into the next cell."""
+"""Fraction of a step by which a skip over an empty cell ends early, so that rounding never skips into the next cell."""
 ROUNDING = np.float32(1e-6)
 """Several times the relative rounding error of a float32."""
 NEARLY_HALF = np.float32(0.49)
-"""Steps from a step's middle to its end, less what a leap may be too short by."""
+"""Half a step, from its midpoint to its end, less the largest rounding error of a skip."""
 
 OCCUPIED = -1
-"""What a map of the ways says of occupied cells (see `march.surroundings`)."""
-NUMBERS = 8
-"""Of each ray: origin, direction, where it began and where it ends."""
-MARKS = 4
-"""Of each ray under way: where its intervals are written, how many are, steps taken, and where it is."""
-_1, _2, _3, _4, _5, _6, _7 = (LANES * index(k) for k in range(1, NUMBERS))
-_START = index(0)
+"""Value of occupied cells in the distance map (see `march.traversal_setup`)."""
+RAY_FLOATS = 8
+"""Per ray, in structure-of-arrays order: origin, direction, start and far distance."""
+STATE_FLOATS = 4
+"""March state per ray: output row, number of intervals written, lattice index of the next step, current distance."""
+_1, _2, _3, _4, _5, _6, _7 = (LANES * index(k) for k in range(1, RAY_FLOATS))
+_0 = index(0)
 
 _PARALLEL = np.float32(1e-20)
-"""Directions with less than this along an axis never reach a wall on it."""
+"""Directions with less than this along an axis count as parallel to its walls."""
 _ZERO, _ONE, _TWO = (np.float32(value) for value in (0.0, 1.0, 2.0))
 _NEVER = np.float32(np.inf)
 
@@ -63,7 +63,7 @@ def _step_length(box, direction, step, x, y, z):
 
 @exact
 def _inside(unit):
-    """Whether positions lie in the unit cube."""
+    """Mask of positions in the unit cube."""
     x, y, z = unit
     return (x >= _ZERO) & (y >= _ZERO) & (z >= _ZERO) & (x <= _ONE) & (y <= _ONE) & (z <= _ONE)
 
@@ -74,144 +74,145 @@ def _cell(unit, resolution):
 
 
 @exact
-def _way_out(unit, first, cells, cell, pace):
-    """Distance along the ray to the far wall, on one axis, of ``cells`` cells from ``first`` on.
+def _wall_distance(unit, first, cells, cell, inverse):
+    """Slab test on one axis: distance along the ray to the exit wall of ``cells`` cells from ``first`` on.
 
-    ``cell`` is a cell's edge in the unit cube, ``pace`` the distance along the ray per unit on this axis.
+    ``cell`` is a cell's edge in the unit cube, ``inverse`` see `_inverse_direction`.
     """
-    return (where(pace > _ZERO, first + cells, first) * cell - unit) * pace
+    return (where(inverse > _ZERO, first + cells, first) * cell - unit) * inverse
 
 
 @exact
-def _aligned(x, edge, gap):
-    """First cell, on one axis, of the blocks less than ``gap`` away from a cell's own."""
-    return (np.floor(x / edge) - gap + _ONE) * edge
+def _aligned(x, edge, distance):
+    """First cell, on one axis, of the blocks less than ``distance`` blocks away from a cell's own."""
+    return (np.floor(x / edge) - distance + _ONE) * edge
 
 
 @exact
-def _pace(direction, half):
-    """Distance along the ray per unit on one axis of the unit cube; next to endless where parallel."""
-    endless = _TWO * half / _PARALLEL
-    straight = where(direction < _ZERO, -endless, endless)
+def _inverse_direction(direction, half):
+    """Inverse direction on one axis, in ray distance per unit of the unit cube; huge where the ray is parallel to the walls."""
+    huge = _TWO * half / _PARALLEL
+    straight = where(direction < _ZERO, -huge, huge)
     return where(abs(direction) > _PARALLEL, _TWO * half / direction, straight)
 
 
 @exact
-def set_ray(lines, lane, origins, directions, r, first, far):
-    """Let a lane walk along ray ``r``."""
+def set_ray(rays, lane, origins, directions, r, first, far):
+    """Load ray ``r`` into a lane."""
     at = index(lane)
     for axis in range(3):
-        lines[at + index(axis) * LANES] = origins[r, axis]
-        lines[at + index(3 + axis) * LANES] = directions[r, axis]
-    lines[at + _6], lines[at + _7] = first, far
+        rays[at + index(axis) * LANES] = origins[r, axis]
+        rays[at + index(3 + axis) * LANES] = directions[r, axis]
+    rays[at + _6], rays[at + _7] = first, far
 
 
 @exact
-def set_marks(marks, lane, row, taken, t):
-    """Have a lane write from ``row`` on; its ray is at ``t`` after so many steps."""
+def set_state(state, lane, row, steps, t):
+    """Initialise a march state: output from ``row`` on, no interval yet, at lattice index ``steps`` and distance ``t``."""
     at = index(lane)
-    marks[at], marks[at + _1], marks[at + _2], marks[at + _3] = row, _ZERO, taken, t
+    state[at], state[at + _1], state[at + _2], state[at + _3] = row, _ZERO, steps, t
 
 
 @exact
-def no_ray(lines, marks, lane, row):
-    """Let a lane stand still; it needs a row all the same."""
-    lines[index(lane) + _7] = -_NEVER
-    set_marks(marks, lane, row, _ZERO, _ZERO)
+def idle_lane(rays, state, lane, row):
+    """Deactivate a lane; it still writes to ``row``."""
+    rays[index(lane) + _7] = -_NEVER
+    set_state(state, lane, row, _ZERO, _ZERO)
 
 
 @exact
-def marks_of(marks, lane):
-    """How many intervals a lane has kept, after how many steps, and where it is."""
+def read_state(state, lane):
+    """Number of intervals a lane has written, lattice index of its next step, and its distance."""
     at = index(lane)
-    return np.int64(marks[at + _1]), marks[at + _2], marks[at + _3]
+    return np.int64(state[at + _1]), state[at + _2], state[at + _3]
 
 
 @exact
-def _position(lines, t):
-    """Where rays are at ``t``, in the scene."""
-    x, y, z = load(lines, _START), load(lines, _1), load(lines, _2)
-    return x + t * load(lines, _3), y + t * load(lines, _4), z + t * load(lines, _5)
+def _position(rays, t):
+    """World positions on the rays at ``t``."""
+    x, y, z = load(rays, _0), load(rays, _1), load(rays, _2)
+    return x + t * load(rays, _3), y + t * load(rays, _4), z + t * load(rays, _5)
 
 
 @exact
-def _paces(lines, box):
-    """`_pace` on all three axes."""
-    return _pace(load(lines, _3), box[3]), _pace(load(lines, _4), box[4]), _pace(load(lines, _5), box[5])
+def _inverse_directions(rays, box):
+    """`_inverse_direction` on all three axes."""
+    x, y, z = load(rays, _3), load(rays, _4), load(rays, _5)
+    return _inverse_direction(x, box[3]), _inverse_direction(y, box[4]), _inverse_direction(z, box[5])
 
 
 @exact
-def _way_through(unit, cells, gap, grid, paces):
-    """Distance along rays to the end of what is known to be empty around a cell.
+def _skip_distance(unit, cells, distance, grid, inverse):
+    """Distance along the rays to the exit of the empty region around their cells.
 
-    ``gap`` is what the map says of it; ``grid`` holds the numbers of cells along an edge of the cube and of a block.
+    ``distance`` is the distance map's value; ``grid`` holds the cells along an edge of the cube and of a block.
     """
-    (ux, uy, uz), (x, y, z), (pace_x, pace_y, pace_z) = unit, cells, paces
+    (ux, uy, uz), (x, y, z), (inverse_x, inverse_y, inverse_z) = unit, cells, inverse
     cell, edge = _ONE / grid[0], grid[1]
-    # All blocks less than ``gap`` away are empty too, on every side.
-    wide = gap > _ZERO
-    count = where(wide, (_TWO * gap - _ONE) * edge, _ONE)
-    x, y = where(wide, _aligned(x, edge, gap), x), where(wide, _aligned(y, edge, gap), y)
-    z = where(wide, _aligned(z, edge, gap), z)
-    out = min(_way_out(ux, x, count, cell, pace_x), _way_out(uy, y, count, cell, pace_y))
-    return min(out, _way_out(uz, z, count, cell, pace_z))
+    # All blocks less than ``distance`` away are empty, on every side.
+    wide = distance > _ZERO
+    count = where(wide, (_TWO * distance - _ONE) * edge, _ONE)
+    x, y = where(wide, _aligned(x, edge, distance), x), where(wide, _aligned(y, edge, distance), y)
+    z = where(wide, _aligned(z, edge, distance), z)
+    exit_distance = min(_wall_distance(ux, x, count, cell, inverse_x), _wall_distance(uy, y, count, cell, inverse_y))
+    return min(exit_distance, _wall_distance(uz, z, count, cell, inverse_z))
 
 
 @exact
-def walk_rays(lines, marks, room, space, t0, t1):
-    """Keep intervals of `LANES` rays, each until it ends or has kept ``room`` of them.
+def march_rays(rays, state, limit, setup, t0, t1):
+    """Occupied intervals of `LANES` rays, each marched until its far end or until it has ``limit`` of them.
 
     Args:
-        lines: `NUMBERS` of each ray, number after number; a lane without a ray ends before it begins.
-        marks: `MARKS` of each ray, which are brought up to date. A row has room for one interval more, of no meaning.
-        room: most intervals (float32).
-        space: see `march.surroundings`.
-        t0: begins of intervals, flat.
-        t1: their ends.
+        rays: `RAY_FLOATS` x `LANES`, flat; idle lanes have far = -inf.
+        state: `STATE_FLOATS` x `LANES`, flat, updated in place. A row has space for one interval more, of no meaning.
+        limit: maximum number of intervals (float32).
+        setup: see `march.traversal_setup`.
+        t0: interval starts, flat.
+        t1: interval ends, flat.
     """
-    box, ways, shift, contracted, step, cone, even = space
-    grid = np.float32(ways.shape[0]), np.float32(1 << shift)
-    paces, per_step = _paces(lines, box), _ONE / step
-    first, far = load(lines, _6), load(lines, _7)
-    row, kept, taken, t = load(marks, _START), load(marks, _1), load(marks, _2), load(marks, _3)
-    free = spread(-_NEVER)
-    going = (t < far) & (kept < room)
-    while any_of(going):
-        # Without a cone the lattice is counted from the first step, so that leaping over steps changes no bit of the rest.
-        after = first + (taken + _ONE) * step if cone == _ZERO else t + max(cone * t, step)
-        if even:
-            x, y, z = _position(lines, t)
-            direction = load(lines, _3), load(lines, _4), load(lines, _5)
+    box, distances, shift, contracted, step, cone, uniform = setup
+    grid = np.float32(distances.shape[0]), np.float32(1 << shift)
+    inverse, per_step = _inverse_directions(rays, box), _ONE / step
+    first, far = load(rays, _6), load(rays, _7)
+    row, count, steps, t = load(state, _0), load(state, _1), load(state, _2), load(state, _3)
+    empty_until = broadcast(-_NEVER)
+    active = (t < far) & (count < limit)
+    while any_of(active):
+        # Without a cone the lattice is counted from the first step, so that skipping steps changes no bit of the others.
+        after = first + (steps + _ONE) * step if cone == _ZERO else t + max(cone * t, step)
+        if uniform:
+            x, y, z = _position(rays, t)
+            direction = load(rays, _3), load(rays, _4), load(rays, _5)
             after = t + _step_length(box, direction, step, x, y, z)
-        # Otherwise the step is lost to rounding, or not a number, and the walk ends.
-        moving = going & (after > t)
+        # Otherwise the step is lost to rounding, or not a number, and the march ends.
+        moving = active & (after > t)
         end = min(after, far)
-        middle = (t + end) / _TWO
-        looking = moving & (middle >= free)
-        if any_of(looking):
-            x, y, z = _position(lines, middle)
+        midpoint = (t + end) / _TWO
+        tested = moving & (midpoint >= empty_until)
+        if any_of(tested):
+            x, y, z = _position(rays, midpoint)
             unit = to_unit(box, contracted, x, y, z)
             cells = _cell(unit[0], grid[0]), _cell(unit[1], grid[0]), _cell(unit[2], grid[0])
-            gap, here = look_up(ways, cells[0], cells[1], cells[2]), looking & _inside(unit)
-            found = here & (gap < _ZERO)
+            distance, valid = gather_int8(distances, cells[0], cells[1], cells[2]), tested & _inside(unit)
+            found = valid & (distance < _ZERO)
             if any_of(found):
-                put(t0, row + kept, t)
-                put(t1, row + kept, end)
-                kept = where(found, kept + _ONE, kept)
+                scatter(t0, row + count, t)
+                scatter(t1, row + count, end)
+                count = where(found, count + _ONE, count)
             if not contracted:
-                empty = here & (gap >= _ZERO)
-                out = _way_through(unit, cells, gap, grid, paces)
-                free = where(empty, min(middle + out - MARGIN * (end - t), far), free)
+                empty = valid & (distance >= _ZERO)
+                exit_distance = _skip_distance(unit, cells, distance, grid, inverse)
+                empty_until = where(empty, min(midpoint + exit_distance - MARGIN * (end - t), far), empty_until)
                 if cone == _ZERO:
-                    # To the first step whose middle is past the wall, or the one before; the comparison settles it.
-                    error = ROUNDING * (abs(first) + abs(free))
-                    leap = np.floor((free - first - error) * per_step + NEARLY_HALF)
-                    leaping = empty & (leap > taken + _ONE)
-                    taken = where(leaping, leap - _ONE, taken)
-                    end = where(leaping, min(first + leap * step, far), end)
-        taken = where(moving, taken + _ONE, taken)
-        t = where(moving, end, where(going, far, t))
-        going = (t < far) & (kept < room)
-    store(marks, _1, kept)
-    store(marks, _2, taken)
-    store(marks, _3, t)
+                    # To the first step whose midpoint is past the wall, or the one before; ``tested`` decides.
+                    error = ROUNDING * (abs(first) + abs(empty_until))
+                    target = np.floor((empty_until - first - error) * per_step + NEARLY_HALF)
+                    skipping = empty & (target > steps + _ONE)
+                    steps = where(skipping, target - _ONE, steps)
+                    end = where(skipping, min(first + target * step, far), end)
+        steps = where(moving, steps + _ONE, steps)
+        t = where(moving, end, where(active, far, t))
+        active = (t < far) & (count < limit)
+    store(state, _1, count)
+    store(state, _2, steps)
+    store(state, _3, t)

@@ -1,1 +1,1 @@
-"""Registers of 16 numbers as a Numba type."""
+"""SIMD registers, their loads and stores, and LLVM intrinsics as Numba types and functions."""

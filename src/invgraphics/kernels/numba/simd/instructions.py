@@ -1,5 +1,4 @@
-"""Instructions that Numba has no words for: one rounding for a product and a sum, two features at a time, the bits of a
-word, and memory that will be needed soon.
+"""LLVM intrinsics that Numba does not expose: fused multiply-add, paired loads and stores, bit scans, and prefetch.
 
 A table of two features per entry holds both in eight consecutive bytes, which one instruction reads or writes. Numba leaves
 LLVM's search for such pairs off, so they are written out here.
@@ -19,18 +18,18 @@ _intrinsic: Any = extending.intrinsic
 _PAIR = ir.VectorType(ir.FloatType(), 2)
 _FLAGS = ("contract", "nsz")
 
-SOON = 8
-"""How many rows ahead `prefetch` asks: from 3 to 12 it makes no difference."""
+PREFETCH_DISTANCE = 8
+"""Rows ahead at which `prefetch` is issued: from 3 to 12 it makes no difference."""
 
 
-def _places(context: Any, builder: Any, table_type: Any, table: Any, entries: Any) -> list[Any]:
+def _pair_pointers(context: Any, builder: Any, table_type: Any, table: Any, entries: Any) -> list[Any]:
     """Pointers to the pairs of these entries of a flat float32 array."""
     data = context.make_array(table_type)(context, builder, table).data
     pairs = builder.bitcast(data, _PAIR.as_pointer())
     return [builder.gep(pairs, [builder.zext(e, ir.IntType(64))]) for e in cgutils.unpack_tuple(builder, entries)]
 
 
-def _both(builder: Any, low: Any, high: Any) -> Any:
+def _pair(builder: Any, low: Any, high: Any) -> Any:
     """The pair (low, high)."""
     pair = builder.insert_element(ir.Constant(_PAIR, ir.Undefined), low, ir.Constant(ir.IntType(32), 0))
     return builder.insert_element(pair, high, ir.Constant(ir.IntType(32), 1))
@@ -51,13 +50,13 @@ def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @_intrinsic
-def blend_pair(typing: Any, table: Any, entries: Any, weights: Any) -> Any:
-    """Weighted sum of both features of 8 entries (uint32) of a flat table."""
+def interpolate_pair(typing: Any, table: Any, entries: Any, weights: Any) -> Any:
+    """Interpolate both features of 8 entries (uint32) of a flat table."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        places = _places(context, builder, signature.args[0], arguments[0], arguments[1])
-        scales = [_both(builder, w, w) for w in cgutils.unpack_tuple(builder, arguments[2])]
-        pairs = [builder.load(place, align=4) for place in places]
+        pointers = _pair_pointers(context, builder, signature.args[0], arguments[0], arguments[1])
+        scales = [_pair(builder, w, w) for w in cgutils.unpack_tuple(builder, arguments[2])]
+        pairs = [builder.load(pointer, align=4) for pointer in pointers]
         # Two chains: one would wait for itself, more take registers.
         sums = [builder.fmul(pair, scale, flags=_FLAGS) for pair, scale in zip(pairs[:2], scales[:2], strict=True)]
         for n, (pair, scale) in enumerate(zip(pairs[2:], scales[2:], strict=True)):
@@ -70,16 +69,16 @@ def blend_pair(typing: Any, table: Any, entries: Any, weights: Any) -> Any:
 
 
 @_intrinsic
-def spread_pair(typing: Any, table: Any, entries: Any, weights: Any, low: Any, high: Any) -> Any:
-    """Add a gradient of both features of 8 entries; the transpose of `blend_pair`."""
+def scatter_add_pair(typing: Any, table: Any, entries: Any, weights: Any, low: Any, high: Any) -> Any:
+    """Transpose of `interpolate_pair`: add a gradient to both features of 8 entries."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        gradient = _both(builder, arguments[3], arguments[4])
-        places = _places(context, builder, signature.args[0], arguments[0], arguments[1])
-        for place, w in zip(places, cgutils.unpack_tuple(builder, arguments[2]), strict=True):
+        gradient = _pair(builder, arguments[3], arguments[4])
+        pointers = _pair_pointers(context, builder, signature.args[0], arguments[0], arguments[1])
+        for pointer, w in zip(pointers, cgutils.unpack_tuple(builder, arguments[2]), strict=True):
             # One after the other: vertices that share an entry add to it in turn.
-            old = builder.load(place, align=4)
-            builder.store(_multiply_add(builder, _both(builder, w, w), gradient, old), place, align=4)
+            old = builder.load(pointer, align=4)
+            builder.store(_multiply_add(builder, _pair(builder, w, w), gradient, old), pointer, align=4)
         return context.get_dummy_value()
 
     return types.void(table, entries, weights, low, high), generate
@@ -87,7 +86,7 @@ def spread_pair(typing: Any, table: Any, entries: Any, weights: Any, low: Any, h
 
 @_intrinsic
 def lowest_bit(typing: Any, word: Any) -> Any:
-    """Number of the lowest set bit of a uint64 that is not zero."""
+    """Index of the lowest set bit of a non-zero uint64."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
@@ -97,7 +96,7 @@ def lowest_bit(typing: Any, word: Any) -> Any:
 
 @_intrinsic
 def count_bits(typing: Any, word: Any) -> Any:
-    """How many bits of a uint64 are set."""
+    """Population count of a uint64."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
@@ -105,20 +104,20 @@ def count_bits(typing: Any, word: Any) -> Any:
     return types.int64(types.uint64), generate
 
 
-def _ask(builder: Any, place: Any) -> None:
-    """Have the cache line of a pointer fetched."""
-    pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
-    ask = ir.FunctionType(ir.VoidType(), [pointer, number, number, number])
-    ask = cgutils.get_or_insert_function(builder.module, ask, "llvm.prefetch.p0")
-    # To read, to be kept in every cache, data.
-    builder.call(ask, [builder.bitcast(place, pointer), *(ir.Constant(number, n) for n in (0, 3, 1))])
+def _emit_prefetch(builder: Any, pointer: Any) -> None:
+    """Emit a prefetch of a pointer's cache line."""
+    byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+    function = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+    function = cgutils.get_or_insert_function(builder.module, function, "llvm.prefetch.p0")
+    # Read access, high temporal locality, data cache.
+    builder.call(function, [builder.bitcast(pointer, byte), *(ir.Constant(number, n) for n in (0, 3, 1))])
 
 
 @_intrinsic
 def prefetch(typing: Any, array: Any, row: Any) -> Any:
-    """Ask for the first and the last byte of a row (uint64) of a contiguous array, some time before it is read or written.
+    """Prefetch the first and the last byte of a row (uint64) of a contiguous array.
 
-    Rows that are visited in no order wait for memory, one after the other; a processor foresees only the next few.
+    For rows that are visited in random order, which hardware prefetchers do not predict.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -129,8 +128,8 @@ def prefetch(typing: Any, array: Any, row: Any) -> Any:
             width = builder.mul(width, builder.extract_value(found.shape, axis))
         first = builder.gep(found.data, [builder.mul(arguments[1], width)])
         last = builder.gep(first, [builder.sub(width, context.get_constant(types.intp, 1))])
-        _ask(builder, first)
-        _ask(builder, last)
+        _emit_prefetch(builder, first)
+        _emit_prefetch(builder, last)
         return context.get_dummy_value()
 
     return types.void(array, row), generate
@@ -143,7 +142,7 @@ def prefetch_pair(typing: Any, table: Any, entry: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         pairs = builder.bitcast(data, _PAIR.as_pointer())
-        _ask(builder, builder.gep(pairs, [builder.zext(arguments[1], ir.IntType(64))]))
+        _emit_prefetch(builder, builder.gep(pairs, [builder.zext(arguments[1], ir.IntType(64))]))
         return context.get_dummy_value()
 
     return types.void(table, types.uint32), generate

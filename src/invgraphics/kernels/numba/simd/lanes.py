@@ -1,4 +1,4 @@
-"""A vector register as a value: `LANES` numbers that Numba's kernels add, multiply and compare like one.
+"""SIMD registers as a Numba type: `LANES` float32 values with arithmetic, comparison, load, store, gather and reduction.
 
 Numba's loops over the lanes of a scratch array are found by LLVM and become the same instructions, but every sum then lives in
 memory. A value of this type stays in a register for as long as it is used, and a kernel reads as if it handled one pixel.
@@ -30,21 +30,21 @@ _infer_global: Any = templates.infer_global
 
 
 class _Register(types.Type):
-    """`LANES` values side by side."""
+    """A SIMD register of `LANES` values."""
 
     def __init__(self, name: str, element: Any) -> None:
         super().__init__(name)
         self.layout = ir.VectorType(element, GROUP)
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """A number can stand for itself in all lanes."""
+        """Implicit broadcast of a float32."""
         return Conversion.safe if self is lanes and other == types.float32 else None
 
 
 lanes = _Register("lanes", ir.FloatType())
-"""`LANES` numbers (float32)."""
+"""Register of `LANES` float32 values."""
 mask = _Register("mask", ir.IntType(1))
-"""What comparing them gives."""
+"""Register of `LANES` booleans, the result of a comparison."""
 
 
 @extending.register_model(_Register)
@@ -53,19 +53,19 @@ class _Model(models.PrimitiveModel):
         super().__init__(dmm, kind, kind.layout)
 
 
-def _everywhere(builder: Any, value: Any) -> Any:
-    """A vector that holds one number in all lanes."""
+def _splat(builder: Any, value: Any) -> Any:
+    """Broadcast one value to all lanes."""
     one = builder.insert_element(ir.Constant(ir.VectorType(value.type, GROUP), ir.Undefined), value, ir.Constant(_WORD, 0))
     return builder.shuffle_vector(one, one, ir.Constant(_WORDS, None))
 
 
 @_lower_cast(types.float32, _Register)
 def _from_number(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
-    return _everywhere(builder, value)
+    return _splat(builder, value)
 
 
 def _define(function: Any, result: _Register, operands: tuple[_Register, ...], generate: Callable[..., Any]) -> None:
-    """Say what a Python operator means for registers; ``generate`` gets the builder and the operands."""
+    """Define a Python operator for registers; ``generate`` gets the builder and the operands."""
     signature = templates.signature(result, *operands)
     _infer_global(function)(type("Rule", (templates.ConcreteTemplate,), {"cases": [signature]}))
 
@@ -76,7 +76,7 @@ def _define(function: Any, result: _Register, operands: tuple[_Register, ...], g
 
 
 def _apply(name: str) -> Callable[..., Any]:
-    """A function of LLVM's own, lane by lane."""
+    """A unary LLVM intrinsic, applied lane by lane."""
     kind, name = ir.FunctionType(lanes.layout, [lanes.layout]), f"llvm.{name}.v{GROUP}f32"
     return lambda builder, value: builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
 
@@ -110,7 +110,7 @@ def _place(context: Any, builder: Any, kind: Any, flat: Any, at: Any) -> Any:
 
 @_intrinsic
 def load(typing: Any, flat: Any, at: Any) -> Any:
-    """`LANES` numbers of a flat array from ``at`` (uint64) on."""
+    """Load `LANES` values of a flat array from ``at`` (uint64) on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_place(context, builder, signature.args[0], *arguments), align=4)
@@ -120,7 +120,7 @@ def load(typing: Any, flat: Any, at: Any) -> Any:
 
 @_intrinsic
 def store(typing: Any, flat: Any, at: Any, value: Any) -> Any:
-    """Write `LANES` numbers to a flat array from ``at`` (uint64) on."""
+    """Store `LANES` values to a flat array from ``at`` (uint64) on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.store(arguments[2], _place(context, builder, signature.args[0], *arguments[:2]), align=4)
@@ -130,22 +130,22 @@ def store(typing: Any, flat: Any, at: Any, value: Any) -> Any:
 
 
 def _each(builder: Any, values: Any) -> list[Any]:
-    """The lanes, one after the other."""
+    """Extract all lanes."""
     return [builder.extract_element(values, ir.Constant(_WORD, lane)) for lane in range(GROUP)]
 
 
-def _whole(builder: Any, values: Any) -> Any:
-    """Whole numbers as integers."""
+def _to_int(builder: Any, values: Any) -> Any:
+    """Convert whole float32 values to int32."""
     return builder.fptosi(values, _WORDS)
 
 
 @_intrinsic
-def put(typing: Any, flat: Any, at: Any, value: Any) -> Any:
-    """Write each lane's number where ``at`` (lanes of whole numbers) says, lane after lane."""
+def scatter(typing: Any, flat: Any, at: Any, value: Any) -> Any:
+    """Scatter: store each lane's value at its index in ``at`` (whole numbers), in lane order."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        for place, number in zip(_each(builder, _whole(builder, arguments[1])), _each(builder, arguments[2]), strict=True):
+        for place, number in zip(_each(builder, _to_int(builder, arguments[1])), _each(builder, arguments[2]), strict=True):
             builder.store(number, builder.gep(data, [place]), align=4)
         return context.get_dummy_value()
 
@@ -153,13 +153,13 @@ def put(typing: Any, flat: Any, at: Any, value: Any) -> Any:
 
 
 @_intrinsic
-def look_up(typing: Any, cube: Any, x: Any, y: Any, z: Any) -> Any:
-    """What a contiguous cube of small integers (int8) holds at each lane's indices (whole numbers)."""
+def gather_int8(typing: Any, cube: Any, x: Any, y: Any, z: Any) -> Any:
+    """Gather from a contiguous int8 cube at each lane's indices (whole numbers), converted to float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         found = context.make_array(signature.args[0])(context, builder, arguments[0])
-        edge = _everywhere(builder, builder.trunc(builder.extract_value(found.shape, 2), _WORD))
-        i, j, k = (_whole(builder, values) for values in arguments[1:])
+        edge = _splat(builder, builder.trunc(builder.extract_value(found.shape, 2), _WORD))
+        i, j, k = (_to_int(builder, values) for values in arguments[1:])
         flat = builder.add(builder.mul(builder.add(builder.mul(i, edge), j), edge), k)
         bytes_ = ir.Constant(ir.VectorType(ir.IntType(8), GROUP), ir.Undefined)
         for lane, place in enumerate(_each(builder, flat)):
@@ -171,7 +171,7 @@ def look_up(typing: Any, cube: Any, x: Any, y: Any, z: Any) -> Any:
 
 @_intrinsic
 def where(typing: Any, condition: Any, yes: Any, no: Any) -> Any:
-    """``yes`` in the lanes where the condition holds, ``no`` in the others."""
+    """Select ``yes`` in lanes where the condition holds, ``no`` in the others."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(*arguments)
@@ -181,7 +181,7 @@ def where(typing: Any, condition: Any, yes: Any, no: Any) -> Any:
 
 @_intrinsic
 def any_of(typing: Any, condition: Any) -> Any:
-    """Whether a condition holds in any lane."""
+    """Horizontal or: whether a condition holds in any lane."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.bitcast(arguments[0], ir.IntType(GROUP))
@@ -191,8 +191,8 @@ def any_of(typing: Any, condition: Any) -> Any:
 
 
 @_intrinsic
-def counting(typing: Any) -> Any:
-    """0, 1, 2, ... in the lanes."""
+def lane_index(typing: Any) -> Any:
+    """Lane indices 0, 1, 2, ..."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return ir.Constant(lanes.layout, [float(lane) for lane in range(GROUP)])
@@ -201,8 +201,8 @@ def counting(typing: Any) -> Any:
 
 
 @_intrinsic
-def spread(typing: Any, value: Any) -> Any:
-    """A number in all lanes."""
+def broadcast(typing: Any, value: Any) -> Any:
+    """Broadcast a float32 to all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return arguments[0]
@@ -216,7 +216,7 @@ def bits_below(typing: Any, counts: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         ones = ir.Constant(_WORDS, [1] * GROUP)
-        bits = builder.sub(builder.shl(ones, _whole(builder, arguments[0])), ones)
+        bits = builder.sub(builder.shl(ones, _to_int(builder, arguments[0])), ones)
         pair = builder.bitcast(builder.trunc(bits, ir.VectorType(ir.IntType(8), GROUP)), ir.VectorType(ir.IntType(64), 2))
         found = [builder.extract_element(pair, ir.Constant(_WORD, k)) for k in range(2)]
         return context.make_tuple(builder, signature.return_type, found)
@@ -229,7 +229,7 @@ def _power_of_two(typing: Any, whole: Any) -> Any:
     """``2**whole`` for whole numbers in [-126, 127]: the exponent of a float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        bits = builder.add(_whole(builder, arguments[0]), ir.Constant(_WORDS, [127] * GROUP))
+        bits = builder.add(_to_int(builder, arguments[0]), ir.Constant(_WORDS, [127] * GROUP))
         return builder.bitcast(builder.shl(bits, ir.Constant(_WORDS, [23] * GROUP)), lanes.layout)
 
     return lanes(lanes), generate
@@ -244,7 +244,7 @@ def exp2_of(x):
 
 
 def _paired(builder: Any, first: Any, second: Any, held: int) -> Any:
-    """Both of two rows in one: of the sums that each holds, in equal parts of its lanes, the halves of a part are added."""
+    """One step of `_summed`: merge two rows of ``held`` partial sums each, adding the halves of every part."""
     part = GROUP // held
     starts = range(0, 2 * GROUP, part)
 
@@ -256,7 +256,7 @@ def _paired(builder: Any, first: Any, second: Any, held: int) -> Any:
 
 
 def _summed(builder: Any, rows: list[Any]) -> Any:
-    """The sums of the rows, in the first lanes of one."""
+    """Horizontal sums of the rows, in the first lanes of one."""
     rows = rows + [ir.Constant(lanes.layout, None)] * (GROUP - len(rows))
     held = 1
     while held < GROUP:
@@ -266,8 +266,8 @@ def _summed(builder: Any, rows: list[Any]) -> Any:
 
 
 @_intrinsic
-def total(typing: Any, value: Any) -> Any:
-    """The sum over the lanes."""
+def reduce_sum(typing: Any, value: Any) -> Any:
+    """Horizontal sum over the lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.extract_element(_summed(builder, [arguments[0]]), ir.Constant(_WORD, 0))
@@ -276,11 +276,10 @@ def total(typing: Any, value: Any) -> Any:
 
 
 @_intrinsic
-def totals(typing: Any, values: Any) -> Any:
-    """The sums over the lanes of up to `LANES` registers, in the first lanes of one; the others hold 0.
+def reduce_sums(typing: Any, values: Any) -> Any:
+    """Horizontal sums of up to `LANES` registers, in the first lanes of one; the others hold 0.
 
-    Registers are added up in pairs, each of which then takes half the room: that takes a quarter of the instructions of summing
-    one after the other.
+    A pairwise transpose-and-add: a quarter of the instructions of one horizontal sum after the other.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -1,1 +1,1 @@
-"""Projection, binning and rasterisation of Gaussians."""
+"""Gaussian splatting: project, intersect tiles, rasterise to pixels, and their backward passes."""

@@ -1,4 +1,4 @@
-"""Depth sort and tile lists of footprints."""
+"""Depth sort and tile intersection of footprints: which footprints each tile composites, front to back."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, prange, scratch, serial, share, threads
-from invgraphics.kernels.numba.simd.instructions import SOON, prefetch
-from invgraphics.kernels.numba.splat.ewa import reach_of
+from invgraphics.kernels.numba.runtime import array, index, inlined, job_start, parallel, prange, scratch, serial, threads
+from invgraphics.kernels.numba.simd.instructions import PREFETCH_DISTANCE, prefetch
+from invgraphics.kernels.numba.splat.ewa import visible_extent
 from invgraphics.kernels.types import ALPHA_MIN, Bins, Footprints
 
 RADIX_BITS = 11
 RADIX_PASSES = 3
 
-# A packed row: what rasterising a footprint needs, followed by its features. Its response over (x, y) from the mean is
+# Columns of a packed footprint, followed by its features. Its response over (x, y) from the mean is
 # opacity 2^(POWER_XX x² + POWER_XY x y + POWER_YY y²).
-MEAN_X, MEAN_Y, POWER_XX, POWER_XY, POWER_YY, OPACITY, WIDEST, HIGHEST, SHEAR, ASPECT, FEATURES = range(11)
+MEAN_X, MEAN_Y, POWER_XX, POWER_XY, POWER_YY, OPACITY, RIGHTMOST_Y, HALF_HEIGHT, SHEAR, ASPECT, FEATURES = range(11)
 
 HALF_LOG2E = np.float32(-0.5 / np.log(2.0))
 """Turns exp(-q / 2) into 2^(HALF_LOG2E q)."""
-SLACK = np.float32(0.01)
-"""Pixels by which ellipses are widened when blocks are chosen, so that rounding never loses a visible pixel."""
-LARGEST = np.float32(1e9)
-"""Coordinates and extents beyond this, in pixels, are taken for numerical failures and skipped."""
-SMALLEST = np.float32(1e-18)
-"""Entries of conics below this belong to footprints wider than ``LARGEST``."""
+MARGIN = np.float32(0.01)
+"""Margin in pixels around ellipses in intersection tests, so that rounding never loses a visible pixel."""
+MAX_EXTENT = np.float32(1e9)
+"""Coordinates and extents beyond this, in pixels, are numerical failures and skipped."""
+MIN_CONIC = np.float32(1e-18)
+"""Conic entries below this belong to footprints wider than ``MAX_EXTENT``."""
 
 
 class Packed(NamedTuple):
-    """m visible footprints front to back, and the tiles they touch.
+    """m visible footprints packed front to back, and their tile intersections.
 
     Attributes:
         order: index of each in the caller's arrays (m,).
@@ -48,7 +48,7 @@ class Packed(NamedTuple):
 
 
 @serial
-def _sort_by_depth(depths, radii, keys, order, keys_other, order_other):
+def _sort_by_depth(depths, radii, keys, order, keys_swap, order_swap):
     """Indices of footprints with a radius, by depth, ties by index (radix sort of the floats' bits); returns their number."""
     m = 0
     buckets = 1 << RADIX_BITS
@@ -72,58 +72,60 @@ def _sort_by_depth(depths, radii, keys, order, keys_other, order_other):
             total += count
         for i in range(m):
             bucket = (keys[i] >> np.uint32(p * RADIX_BITS)) & mask
-            to = counts[p, bucket]
-            counts[p, bucket] = to + 1
-            keys_other[to] = keys[i]
-            order_other[to] = order[i]
-        keys, keys_other = keys_other, keys
-        order, order_other = order_other, order
+            slot = counts[p, bucket]
+            counts[p, bucket] = slot + 1
+            keys_swap[slot] = keys[i]
+            order_swap[slot] = order[i]
+        keys, keys_swap = keys_swap, keys
+        order, order_swap = order_swap, order
     return m
 
 
 def depth_order(footprints: Footprints) -> np.ndarray:
     """Indices of the footprints that are not culled, front to back, ties by index; valid until the next call."""
     n = len(footprints)
-    keys, keys_other = scratch("sort keys", n, np.uint32), scratch("sort keys 2", n, np.uint32)
-    order, order_other = scratch("sort order", n, np.int32), scratch("sort order 2", n, np.int32)
-    m = _sort_by_depth(array(footprints.depths), array(footprints.radii), keys, order, keys_other, order_other)
-    return (order_other if RADIX_PASSES % 2 else order)[:m]
+    keys, keys_swap = scratch("sort keys", n, np.uint32), scratch("sort keys 2", n, np.uint32)
+    order, order_swap = scratch("sort order", n, np.int32), scratch("sort order 2", n, np.int32)
+    m = _sort_by_depth(array(footprints.depths), array(footprints.radii), keys, order, keys_swap, order_swap)
+    return (order_swap if RADIX_PASSES % 2 else order)[:m]
 
 
 @inlined
-def _tiles(low, high, tile, count):
-    """Tiles that the closed interval of pixel coordinates touches, clipped to ``count``; empty if first > last."""
+def _tile_range(low, high, tile, count):
+    """First and last tile that a closed interval of pixel coordinates touches, clipped to ``count``; empty if first > last."""
     first = min(max(np.floor(low / tile), np.float32(0.0)), np.float32(count))
     last = max(min(np.floor(high / tile), np.float32(count - 1)), np.float32(-1.0))
     return np.int32(first), np.int32(last)
 
 
 @inlined
-def _drawable(x, y, xx, yy, det):
-    """Whether a footprint is finite and a proper ellipse; written so that NaN says no."""
-    inside = abs(x) < LARGEST and abs(y) < LARGEST
-    regular = xx > SMALLEST and yy > SMALLEST and max(xx, yy) < LARGEST * max(det, np.float32(0.0)) * LARGEST
-    return inside and regular and max(xx, yy) < np.float32(1.0) / SMALLEST
+def _is_regular(x, y, xx, yy, det):
+    """Whether a footprint is a finite, proper ellipse; False for NaN."""
+    inside = abs(x) < MAX_EXTENT and abs(y) < MAX_EXTENT
+    regular = xx > MIN_CONIC and yy > MIN_CONIC and max(xx, yy) < MAX_EXTENT * max(det, np.float32(0.0)) * MAX_EXTENT
+    return inside and regular and max(xx, yy) < np.float32(1.0) / MIN_CONIC
 
 
 @inlined
-def _tile_rows(rows, r, tile, count):
+def _row_range(rows, r, tile, count):
     # A tile's pixel centres begin and end half a pixel inside it.
     half = np.float32(0.5)
-    return _tiles(rows[r, MEAN_Y] - rows[r, HIGHEST] + half, rows[r, MEAN_Y] + rows[r, HIGHEST] - half, tile, count)
+    return _tile_range(
+        rows[r, MEAN_Y] - rows[r, HALF_HEIGHT] + half, rows[r, MEAN_Y] + rows[r, HALF_HEIGHT] - half, tile, count
+    )
 
 
 @parallel
-def _pack(order, means, conics, opacities, features, tile, columns, lines, rows, most):
-    """Gather footprints front to back; those that cannot be drawn get an ellipse of negative height.
+def _pack(order, means, conics, opacities, features, tile, tile_columns, tile_rows, rows, max_pairs):
+    """Pack footprints front to back; degenerate ones get an ellipse of negative height.
 
-    ``most`` receives, per job, in how many tiles its footprints' boxes lie: they touch no more.
+    ``max_pairs`` receives, per job, the number of tiles in its footprints' bounding boxes, an upper bound of intersections.
     """
-    jobs, edge, half = len(most), np.float32(tile), np.float32(0.5)
+    jobs, edge, half = len(max_pairs), np.float32(tile), np.float32(0.5)
     for job in prange(jobs):
         total = 0
-        for r in range(share(len(order), jobs, job), share(len(order), jobs, job + 1)):
-            ahead = index(order[min(r + SOON, len(order) - 1)])
+        for r in range(job_start(len(order), jobs, job), job_start(len(order), jobs, job + 1)):
+            ahead = index(order[min(r + PREFETCH_DISTANCE, len(order) - 1)])
             prefetch(means, ahead)
             prefetch(conics, ahead)
             prefetch(features, ahead)
@@ -132,35 +134,35 @@ def _pack(order, means, conics, opacities, features, tile, columns, lines, rows,
             rows[r, MEAN_X], rows[r, MEAN_Y] = means[i, 0], means[i, 1]
             rows[r, POWER_XX], rows[r, POWER_XY] = HALF_LOG2E * a, (HALF_LOG2E + HALF_LOG2E) * b
             rows[r, POWER_YY], rows[r, OPACITY] = HALF_LOG2E * c, opacity
-            rows[r, HIGHEST] = np.float32(-1.0)
+            rows[r, HALF_HEIGHT] = np.float32(-1.0)
             # In float64: a c - b² cancels for thin footprints.
             det = np.float32(np.float64(a) * np.float64(c) - np.float64(b) * np.float64(b))
-            if _drawable(means[i, 0], means[i, 1], a, c, det) and opacity >= np.float32(ALPHA_MIN):
-                # The visible ellipse is a x² + 2 b x y + c y² = `reach_of`; its rightmost point lies at y = WIDEST.
-                size = np.sqrt(reach_of(opacity) / det)
-                rows[r, WIDEST] = -b * size / np.sqrt(c)
-                rows[r, HIGHEST] = np.sqrt(a) * size * np.float32(1.00001) + SLACK
+            if _is_regular(means[i, 0], means[i, 1], a, c, det) and opacity >= np.float32(ALPHA_MIN):
+                # The visible ellipse is a x² + 2 b x y + c y² = `visible_extent`; its rightmost point lies at y = RIGHTMOST_Y.
+                size = np.sqrt(visible_extent(opacity) / det)
+                rows[r, RIGHTMOST_Y] = -b * size / np.sqrt(c)
+                rows[r, HALF_HEIGHT] = np.sqrt(a) * size * np.float32(1.00001) + MARGIN
                 rows[r, SHEAR] = -b / a
                 rows[r, ASPECT] = np.sqrt(det) / a
-                # No chord of the ellipse that high reaches farther.
-                wide = rows[r, HIGHEST] * np.sqrt(c / a) * np.float32(1.00001) + SLACK + SLACK
-                left, right = _tiles(means[i, 0] - wide + half, means[i, 0] + wide - half, edge, columns)
-                top, bottom = _tile_rows(rows, r, edge, lines)
+                # Upper bound of the ellipse's half-width.
+                half_width = rows[r, HALF_HEIGHT] * np.sqrt(c / a) * np.float32(1.00001) + MARGIN + MARGIN
+                left, right = _tile_range(means[i, 0] - half_width + half, means[i, 0] + half_width - half, edge, tile_columns)
+                top, bottom = _row_range(rows, r, edge, tile_rows)
                 total += max(right - left + 1, 0) * max(bottom - top + 1, 0)
             rows[r, FEATURES:] = np.float32(0.0)
             for k in range(features.shape[1]):
                 rows[r, FEATURES + k] = features[i, k]
-        most[job] = total
+        max_pairs[job] = total
 
 
 @inlined
 def half_span(shape, y):
-    """Half the ellipse's width at height ``y`` over its centre, and the offset of that chord's middle.
+    """Half-length of the ellipse's horizontal chord at height ``y`` over its centre, and the chord's midpoint.
 
-    ``shape`` is what `_pack` wrote to the columns from WIDEST to ASPECT; ``y`` may be a register.
+    ``shape`` holds the packed columns from RIGHTMOST_Y to ASPECT; ``y`` may be a SIMD register.
     """
-    _, highest, shear, aspect = shape
-    return aspect * np.sqrt(max(highest * highest - y * y, np.float32(0.0))), shear * y
+    _, half_height, shear, aspect = shape
+    return aspect * np.sqrt(max(half_height * half_height - y * y, np.float32(0.0))), shear * y
 
 
 @inlined
@@ -169,45 +171,45 @@ def _chord(shape, low, high):
     right, left = min(max(shape[0], low), high), min(max(-shape[0], low), high)
     width_right, middle_right = half_span(shape, right)
     width_left, middle_left = half_span(shape, left)
-    return middle_left - width_left - SLACK, middle_right + width_right + SLACK
+    return middle_left - width_left - MARGIN, middle_right + width_right + MARGIN
 
 
 @inlined
-def _tile_columns(rows, r, y, tile, count):
-    """Tiles of tile row ``y`` that the ellipse touches (between the first and the last pixel centre)."""
+def _column_range(rows, r, y, tile, count):
+    """First and last tile of tile row ``y`` that the ellipse touches (between the first and the last pixel centre)."""
     low = y * tile + np.float32(0.5) - rows[r, MEAN_Y]
-    shape = rows[r, WIDEST], rows[r, HIGHEST], rows[r, SHEAR], rows[r, ASPECT]
+    shape = rows[r, RIGHTMOST_Y], rows[r, HALF_HEIGHT], rows[r, SHEAR], rows[r, ASPECT]
     left, right = _chord(shape, low, low + tile - np.float32(1.0))
     x, half = rows[r, MEAN_X], np.float32(0.5)
-    return _tiles(x + left + half, x + right - half, tile, count)
+    return _tile_range(x + left + half, x + right - half, tile, count)
 
 
 @parallel
-def _count(rows, tile, columns, lines, counts, pairs, found):
-    """Per job, how many of its footprints touch each tile; and all pairs of a tile and a footprint that touches it."""
+def _intersect_ellipses(rows, tile, tile_columns, tile_rows, counts, pairs, pair_counts):
+    """Exact ellipse-tile intersection: all pairs (tile, footprint) per job, and their number per tile."""
     jobs, m = counts.shape[0], rows.shape[0]
     edge = np.float32(tile)
     for job in prange(jobs):
         counts[job, :] = 0
         number = 0
-        for r in range(share(m, jobs, job), share(m, jobs, job + 1)):
-            if rows[r, HIGHEST] > 0:
-                top, bottom = _tile_rows(rows, r, edge, lines)
+        for r in range(job_start(m, jobs, job), job_start(m, jobs, job + 1)):
+            if rows[r, HALF_HEIGHT] > 0:
+                top, bottom = _row_range(rows, r, edge, tile_rows)
                 for y in range(top, bottom + 1):
-                    first, last = _tile_columns(rows, r, np.float32(y), edge, columns)
+                    first, last = _column_range(rows, r, np.float32(y), edge, tile_columns)
                     for x in range(first, last + 1):
-                        # Always so, but for what rounding might do.
+                        # Guaranteed but for rounding.
                         if number < pairs.shape[2]:
-                            t = y * columns + x
+                            t = y * tile_columns + x
                             counts[job, index(t)] += 1
                             pairs[job, 0, index(number)], pairs[job, 1, index(number)] = t, r
                             number += 1
-        found[job] = number
+        pair_counts[job] = number
 
 
 @serial
-def _running_totals(counts, starts):
-    """Turn counts into places: tile after tile, within a tile job after job."""
+def _prefix_sum(counts, starts):
+    """Exclusive prefix sum of counts over tiles, and over jobs within a tile; returns the total."""
     total = 0
     for t in range(counts.shape[1]):
         starts[t] = total
@@ -220,60 +222,62 @@ def _running_totals(counts, starts):
 
 
 @parallel
-def _list(pairs, found, places, entries):
-    """Write each footprint to the tiles it touches; ``places`` says where each job's next entry of a tile goes."""
-    for job in prange(len(found)):
-        for k in range(found[job]):
+def _write_entries(pairs, pair_counts, cursors, entries):
+    """Scatter pairs into tile lists; ``cursors`` holds the position of each job's next entry per tile."""
+    for job in prange(len(pair_counts)):
+        for k in range(pair_counts[job]):
             t = index(pairs[job, 0, index(k)])
-            place = places[job, t]
-            places[job, t] = place + 1
-            entries[index(place)] = pairs[job, 1, index(k)]
+            cursor = cursors[job, t]
+            cursors[job, t] = cursor + 1
+            entries[index(cursor)] = pairs[job, 1, index(k)]
 
 
-def pack(footprints: Footprints, features: Float[Tensor, "n c"], columns: int, lines: int, tile: int) -> Packed:
-    """Sort visible footprints by depth and list, per tile, those whose visible ellipse touches it."""
+def pack_and_intersect(
+    footprints: Footprints, features: Float[Tensor, "n c"], tile_columns: int, tile_rows: int, tile: int
+) -> Packed:
+    """Sort visible footprints by depth, pack them, and intersect their visible ellipses with tiles."""
     jobs = threads()
     order = depth_order(footprints).copy()
-    # Features are handled three at a time.
+    # Features are padded to a multiple of three.
     rows = np.empty((len(order), FEATURES + 3 * -(-features.shape[1] // 3)), np.float32)
     means, conics, opacities = array(footprints.means2d), array(footprints.conics), array(footprints.opacities)
-    most, found = np.empty(jobs, np.int64), np.empty(jobs, np.int64)
-    _pack(order, means, conics, opacities, array(features), tile, columns, lines, rows, most)
-    counts = scratch("tile counts", jobs * columns * lines, np.int64).reshape(jobs, columns * lines)
-    starts = np.empty(columns * lines + 1, np.int64)
-    room = int(most.max())
-    pairs = scratch("tile pairs", jobs * 2 * room, np.int32).reshape(jobs, 2, room)
-    _count(rows, tile, columns, lines, counts, pairs, found)
-    entries = np.empty(_running_totals(counts, starts), np.int32)
-    _list(pairs, found, counts, entries)
+    max_pairs, pair_counts = np.empty(jobs, np.int64), np.empty(jobs, np.int64)
+    _pack(order, means, conics, opacities, array(features), tile, tile_columns, tile_rows, rows, max_pairs)
+    counts = scratch("tile counts", jobs * tile_columns * tile_rows, np.int64).reshape(jobs, tile_columns * tile_rows)
+    starts = np.empty(tile_columns * tile_rows + 1, np.int64)
+    capacity = int(max_pairs.max())
+    pairs = scratch("tile pairs", jobs * 2 * capacity, np.int32).reshape(jobs, 2, capacity)
+    _intersect_ellipses(rows, tile, tile_columns, tile_rows, counts, pairs, pair_counts)
+    entries = np.empty(_prefix_sum(counts, starts), np.int32)
+    _write_entries(pairs, pair_counts, counts, entries)
     return Packed(order, rows, entries, starts)
 
 
 @serial
-def _squares(order, means, radii, tile, columns, lines, places, entries):
-    """Count (``entries`` empty) or list the tiles each footprint's square touches, front to back."""
+def _intersect_squares(order, means, radii, tile, tile_columns, tile_rows, cursors, entries):
+    """Count (``entries`` empty) or list the tiles that each footprint's square overlaps, front to back."""
     edge = np.float32(tile)
     for r in range(len(order)):
         i = order[r]
         x, y, radius = means[i, 0], means[i, 1], radii[i]
-        if abs(x) < LARGEST and abs(y) < LARGEST and radius < LARGEST:
-            left, right = _tiles(x - radius, x + radius, edge, columns)
-            top, bottom = _tiles(y - radius, y + radius, edge, lines)
-            for line in range(top, bottom + 1):
+        if abs(x) < MAX_EXTENT and abs(y) < MAX_EXTENT and radius < MAX_EXTENT:
+            left, right = _tile_range(x - radius, x + radius, edge, tile_columns)
+            top, bottom = _tile_range(y - radius, y + radius, edge, tile_rows)
+            for row in range(top, bottom + 1):
                 for column in range(left, right + 1):
-                    t = line * columns + column
+                    t = row * tile_columns + column
                     if len(entries):
-                        entries[places[0, t]] = i
-                    places[0, t] += 1
+                        entries[cursors[0, t]] = i
+                    cursors[0, t] += 1
 
 
 def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bins:
     """See `invgraphics.kernels.splat_bin`."""
-    columns, lines = -(-width // tile), -(-height // tile)
+    tile_columns, tile_rows = -(-width // tile), -(-height // tile)
     order, means, radii = depth_order(footprints), array(footprints.means2d), array(footprints.radii)
-    places, starts = np.zeros((1, columns * lines), np.int64), np.empty(columns * lines + 1, np.int64)
-    _squares(order, means, radii, tile, columns, lines, places, np.empty(0, np.int64))
-    entries = np.empty(_running_totals(places, starts), np.int64)
+    cursors, starts = np.zeros((1, tile_columns * tile_rows), np.int64), np.empty(tile_columns * tile_rows + 1, np.int64)
+    _intersect_squares(order, means, radii, tile, tile_columns, tile_rows, cursors, np.empty(0, np.int64))
+    entries = np.empty(_prefix_sum(cursors, starts), np.int64)
     if len(entries):
-        _squares(order, means, radii, tile, columns, lines, places, entries)
-    return Bins(torch.from_numpy(entries), torch.from_numpy(starts), tile, columns, lines)
+        _intersect_squares(order, means, radii, tile, tile_columns, tile_rows, cursors, entries)
+    return Bins(torch.from_numpy(entries), torch.from_numpy(starts), tile, tile_columns, tile_rows)

@@ -1,7 +1,6 @@
 """EWA projection, forward: the formulas are those of `invgraphics.kernels.reference.splat_project`.
 
-Primitives are projected `LANES` at a time, side by side in vector registers, without a branch: what is culled is computed too,
-and replaced by something harmless.
+`LANES` primitives at a time, one per SIMD lane, without branches: culled primitives are computed too, and their results masked.
 """
 
 from __future__ import annotations
@@ -9,29 +8,29 @@ from __future__ import annotations
 import numpy as np
 
 from invgraphics.kernels.numba.harmonics import harmonics
-from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined, log2, parallel, prange, share
+from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined, job_start, log2, parallel, prange
 from invgraphics.kernels.numba.simd.layouts import read_1, read_3, read_4, write_1, write_2, write_3
 from invgraphics.kernels.reference.splat_project import ILL_CONDITIONED, MARGIN, NEAR
-from invgraphics.kernels.types import ALPHA_MIN, FADE_MIN
+from invgraphics.kernels.types import ALPHA_MIN, COMPENSATION_MIN
 
 # A camera as a flat tuple: rotation to the world row by row, position, focal lengths, principal point, width, height.
 ROTATION, POSITION, FOCAL, CENTRE, SIZE, VIEW = 0, 9, 12, 14, 16, 18
 
-# Slots of a group of primitives, LANES values each.
+# Slots of a group of primitives in the flat scratch array, LANES values each.
 MEAN, QUATERNION, SCALE, _OPACITY = (index(slot) * LANES for slot in (0, 3, 7, 10))
-_DEPTH, _RADIUS, _FADE, _SCREEN, _CONIC, _PLANE = (index(slot) * LANES for slot in (11, 12, 13, 14, 16, 19))
-_WEIGHTS, _ROOM = index(22) * LANES, index(22 + 16) * LANES
+_DEPTH, _RADIUS, _COMPENSATION, _MEAN2D, _CONIC, _PLANE = (index(slot) * LANES for slot in (11, 12, 13, 14, 16, 19))
+_HARMONICS, _SLOTS = index(22) * LANES, index(22 + 16) * LANES
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 _NEAR, _MARGIN, _THIN = np.float32(NEAR), np.float32(MARGIN), np.float32(ILL_CONDITIONED)
 _TINY, _EPSILON = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
 _TWO_LN_2, _PER_ALPHA_MIN = np.float32(2 * np.log(2)), np.float32(1 / ALPHA_MIN)
-_NORM_MIN, _FADE_MIN = np.float32(1e-12), np.float32(FADE_MIN)
+_NORM_MIN, _COMPENSATION_MIN = np.float32(1e-12), np.float32(COMPENSATION_MIN)
 
 
 @inlined
 def read_primitives(means, quaternions, scales, i, count, lanes):
-    """Read ``count`` primitives from the ``i``-th on."""
+    """Load ``count`` primitives, from the ``i``-th on, into the scratch slots."""
     read_3(means, i, count, lanes, MEAN)
     read_4(quaternions, i, count, lanes, QUATERNION)
     read_3(scales, i, count, lanes, SCALE)
@@ -39,19 +38,19 @@ def read_primitives(means, quaternions, scales, i, count, lanes):
 
 @inlined
 def three(lanes, at):
-    """What a lane holds in three slots."""
+    """Load three consecutive slots of a lane."""
     return lanes[at], lanes[at + LANES], lanes[at + LANES + LANES]
 
 
 @inlined
 def four(lanes, at):
-    """The same of four slots."""
+    """Load four consecutive slots of a lane."""
     return lanes[at], lanes[at + LANES], lanes[at + LANES + LANES], lanes[at + LANES + LANES + LANES]
 
 
 @inlined
 def put(lanes, at, values):
-    """Write three values to a lane."""
+    """Store three values to consecutive slots of a lane."""
     lanes[at], lanes[at + LANES], lanes[at + LANES + LANES] = values
 
 
@@ -113,7 +112,7 @@ def camera_point(view, point):
 
 @inlined
 def clamped_slope(view, axis, slope):
-    """Tangent of the viewing angle along one image axis, held within the image plus a margin."""
+    """Slope x / z of the mean on one image axis, clamped to the image plus a margin."""
     focal, centre, size = view[FOCAL + axis], view[CENTRE + axis], view[SIZE + axis]
     margin = _MARGIN * _HALF * size / focal
     return min(max(slope, -centre / focal - margin), (size - centre) / focal + margin)
@@ -133,8 +132,8 @@ def scaled_columns(m, s):
 @inlined
 def scaled_axes(view, q, scales):
     """Rotation of the primitive to the camera's axes, and the same with its columns scaled (a root of the covariance)."""
-    turn = transposed_product(rotation_of(view), matrix_of(q))
-    return turn, scaled_columns(turn, scales)
+    axes = transposed_product(rotation_of(view), matrix_of(q))
+    return axes, scaled_columns(axes, scales)
 
 
 @inlined
@@ -158,16 +157,16 @@ def covariance(x, y, dilation):
 
 
 @inlined
-def fade_of(x, y, dilation):
-    """Factor that gives a filtered footprint the integral it had unfiltered, and the unfiltered covariance."""
+def compensation_of(x, y, dilation):
+    """Opacity compensation of the low-pass filter (Mip-Splatting, §4.2), and the unfiltered covariance."""
     xx, xy, yy, area = covariance(x, y, _ZERO)
     _, _, _, det = covariance(x, y, dilation)
-    return max(np.sqrt(area / det), _FADE_MIN), xx, xy, yy, area
+    return max(np.sqrt(area / det), _COMPENSATION_MIN), xx, xy, yy, area
 
 
 @inlined
 def _plane(mean, x, y, root, dilation):
-    """Distance of the centre, and its change per pixel along the ridge of maximal response."""
+    """Depth plane: distance of the centre, and its slopes per pixel along the ridge of maximal response."""
     distance = np.sqrt(dot(mean, mean))
     away = (
         dot(mean, column(root, 0)) / distance,
@@ -182,26 +181,26 @@ def _plane(mean, x, y, root, dilation):
 
 
 @inlined
-def reach_of(opacity):
-    """The quadratic form q at which ``opacity exp(-q / 2)`` has faded to what is skipped; 0 if it never is more."""
+def visible_extent(opacity):
+    """Quadratic form q at which ``opacity exp(-q / 2)`` falls to 1/255; 0 if it is never above."""
     return _TWO_LN_2 * log2(max(opacity * _PER_ALPHA_MIN, _ONE))
 
 
 @inlined
 def _radius(view, u, v, xx, xy, yy, opacity):
     """Half-width of the visible ellipse's square; 0 where its bounding box misses the image."""
-    reach = np.sqrt(reach_of(opacity))
-    width, height = reach * np.sqrt(xx), reach * np.sqrt(yy)
+    extent = np.sqrt(visible_extent(opacity))
+    width, height = extent * np.sqrt(xx), extent * np.sqrt(yy)
     half = _HALF * (xx - yy)
     largest = _HALF * (xx + yy) + np.sqrt(half * half + xy * xy)
     meets_x = u + width > _ZERO and u - width < view[SIZE] and width > _ZERO
     meets_y = v + height > _ZERO and v - height < view[SIZE + 1] and height > _ZERO
-    return reach * np.sqrt(largest) if meets_x and meets_y else _ZERO
+    return extent * np.sqrt(largest) if meets_x and meets_y else _ZERO
 
 
 @inlined
-def _project_lane(view, dilation, compensate, lanes, lane):
-    """Footprint of one primitive, and the harmonics in its direction."""
+def _project_lane(view, dilation, antialiased, lanes, lane):
+    """Project one primitive: its footprint, and the spherical harmonics of its direction."""
     offset, mean = camera_point(view, three(lanes, MEAN + lane))
     in_front = mean[2] > _NEAR
     lanes[_DEPTH + lane] = mean[2]
@@ -212,29 +211,29 @@ def _project_lane(view, dilation, compensate, lanes, lane):
     xx, xy, yy, det = covariance(x, y, dilation)
     u = view[CENTRE] + view[FOCAL] * mean[0] / mean[2]
     v = view[CENTRE + 1] + view[FOCAL + 1] * mean[1] / mean[2]
-    fade = _ONE
-    if compensate:
-        fade, _, _, _, _ = fade_of(x, y, dilation)
-    radius = _radius(view, u, v, xx, xy, yy, lanes[_OPACITY + lane] * fade)
-    seen = in_front and radius > _ZERO
-    lanes[_RADIUS + lane], lanes[_FADE + lane] = radius if seen else _ZERO, fade if in_front else _ONE
-    lanes[_SCREEN + lane], lanes[_SCREEN + LANES + lane] = u if seen else _ZERO, v if seen else _ZERO
-    put(lanes, _CONIC + lane, (yy / det if seen else _ONE, -xy / det if seen else _ZERO, xx / det if seen else _ONE))
+    compensation = _ONE
+    if antialiased:
+        compensation, _, _, _, _ = compensation_of(x, y, dilation)
+    radius = _radius(view, u, v, xx, xy, yy, lanes[_OPACITY + lane] * compensation)
+    visible = in_front and radius > _ZERO
+    lanes[_RADIUS + lane], lanes[_COMPENSATION + lane] = radius if visible else _ZERO, compensation if in_front else _ONE
+    lanes[_MEAN2D + lane], lanes[_MEAN2D + LANES + lane] = u if visible else _ZERO, v if visible else _ZERO
+    put(lanes, _CONIC + lane, (yy / det if visible else _ONE, -xy / det if visible else _ZERO, xx / det if visible else _ONE))
     distance, along_x, along_y = _plane(mean, x, y, root, dilation)
-    put(lanes, _PLANE + lane, (distance if seen else _ZERO, along_x if seen else _ZERO, along_y if seen else _ZERO))
+    put(lanes, _PLANE + lane, (distance if visible else _ZERO, along_x if visible else _ZERO, along_y if visible else _ZERO))
     scale = _ONE / max(distance, _NORM_MIN)
-    harmonics((offset[0] * scale, offset[1] * scale, offset[2] * scale), lanes, _WEIGHTS + lane)
+    harmonics((offset[0] * scale, offset[1] * scale, offset[2] * scale), lanes, _HARMONICS + lane)
 
 
 @inlined
 def _colour(lanes, lane, sh, i):
-    """Colour of a primitive; black where it is culled."""
+    """Colour max(0, SH + 0.5) of a primitive; black where it is culled."""
     red = green = blue = _HALF
     if lanes[_RADIUS + lane] == _ZERO:
         return _ZERO, _ZERO, _ZERO
     for band in range(sh.shape[1]):
         k = index(band)
-        weight = lanes[_WEIGHTS + k * LANES + lane]
+        weight = lanes[_HARMONICS + k * LANES + lane]
         red += weight * sh[i, k, 0]
         green += weight * sh[i, k, 1]
         blue += weight * sh[i, k, 2]
@@ -243,27 +242,27 @@ def _colour(lanes, lane, sh, i):
 
 @parallel
 def project(
-    view, dilation, compensate, means, quaternions, scales, opacities, sh, jobs,
-    means2d, conics, depths, planes, radii, rgb, fades,
+    view, dilation, antialiased, means, quaternions, scales, opacities, sh, jobs,
+    means2d, conics, depths, depth_planes, radii, rgb, compensations,
 ):  # fmt: skip
-    """Footprints and colours; those of culled primitives are set to something harmless."""
+    """EWA projection of all primitives: footprints and colours; culled ones get radius 0 and finite values."""
     n = len(means)
     for job in prange(jobs):
-        lanes = np.zeros(_ROOM, np.float32)
-        end = share(n, jobs, job + 1)
-        for begin in range(share(n, jobs, job), end, GROUP):
+        lanes = np.zeros(_SLOTS, np.float32)
+        end = job_start(n, jobs, job + 1)
+        for begin in range(job_start(n, jobs, job), end, GROUP):
             count = min(GROUP, end - begin)
             i = index(begin)
             read_primitives(means, quaternions, scales, i, count, lanes)
             read_1(opacities, i, count, lanes, _OPACITY)
             for lane in range(LANES):
-                _project_lane(view, dilation, compensate, lanes, lane)
+                _project_lane(view, dilation, antialiased, lanes, lane)
             write_1(depths, i, count, lanes, _DEPTH)
             write_1(radii, i, count, lanes, _RADIUS)
-            write_1(fades, i, count, lanes, _FADE)
-            write_2(means2d, i, count, lanes, _SCREEN)
+            write_1(compensations, i, count, lanes, _COMPENSATION)
+            write_2(means2d, i, count, lanes, _MEAN2D)
             write_3(conics, i, count, lanes, _CONIC)
-            write_3(planes, i, count, lanes, _PLANE)
+            write_3(depth_planes, i, count, lanes, _PLANE)
             for lane in range(count):
                 i, at = index(begin + lane), index(lane)
                 rgb[i, 0], rgb[i, 1], rgb[i, 2] = _colour(lanes, at, sh, i)

@@ -1,4 +1,4 @@
-"""`splat_project` as torch sees it."""
+"""`splat_project` as a torch function: EWA projection forward and backward."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from invgraphics.core.field import Gaussians
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.runtime import array, once_differentiable, threads
 from invgraphics.kernels.numba.splat.ewa import CENTRE, FOCAL, POSITION, SIZE, VIEW, project
-from invgraphics.kernels.numba.splat.ewa_backward import project_back
+from invgraphics.kernels.numba.splat.ewa_backward import project_backward
 from invgraphics.kernels.types import Footprints
 
 
@@ -26,46 +26,53 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, pose: Tensor, *constants: Any
     ) -> tuple[Tensor, ...]:
-        opacities, camera, dilation, compensate = constants
+        opacities, camera, dilation, antialiased = constants
         n = len(means)
-        view = _flat(camera)
+        view = _flatten_camera(camera)
         means2d, conics, rgb = means.new_empty(n, 2), means.new_empty(n, 3), means.new_empty(n, 3)
-        depths, planes, radii, fades = means.new_empty(n), means.new_empty(n, 3), means.new_empty(n), means.new_empty(n)
-        outputs = (means2d, conics, depths, planes, radii, rgb, fades)
+        depths, depth_planes, radii, compensations = (
+            means.new_empty(n),
+            means.new_empty(n, 3),
+            means.new_empty(n),
+            means.new_empty(n),
+        )
+        outputs = (means2d, conics, depths, depth_planes, radii, rgb, compensations)
         inputs = (array(x) for x in (means, quaternions, scales, opacities, sh))
-        project(view, np.float32(dilation), compensate, *inputs, threads(), *(output.numpy() for output in outputs))
+        project(view, np.float32(dilation), antialiased, *inputs, threads(), *(output.numpy() for output in outputs))
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(means, quaternions, scales, sh, opacities, conics, radii, rgb, pose)
-        ctx.view, ctx.camera, ctx.dilation, ctx.compensate = view, camera, dilation, compensate
+        ctx.view, ctx.camera, ctx.dilation, ctx.antialiased = view, camera, dilation, antialiased
         return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         means, quaternions, scales, sh, opacities, conics, radii, rgb, pose = ctx.saved_tensors
-        to_means2d, to_conics, to_depths, to_planes, _, to_rgb, to_fades = grad_outputs
+        grad_means2d, grad_conics, grad_depths, grad_planes, _, grad_rgb, grad_compensations = grad_outputs
         likes = (means[:, :2], conics, radii, rgb, radii)
-        given = (to_means2d, to_conics, to_depths, to_rgb, to_fades)
-        # A gradient that nobody asked for counts as zero.
+        given = (grad_means2d, grad_conics, grad_depths, grad_rgb, grad_compensations)
+        # Missing gradients are zero.
         received = [torch.zeros(x.shape) if g is None else g for x, g in zip(likes, given, strict=True)]
         results = [torch.empty(x.shape) for x in (means, quaternions, scales, sh)]
-        poses = np.empty((threads(), 12))
+        pose_sums = np.empty((threads(), 12))
         inputs = (array(x) for x in (means, quaternions, scales, sh, radii, conics, rgb))
         outputs = (result.numpy() for result in results)
-        project_back(ctx.view, np.float32(ctx.dilation), ctx.compensate, *inputs, *map(array, received), *outputs, poses)
-        along_pose = _pose_gradient(poses, pose) if ctx.needs_input_grad[4] else None
-        if to_planes is not None:
+        project_backward(
+            ctx.view, np.float32(ctx.dilation), ctx.antialiased, *inputs, *map(array, received), *outputs, pose_sums
+        )
+        grad_pose = _pose_gradient(pose_sums, pose) if ctx.needs_input_grad[4] else None
+        if grad_planes is not None:
             gaussians = Gaussians(means, quaternions, scales, opacities, sh)
-            extras = _through_planes(gaussians, ctx.camera, ctx.dilation, to_planes, radii)
-            for result, extra in zip((*results, along_pose), extras, strict=True):
+            extras = _depth_plane_backward(gaussians, ctx.camera, ctx.dilation, grad_planes, radii)
+            for result, extra in zip((*results, grad_pose), extras, strict=True):
                 if result is not None and extra is not None:
                     result.add_(extra)
-        return (*results, along_pose, None, None, None, None)
+        return (*results, grad_pose, None, None, None, None)
 
 
-def _flat(camera: Camera) -> tuple[np.float32, ...]:
-    """The camera as `project` reads it."""
+def _flatten_camera(camera: Camera) -> tuple[np.float32, ...]:
+    """The camera as the flat tuple that `project` reads (layout in `ewa`)."""
     view = np.empty(VIEW, np.float32)
     pose = array(camera.cam_to_world)
     view[:POSITION], view[POSITION:FOCAL] = pose[:3, :3].reshape(-1), pose[:3, 3]
@@ -75,37 +82,37 @@ def _flat(camera: Camera) -> tuple[np.float32, ...]:
 
 
 def _pose_gradient(jobs: np.ndarray, pose: Tensor) -> Tensor:
-    """Gradient along ``cam_to_world`` from each job's share."""
+    """Gradient of ``cam_to_world`` (4, 4), reduced over jobs."""
     total = jobs.sum(axis=0)
     gradient = np.zeros((4, 4))
     gradient[:3, :3], gradient[:3, 3] = total[:9].reshape(3, 3), total[9:]
     return torch.from_numpy(gradient).to(pose)
 
 
-def _through_planes(
-    gaussians: Gaussians, camera: Camera, dilation: float, to_planes: Tensor, radii: Tensor
+def _depth_plane_backward(
+    gaussians: Gaussians, camera: Camera, dilation: float, grad_planes: Tensor, radii: Tensor
 ) -> tuple[Tensor | None, ...]:
-    """Gradients that arrive by the planes, which only depth losses use: left to the reference."""
+    """Gradients through the depth planes, which only depth losses have, by the reference."""
     with torch.enable_grad():
         leaves = [x.detach().requires_grad_() for x in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.sh)]
         means, quaternions, scales, sh = leaves
         pose = camera.cam_to_world.detach().requires_grad_()
         again = Gaussians(means, quaternions, scales, gaussians.opacities.detach(), sh)
         footprints, _ = reference.splat_project(again, camera.moved(pose), dilation)
-        visible = torch.where(radii[:, None] > 0, to_planes, 0.0)
-        return torch.autograd.grad(footprints.planes, [*leaves, pose], visible, allow_unused=True)
+        visible = torch.where(radii[:, None] > 0, grad_planes, 0.0)
+        return torch.autograd.grad(footprints.depth_planes, [*leaves, pose], visible, allow_unused=True)
 
 
 def splat_project(
-    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, compensate: bool = False
+    gaussians: Gaussians, camera: Camera, dilation: float = 0.3, antialiased: bool = False
 ) -> tuple[Footprints, Float[Tensor, "n 3"]]:
-    """See `invgraphics.kernels.splat_project`; a camera whose lens is being optimised is left to the reference."""
+    """See `invgraphics.kernels.splat_project`; optimised intrinsics are left to the reference."""
     if camera.focal.requires_grad or camera.centre.requires_grad:
-        return reference.splat_project(gaussians, camera, dilation, compensate)
+        return reference.splat_project(gaussians, camera, dilation, antialiased)
     g = gaussians
-    constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation, compensate)
-    means2d, conics, depths, planes, radii, rgb, fades = _Project.apply(
+    constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation, antialiased)
+    means2d, conics, depths, depth_planes, radii, rgb, compensations = _Project.apply(
         g.means, g.quaternions, g.scales, g.sh, camera.cam_to_world, *constants
     )
-    opacities = g.opacities * fades if compensate else g.opacities
-    return Footprints(means2d, conics, opacities, depths, planes, radii), rgb
+    opacities = g.opacities * compensations if antialiased else g.opacities
+    return Footprints(means2d, conics, opacities, depths, depth_planes, radii), rgb

@@ -1,7 +1,7 @@
-"""Front-to-back compositing of footprints, forward.
+"""Rasterise to pixels, forward: front-to-back alpha compositing of each tile's footprints.
 
-Tiles are walked in blocks of 4 x 4 pixels, whose 16 lanes fill one or two vector registers. A tile's state lies in one flat
-scratch array, block after block, so that it stays in the L1 cache. A set of a tile's blocks is a word with a bit for each.
+A tile is processed in blocks of 4 x 4 pixels, one pixel per SIMD lane. Its state lies in one flat scratch array, block after
+block, so that it stays in the L1 cache. A set of blocks is a 64-bit mask. Judged by `invgraphics.kernels.reference`.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ import numpy as np
 
 from invgraphics.kernels.numba.runtime import LANES, index, inlined, parallel, prange
 from invgraphics.kernels.numba.simd.instructions import count_bits, lowest_bit, prefetch
-from invgraphics.kernels.numba.simd.lanes import any_of, bits_below, counting, exp2_of, load, store, where
+from invgraphics.kernels.numba.simd.lanes import any_of, bits_below, exp2_of, lane_index, load, store, where
 from invgraphics.kernels.numba.simd.layouts import write_colour_block, write_grey_block
 from invgraphics.kernels.numba.splat.binning import (
     ASPECT,
     FEATURES,
-    HIGHEST,
+    HALF_HEIGHT,
+    MARGIN,
     MEAN_X,
     MEAN_Y,
     OPACITY,
     POWER_XX,
     POWER_XY,
     POWER_YY,
+    RIGHTMOST_Y,
     SHEAR,
-    SLACK,
-    WIDEST,
     half_span,
 )
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -32,74 +32,74 @@ from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 BLOCK = 4
 """Edge of a block in pixels, which are the `LANES`."""
 EDGE = 8
-"""Most blocks along a tile's edge: what a word has bits for, and what the L1 cache holds."""
+"""Maximum number of blocks along a tile's edge: the mask has 64 bits, and the state must fit into the L1 cache."""
 BLOCKS = index(EDGE * EDGE)
-AHEAD = 16
-"""Footprints whose blocks are found before the first of them is drawn."""
+BATCH = 16
+"""Footprints that are intersected with blocks before the first of them is composited."""
 
 _ALPHA_MIN, _ALPHA_MAX = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX)
-_STOP = np.float32(TRANSMITTANCE_MIN)
+_TRANSMITTANCE_MIN = np.float32(TRANSMITTANCE_MIN)
 _ONE, _ZERO = np.float32(1.0), np.float32(0.0)
 
 
 @inlined
-def measure(rows, entries, begin, end, x0, y0, blocks, touched):
-    """Write to ``touched`` which of a tile's ``blocks`` a few footprints touch, before any of them is drawn.
+def overlapped_blocks(rows, entries, begin, end, x0, y0, blocks, touched):
+    """Intersect a batch of footprints with a tile's ``blocks``; their masks are written to ``touched``.
 
-    Otherwise a processor would guess how long every row is, and wait for its square roots to learn that it was wrong. Half of
-    the lanes find how many blocks of each row begin before the ellipse ends on the right; the others how many end before it
-    begins on the left, as if it were turned by 180 degrees.
+    In batches, ahead of compositing: loops over the blocks of each row would mispredict while they wait for square roots. Half
+    of the lanes count the blocks of each row that begin before the ellipse's right end; the others, turned by 180 degrees,
+    those that end before its left end.
     """
-    numbers, height, half = counting(), np.float32(BLOCK - 1), np.float32(0.5)
+    numbers, height, half = lane_index(), np.float32(BLOCK - 1), np.float32(0.5)
     turned = numbers >= np.float32(EDGE)
     side = where(turned, -_ONE, _ONE)
     row = where(turned, numbers - np.float32(EDGE), numbers) * np.float32(BLOCK) + half
     top = where(turned, -row - height, row)
     for entry in range(begin, end):
-        prefetch(rows, index(entries[index(min(entry + AHEAD, len(entries) - 1))]))
+        prefetch(rows, index(entries[index(min(entry + BATCH, len(entries) - 1))]))
         r = index(entries[index(entry)])
-        x, y, highest = rows[r, MEAN_X] - x0, rows[r, MEAN_Y] - y0, rows[r, HIGHEST]
-        shape = rows[r, WIDEST], highest, rows[r, SHEAR], rows[r, ASPECT]
+        x, y, half_height = rows[r, MEAN_X] - x0, rows[r, MEAN_Y] - y0, rows[r, HALF_HEIGHT]
+        ellipse = rows[r, RIGHTMOST_Y], half_height, rows[r, SHEAR], rows[r, ASPECT]
         low = top - side * y
         high = low + height
-        width, middle = half_span(shape, min(max(low, shape[0]), high))
-        reached = np.floor((middle + width + side * x + (height + half + SLACK)) * np.float32(1.0 / BLOCK))
+        width, middle = half_span(ellipse, min(max(low, ellipse[0]), high))
+        reached = np.floor((middle + width + side * x + (height + half + MARGIN)) * np.float32(1.0 / BLOCK))
         counts = min(max(side * reached, _ZERO), np.float32(EDGE))
-        begun, passed = bits_below(where((low <= highest) & (high >= -highest), counts, _ZERO))
+        begun, passed = bits_below(where((low <= half_height) & (high >= -half_height), counts, _ZERO))
         touched[index(entry)] = begun & ~passed & blocks
 
 
 @inlined
-def first_of(blocks):
-    """The first of a set of blocks, and the set of all others."""
+def pop_block(blocks):
+    """Lowest block of a mask, and the mask without it."""
     return lowest_bit(blocks), blocks & (blocks - index(1))
 
 
 @inlined
-def corner(x0, y0, block):
-    """First pixel of a block of the tile that begins there."""
+def block_origin(x0, y0, block):
+    """First pixel of a block of the tile at (x0, y0)."""
     return x0 + np.int64(block % index(EDGE)) * BLOCK, y0 + np.int64(block // index(EDGE)) * BLOCK
 
 
 @inlined
-def placed(rows, r, x0, y0, block):
-    """From a footprint's mean to a block's first pixel centre."""
-    left, top = corner(x0, y0, block)
+def block_offset(rows, r, x0, y0, block):
+    """Offset of a block's first pixel centre from a footprint's mean."""
+    left, top = block_origin(x0, y0, block)
     half = np.float32(0.5)
     return np.float32(left) + half - rows[r, MEAN_X], np.float32(top) + half - rows[r, MEAN_Y]
 
 
 @inlined
-def pixels():
-    """How far each of a block's pixels lies from its first, across and down."""
-    numbers = counting()
+def pixel_offsets():
+    """Offsets in x and y of each of a block's pixels from its first."""
+    numbers = lane_index()
     down = np.floor(numbers / np.float32(BLOCK))
     return numbers - down * np.float32(BLOCK), down
 
 
 @inlined
-def inside(x0, y0, edge, width, height):
-    """The set of a tile's blocks that have pixels of the image."""
+def image_blocks(x0, y0, edge, width, height):
+    """Mask of a tile's blocks that overlap the image."""
     blocks = index(0)
     for j in range(min(edge, -(-(height - y0) // BLOCK))):
         for i in range(min(edge, -(-(width - x0) // BLOCK))):
@@ -108,60 +108,60 @@ def inside(x0, y0, edge, width, height):
 
 
 @inlined
-def _open_tile(state, blocks, x0, y0, width, height, stride):
-    """Full transmittance on every pixel of the image, and none (-1 marks a finished pixel) outside."""
-    across, down = pixels()
+def _init_tile(state, blocks, x0, y0, width, height, stride):
+    """Initialise transmittance: 1 on pixels of the image, -1 (finished) outside."""
+    across, down = pixel_offsets()
     while blocks:
-        block, blocks = first_of(blocks)
+        block, blocks = pop_block(blocks)
         base = block * stride
         state[base : base + stride] = _ZERO
-        left, top = corner(x0, y0, block)
+        left, top = block_origin(x0, y0, block)
         in_image = (across < np.float32(width - left)) & (down < np.float32(height - top))
         store(state, base, where(in_image, _ONE, -_ONE))
 
 
 @inlined
-def response_of(shape, opacity, dx, dy):
-    """What a footprint answers with to each pixel of a block, at ``dx`` and ``dy`` from its mean; 0 where it cannot be seen."""
-    xx, xy, yy = shape
+def gaussian_response(exponent, opacity, dx, dy):
+    """Response of a footprint, opacity exp(-q / 2), at offsets ``dx``, ``dy`` from its mean; 0 below 1/255."""
+    xx, xy, yy = exponent
     response = opacity * exp2_of((xx * dx + xy * dy) * dx + yy * dy * dy)
     return where(response >= _ALPHA_MIN, response, _ZERO)
 
 
 @inlined
-def shape_of(rows, r):
-    """The exponent's coefficients of a footprint, and its opacity."""
+def exponent_of(rows, r):
+    """Coefficients of a footprint's quadratic exponent, and its opacity."""
     return (rows[r, POWER_XX], rows[r, POWER_XY], rows[r, POWER_YY]), rows[r, OPACITY]
 
 
 @inlined
-def blended(state, base, response):
-    """Composite a footprint onto a block, whose transmittance is in ``state``.
+def blend(state, base, response):
+    """Alpha-blend a footprint onto a block, updating its transmittance in ``state``.
 
-    Returns alpha, the transmittance before, the footprint's weight, and which pixels go on.
+    Returns alpha, the transmittance before, the weight, and the mask of pixels that remain active.
     """
     alpha = min(response, _ALPHA_MAX)
     transmittance = load(state, base)
     weight = transmittance * alpha
     after = transmittance - weight
     # Finished pixels carry their final transmittance with a minus sign, so they stay below the limit.
-    goes_on = after >= _STOP
-    store(state, base, where(goes_on, after, -abs(transmittance)))
-    return alpha, transmittance, where(goes_on, weight, _ZERO), goes_on
+    active = after >= _TRANSMITTANCE_MIN
+    store(state, base, where(active, after, -abs(transmittance)))
+    return alpha, transmittance, where(active, weight, _ZERO), active
 
 
 @inlined
-def _draw(state, stride, rows, r, blocks, x0, y0, channels):
-    """Composite one footprint onto blocks of a tile; returns those whose pixels are all finished by then."""
-    shape, opacity = shape_of(rows, r)
+def _blend_splat(state, stride, rows, r, blocks, x0, y0, channels):
+    """Composite one footprint onto blocks of a tile; returns the mask of blocks that it finished."""
+    exponent, opacity = exponent_of(rows, r)
     red, green, blue = rows[r, FEATURES], rows[r, FEATURES + 1], rows[r, FEATURES + 2]
-    across, down = pixels()
+    across, down = pixel_offsets()
     finished = index(0)
     while blocks:
-        block, blocks = first_of(blocks)
-        left, top = placed(rows, r, x0, y0, block)
+        block, blocks = pop_block(blocks)
+        left, top = block_offset(rows, r, x0, y0, block)
         base = block * stride
-        _, _, weight, goes_on = blended(state, base, response_of(shape, opacity, across + left, down + top))
+        _, _, weight, active = blend(state, base, gaussian_response(exponent, opacity, across + left, down + top))
         at = base + LANES
         store(state, at, load(state, at) + weight * red)
         store(state, at + LANES, load(state, at + LANES) + weight * green)
@@ -169,39 +169,39 @@ def _draw(state, stride, rows, r, blocks, x0, y0, channels):
         for k in range(3, channels):
             at = base + index(1 + k) * LANES
             store(state, at, load(state, at) + weight * rows[r, index(FEATURES + k)])
-        finished |= index(0) if any_of(goes_on) else index(1) << block
+        finished |= index(0) if any_of(active) else index(1) << block
     return finished
 
 
 @inlined
-def _composite_tile(rows, entries, first, last, x0, y0, channels, state, alive, touched, ends):
-    """Walk a tile's footprints front to back until all its pixels are finished; returns the number of blocks visited."""
+def _composite_tile(rows, entries, first, last, x0, y0, channels, state, active_blocks, touched, last_entries):
+    """Composite a tile's footprints front to back until all pixels are finished; returns the number of block visits."""
     stride = LANES * index(1 + channels)
-    visits = 0
-    for begin in range(first, last, AHEAD):
-        end = min(begin + AHEAD, last)
-        measure(rows, entries, begin, end, np.float32(x0), np.float32(y0), alive, touched)
+    visited = 0
+    for begin in range(first, last, BATCH):
+        end = min(begin + BATCH, last)
+        overlapped_blocks(rows, entries, begin, end, np.float32(x0), np.float32(y0), active_blocks, touched)
         for entry in range(begin, end):
-            blocks = touched[index(entry)] & alive
-            visits += count_bits(blocks)
-            finished = _draw(state, stride, rows, index(entries[index(entry)]), blocks, x0, y0, channels)
-            alive ^= finished
+            blocks = touched[index(entry)] & active_blocks
+            visited += count_bits(blocks)
+            finished = _blend_splat(state, stride, rows, index(entries[index(entry)]), blocks, x0, y0, channels)
+            active_blocks ^= finished
             while finished:
-                block, finished = first_of(finished)
-                ends[block] = entry + 1
-        if alive == 0:
+                block, finished = pop_block(finished)
+                last_entries[block] = entry + 1
+        if active_blocks == 0:
             break
-    return visits
+    return visited
 
 
 @inlined
 def _write_tile(state, blocks, x0, y0, stride, image, alpha):
-    """Copy a tile's sums into the picture."""
+    """Write a tile's sums to the image."""
     height, width, channels = image.shape
     while blocks:
-        block, blocks = first_of(blocks)
+        block, blocks = pop_block(blocks)
         base = block * stride
-        left, top = corner(x0, y0, block)
+        left, top = block_origin(x0, y0, block)
         if channels == 3 and left + BLOCK <= width and top + BLOCK <= height:
             write_grey_block(alpha, index(top), index(left), (_ONE - abs(load(state, base)),))
             at = base + LANES
@@ -217,7 +217,7 @@ def _write_tile(state, blocks, x0, y0, stride, image, alpha):
 
 
 @parallel
-def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, touched, ends, work):
+def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, touched, last_entries, work):
     """Composite every tile.
 
     Args:
@@ -229,9 +229,9 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, touche
         columns: tiles per row.
         image: output, sums of w * features (h, w, c).
         alpha: output, sums of w (h, w).
-        touched: output, per entry the set of blocks that it touches; none behind the last one that was drawn in a tile.
-        ends: output, per tile and block, the entry at which all its pixels were finished.
-        work: output, blocks visited per tile.
+        touched: output, per entry the mask of blocks that it touches; undefined behind a tile's last composited entry.
+        last_entries: output, per tile and block, one past the entry at which its last pixel was finished.
+        work: output, block visits per tile.
     """
     height, width = alpha.shape
     # Features were filled up to a multiple of three.
@@ -241,9 +241,11 @@ def rasterise(rows, entries, starts, bounds, edge, columns, image, alpha, touche
         state = np.empty(BLOCKS * stride, np.float32)
         for tile in range(bounds[job], bounds[job + 1]):
             x0, y0 = tile % columns * edge * BLOCK, tile // columns * edge * BLOCK
-            blocks = inside(x0, y0, edge, width, height)
-            _open_tile(state, blocks, x0, y0, width, height, stride)
+            blocks = image_blocks(x0, y0, edge, width, height)
+            _init_tile(state, blocks, x0, y0, width, height, stride)
             first, last = starts[tile], starts[tile + 1]
-            ends[tile, :] = last
-            work[tile] = _composite_tile(rows, entries, first, last, x0, y0, channels, state, blocks, touched, ends[tile])
+            last_entries[tile, :] = last
+            work[tile] = _composite_tile(
+                rows, entries, first, last, x0, y0, channels, state, blocks, touched, last_entries[tile]
+            )
             _write_tile(state, blocks, x0, y0, stride, image, alpha)

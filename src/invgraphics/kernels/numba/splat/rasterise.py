@@ -1,4 +1,4 @@
-"""`splat_rasterise` as torch sees it."""
+"""`splat_rasterise` and `splat_median` as torch functions: bin, rasterise to pixels, backward."""
 
 from __future__ import annotations
 
@@ -11,62 +11,62 @@ from torch import Tensor
 
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.runtime import GROUP, array, once_differentiable, scratch, split_by_work, threads
-from invgraphics.kernels.numba.splat.binning import FEATURES, Packed, pack
+from invgraphics.kernels.numba.splat.binning import FEATURES, Packed, pack_and_intersect
 from invgraphics.kernels.numba.splat.median import median
 from invgraphics.kernels.numba.splat.raster import BLOCK, BLOCKS, EDGE, rasterise
-from invgraphics.kernels.numba.splat.raster_backward import OFF, ON, PULLS, gather, walk_back
+from invgraphics.kernels.numba.splat.raster_backward import ABSGRADS, OFF, ON, rasterise_backward, reduce_gradients
 from invgraphics.kernels.types import Footprints
 
 TILE = EDGE * BLOCK
-"""Edge of a tile in pixels, and the largest: the measured best on CPUs (a tile's state fits into the L1 cache)."""
+"""Default and maximum edge of a tile in pixels: the measured optimum on CPUs (a tile's state fits into the L1 cache)."""
 
 
-class _Walk(NamedTuple):
-    """What the backward pass needs of the forward pass."""
+class _TileState(NamedTuple):
+    """Tile lists and block masks that the forward pass saves for the backward pass."""
 
     packed: Packed
     edge: int
     columns: int
     touched: np.ndarray
-    ends: np.ndarray
+    last_entries: np.ndarray
     work: np.ndarray
 
 
 class _Rasterise(torch.autograd.Function):
-    """Differentiable in means2d, conics, opacities and features; `Footprints.pull` gets the absolute gradients."""
+    """Differentiable in means2d, conics, opacities and features; `Footprints.absgrad` gets the absolute gradients."""
 
     @staticmethod
     def forward(
-        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, pull: Tensor | None, *constants: Any
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, absgrad: Tensor | None, *constants: Any
     ) -> tuple[Tensor, Tensor]:
-        footprints, (width, height), tile, ctx.receivers = constants
-        edge, columns, lines = _tiles(width, height, tile)
-        packed = pack(footprints, features, columns, lines, edge * BLOCK)
+        footprints, (width, height), tile, ctx.max_grad_splats = constants
+        edge, columns, tile_rows = _tiles(width, height, tile)
+        packed = pack_and_intersect(footprints, features, columns, tile_rows, edge * BLOCK)
         image, alpha = means2d.new_empty(height, width, features.shape[1]), means2d.new_empty(height, width)
-        ends = np.empty((columns * lines, BLOCKS), np.int32)
-        touched, work = np.empty(len(packed.entries), np.uintp), np.empty(columns * lines, np.int64)
+        last_entries = np.empty((columns * tile_rows, BLOCKS), np.int32)
+        touched, work = np.empty(len(packed.entries), np.uintp), np.empty(columns * tile_rows, np.int64)
         pixels = image.numpy(), alpha.numpy()
         bounds = _bounds(np.diff(packed.starts))
-        rasterise(packed.rows, packed.entries, packed.starts, bounds, edge, columns, *pixels, touched, ends, work)
+        rasterise(packed.rows, packed.entries, packed.starts, bounds, edge, columns, *pixels, touched, last_entries, work)
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(means2d, conics, opacities, features, image, alpha)
-        ctx.walk = _Walk(packed, edge, columns, touched, ends, work)
+        ctx.tile_state = _TileState(packed, edge, columns, touched, last_entries, work)
         return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        image_gradient, alpha_gradient = grad_outputs
+        grad_image, grad_alpha = grad_outputs
         means2d, conics, opacities, features, image, alpha = ctx.saved_tensors
-        packed, edge, columns, touched, ends, work = ctx.walk
-        to_image = array(torch.zeros_like(image) if image_gradient is None else image_gradient)
-        to_alpha = array(torch.zeros_like(alpha) if alpha_gradient is None else alpha_gradient)
+        packed, edge, columns, touched, last_entries, work = ctx.tile_state
+        image_cotangent = array(torch.zeros_like(image) if grad_image is None else grad_image)
+        alpha_cotangent = array(torch.zeros_like(alpha) if grad_alpha is None else grad_alpha)
         bounds = _bounds(work)
-        absolute = ctx.needs_input_grad[4]
+        wants_absgrad = ctx.needs_input_grad[4]
         rows = packed.rows
         shape = (len(bounds) - 1, len(rows), GROUP + rows.shape[1] - FEATURES - 3)
         sums = scratch("splat sums", int(np.prod(shape))).reshape(shape)
-        walk_back(
+        rasterise_backward(
             rows,
             packed.entries,
             packed.starts,
@@ -74,31 +74,31 @@ class _Rasterise(torch.autograd.Function):
             edge,
             columns,
             touched,
-            ends,
+            last_entries,
             array(image),
             array(alpha),
-            to_image,
-            to_alpha,
+            image_cotangent,
+            alpha_cotangent,
             sums,
-            (np.float32(0),) * (ON if absolute else OFF),
-            (np.float32(ctx.receivers),) * (ON if ctx.receivers else OFF),
+            (np.float32(0),) * (ON if wants_absgrad else OFF),
+            (np.float32(ctx.max_grad_splats),) * (ON if ctx.max_grad_splats else OFF),
         )
         gradients = tuple(
             torch.zeros_like(x, memory_format=torch.contiguous_format) for x in (means2d, conics, opacities, features)
         )
-        pulls = means2d.new_zeros(len(means2d) if absolute else 0, PULLS)
-        gather(packed.order, rows, sums, *(gradient.numpy() for gradient in (*gradients, pulls)))
-        return (*gradients, pulls if absolute else None, None, None, None, None)
+        absgrads = means2d.new_zeros(len(means2d) if wants_absgrad else 0, ABSGRADS)
+        reduce_gradients(packed.order, rows, sums, *(gradient.numpy() for gradient in (*gradients, absgrads)))
+        return (*gradients, absgrads if wants_absgrad else None, None, None, None, None)
 
 
 def _tiles(width: int, height: int, tile: int | None) -> tuple[int, int, int]:
-    """Blocks along a tile's edge, and the tiles per row and per column."""
+    """Blocks along a tile's edge, and numbers of tiles in x and in y."""
     edge = -(-min(tile or TILE, TILE) // BLOCK)
     return edge, -(-width // (edge * BLOCK)), -(-height // (edge * BLOCK))
 
 
 def _bounds(work: np.ndarray) -> np.ndarray:
-    """First tile of each job, such that all have about equal work."""
+    """First tile of each job, balanced by work."""
     jobs = threads()
     bounds = np.empty(jobs + 1, np.int64)
     split_by_work(work, jobs, bounds)
@@ -111,14 +111,14 @@ def splat_rasterise(
     width: int,
     height: int,
     tile: int | None = None,
-    receivers: int = 0,
+    max_grad_splats: int = 0,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """See `invgraphics.kernels.splat_rasterise`; discs are left to the reference."""
     if footprints.homography is not None:
-        return reference.splat_rasterise(footprints, features, width, height, tile, receivers)
+        return reference.splat_rasterise(footprints, features, width, height, tile, max_grad_splats)
     f = footprints
-    constants = (footprints, (width, height), tile, receivers)
-    return _Rasterise.apply(f.means2d, f.conics, f.opacities, features, f.pull, *constants)
+    constants = (footprints, (width, height), tile, max_grad_splats)
+    return _Rasterise.apply(f.means2d, f.conics, f.opacities, features, f.absgrad, *constants)
 
 
 @torch.no_grad()
@@ -126,8 +126,8 @@ def splat_median(footprints: Footprints, width: int, height: int, tile: int | No
     """See `invgraphics.kernels.splat_median`; discs are left to the reference."""
     if footprints.homography is not None:
         return reference.splat_median(footprints, width, height, tile)
-    edge, columns, lines = _tiles(width, height, tile)
-    packed = pack(footprints, footprints.planes, columns, lines, edge * BLOCK)
+    edge, columns, tile_rows = _tiles(width, height, tile)
+    packed = pack_and_intersect(footprints, footprints.depth_planes, columns, tile_rows, edge * BLOCK)
     depth = torch.full((height, width), torch.inf)
     bounds, touched = _bounds(np.diff(packed.starts)), np.empty(len(packed.entries), np.uintp)
     median(packed.rows, packed.entries, packed.starts, bounds, edge, columns, touched, depth.numpy())

@@ -1,0 +1,9 @@
+"""The functions of ``import invgraphics as ig``: scenes, methods, fits, scores, comparisons, studies."""
+
+from invgraphics.api.comparing import compare as compare
+from invgraphics.api.fitting import evaluate as evaluate
+from invgraphics.api.fitting import fit as fit
+from invgraphics.api.loading import load_method as load_method
+from invgraphics.api.loading import load_run as load_run
+from invgraphics.api.loading import load_scene as load_scene
+from invgraphics.api.studying import ablate as ablate

@@ -1,0 +1,159 @@
+"""Scenes, methods and runs, from names and paths; and names of what has none yet, for other processes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import tomlkit
+import torch
+
+from invgraphics.core import Scene
+from invgraphics.errors import InputError
+from invgraphics.experiments.build import open_with_progress
+from invgraphics.experiments.fitted import open_fitted
+from invgraphics.experiments.session import FolderRun
+from invgraphics.recipes import recipe
+from invgraphics.recipes.recipe import Method
+from invgraphics.scenes.npz import save_npz
+from invgraphics.scenes.open import SceneOptions, open_scene, source_of, validate
+from invgraphics.studies.factors import override
+from invgraphics.training.budget import Budget
+
+MethodLike: TypeAlias = str | os.PathLike[str] | Mapping[str, Any] | Method
+"""A method's name, the path of a recipe, a recipe as a table, or a method that `load_method` returned."""
+
+
+def load_scene(
+    spec: str | os.PathLike[str],
+    *,
+    size: int | tuple[int, int] | None = None,
+    test_views: int | None = 16,
+    spp: int | None = None,
+) -> Scene:
+    """Open a scene: views with known cameras to fit, and others to score.
+
+    Args:
+        spec: a built-in scene (``bricks``; it is rendered at first use and cached), the path of a data set in a known format,
+            or a folder that ``invgraphics import-photos`` wrote.
+        size: longest side of the pictures in pixels, or (width, height); ``None`` for the scene's own.
+        test_views: how many views score, evenly spaced; ``None`` for all.
+        spp: samples per pixel of a scene that is rendered; ``None`` for its own.
+
+    Raises:
+        InputError: nothing is known by this name, no format fits, or the data cannot be used.
+
+    Example:
+        >>> import invgraphics as ig
+        >>> scene = ig.load_scene("toy.npz", size=16)
+        >>> len(scene.train), scene.test[0].camera.width
+        (8, 16)
+    """
+    return open_with_progress(os.fspath(spec), SceneOptions(size=size, test_views=test_views, spp=spp))
+
+
+def load_method(method: str | os.PathLike[str], *, preset: str | None = None, set: Mapping[str, Any] | None = None) -> Method:
+    """Read a method's recipe, with values of it changed.
+
+    Args:
+        method: ``renderer/recipe`` or the path of a recipe.
+        preset: one of the recipe's presets; ``None`` leaves the choice to the budget of the fit that gets the method, and shows
+            the one for short budgets.
+        set: dotted path of a value in the recipe -> its new value.
+
+    Raises:
+        InputError: unknown method, preset or key, or a value of the wrong type.
+
+    Example:
+        >>> import invgraphics as ig
+        >>> wide = ig.load_method("volumetric/hash", set={"field.width": 64})
+        >>> wide.recipe.field.width, wide.name
+        (64, 'volumetric/hash:field.width=64')
+    """
+    changes = [override(path, value) for path, value in (set or {}).items()]
+    return recipe.load_method(":".join([os.fspath(method), *([f"preset={preset}"] if preset else []), *changes]))
+
+
+def load_run(folder: str | os.PathLike[str], scene: str | None = None) -> FolderRun:
+    """Open a run that `fit`, `compare` or the command line wrote: its model, its scene, its history, its scores.
+
+    Args:
+        folder: of the run.
+        scene: another copy of its scene, where that has moved.
+
+    Raises:
+        InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe.
+
+    Example:
+        >>> import invgraphics as ig
+        >>> fit = ig.fit("splatting/gaussians", "toy.npz", budget="20steps", out="runs/toy")
+        >>> run = ig.load_run("runs/toy")
+        >>> run.scores["psnr"] == fit.scores["psnr"]
+        True
+        >>> exact = run.through("gaussian-volume/exact")  # the same Gaussians, integrated instead of splatted
+        >>> exact.render(run.scene.test[0].camera.resized(24, 24)).alpha.shape
+        torch.Size([24, 24])
+    """
+    return FolderRun(open_fitted(Path(folder), scene))
+
+
+def opened(scene: Scene | str | os.PathLike[str]) -> Scene:
+    """A scene that may be opened already, checked.
+
+    Raises:
+        InputError: it cannot be opened, or not be used.
+    """
+    return validate(scene) if isinstance(scene, Scene) else load_scene(scene)
+
+
+def name_of(method: MethodLike, file: Path | None, budget: str) -> tuple[str, Method | None]:
+    """A name under which other processes find a method, and the method where it has no such name.
+
+    Args:
+        method: of any kind.
+        file: where a recipe is written that has no name; ``None`` writes nothing.
+        budget: that chooses a table's preset.
+    """
+    if isinstance(method, str | os.PathLike):
+        return os.fspath(method), None
+    if isinstance(method, Method):
+        try:
+            if recipe.load_method(method.name, method.preset or None).digest == method.digest:
+                return method.name, None
+        except InputError:  # a name that was given to a table
+            pass
+    table = dict(method.table if isinstance(method, Method) else method)
+    if file is None:
+        return "recipe", recipe.method_from(table, "recipe", budget=Budget.parse(budget))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(tomlkit.dumps(table))
+    return str(file), None
+
+
+def place_of(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:
+    """A scene as other processes open it, and how a request names it: as it was opened, or as a copy in ``folder``.
+
+    Raises:
+        InputError: the scene was made in Python and cannot be kept, or the folder holds another one.
+    """
+    source = source_of(scene)
+    if source is not None and (source.options.train_views, source.options.seed) == (None, 0):
+        options = source.options
+        return scene, {"scene": source.spec, "size": options.size, "test_views": options.test_views, "spp": options.spp}
+    path, present = folder / "scene.npz", (folder / "scene.npz").is_file()
+    if not present:
+        save_npz(scene, path)
+    kept = open_scene(str(path), SceneOptions(test_views=None))
+    if present and not _same(scene, kept):
+        raise InputError(f"{path} holds another scene.", "Choose another out.")
+    return kept, {"scene": str(path), "test_views": None}
+
+
+def _same(one: Scene, other: Scene) -> bool:
+    """Whether two scenes show the same; poses that are read from a file are polished, and differ by rounding."""
+    if any(one.digest(split) != other.digest(split) for split in ("train", "test")):
+        return False
+    pairs = zip((*one.train, *one.test), (*other.train, *other.test), strict=True)
+    return all(torch.allclose(a.camera.cam_to_world, b.camera.cam_to_world, atol=1e-5) for a, b in pairs)

@@ -1,0 +1,92 @@
+"""Studies: factors and levels as a TOML file, every cell fitted in a process of its own, effects with intervals."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from invgraphics.experiments.request import AblateRequest
+from invgraphics.report.data.studies import Study, read_study
+from invgraphics.report.study import build_study_report, study_sentences
+from invgraphics.studies import ablate as ablating
+from invgraphics.studies import reading as studies
+from invgraphics.studies.forecast import Forecast
+
+
+class StudyResult:
+    """What a study has found so far; in a notebook, its sentences.
+
+    Args:
+        folder: that `ablate` wrote.
+
+    Attributes:
+        folder: of the report and its runs.
+        page: the report, an HTML file.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.page = folder, build_study_report(folder)
+
+    @cached_property
+    def record(self) -> Study:
+        """Everything that the report knows: design, cells and scores."""
+        return read_study(self.folder)
+
+    def sentences(self) -> list[str]:
+        """What the factors do, with intervals."""
+        return study_sentences(self.folder)
+
+    def _repr_markdown_(self) -> str:
+        return "\n".join(f"- {sentence}" for sentence in self.sentences())
+
+
+def _announce(forecast: Forecast) -> None:
+    print(forecast, file=sys.stderr)
+
+
+def ablate(
+    study: str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str] | None = None,
+    seeds: Sequence[int] | None = None,
+    budget: str | None = None,
+    size: int | tuple[int, int] | None = None,
+    device: Literal["cpu", "cuda"] | None = None,
+    jobs: int = 1,
+    confirm: Callable[[Forecast], None] = _announce,
+) -> StudyResult:
+    r"""Run every cell of a study that is missing, and write its report.
+
+    Args:
+        study: a built-in study's name, or the path of a ``study.toml``.
+        out: folder of the report and its runs; ``None`` for ``reports/STUDY``.
+        seeds: instead of the study's own.
+        budget: of each fit, instead of the study's own.
+        size: of the pictures, instead of the study's own.
+        device: ``cpu`` or ``cuda``; ``None`` for the CPU.
+        jobs: cells that share this machine at the same time; each gets an equal part of its cores.
+        confirm: is shown the forecast before the first fit, and may raise to call it off.
+
+    Raises:
+        InputError: something cannot be used; found before the first fit.
+        KeyboardInterrupt: interrupted; the same call goes on.
+
+    Example:
+        >>> import invgraphics as ig
+        >>> from pathlib import Path
+        >>> head = 'question = "?"\nscenes = ["toy.npz"]\nmethods = ["splatting/gaussians"]\nbudget = "3steps"\n'
+        >>> _ = Path("views.toml").write_text(head + "[factors]\ndata.train_views = [4, 8]\n")
+        >>> result = ig.ablate("views.toml", out="views")
+        >>> [(run.levels["data.train_views"], run.run.scores.quality["psnr"].unit) for run in result.record.observations()]
+        [('4', 'dB'), ('8', 'dB')]
+    """
+    name = os.fspath(study)
+    folder = Path("reports") / studies.name_of(studies.locate(name)) if out is None else Path(out)
+    given: dict[str, Any] = {"budget": budget, "size": size, "device": device, "jobs": jobs}
+    given |= {} if seeds is None else {"seeds": tuple(seeds)}
+    root, _ = ablating.ablate(AblateRequest(study=name, out=str(folder), **given), confirm)
+    return StudyResult(root)

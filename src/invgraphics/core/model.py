@@ -1,0 +1,107 @@
+"""A model: a field and the renderer through which it is seen, checked against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.camera import Camera
+from invgraphics.core.contributions import Contributions
+from invgraphics.core.field import Field
+from invgraphics.core.renderer import Renderer, check
+from invgraphics.core.rendering import Context, Rendering
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A field seen through a renderer: what a fit fits, and what renders pictures afterwards.
+
+    Attributes:
+        field: the scene's parameterisation.
+        renderer: what makes pictures of it.
+        bounds: the region that the field describes, local frame.
+
+    Raises:
+        NotComposableError: the renderer needs a quantity that the field does not provide.
+
+    Example:
+        >>> from invgraphics.core import Model
+        >>> from invgraphics.renderers.samplers import StratifiedConfig
+        >>> from invgraphics.renderers.volumetric import VolumetricConfig
+        >>> from invgraphics.testing import TwoBalls, toy_scene
+        >>> scene = toy_scene(views=2, size=8)
+        >>> model = Model(TwoBalls(), VolumetricConfig(StratifiedConfig(32)).build(scene), scene.bounds)
+        >>> model.render(scene.test[0].camera).rgb.shape
+        torch.Size([8, 8, 3])
+    """
+
+    field: Field
+    renderer: Renderer
+    bounds: Bounds
+
+    def __post_init__(self) -> None:
+        check(self.field, self.renderer)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model's tensors are."""
+        return self.bounds.lo.device
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        """``field`` and ``renderer`` by name, as checkpoints and optimisers know them."""
+        return {"field": self.field, "renderer": self.renderer}
+
+    @torch.no_grad()
+    def render(self, camera: Camera, *, normals: bool = True) -> Rendering:
+        """Render a picture as evaluation does: without randomness or gradients.
+
+        Args:
+            camera: on any device; the picture is returned on the same one.
+            normals: whether normals are rendered, where the model has some; without them a picture can be faster.
+
+        Returns:
+            Premultiplied colour in the scene's colour space, alpha, depth in local units and normals, (height, width).
+        """
+        rendering, _ = self.renderer.render_image(self.field, camera.to(self.device), self.context(normals=normals))
+        return rendering.detach().to(camera.focal.device)
+
+    @torch.no_grad()
+    def contributions(self, camera: Camera, pixel: tuple[int, int]) -> Contributions:
+        """Everything that `render` composites into one pixel.
+
+        Args:
+            camera: on any device; the contributions are returned on the same one.
+            pixel: column and row, from 0.
+
+        Raises:
+            NotComposableError: the renderer composites nothing along rays that could be listed.
+        """
+        found = self.renderer.contributions(self.field, camera.to(self.device), pixel, self.context())
+        return found.to(camera.focal.device)
+
+    def context(self, *, normals: bool = False) -> Context:
+        """The circumstances of an evaluation; ``normals`` as for `render`."""
+        return Context(self.bounds, training=False, geometry=normals)
+
+    def to(self, device: torch.device | str) -> Model:
+        """Move the model's tensors; modules move in place, as torch's do."""
+        return Model(self.field.to(device), self.renderer.to(device), self.bounds.to(device))
+
+    def state_dict(self) -> dict[str, dict[str, Tensor]]:
+        """All tensors of `parts`, by part, as checkpoints hold them."""
+        return {name: dict(part.state_dict()) for name, part in self.parts.items()}
+
+    def load_state_dict(self, state: Mapping[str, Mapping[str, Any]]) -> None:
+        """Take over the tensors of a `state_dict` or of a checkpoint, which may hold more than a model.
+
+        Raises:
+            RuntimeError: they do not fit.
+        """
+        for name, part in self.parts.items():
+            part.load_state_dict(state.get(name, {}))

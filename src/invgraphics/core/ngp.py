@@ -1,0 +1,83 @@
+"""A hash grid with two networks, as fields hand it to fused kernels (Instant-NGP, Müller et al. 2022)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class HashGrid:
+    """Geometry of a multi-resolution hash grid (Instant-NGP, §3).
+
+    Level l has ``resolution[l]`` cells along an edge, its vertices are stored densely while they fit into ``2**log2_size``
+    entries and are hashed beyond. All levels lie behind one another in one table.
+
+    Attributes:
+        levels: number of resolutions.
+        features: features per entry.
+        log2_size: most entries of a level, as a power of two.
+        base: cells along an edge on the coarsest level.
+        finest: cells along an edge on the finest level.
+    """
+
+    levels: int = 16
+    features: int = 2
+    log2_size: int = 17
+    base: int = 16
+    finest: int = 2048
+
+    @property
+    def resolutions(self) -> tuple[int, ...]:
+        """Cells along an edge, per level: a geometric progression from ``base`` to ``finest``."""
+        if self.levels == 1:
+            return (self.base,)
+        growth = np.exp(np.log(self.finest / self.base) / (self.levels - 1))
+        return tuple(int(np.floor(self.base * growth**level + 1e-9)) for level in range(self.levels))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Entries per level: all (r+1)^3 vertices, or the hash table's size."""
+        return tuple(min((r + 1) ** 3, 2**self.log2_size) for r in self.resolutions)
+
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """First entry of each level, and the total at the end."""
+        return (0, *(int(total) for total in np.cumsum(self.sizes)))
+
+    @property
+    def entries(self) -> int:
+        """Entries of the whole table."""
+        return self.offsets[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class FusedNGP:
+    """Detached parameters of a hash grid with a density and a colour network, for fused inference (Instant-NGP, §5).
+
+    Attributes:
+        table: features of all levels.
+        grid: geometry of the levels.
+        density_net: weight (outs, ins) and bias of each layer of a ReLU network from grid features to the raw density, followed
+            by the latent features for the colour network.
+        colour_net: weight and bias of each layer of a ReLU network from latent features and direction to raw RGB.
+        density_activation: maps raw density + ``density_bias`` to density; ``exp`` is clamped at exp(15).
+        density_bias: added to the raw density.
+        sh_bands: bands of spherical harmonics that encode the direction, 0 to 4.
+        colour_space: activation of raw RGB, sigmoid for ``srgb`` and softplus for ``linear``.
+        contracted_density: factor of densities in contracted space, besides `Bounds.radial_scale`; 0 for no factor at all.
+    """
+
+    table: Float[Tensor, "entries f"]
+    grid: HashGrid
+    density_net: tuple[tuple[Tensor, Tensor], ...]
+    colour_net: tuple[tuple[Tensor, Tensor], ...]
+    density_activation: Literal["exp", "softplus", "relu"]
+    density_bias: float
+    sh_bands: int
+    colour_space: Literal["srgb", "linear"]
+    contracted_density: float = 0.0

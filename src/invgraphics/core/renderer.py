@@ -1,0 +1,142 @@
+"""Renderers: pictures of a field from a camera; samplers, which place samples along rays; and the check of a pair."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, Literal, Self, final
+
+import torch
+from torch import nn
+
+from invgraphics.core.camera import Camera
+from invgraphics.core.contributions import Contributions, sampled_contributions
+from invgraphics.core.field import Field, Quantity
+from invgraphics.core.rays import Rays
+from invgraphics.core.rendering import Context, Rendering, Trace
+from invgraphics.core.samples import Samples
+from invgraphics.errors import NotComposableError
+
+
+class _Learning(nn.Module):
+    """A module whose state a fit may learn, and for which constants may stand in."""
+
+    def untrained(self) -> Self:
+        """This module with constants in place of learnt state, for fields that it was not trained with; may be itself.
+
+        Raises:
+            NotComposableError: it has state, and no constants stand in for it.
+        """
+        if self.state_dict():
+            raise NotComposableError(
+                f"{type(self).__name__} has learnt state for which no constants stand in.", "It needs a fit of its own."
+            )
+        return self
+
+
+class Sampler(_Learning, ABC):
+    """Places samples along rays. May own parameters (proposal networks) and buffers (occupancy grids)."""
+
+    @abstractmethod
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        """Samples on ``rays``, whose near and far are set, and the traces of earlier passes (coarse or proposal)."""
+
+    def update(self, field: Field, ctx: Context) -> None:
+        """Refresh what is learnt without gradients (an occupancy grid); called once after each training step."""
+
+
+class Renderer(_Learning, ABC):
+    """Renders a field from a camera, differentiably in the field and in the camera's pose.
+
+    Attributes:
+        requires: the quantities that the field must provide.
+        depth_kind: what `Rendering.depth` is: the weighted mean of the distances along a ray, or their median.
+    """
+
+    requires: ClassVar[Quantity]
+    depth_kind: Literal["mean", "median"] = "mean"
+
+    @abstractmethod
+    def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
+        """Render every pixel of ``camera``; the rendering has shape (height, width)."""
+
+    def update(self, field: Field, ctx: Context) -> None:
+        """Refresh what is learnt without gradients; called once after each training step."""
+
+    def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
+        """Everything that is composited into one pixel.
+
+        Args:
+            field: what is rendered.
+            camera: whose pixel.
+            pixel: column and row, from 0.
+            ctx: of an evaluation, without randomness.
+
+        Raises:
+            NotComposableError: this renderer composites nothing along rays that could be listed.
+        """
+        raise NotComposableError(f"{type(self).__name__} composites nothing along rays that could be listed.")
+
+    def for_depth_fusion(self) -> Renderer:
+        """The variant of this renderer whose depth maps are fused to a mesh; itself, where there is no sharper one."""
+        return self
+
+
+SAMPLES_EXPECTED = 16
+"""Samples per ray that a picture's first rays are counted with, to keep within `Context.chunk`."""
+MORE_RAYS = 16
+"""How many times as many rays a part may have where they take fewer samples than expected."""
+
+
+class RayRenderer(Renderer):
+    """A renderer whose pixels are independent, so that it can train on any set of rays."""
+
+    @abstractmethod
+    def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
+        """Render n rays; the rendering has shape (n,)."""
+
+    def render_whole(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace] | None:
+        """Render a whole picture at once, where that is faster than in parts; ``None`` where it is not."""
+        return None
+
+    @final
+    def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
+        """Render every pixel: by `render_whole`, else in parts, larger where rays take few samples (the last part's trace)."""
+        whole = self.render_whole(field, camera, ctx)
+        if whole is not None:
+            return whole
+        rays = camera.rays()
+        least = max(1, ctx.chunk // SAMPLES_EXPECTED)
+        size = min(least, len(rays))
+        rendering, trace = self.render_rays(field, rays[:size], ctx)
+        parts, begin = [rendering], size
+        while begin < len(rays):
+            if trace.samples is not None:
+                fitting = size * ctx.chunk // max(len(trace.samples), 1)
+                size = min(max(fitting, least), 2 * size, MORE_RAYS * least)
+            rendering, trace = self.render_rays(field, rays[begin : begin + size], ctx)
+            parts.append(rendering)
+            begin += size
+        return Rendering.cat(parts).reshape(camera.height, camera.width), trace
+
+    @torch.no_grad()
+    def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
+        """The samples of the pixel's ray, as `render_rays` traces them; see `Renderer.contributions`."""
+        rays = camera.ray(pixel)
+        _, trace = self.render_rays(field, rays, ctx)
+        if trace.samples is None or trace.weights is None or trace.values is None:
+            return super().contributions(field, camera, pixel, ctx)
+        return sampled_contributions(field, trace, rays, ctx)
+
+
+def check(field: Field, renderer: Renderer) -> None:
+    """Refuse a pair that does not fit.
+
+    Raises:
+        NotComposableError: names what the renderer needs and the field lacks.
+    """
+    missing = renderer.requires & ~field.provides
+    if missing:
+        raise NotComposableError(
+            f"{type(renderer).__name__} needs {missing.words()}, which {type(field).__name__} does not provide.",
+            f"It provides {field.provides.words()}.",
+        )

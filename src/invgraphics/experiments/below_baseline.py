@@ -1,0 +1,64 @@
+"""A sentence for a method that scores below the mean training image: the likely cause, and a remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from invgraphics.core import Camera, Rendering, Scene
+from invgraphics.metrics.baselines import mean_image
+from invgraphics.metrics.protocols import Protocol, score
+
+FLOATER_DEPTH = 0.6
+"""Median depth, over the camera's distance to the scene's centre, below which floaters stand in front of the cameras."""
+SPARSE_ALPHA = 0.6
+"""Mean alpha below which renderings of opaque photographs are mostly background."""
+
+
+def coverage_and_depth(picture: Rendering, camera: Camera, scene: Scene) -> dict[str, float]:
+    """Mean ``alpha``, and ``relative_depth``: median depth over the camera's distance to the scene's centre."""
+    seen = picture.depth[picture.depth.isfinite() & (picture.alpha >= 0.5)]
+    reach = float((camera.position.cpu() - scene.bounds.centre).norm())
+    relative_depth = float(seen.median()) / max(reach, 1e-9) if len(seen) else 1.0
+    return {"alpha": float(picture.alpha.mean()), "relative_depth": relative_depth}
+
+
+def below_baseline(
+    method: str, quality: Mapping[str, Any], statistics: Sequence[Mapping[str, float]], scene: Scene, protocol: Protocol
+) -> str:
+    """A sentence where the mean PSNR is below that of the mean training image; else empty.
+
+    Args:
+        method: ``renderer/recipe``.
+        quality: the ``quality`` part of its scores.
+        statistics: `coverage_and_depth` of each test view.
+        scene: with its training views.
+        protocol: of the scores.
+    """
+    if "psnr" not in quality or not scene.train:
+        return ""
+    with torch.no_grad():
+        pairs = zip(mean_image(scene), scene.test, strict=True)
+        values = [score(picture, view, scene, protocol, only=("psnr",)).values.get("psnr") for picture, view in pairs]
+    known = [value for value in values if value is not None]
+    if not known or quality["psnr"]["mean"] >= (baseline := sum(known) / len(known)):
+        return ""
+    means = {key: sum(view[key] for view in statistics) / len(statistics) for key in ("alpha", "relative_depth")}
+    cause, remedy = _diagnose(method, means, opaque=not scene.has_alpha)
+    lost = f"{method} reaches {quality['psnr']['mean']:.1f} dB, below the mean training image ({baseline:.1f} dB)"
+    return f"{lost}: {cause}. Try {remedy}."
+
+
+def _diagnose(method: str, means: Mapping[str, float], opaque: bool) -> tuple[str, str]:
+    """Cause and remedy, by the family of the method and the statistics of its renderings."""
+    if method.startswith("splatting/"):
+        return "its Gaussians do not cover the views yet, or overfit few photographs", "a longer --budget or more photographs"
+    remedy = "a longer --budget, a smaller --size, more photographs, or splatting/gaussians, which starts from known points"
+    if means["relative_depth"] < FLOATER_DEPTH:
+        where = f"median depth {means['relative_depth']:.0%} of the way to the scene's middle"
+        return f"fog hangs in front of the cameras ({where})", remedy
+    if opaque and means["alpha"] < SPARSE_ALPHA:
+        return f"its pictures are mostly empty (mean alpha {means['alpha']:.2f})", remedy
+    return "the budget ended before its fog had cleared, or it overfits few photographs", remedy

@@ -1,0 +1,88 @@
+"""A run with all of its text read: the one place where requests are parsed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from invgraphics.config import fill
+from invgraphics.experiments.build import device_of
+from invgraphics.experiments.request import DATA, FitRequest
+from invgraphics.experiments.variants import RendererVariant, variant_named
+from invgraphics.metrics.protocols import Protocol, protocol_named
+from invgraphics.recipes.recipe import Method, assign, load_method
+from invgraphics.runs.folder import RunFolder
+from invgraphics.scenes.degrade import TrainingData
+from invgraphics.scenes.open import SceneOptions
+from invgraphics.training.budget import Budget, Cadence
+
+
+@dataclass(frozen=True)
+class Job:
+    """A `FitRequest` with everything that is text in it resolved and checked; what makes a run takes this.
+
+    Attributes:
+        request: as it was asked for; its values that need no reading (seed, scene, folders) stand there.
+        method: its recipe, under the request's preset (or its budget's) and overrides.
+        budget: of the fit.
+        cadence: of its checkpoints.
+        data: what is done to the training data.
+        device: where it computes.
+        options: with which the scene is opened.
+        protocol: that scores it.
+        variants: renderers that show the fitted field besides its own.
+    """
+
+    request: FitRequest
+    method: Method
+    budget: Budget
+    cadence: Cadence
+    data: TrainingData
+    device: torch.device
+    options: SceneOptions
+    protocol: Protocol
+    variants: tuple[RendererVariant, ...] = ()
+
+    @staticmethod
+    def of(request: FitRequest, method: Method | None = None) -> Job:
+        """Resolve a request.
+
+        Args:
+            request: what is asked for.
+            method: its method, where it has been resolved before.
+
+        Raises:
+            InputError: a method, preset, key, value, budget, interval, protocol or device is unknown or cannot be read.
+        """
+        protocol = protocol_named(request.protocol)
+        budget, cadence = Budget.parse(request.budget), Cadence.parse(request.checkpoint_every)
+        return Job(
+            request=request,
+            method=method or load_method(request.method, request.preset, request.recipe_overrides, budget),
+            budget=budget,
+            cadence=cadence,
+            data=_training_data(request),
+            device=device_of(request.device),
+            options=SceneOptions(size=request.size, test_views=request.test_views, spp=request.spp),
+            protocol=protocol,
+            variants=tuple(map(variant_named, request.render_with)),
+        )
+
+    @property
+    def folder(self) -> RunFolder:
+        """Of the run."""
+        return RunFolder(Path(self.request.out))
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the protocols that score the run, the default one last: a run that has its scores is finished."""
+        return tuple(dict.fromkeys([self.protocol.name, "default"]))
+
+
+def _training_data(request: FitRequest) -> TrainingData:
+    table: dict[str, Any] = {}
+    assign(table, request.data_overrides)
+    return fill(TrainingData, table.get(DATA.rstrip("."), {}), DATA.rstrip("."))

@@ -1,0 +1,282 @@
+"""Fits as objects: one that is made in this process, or one that a run folder keeps."""
+
+from __future__ import annotations
+
+import math
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import final
+
+from invgraphics.core import Model, Scene
+from invgraphics.experiments.build import repeatable, use_kernels
+from invgraphics.experiments.clocks import fit_costs, fit_record
+from invgraphics.experiments.display import curve_svg, table_html
+from invgraphics.experiments.evaluate import score_model
+from invgraphics.experiments.fitted import Fitted
+from invgraphics.experiments.job import Job
+from invgraphics.experiments.recorder import Monitor, Recorder
+from invgraphics.experiments.renderings import check_variants
+from invgraphics.experiments.run import prepare
+from invgraphics.experiments.start import memory_forecast
+from invgraphics.experiments.variants import variant_named, with_renderer
+from invgraphics.metrics.cost import PeakMemory
+from invgraphics.recipes.recipe import Method
+from invgraphics.runs.history import Moment, read_history
+from invgraphics.runs.scores import Scores
+from invgraphics.scenes.degrade import degrade
+from invgraphics.training.budget import Budget
+from invgraphics.training.fit import Fit
+from invgraphics.training.poses import Poses
+
+OnStep = Callable[[Fit], None]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ScoreTable(Mapping[str, float]):
+    """Scores of a model on a scene's test views: metric -> mean over the views.
+
+    Attributes:
+        record: everything, as a run folder holds it: ``quality``, ``cost``, ``views``, ``skipped``, ``protocol``.
+
+    Example:
+        >>> import invgraphics as ig
+        >>> from invgraphics.testing import TwoBalls, toy_scene
+        >>> scene = toy_scene(views=2, size=16)
+        >>> renderer = ig.load_method("volumetric/nerf").recipe.renderer.build(scene)
+        >>> scores = ig.evaluate(ig.Model(TwoBalls(), renderer, scene.bounds), scene)
+        >>> scores["psnr"] > 25 and scores.unit("psnr") == "dB" and len(scores.per_view("psnr")) == len(scene.test)
+        True
+    """
+
+    record: Scores
+
+    def __getitem__(self, metric: str) -> float:
+        mean = self.record.quality[metric].mean
+        return math.nan if mean is None else mean
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.record.quality)
+
+    def __len__(self) -> int:
+        return len(self.record.quality)
+
+    def per_view(self, metric: str) -> tuple[float, ...]:
+        """One value for each test view, in the scene's order; NaN where a view has none."""
+        return tuple(math.nan if value is None else value for value in self.record.quality[metric].per_view)
+
+    def unit(self, metric: str) -> str:
+        """The metric's unit; empty where it has none."""
+        return self.record.quality[metric].unit
+
+    def _title(self) -> str:
+        return f"{self.record.scene}, {len(self.record.views)} test views, protocol {self.record.protocol}"
+
+    def __repr__(self) -> str:
+        return "\n".join([self._title(), *(f"  {name:20} {value:10.4g} {self.unit(name)}" for name, value in self.items())])
+
+    def _repr_html_(self) -> str:
+        better = {True: "higher", False: "lower"}
+        rows = [
+            (name, f"{value:.4g}", self.unit(name), better[self.record.quality[name].higher_is_better])
+            for name, value in self.items()
+        ]
+        return table_html(self._title(), ("metric", "mean", "unit", "better"), rows)
+
+
+class FittedRun(ABC):
+    """A method fitted to a scene.
+
+    Attributes:
+        method: what was fitted.
+        scene: as loaded, with the views that score it.
+    """
+
+    method: Method
+    scene: Scene
+
+    @property
+    @abstractmethod
+    def model(self) -> Model:
+        """The fitted field and its renderer."""
+
+    @property
+    @abstractmethod
+    def poses(self) -> Poses | None:
+        """The training cameras' poses, where they were fitted too."""
+
+    @property
+    @abstractmethod
+    def history(self) -> tuple[Moment, ...]:
+        """The fit's course: moments with ``step``, ``seconds``, ``progress``, and ``psnr`` on views that are not trained on."""
+
+    @property
+    @abstractmethod
+    def finished(self) -> bool:
+        """Whether the budget is spent."""
+
+    @property
+    @abstractmethod
+    def scores(self) -> ScoreTable:
+        """Scores under the default protocol; of a fit without a folder, computed when they are first asked for."""
+
+    def evaluate(self, protocol: str = "default") -> ScoreTable:
+        """Render and score the test views by the rules of the command line.
+
+        Args:
+            protocol: ``default`` (pictures rounded to 8 bits) or ``float``.
+
+        Raises:
+            InputError: there is no such protocol.
+        """
+        return ScoreTable(score_model(self.model, self.scene, protocol, self.method.name, self.poses))
+
+    def through(self, renderer: str) -> Model:
+        """The fitted field seen through the renderer of another method.
+
+        Args:
+            renderer: a method's name; settings of its renderer may follow, ``gaussian-volume/exact:steps=8``.
+
+        Raises:
+            InputError: that renderer needs what the field does not provide, or learnt state for which no constants stand in.
+        """
+        variant = variant_named(renderer)
+        check_variants([variant], [self.method], self.scene)
+        other = with_renderer(self.method, variant).recipe.renderer.build(self.scene)
+        other = other if variant.table == self.method.table["renderer"] else other.untrained()
+        return replace(self.model, renderer=other.to(self.model.device))
+
+    def __repr__(self) -> str:
+        last = self.history[-1] if self.history else Moment(step=0, seconds=0.0)
+        state = "finished" if self.finished else "not finished"
+        return f"{self.method.name} on {self.scene.name}: {state}, {last.step} steps, {last.seconds:.1f} s"
+
+    def _repr_svg_(self) -> str:
+        points = [(moment.seconds, moment.psnr) for moment in self.history if moment.psnr is not None]
+        return curve_svg(points, repr(self), ("s", "monitor PSNR in dB"))
+
+
+@final
+class MemoryRun(FittedRun):
+    """A fit in this process that no folder keeps; an interrupted one can go on.
+
+    Args:
+        job: what to fit, and how.
+        scene: as loaded.
+        on_step: is given the fit before its first step and after each one.
+
+    Raises:
+        InputError: method and scene do not go together, or would need more memory than there is.
+        NumericalError: the fit left the finite numbers.
+    """
+
+    def __init__(self, job: Job, scene: Scene, on_step: OnStep | None = None) -> None:
+        self.method, self.scene = job.method, scene
+        self._job, self._on_step = job, on_step
+        self._history: list[Moment] = []
+        self._scores: ScoreTable | None = None
+        repeatable(job.device)
+        use_kernels(job.request.kernels)
+        with PeakMemory(job.device) as memory:
+            self.fit = prepare(job, degrade(scene, job.data, job.request.seed))
+            self.fit.warmup_step()
+            Monitor(self.fit.plan.scene, job.device).psnr(self.fit)
+            memory_forecast(self.fit.plan, job.method, memory.peak_bytes)
+        self._run()
+
+    def _run(self) -> None:
+        recorder = Recorder(self.fit, None, self._job.cadence, self.method.name, on_step=self._on_step)
+        try:
+            recorder.run()
+        except KeyboardInterrupt:
+            print(f"Interrupted after {self.fit.steps} steps; resume() goes on.", file=sys.stderr)
+        finally:
+            self._history += recorder.history
+            self._scores = None
+
+    def resume(self, budget: str | None = None) -> None:
+        """Go on where the fit stands, in this object; one that was interrupted ends with the same bits as one that was not.
+
+        Args:
+            budget: of the whole fit from its beginning, ``60s`` or ``5000steps``; ``None`` for the one that it had. A larger
+                one stretches the schedules of a finished fit: its learning rates rise again, to those of the new progress.
+
+        Raises:
+            InputError: the budget cannot be read.
+        """
+        if budget is not None:
+            self.fit.plan = replace(self.fit.plan, budget=Budget.parse(budget))
+        self._run()
+
+    @property
+    def model(self) -> Model:
+        """The fitted field and its renderer."""
+        return self.fit.model
+
+    @property
+    def poses(self) -> Poses | None:
+        """The training cameras' poses, where they are fitted too."""
+        return self.fit.plan.poses
+
+    @property
+    def history(self) -> tuple[Moment, ...]:
+        """See `FittedRun.history`."""
+        return tuple(self._history)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is spent."""
+        return self.fit.progress >= 1
+
+    @property
+    def scores(self) -> ScoreTable:
+        """Scores under the default protocol, computed when they are first asked for."""
+        if self._scores is None:
+            scores = self.evaluate()
+            costs = fit_costs(fit_record(self.fit.steps, self.fit.clocks()))
+            self._scores = ScoreTable(replace(scores.record, cost=costs | scores.record.cost))
+        return self._scores
+
+
+@final
+class FolderRun(FittedRun):
+    """A run that a folder keeps, opened again.
+
+    Args:
+        fitted: the run's scene and model.
+
+    Attributes:
+        folder: where the run is.
+    """
+
+    def __init__(self, fitted: Fitted) -> None:
+        self.method, self.scene, self._fitted = fitted.method, fitted.scene, fitted
+        self.folder: Path = fitted.folder.root
+
+    @property
+    def model(self) -> Model:
+        """The fitted field and its renderer, from the last checkpoint."""
+        return self._fitted.model
+
+    @property
+    def poses(self) -> Poses | None:
+        """The training cameras' poses, where they were fitted too."""
+        return self._fitted.poses
+
+    @property
+    def history(self) -> tuple[Moment, ...]:
+        """See `FittedRun.history`."""
+        return read_history(self._fitted.source.history)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has its scores."""
+        return self._fitted.folder.finished
+
+    @property
+    def scores(self) -> ScoreTable:
+        """The scores that the folder keeps; those of the last checkpoint where the run was interrupted."""
+        return ScoreTable(self._fitted.folder.read_scores()) if self.finished else self.evaluate()

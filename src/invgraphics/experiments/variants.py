@@ -1,0 +1,53 @@
+"""Renderers by name, for looking at a field that was fitted through another one."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from invgraphics.recipes.recipe import Method, load_method, resolve
+from invgraphics.text import sha256_of, slug
+
+_SETTING = r":(?=[\w.]+=)"
+
+
+@dataclass(frozen=True)
+class RendererVariant:
+    """A renderer through which a fitted field is shown.
+
+    Attributes:
+        name: as it was asked for, ``METHOD`` or ``METHOD:key=value:key=value`` with keys of the recipe's renderer.
+        table: the resolved ``[renderer]`` of its recipe.
+    """
+
+    name: str
+    table: dict[str, Any]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the settings."""
+        return sha256_of(self.table)
+
+    @property
+    def folder(self) -> str:
+        """The name as one folder name."""
+        method, *settings = re.split(_SETTING, self.name)
+        return re.sub(r"[^\w.=+-]+", "-", "-".join([slug(method), *settings]))
+
+
+def variant_named(name: str) -> RendererVariant:
+    """Read what ``--render-with`` names.
+
+    Raises:
+        InputError: unknown method or setting, or a renderer of several parts whose recipe does not say which.
+    """
+    method, *settings = re.split(_SETTING, name)
+    recipe = load_method(method, None, tuple(f"renderer.{item}" for item in settings))
+    return RendererVariant(name, recipe.table["renderer"])
+
+
+def with_renderer(method: Method, variant: RendererVariant) -> Method:
+    """A method with another renderer."""
+    name = f"{method.name} rendered with {variant.name}"
+    return resolve(name, method.preset, method.table | {"renderer": variant.table})

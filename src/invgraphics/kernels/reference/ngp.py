@@ -1,0 +1,82 @@
+"""Rendering and marching of an Instant-NGP field, composed of `ray_march`, `hash_encode` and `composite`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import linear, relu, softplus
+
+from invgraphics.core import harmonics
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedNGP
+from invgraphics.core.rays import Rays
+from invgraphics.kernels.reference.composite import OPAQUE, composite, transmittance
+from invgraphics.kernels.reference.hash import hash_encode
+from invgraphics.kernels.reference.march import ray_march
+from invgraphics.kernels.types import EXP_LIMIT, March, MarchSteps
+
+UNLIMITED = 1 << 62
+"""`MarchSteps.limit` that no ray reaches."""
+
+
+@torch.no_grad()
+def ngp_render(
+    rays: Rays,
+    occupied: Bool[Tensor, "r r r"],
+    bounds: Bounds,
+    steps: MarchSteps,
+    field: FusedNGP,
+    min_transmittance: float = 0.0,
+    max_error: float = 0.0,
+    width: int = 0,
+) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
+    """See `invgraphics.kernels.ngp_render`; exact: evaluates every occupied interval, whatever the error budget allows."""
+    march = ray_march(rays, occupied, bounds, replace(steps, limit=UNLIMITED), rays.near)
+    density, radiance = _query(field, rays, bounds, march)
+    channels = torch.cat([radiance, ((march.t0 + march.t1) / 2)[:, None]], dim=1)
+    _, sums, alpha = composite(density * (march.t1 - march.t0), channels, march.ray, len(rays))
+    return sums, alpha
+
+
+@torch.no_grad()
+def ngp_march(
+    rays: Rays,
+    occupied: Bool[Tensor, "r r r"],
+    bounds: Bounds,
+    steps: MarchSteps,
+    field: FusedNGP,
+    start: Float[Tensor, " n"],
+    min_transmittance: float,
+) -> March:
+    """See `invgraphics.kernels.ngp_march`."""
+    march = ray_march(rays, occupied, bounds, replace(steps, limit=UNLIMITED), start)
+    density, _ = _query(field, rays, bounds, march)
+    tau = (density * (march.t1 - march.t0)).double().clamp_max(OPAQUE)
+    kept = transmittance(tau, march.ray, len(rays)) >= min_transmittance
+    return March(march.ray[kept], march.t0[kept], march.t1[kept], march.resume)
+
+
+def _query(field: FusedNGP, rays: Rays, bounds: Bounds, march: March) -> tuple[Float[Tensor, " m"], Float[Tensor, "m 3"]]:
+    """Density and radiance at the midpoint of every interval."""
+    direction = rays.directions[march.ray]
+    position = rays.origins[march.ray] + ((march.t0 + march.t1) / 2)[:, None] * direction
+    features, _ = hash_encode(bounds.to_unit(position), field.table, field.grid)
+    outputs = _mlp(field.density_net, features)
+    raw = outputs[:, 0] + field.density_bias
+    density = {"exp": raw.clamp_max(EXP_LIMIT).exp(), "softplus": softplus(raw), "relu": relu(raw)}[field.density_activation]
+    if field.contracted_density > 0:
+        density = density * (field.contracted_density * bounds.radial_scale(position))
+    inputs = outputs[:, 1:]
+    if field.sh_bands:
+        inputs = torch.cat([inputs, harmonics.basis(direction, field.sh_bands - 1)], dim=1)
+    colour = _mlp(field.colour_net, inputs)
+    return density, colour.sigmoid() if field.colour_space == "srgb" else softplus(colour)
+
+
+def _mlp(layers: tuple[tuple[Tensor, Tensor], ...], x: Float[Tensor, "m ins"]) -> Float[Tensor, "m outs"]:
+    for weight, bias in layers[:-1]:
+        x = relu(linear(x, weight, bias))
+    return linear(x, *layers[-1])

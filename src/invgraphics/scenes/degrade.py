@@ -1,0 +1,199 @@
+"""Degraded training data for studies: fewer, smaller, noisier or differently exposed photographs, poses with errors.
+
+Test views are never changed. Every degradation is drawn per view from the run's seed, by a generator of its own, and grows
+in proportion to its setting: two levels of one study share their random numbers, and leaving views out changes none that stay.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Scene, View
+from invgraphics.core.colour import linear_to_srgb, quantise, srgb_to_linear
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import area_resize, wanted_size
+
+COLOURS = {"black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "white": (1.0, 1.0, 1.0)}
+"""Backgrounds that have a name."""
+
+KEEP = "random"
+"""The background of a scene as loaded: its photographs keep their alpha, and each step draws a colour."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Degradations of the training data; the defaults change nothing.
+
+    Attributes:
+        train_views: number of training views, those farthest from each other first; a smaller choice is part of a larger one.
+        size: longest side of the training photographs in pixels, by area average; test views keep theirs.
+        pose_noise: root-mean-square error of training poses: so many degrees of rotation, about a random axis, and so many per
+            cent of the scene's extent (`Scene.extent`) of position.
+        photo_noise: standard deviation of Gaussian noise on each channel, as a share of white.
+        exposure: standard deviation, in stops, of each photograph's exposure, applied to linear light.
+        background: ``random`` keeps the photographs' alpha; a colour (``white``, ``grey``, ``black`` or [r, g, b] in [0, 1])
+            puts every photograph in front of it and drops the alpha, and the fit composites over the same colour. What is empty
+            can then not be told from what has this colour: fits are slower and end lower.
+    """
+
+    train_views: int | None = None
+    size: int | None = None
+    pose_noise: float = 0.0
+    photo_noise: float = 0.0
+    exposure: float = 0.0
+    background: str | tuple[float, float, float] = KEEP
+
+    def __post_init__(self) -> None:
+        for name in ("train_views", "size"):
+            if (count := getattr(self, name)) is not None and count < 1:
+                raise ValueError(f"'{name}' must be at least 1, not {count}.")
+        for name in ("pose_noise", "photo_noise", "exposure"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise ValueError(f"'{name}' must be 0 or more, not {getattr(self, name)}.")
+        if isinstance(self.background, str):
+            if self.background not in (KEEP, *COLOURS):
+                raise ValueError(f"'background' is one of {KEEP}, {', '.join(COLOURS)}, or [r, g, b], not '{self.background}'.")
+        elif not all(0 <= channel <= 1 for channel in self.background):
+            raise ValueError(f"'background' has channels in [0, 1], not {list(self.background)}.")
+
+    def changes(self) -> dict[str, object]:
+        """The settings that differ from their defaults, as plain values."""
+        values = {field.name: getattr(self, field.name) for field in fields(self) if getattr(self, field.name) != field.default}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    def check(self, scene: Scene) -> None:
+        """Refuse settings that ``scene`` cannot have.
+
+        Raises:
+            InputError: it has fewer views, smaller photographs, or no transparency to put a background behind.
+        """
+        if self.train_views is not None and self.train_views > len(scene.train):
+            raise InputError(
+                f"data.train_views = {self.train_views}, but '{scene.name}' has {len(scene.train)} training views."
+            )
+        largest = max(max(view.camera.width, view.camera.height) for view in scene.train)
+        if self.size is not None and self.size > largest:
+            raise InputError(
+                f"data.size = {self.size}, but the photographs of '{scene.name}' are {largest} pixels long.",
+                "Give a smaller one, or a larger --size.",
+            )
+        if self.background != KEEP and not scene.has_alpha:
+            raise InputError(f"data.background has no effect on '{scene.name}': its photographs are opaque everywhere.")
+
+
+def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
+    """The scene with degraded training views; the same object where ``data`` changes nothing.
+
+    Args:
+        scene: as loaded.
+        data: what to change.
+        seed: of all degradations.
+
+    Raises:
+        InputError: the scene cannot be changed like this (see `TrainingData.check`).
+    """
+    changes = data.changes()
+    if not changes:
+        return scene
+    data.check(scene)
+    views = [(index, scene.train[index]) for index in chosen_views(scene, data.train_views)]
+    train = [_degraded(view, index, scene, data, seed) for index, view in views]
+    notes = scene.notes | {"training_data": ", ".join(f"{name} = {value}" for name, value in changes.items())}
+    if data.background != KEEP:
+        colour = torch.tensor(COLOURS[data.background] if isinstance(data.background, str) else data.background)
+        train = [replace(view, image=_like(view.over(colour), view), alpha=None) for view in train]
+        scene = replace(scene, background=colour)
+    return replace(scene, train=tuple(train), notes=notes)
+
+
+def chosen_views(scene: Scene, count: int | None) -> list[int]:
+    """Indices of the training views that stay, in their old order.
+
+    Farthest-point order (Gonzalez 1985) over position, in units of the scene's extent, and viewing direction; it begins with
+    the view closest to the mean. The choice for fewer views is the beginning of the same order.
+    """
+    if count is None or count >= len(scene.train):
+        return list(range(len(scene.train)))
+    poses = torch.stack([view.camera.cam_to_world.double() for view in scene.train])
+    features = torch.cat([poses[:, :3, 3] / scene.extent, poses[:, :3, 2]], dim=1)
+    order = [int((features - features.mean(dim=0)).norm(dim=1).argmin())]
+    distance = (features - features[order[0]]).norm(dim=1)
+    while len(order) < count:
+        order.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (features - features[order[-1]]).norm(dim=1))
+    return sorted(order)
+
+
+def _degraded(view: View, index: int, scene: Scene, data: TrainingData, seed: int) -> View:
+    """One training view with pose errors, resized, then exposure and noise."""
+    if data.pose_noise:
+        generator = _generator(seed, "pose", index)
+        # Three equal axes share the mean square.
+        axis, shift = torch.randn(2, 3, generator=generator, dtype=torch.float64) / 3**0.5
+        turn = _rotation(axis * torch.pi / 180 * data.pose_noise)
+        pose = view.camera.cam_to_world.double().clone()
+        pose[:3, :3] = pose[:3, :3] @ turn
+        pose[:3, 3] += shift * scene.extent * data.pose_noise / 100
+        wrong = view.camera.moved(pose.float())
+        view = replace(view, camera=wrong, depth=None, normal=None, ground_truth_pose=view.true_pose)
+    if data.size is not None:
+        view = _resized(view, data.size)
+    if data.exposure:
+        stops = data.exposure * float(torch.randn((), generator=_generator(seed, "exposure", index)))
+        view = _recoloured(view, lambda colour: _exposed(colour, 2**stops, scene.colour == "linear"))
+    if data.photo_noise:
+        generator = _generator(seed, "photo", index)
+        view = _recoloured(view, lambda colour: colour + data.photo_noise * torch.randn(colour.shape, generator=generator))
+    return view
+
+
+def _generator(seed: int, degradation: str, index: int) -> torch.Generator:
+    """Randomness of one degradation of one view."""
+    digest = hashlib.sha256(f"{degradation} {seed} {index}".encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
+
+
+def _rotation(vector: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:
+    """The matrix of a rotation vector (radians along its axis)."""
+    x, y, z = vector.tolist()
+    return torch.linalg.matrix_exp(vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
+
+
+def _recoloured(view: View, change: Callable[[Tensor], Tensor]) -> View:
+    return replace(view, image=_like(change(view.colour()), view))
+
+
+def _like(colour: Float[Tensor, "h w 3"], view: View) -> Tensor:
+    """Colours in the number format of the view's photograph."""
+    return quantise(colour) if view.image.dtype == torch.uint8 else colour.clamp_min(0)
+
+
+def _exposed(colour: Float[Tensor, "*p"], gain: float, linear: bool) -> Float[Tensor, "*p"]:
+    return colour * gain if linear else linear_to_srgb(srgb_to_linear(colour) * gain)
+
+
+def _resized(view: View, size: int) -> View:
+    """The photograph at another size: area average of premultiplied colour; a pixel counts if all of it did."""
+    width, height = wanted_size(view.camera.width, view.camera.height, size)
+    alpha = view.opacity()[..., None]
+    mask = torch.ones_like(alpha) if view.mask is None else view.mask[..., None].float()
+    stacked = torch.cat([view.colour() * alpha, alpha, mask], dim=-1).numpy().astype(np.float64)
+    small = torch.from_numpy(area_resize(stacked, width, height)).float()
+    coverage = small[..., 3]
+    straight = small[..., :3] / coverage[..., None].clamp_min(1e-6)
+    return replace(
+        view,
+        camera=view.camera.resized(width, height),
+        image=_like(straight, view),
+        alpha=None if view.alpha is None else quantise(coverage) if view.alpha.dtype == torch.uint8 else coverage,
+        depth=None,
+        normal=None,
+        mask=None if view.mask is None else small[..., 4] > 1 - 1e-6,
+    )

@@ -1,0 +1,59 @@
+"""Outlier cameras of a reconstruction: few observations, or far from all others. They are deregistered and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from invgraphics.scenes.photos.prepare import Prepared
+
+FEW_POINTS = 15
+"""Fewest observations of a camera that is kept: COLMAP accepts no pair of photographs with fewer verified matches."""
+
+FAR = 10.0
+"""Distance to the nearest neighbour, in units of the 90 % quantile of these distances, from which a camera is an outlier."""
+
+MOST = 1 / 3
+"""Largest share of the cameras that may be outliers: beyond, the whole reconstruction is weak, and stays as it is."""
+
+_QUANTILE = 0.9
+
+
+def remove_outlier_cameras(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
+    """Deregister the outlier cameras of a ``pycolmap.Reconstruction``.
+
+    Returns:
+        Photograph -> why its camera was removed.
+    """
+    source = {photo.name: photo.source for photo in photos}
+    images = [image for image in model.images.values() if image.has_pose]
+    centres = np.array([image.projection_center() for image in images]).reshape(-1, 3)
+    far = isolation(centres)
+    reasons: dict[str, str] = {}
+    frames = []
+    for image, times in zip(images, far, strict=True):
+        if image.num_points3D < FEW_POINTS:
+            reasons[source[image.name]] = f"an outlier: it observes only {image.num_points3D} of the points"
+        elif times > FAR:
+            reasons[source[image.name]] = f"an outlier: {times:.0f} times as far from the other cameras as they are apart"
+        else:
+            continue
+        frames.append(image.frame_id)
+    if len(frames) > MOST * len(images):
+        return {}
+    for frame in frames:
+        model.deregister_frame(frame)
+    return reasons
+
+
+def isolation(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Distance of each camera to its nearest neighbour, in units of the 90 % quantile of these distances."""
+    if len(centres) < 3:
+        return np.zeros(len(centres))
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    nearest = distance.min(axis=1)
+    return nearest / max(float(np.quantile(nearest, _QUANTILE, method="lower")), 1e-12)

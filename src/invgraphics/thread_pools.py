@@ -1,0 +1,11 @@
+"""How long the waiting threads of torch's pool may spin; set before torch is imported."""
+
+import os
+import sys
+
+SPIN_SETTING_IS_LATE = "torch" in sys.modules and not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & os.environ.keys()
+"""Whether torch has read the environment without the setting below; `invgraphics.kernels.openmp` then finds another way."""
+
+# torch and Numba bring a thread pool each. A thread that waits by spinning takes the core that the other pool's thread needs;
+# with one more busy process on two cores, steps then took ten times as long. Read by libgomp when torch is imported.
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")

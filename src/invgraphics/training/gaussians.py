@@ -1,0 +1,41 @@
+"""Gaussians as density control, relocation, smoothing and limits see them: parameters that can be replaced row by row."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.training.requirement import Requirement
+
+
+class GaussianParameters(Protocol):
+    """The part of a field of n Gaussians that hooks edit; parameters are stored before activation."""
+
+    means: Float[Tensor, "n 3"]
+    log_scales: Float[Tensor, "n 3"]
+    quaternions: Float[Tensor, "n 4"]
+    opacity_logits: Float[Tensor, " n"]
+
+    def replace(self, tensors: dict[str, Tensor]) -> None:
+        """Replace all parameters by new ones, of any common number of rows."""
+        ...
+
+
+GAUSSIANS = Requirement("Gaussians", GaussianParameters)
+"""For hooks that edit Gaussians."""
+
+
+def cap_at(first: int, most: int, passed: float, ramp: float) -> int:
+    """Cap on the number of Gaussians: from ``first`` to ``most`` by equal factors over ``ramp`` of a fit.
+
+    Args:
+        first: number when growth began.
+        most: number in the end.
+        passed: progress since growth began.
+        ramp: progress until the end; 0 for no cap but ``most``.
+    """
+    if not ramp or first >= most:
+        return most
+    return int(first * (most / first) ** min(1.0, max(0.0, passed) / ramp))

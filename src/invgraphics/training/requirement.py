@@ -1,0 +1,39 @@
+"""What a hook needs of the field that is fitted, declared so that a recipe can be refused before anything is built."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from inspect import get_annotations
+
+from typing_extensions import get_protocol_members
+
+from invgraphics.errors import InputError
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """Members that a field must have.
+
+    Attributes:
+        words: what they are, for a sentence.
+        protocol: a `typing.Protocol` that lists them.
+    """
+
+    words: str
+    protocol: type
+
+    def met_by(self, field: object) -> bool:
+        """Whether a field, or a class of fields, has every member. Annotations of a class count as its members."""
+        cls = field if isinstance(field, type) else type(field)
+        declared = {name for base in cls.__mro__ for name in get_annotations(base)}
+        return all(hasattr(field, name) or name in declared for name in get_protocol_members(self.protocol))
+
+    def check(self, hook: str, field: object) -> None:
+        """Refuse a field, or a class of fields, that lacks a member.
+
+        Raises:
+            InputError: names the hook, what it needs, and the field.
+        """
+        if not self.met_by(field):
+            name = (field if isinstance(field, type) else type(field)).__name__
+            raise InputError(f"The hook '{hook}' needs {self.words}, which {name} does not have.")

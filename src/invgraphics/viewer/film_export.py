@@ -1,0 +1,83 @@
+"""Export of a camera path as a film of what a browser shows."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from invgraphics.core import Camera, Rendering
+from invgraphics.tools.camera_path import CameraPath
+from invgraphics.tools.colorize import colorize, depth_range
+from invgraphics.tools.film import PROBE_SIZE, PROBES, FilmWriter
+from invgraphics.viewer.cameras import limit_size
+from invgraphics.viewer.crop import CropBox
+from invgraphics.viewer.loaded_run import LoadedRun
+from invgraphics.viewer.render_thread import Task
+
+RATE = 24
+"""Frames per second of an exported film."""
+
+
+@dataclass(frozen=True)
+class FilmLook:
+    """What the frames of a film show.
+
+    Attributes:
+        output: prediction, depth or normal.
+        background: behind predictions, in the scene's colour space; ``None`` for the scene's own.
+        crop: in the run's local frame.
+    """
+
+    output: str
+    background: tuple[float, float, float] | None
+    crop: CropBox | None
+
+
+def film_cameras(path: CameraPath, run: LoadedRun, max_size: int) -> list[Camera]:
+    """The frames' cameras in the run's local frame, of the test views' size, at most ``max_size`` along the longer side."""
+    size = limit_size(run.scene.test[0].camera, max_size)
+    return path.cameras(run.scene, path.frame_count(RATE), (size.width, size.height))
+
+
+def export_film(
+    run: LoadedRun,
+    cameras: Sequence[Camera],
+    look: FilmLook,
+    on_progress: Callable[[int], None],
+    on_film: Callable[[bytes], None],
+) -> Task:
+    """Task for the render thread that renders a film, one frame per slice; cancelled, it leaves no file.
+
+    Args:
+        run: what is rendered.
+        cameras: in the run's local frame, all of one size.
+        look: of the frames.
+        on_progress: called with the number of finished frames.
+        on_film: called with the MP4 file's content.
+    """
+
+    def render(camera: Camera) -> Rendering:
+        return run.render(camera, look.output == "normal", look.crop)
+
+    scene, span = run.scene, None
+    if look.output == "prediction" and look.background is not None:
+        scene = replace(scene, background=torch.tensor(look.background))
+    if look.output == "depth":
+        probes = []
+        for index in np.linspace(0, len(cameras) - 1, min(PROBES, len(cameras))):
+            probes.append(render(limit_size(cameras[round(index)], PROBE_SIZE)))
+            yield 0.0
+        span = depth_range(probes, [scene] * len(probes))
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "film.mp4"
+        with FilmWriter(out, RATE) as writer:
+            for index, camera in enumerate(cameras):
+                writer.add(colorize(look.output, [render(camera)], [scene], [None], span).pictures[0])
+                on_progress(index + 1)
+                yield 0.0
+        on_film(out.read_bytes())

@@ -1,0 +1,145 @@
+"""Overlays drawn by the browser: camera frustums and Gaussian splats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from invgraphics.core import Gaussians, Quantity, Scene, View
+from invgraphics.core.colour import linear_to_srgb
+from invgraphics.core.harmonics import BAND_0
+from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.tools.colorize import Picture, true_image
+from invgraphics.viewer.cameras import fov_and_aspect, rotation_quaternion
+from invgraphics.viewer.loaded_run import LoadedRun
+
+THUMBNAIL = 96
+"""Pixels along the longer side of a frustum's photograph."""
+FRUSTUM_SIZE = 0.04
+"""Size of a frustum, of the scene's extent; viser takes a third of its sides' product as the size cubed."""
+TEST_COLOUR, TRAIN_COLOUR = (213, 94, 0), (0, 114, 178)
+LARGEST_HALF = 3e4
+"""Largest variance that is sent; the browser keeps half floats, at most 65504."""
+
+
+class CameraFrustums:
+    """Camera frustums of a scene's photographs, with thumbnails that are made on first use.
+
+    Args:
+        views: names and views.
+        scene: they belong to.
+    """
+
+    def __init__(self, views: Sequence[tuple[str, View]], scene: Scene) -> None:
+        self._views, self._scene = views, scene
+        self._thumbnails: dict[int, Picture] = {}
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def add(self, index: int, viser_scene: Any, on_click: Callable[[], Any]) -> Any:
+        """Add one frustum to a viser scene; returns its handle. ``on_click`` is awaited when it is clicked."""
+        name, view = self._views[index]
+        fov, aspect = fov_and_aspect(view.camera)
+        handle = viser_scene.add_camera_frustum(
+            f"/cameras/{index}",
+            fov,
+            aspect,
+            scale=FRUSTUM_SIZE * self._scene.extent,
+            thickness=1.5,
+            thickness_units="screen",
+            color=TEST_COLOUR if name.startswith("test") else TRAIN_COLOUR,
+            image=self._thumbnail(index),
+            wxyz=rotation_quaternion(view.camera.cam_to_world),
+            position=tuple(view.camera.position.tolist()),
+        )
+
+        async def clicked(_: Any) -> None:
+            await on_click()
+
+        handle.on_click(clicked)
+        return handle
+
+    def _thumbnail(self, index: int) -> Picture:
+        if index not in self._thumbnails:
+            view = self._views[index][1]
+            height, width = view.image.shape[:2]
+            scale = min(1.0, THUMBNAIL / max(width, height))
+            size = (max(1, round(width * scale)), max(1, round(height * scale)))
+            self._thumbnails[index] = true_image(view, self._scene, size)
+        return self._thumbnails[index]
+
+
+class Overlays:
+    """Frustums and splats in one browser, added when they are first shown.
+
+    Args:
+        viser_scene: of the browser.
+        run: whose splats are drawn.
+        frustums: of its views.
+        on_click: awaited with the index of a frustum that is clicked.
+    """
+
+    def __init__(
+        self, viser_scene: Any, run: LoadedRun, frustums: CameraFrustums, on_click: Callable[[int], Awaitable[None]]
+    ) -> None:
+        self._viser_scene, self._run, self._views, self._on_click = viser_scene, run, frustums, on_click
+        self._frustums: dict[int, Any] = {}
+        self._splats: Any = None
+
+    def update(self, splats: bool, frustums: bool, hidden: int | None) -> Iterator[float]:
+        """Show or hide splats and frustums, except the one of the view ``hidden``; a task of the render thread."""
+        if splats and self._splats is None:
+            self._splats = add_splats(self._run, self._viser_scene)
+        if self._splats is not None:
+            self._splats.visible = splats
+        for index in range(len(self._views)):
+            wanted = frustums and index != hidden
+            if index not in self._frustums and wanted:
+                self._frustums[index] = self._views.add(index, self._viser_scene, partial(self._on_click, index))
+                yield 0.0
+            elif index in self._frustums and self._frustums[index].visible != wanted:
+                self._frustums[index].visible = wanted
+
+    def remove_splats(self) -> None:
+        """Remove the splats, whose model has changed; `update` adds the new ones."""
+        if self._splats is not None:
+            self._splats.remove()
+            self._splats = None
+
+
+def add_splats(run: LoadedRun, viser_scene: Any) -> Any:
+    """Add a run's Gaussians to a viser scene, coloured by spherical-harmonics band 0; returns their handle."""
+    ctx = run.fitted.model.context()
+    with torch.no_grad():
+        gaussians: Gaussians = run.fitted.model.field.primitives(Quantity.GAUSSIANS, ctx)
+        rgb = (0.5 + BAND_0 * gaussians.sh[:, 0]).clamp(0, 1)
+        rgb = linear_to_srgb(rgb) if run.scene.colour == "linear" else rgb
+        unit = half_precision_scale(gaussians)
+        centres, covariances = _moments(gaussians)
+    return viser_scene.add_gaussian_splats(
+        "/splats",
+        centers=(centres * unit).astype(np.float32),
+        covariances=(covariances * unit**2).astype(np.float32),
+        rgbs=rgb.cpu().numpy(),
+        opacities=gaussians.opacities.cpu().numpy()[:, None],
+        scale=1 / unit,
+    )
+
+
+def half_precision_scale(gaussians: Gaussians) -> float:
+    """Scale factor that maps the largest variance to `LARGEST_HALF`."""
+    return math.sqrt(LARGEST_HALF) / max(float(gaussians.scales.max()), 1e-12)
+
+
+def _moments(gaussians: Gaussians) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3 3"]]:
+    """Means and covariances in double precision."""
+    axes = quaternion_to_matrix(gaussians.quaternions.double()) * gaussians.scales.double()[:, None, :]
+    return gaussians.means.double().cpu().numpy(), (axes @ axes.transpose(1, 2)).cpu().numpy()

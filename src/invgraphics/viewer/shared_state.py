@@ -1,0 +1,32 @@
+"""State shared by the sessions of all browsers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from invgraphics.core import View
+from invgraphics.viewer.overlays import CameraFrustums
+from invgraphics.viewer.progressive import ProgressiveRenderer
+from invgraphics.viewer.render_thread import RenderThread
+
+
+@dataclass(frozen=True, eq=False)
+class SharedState:
+    """State shared by all sessions.
+
+    Attributes:
+        renderer: of the runs.
+        thread: runs render tasks.
+        views: names and views to choose from.
+        frustums: overlays of the same views.
+        start: index of the initial view.
+        max_size: initial limit of the longer side, pixels.
+    """
+
+    renderer: ProgressiveRenderer
+    thread: RenderThread
+    views: Sequence[tuple[str, View]]
+    frustums: CameraFrustums
+    start: int
+    max_size: int

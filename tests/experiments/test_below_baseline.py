@@ -1,0 +1,54 @@
+"""The sentence about methods that lose to the mean training image, on pictures made by hand."""
+
+import pytest
+import torch
+
+from invgraphics.core import Bounds, Camera, Rendering, Scene, View
+from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
+from invgraphics.metrics.protocols import protocol_named, score, summarise
+
+
+def scene() -> Scene:
+    """Training views that are black and white: their mean is grey. The test view is light grey."""
+    pose = torch.eye(4)
+    pose[2, 3] = -2.0
+    camera = Camera(pose, torch.tensor([20.0, 20.0]), torch.tensor([8.0, 8.0]), 16, 16)
+    views = [View(camera, torch.full((16, 16, 3), value), str(value)) for value in (0.0, 1.0, 0.6)]
+    bounds = Bounds(-torch.ones(3), torch.ones(3), "contracted")
+    return Scene("grey", tuple(views[:2]), (views[2],), torch.zeros(3), bounds)
+
+
+def picture(colour: float, alpha: float, depth: float) -> Rendering:
+    full = torch.full((16, 16), 1.0)
+    return Rendering(torch.full((16, 16, 3), colour), alpha * full, depth * full)
+
+
+@pytest.mark.parametrize(
+    ("method", "colour", "alpha", "depth", "words"),
+    [
+        ("volumetric/hash", 0.2, 0.9, 0.4, "fog hangs in front of the cameras (median depth 20% of the way"),
+        ("volumetric/nerf", 0.2, 0.4, 9.0, "mostly empty (mean alpha 0.40)"),
+        ("volumetric/nerf", 0.2, 1.0, 2.0, "budget ended"),
+        ("splatting/gaussians", 0.2, 0.4, 9.0, "Gaussians do not cover"),
+        ("volumetric/hash", 0.55, 0.9, 0.4, ""),
+    ],
+)
+def test_says_why_and_what_to_try(method: str, colour: float, alpha: float, depth: float, words: str) -> None:
+    shown, rules = scene(), protocol_named("default")
+    prediction, view = picture(colour, alpha, depth), scene().test[0]
+    quality, _ = summarise([score(prediction, view, shown, rules, only=("psnr",))], rules)
+    found = below_baseline(method, quality, [coverage_and_depth(prediction, view.camera, shown)], shown, rules)
+    if words:
+        assert words in found
+        assert found.startswith(f"{method} reaches 8.0 dB, below the mean training image (20.2 dB): ")
+        assert " Try a longer --budget" in found
+        assert "splatting" not in found.removeprefix(method) or method.startswith("volumetric")
+    else:
+        assert found == ""
+
+
+def test_says_nothing_where_there_is_nothing_to_compare_with() -> None:
+    shown = scene()
+    assert below_baseline("volumetric/hash", {}, [], shown, protocol_named("default")) == ""
+    alone = shown.with_views(train=())
+    assert below_baseline("volumetric/hash", {"psnr": {"mean": 1.0}}, [], alone, protocol_named("default")) == ""

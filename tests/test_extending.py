@@ -1,0 +1,105 @@
+"""docs/extending.md as a stranger's package: installed by entry points, conforming, fitted, compared and reported."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from invgraphics import core
+from invgraphics.core import Camera, Model
+from invgraphics.core.transforms import look_at
+from invgraphics.renderers.samplers import StratifiedConfig
+from invgraphics.renderers.volumetric import VolumetricConfig
+from invgraphics.scenes.open import Loader
+from invgraphics.testing import TwoBalls, toy_scene
+
+PAGE = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
+
+
+def _blocks(language: str) -> str:
+    return "\n".join(re.findall(rf"^```{language}\n(.*?)^```", PAGE, flags=re.S | re.M))
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """A process environment in which the page's package is installed."""
+    info = tmp_path / "site" / "voxel_world-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info.parent / "voxel_world.py").write_text(_blocks("python"))
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: voxel-world\nVersion: 1.0\n")
+    groups = tomllib.loads(_blocks("toml"))["project"]["entry-points"]
+    lines = [line for group, names in groups.items() for line in (f"[{group}]", *(f"{key} = {names[key]}" for key in names))]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    paths = [str(info.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "200"}
+
+
+@pytest.fixture
+def turntable(tmp_path: Path) -> Path:
+    """Sixteen turns of two balls, seen from a little above."""
+    folder = tmp_path / "turntable"
+    folder.mkdir()
+    scene, size = toy_scene(views=2, size=8), 20
+    renderer, field = VolumetricConfig(StratifiedConfig(count=96)).build(scene), TwoBalls()
+    for index in range(16):
+        turn = torch.tensor(2 * torch.pi * index / 16)
+        pose = look_at(torch.tensor([3 * turn.cos(), 3 * turn.sin(), 1.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+        camera = Camera(pose, torch.full((2,), 26.0), torch.full((2,), size / 2), size, size)
+        picture = Model(field, renderer, scene.bounds).render(camera)
+        straight = picture.rgb / picture.alpha.clamp_min(1e-3)[..., None]
+        pixels = (torch.cat([straight, picture.alpha[..., None]], dim=2).clamp(0, 1) * 255).round().to(torch.uint8)
+        Image.fromarray(pixels.numpy()).save(folder / f"{index:03d}.png")
+    (folder / "turntable.json").write_text(json.dumps({"distance": 3.0, "height": 1.0, "focal": 26.0}))
+    return folder
+
+
+def _run(environment: dict[str, str], *arguments: str) -> str:
+    done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_signatures_on_the_page_are_those_of_the_contract() -> None:
+    for owner, name in ((core.Field, "query"), (core.RayRenderer, "render_rays"), (Loader, "matches"), (Loader, "load")):
+        hints = owner.__dict__[name].__annotations__
+        written = ", ".join(f"{key}: {hint}" for key, hint in hints.items() if key != "return")
+        assert f"`{name}({written}) -> {hints['return']}`" in PAGE, name
+
+
+def test_the_parts_conform(environment: dict[str, str]) -> None:
+    code = (
+        "from voxel_world import VoxelsConfig, BrightestConfig\n"
+        "from invgraphics.testing import TwoBalls, check_field, check_renderer, toy_scene\n"
+        "scene = toy_scene(views=2, size=8)\n"
+        "check_field(VoxelsConfig(resolution=8).build(scene), scene)\n"
+        "check_renderer(BrightestConfig(count=16).build(scene), VoxelsConfig(resolution=8).build(scene), scene)\n"
+    )
+    _run(environment, "-c", code)
+
+
+def test_the_parts_take_part(environment: dict[str, str], turntable: Path, tmp_path: Path) -> None:
+    listed = _run(environment, "-m", "invgraphics", "list", "fields", "renderers", "methods")
+    assert "voxel_world:VoxelsConfig" in listed and "voxel_world:BrightestConfig" in listed and "brightest/voxels" in listed
+    code = (
+        "import invgraphics as ig\n"
+        f"scene = ig.load_scene({str(turntable)!r})\n"
+        "small = {'field.resolution': 16, 'batches.rays': 256}\n"
+        "names = ['volumetric/voxels', 'brightest/voxels']\n"
+        "methods = [ig.load_method(name, set=small) for name in names]\n"
+        f"out = {str(tmp_path / 'report')!r}\n"
+        "report = ig.compare(scene, methods, budget='250steps', out=out, render_with=['brightest/voxels'])\n"
+        "print(len(scene.train), len(scene.test), report.failures, *[report.scores(name)['psnr'] for name in report.methods])\n"
+        "print((report.run(report.methods[0]).through('brightest/voxels')).render(scene.test[0].camera).rgb.shape)\n"
+    )
+    numbers, shape = _run(environment, "-c", code).splitlines()
+    train, test, failures, *psnr = numbers.split()
+    assert (train, test, failures, shape) == ("14", "2", "()", "torch.Size([20, 20, 3])")
+    assert float(psnr[0]) > 18 and float(psnr[1]) > 12, psnr
+    assert "Dense voxel grid" in (tmp_path / "report" / "index.html").read_text()

@@ -1,0 +1,233 @@
+"""``import invgraphics as ig``: every example runs, names come lazily, fits stop, go on and show themselves."""
+
+import doctest
+import importlib
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from training_fixtures import SMALL
+
+import invgraphics as ig
+from invgraphics.core.transforms import look_at
+from invgraphics.errors import InputError
+from invgraphics.experiments.session import ScoreTable
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.scenes.npz import Npz, save_npz
+from invgraphics.scenes.open import SceneOptions, source_of
+from invgraphics.testing import toy_scene
+
+SPLATS = ig.load_method("splatting/gaussians", set={"field.count": 60, "field.max_init": 60, "field.sh_degree": 0})
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ("load_scene", "load_method", "fit", "evaluate", "load_run", "compare", "ablate", "Model")
+
+
+@pytest.fixture(autouse=True)
+def _toy_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of its own for each test, with the data set that examples open."""
+    save_npz(toy_scene(views=8, size=24), tmp_path / "toy.npz")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("thing", [*(getattr(ig, name) for name in EXAMPLES), ScoreTable], ids=[*EXAMPLES, "ScoreTable"])
+def test_the_examples_hold(thing: object) -> None:
+    (test,) = doctest.DocTestFinder(recurse=False).find(thing, name=thing.__name__)
+    assert test.examples
+    said = io.StringIO()
+    failed, _ = doctest.DocTestRunner().run(test, out=said.write)
+    assert not failed, said.getvalue()
+
+
+def test_the_readme_holds() -> None:
+    """Its blocks of Python, one after the other, on the toy and with few steps."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.S | re.M)
+    assert len(blocks) == 3
+    code = "\n".join(blocks).replace('"bricks"', '"toy.npz"')
+    code, budgets = re.subn(r'"(?:30s|60s|500steps)"', '"4steps"', code)
+    assert budgets == 3
+    code = code.replace('"1000steps"', '"6steps"').replace('{"field.width": 64}', '{"field.width": 16, "batches.rays": 64}')
+    names: dict = {}
+    exec(code, names)
+    assert names["fit"].fit.steps == 6 and len(names["frames"]) == 1
+    assert names["splatted"].rgb.shape == names["integrated"].rgb.shape == (128, 128, 3)
+
+
+def test_names_are_lazy_and_typed() -> None:
+    code = "import sys, invgraphics as ig; print('torch' in sys.modules, set(ig.__all__) <= set(dir(ig)), ig.Camera.__module__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True", "invgraphics.core.camera"]
+    for name, home in ig._HOMES.items():
+        assert getattr(importlib.import_module(home), name) is getattr(ig, name)
+    assert sorted(ig._HOMES) == sorted(ig.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'render'"):
+        ig.render  # noqa: B018
+
+
+def test_fits_in_memory_and_in_a_folder_are_the_same_fit() -> None:
+    """A scene that no file holds is fitted as it is; a folder keeps a copy of it."""
+    kept = ig.fit(SPLATS, toy_scene(views=8, size=24), budget="20steps", out="run")
+    in_memory = ig.fit(SPLATS, kept.scene, budget="20steps")
+    state = checkpoint.load(Path("run") / CHECKPOINT)["field"]
+    assert all(torch.equal(value, state[name]) for name, value in in_memory.model.field.state_dict().items())
+    assert in_memory.scores["psnr"] == kept.scores["psnr"] == kept.evaluate()["psnr"]
+    assert [moment.psnr for moment in in_memory.history] == [moment.psnr for moment in kept.history]
+    assert in_memory.scores.record.cost["steps"] == 20
+    command = json.loads(Path("run/provenance.json").read_text())["command"]
+    assert f"fit {SPLATS.name} run/scene.npz" in command
+
+
+def test_a_stopped_fit_goes_on_to_the_same_bits(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = ig.load_scene("toy.npz")
+
+    def stop(fit) -> None:
+        if fit.steps == 7:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    whole = ig.fit(SPLATS, scene, budget="20steps")
+    stopped = ig.fit(SPLATS, scene, budget="20steps", on_step=stop)
+    assert (stopped.finished, stopped.fit.steps) == (False, 7)
+    assert "Interrupted after 7 steps" in capsys.readouterr().err
+    stopped.resume()
+    assert stopped.finished
+    assert torch.equal(stopped.model.field.means, whole.model.field.means)
+    stopped.resume("30steps")
+    assert stopped.fit.steps == 30 and stopped.history[-1].step == 30
+    kept = ig.fit(SPLATS, scene, budget="20steps", out="run", on_step=stop)
+    assert not kept.finished and kept.scores["psnr"] > 0 and not Path("run/scores.json").exists()
+    kept = ig.fit(SPLATS, scene, budget="20steps", out="run")
+    assert kept.finished and torch.equal(kept.model.field.means, whole.model.field.means)
+    seen = []
+    ig.fit(SPLATS, scene, budget="20steps", out="run", on_step=seen.append)
+    assert not seen, "what is finished is only opened"
+    with pytest.raises(InputError, match="holds another run"):
+        ig.fit(SPLATS, scene, budget="21steps", out="run")
+    ig.fit(SPLATS, toy_scene(views=8, size=24), budget="2steps", out="own")
+    with pytest.raises(InputError, match="holds another scene"):
+        ig.fit(SPLATS, toy_scene(views=9, size=24), budget="2steps", out="own")
+
+
+def test_steps_can_be_watched() -> None:
+    seen = []
+    ig.fit(SPLATS, "toy.npz", "3steps", on_step=lambda fit: seen.append((fit.steps, fit.model.field.means.sum().item())))
+    assert [step for step, _ in seen] == [0, 1, 2, 3]
+    assert len({total for _, total in seen}) == 4
+
+
+@pytest.mark.parametrize("out", [None, "run"])
+def test_methods_come_in_every_shape(out: str | None) -> None:
+    table = {"summary": "mine", "paper": "none", **SPLATS.table, "batches": {"views": 1}}
+    Path("mine.toml").write_text("")
+    by_table = ig.fit(table, "toy.npz", "2steps", out=out)
+    assert by_table.method.recipe.field.count == 60
+    assert ig.fit(SPLATS.name, "toy.npz", "2steps").method.table == SPLATS.table
+    paper = ig.load_method("volumetric/nerf", preset="paper", set={"field.width": 32})
+    assert (paper.preset, paper.recipe.field.width, paper.name) == ("paper", 32, "volumetric/nerf:preset=paper:field.width=32")
+    with pytest.raises(InputError, match=r"Unknown key 'field\.widht'"):
+        ig.load_method("volumetric/nerf", set={"field.widht": 32})
+
+
+def test_a_comparison_of_a_scene_made_in_python() -> None:
+    scene = toy_scene(views=8, size=24)
+    broken = ig.load_method("splatting/gaussians", set={"field.init": "field", "field.source": "nowhere"})
+    report = ig.compare(scene, [SPLATS, broken], budget="2steps", seeds=(3,), out="report")
+    assert report.methods == (SPLATS.name, broken.name)
+    assert [(failure.method, failure.seed) for failure in report.failures] == [(broken.name, 3)]
+    assert report.run(SPLATS.name, 3).scores["psnr"] == report.scores(SPLATS.name, 3)["psnr"]
+    columns, rows = report.table()
+    assert columns[0] == "" and any(SPLATS.name in row[0] for row in rows)
+    assert SPLATS.name in report._repr_html_() and report.page.is_file()
+    with pytest.raises(InputError, match="no run of 'splatting/nothing'"):
+        report.run("splatting/nothing")
+
+
+def test_a_scene_is_kept_as_it_is(tmp_path: Path) -> None:
+    scene = toy_scene(views=8, size=24)
+    save_npz(scene, tmp_path / "kept.npz")
+    kept = Npz().load(tmp_path / "kept.npz", SceneOptions(test_views=None))
+    for split in ("train", "test"):
+        assert kept.digest(split) == scene.digest(split)
+        assert torch.equal(getattr(kept, split)[0].depth, getattr(scene, split)[0].depth)
+    for a, b in zip((*kept.train, *kept.test), (*scene.train, *scene.test), strict=True):
+        torch.testing.assert_close(a.camera.cam_to_world, b.camera.cam_to_world, atol=1e-6, rtol=0)
+        assert torch.equal(a.camera.focal, b.camera.focal) and torch.equal(a.camera.centre, b.camera.centre)
+    assert torch.equal(kept.background, scene.background)
+    assert torch.equal(kept.bounds.lo, scene.bounds.lo) and kept.bounds.space == "box"
+    assert torch.equal(kept.points.position, scene.points.position)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda scene: replace(scene, val=scene.train[:1]), "validation views"),
+        (lambda scene: replace(scene, colour="linear"), "linear colours"),
+        (lambda scene: replace(scene, background=torch.zeros(3)), "a background other than the default"),
+        (lambda scene: replace(scene, bounds=replace(scene.bounds, space="contracted")), "no box around it"),
+        (lambda scene: replace(scene, test=(replace(scene.test[0], depth=None), *scene.test[1:])), "depth for some views only"),
+    ],
+)
+def test_a_scene_that_cannot_be_kept_is_refused_but_fitted(change: Callable[[ig.Scene], ig.Scene], what: str) -> None:
+    scene = change(toy_scene(views=8, size=24))
+    with pytest.raises(InputError, match=f"cannot be kept as a data set: it has {what}"):
+        ig.compare(scene, [SPLATS], budget="2steps", out="report")
+    assert ig.fit(SPLATS, scene, "2steps").finished
+
+
+def test_a_changed_scene_is_not_the_one_that_was_opened() -> None:
+    scene = ig.load_scene("toy.npz", size=16)
+    source = source_of(scene)
+    assert source is not None and (source.spec, source.options.size) == ("toy.npz", 16)
+    assert source_of(scene.with_views(train=scene.train[:4])) is None
+    ig.fit(SPLATS, scene, "2steps", out="loaded")
+    ig.fit(SPLATS, scene.with_views(train=scene.train[:4]), "2steps", out="changed")
+    assert not Path("loaded/scene.npz").exists() and Path("changed/scene.npz").exists()
+    assert len(ig.load_run("changed").scene.train) == 4
+
+
+def test_a_finished_run_shows_new_views_through_other_renderers() -> None:
+    ig.fit(SPLATS, "toy.npz", "20steps", out="run")
+    run = ig.load_run("run")
+    camera = run.scene.test[0].camera.moved(
+        look_at(torch.tensor([0.0, -3.0, 1.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    )
+    splatted, integrated = run.model.render(camera), run.through("gaussian-volume/exact:steps=8").render(camera)
+    assert 0 < float((splatted.rgb - integrated.rgb).abs().max()) < 0.5
+    with pytest.raises(InputError, match="cannot be rendered with volumetric/nerf"):
+        run.through("volumetric/nerf")
+
+
+def test_objects_show_themselves() -> None:
+    scene = ig.load_scene("toy.npz")
+    fit = ig.fit(SPLATS, scene, "5steps")
+    view, white = scene.test[0], torch.ones(3)
+    picture = fit.model.render(view.camera)
+    for shown in (view, picture):
+        colours = shown.over(white)
+        pixels = torch.from_numpy(np.array(Image.open(io.BytesIO(shown._repr_png_())))) / 255
+        assert torch.allclose(pixels, colours.clamp(0, 1), atol=0.5 / 255 + 1e-6)
+    assert picture.reshape(24 * 24)._repr_png_() is None
+    assert "8 to fit, 0 to watch" in scene._repr_html_() and "data:image/png;base64," in scene._repr_html_()
+    curve = ElementTree.fromstring(fit._repr_svg_())
+    (line,) = curve.iter("{http://www.w3.org/2000/svg}polyline")
+    assert len(line.attrib["points"].split()) == len(fit.history)
+    assert "psnr" in fit.scores._repr_html_() and "dB" in repr(fit.scores)
+    assert "finished, 5 steps" in repr(fit)
+
+
+def test_small_methods_of_each_family_fit() -> None:
+    scene = toy_scene(views=6, size=16)
+    for name, items in SMALL.items():
+        method = ig.load_method(name, set={key: json.loads(value) for key, _, value in (item.partition("=") for item in items)})
+        assert ig.fit(method, scene, "2steps").finished, name
