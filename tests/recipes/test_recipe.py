@@ -11,9 +11,9 @@ import torch
 from invgraphics.cli.arguments import parse_list
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
-from invgraphics.experiments.request import slug
 from invgraphics.recipes.recipe import load_method, methods, presets, resolve, split_name
 from invgraphics.testing import check_field, check_renderer, toy_scene
+from invgraphics.text import slug
 
 CELLS = [(name, preset) for name in methods() for preset in (*presets(name), "")]
 

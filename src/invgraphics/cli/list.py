@@ -96,7 +96,7 @@ def _list_scenes() -> None:
 
 
 def _list_studies() -> None:
-    from invgraphics.studies.study import FILE, read_study
+    from invgraphics.studies.reading import FILE, read_study
 
     rows = []
     for path in sorted(find("studies").glob(f"*/{FILE}")):

@@ -14,6 +14,7 @@ from invgraphics.experiments.fitted import load_fitted
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
 from invgraphics.training.batches import Batches
 from invgraphics.training.fit import Plan
 
@@ -45,7 +46,7 @@ def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
     if not source:
         return plan
     folder = RunFolder(Path(source))
-    shown = str(folder.read_json("provenance.json")["scene"])
+    shown = folder.read(Provenance).scene
     if Path(shown).resolve() != Path(scene_spec).resolve():
         raise InputError(f"field.source: {source} is a run on '{shown}', not on '{scene_spec}'.")
     source_field = load_fitted(folder, plan.scene).model.field

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +15,7 @@ from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.presets import select_preset
 from invgraphics.recipes.renamed import with_current_names, with_first_names
 from invgraphics.tables import LIMITS, parse_toml, read_text
+from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
@@ -48,11 +47,6 @@ class Method:
     chosen_on: tuple[str, ...] = ()
 
     @property
-    def slug(self) -> str:
-        """The name as one folder name."""
-        return self.name.removesuffix(".toml").strip("/").replace("/", "-")
-
-    @property
     def choice(self) -> tuple[str, str, str]:
         """Name, preset and what chose the preset, for `recipes.presets.announcements`."""
         return self.name, self.preset, self.preset_choice
@@ -60,7 +54,7 @@ class Method:
     @property
     def digest(self) -> str:
         """SHA-256 of the resolved table, the same whatever its keys are called by now."""
-        return hashlib.sha256(json.dumps(with_first_names(self.table), sort_keys=True).encode()).hexdigest()
+        return sha256_of(with_first_names(self.table))
 
 
 def methods() -> dict[str, str]:

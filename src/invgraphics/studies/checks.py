@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.studies.analyses import check_analyses
 from invgraphics.studies.factors import BUDGET, NARROWING, PRESET, SETTINGS, SIZE, in_scope, levels_of, path_of
+from invgraphics.studies.study import Study
 from invgraphics.training.budget import Budget
-
-if TYPE_CHECKING:
-    from invgraphics.studies.study import Study
 
 MOST_CELLS = 10_000
 """Runs of a study: as many take a week at a minute each."""
