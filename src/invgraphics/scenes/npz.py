@@ -177,6 +177,6 @@ def _parts(similarity: Float[Tensor, "4 4"]) -> tuple[float, Float[Tensor, "3 3"
 def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shape"]:
     if values.dtype == np.uint8:
         return values
-    if values.dtype.kind == "f" and np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1:
+    if values.dtype.kind == "f" and np.isfinite(values).all() and (values >= 0).all() and (values <= 1).all():
         return (values * 255 + 0.5).astype(np.uint8)
     raise InputError(f"'{key}' of {path} holds neither bytes nor finite floats in [0, 1].")
