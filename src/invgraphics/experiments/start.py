@@ -11,6 +11,7 @@ import torch
 from invgraphics.core import RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
+from invgraphics.experiments.requested import COPIES, RAY_BYTES
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder
@@ -18,14 +19,10 @@ from invgraphics.runs.provenance import Provenance
 from invgraphics.training.batches import Batches
 from invgraphics.training.fit import Plan
 
-COPIES = 6
-"""Of each primitive's values during a step: parameter, gradient, Adam's two moments; activated, and the gradient of that."""
 SCREEN_BYTES = 300
 """Of a primitive on the screen: footprint, its gradients, packed row and sums; rounded up from two threads."""
 PICTURE_BYTES = 300
 """Of a pixel of a training picture: rendering, truth, SSIM's moments, and their gradients."""
-RAY_BYTES = 512
-"""Of a ray of a batch that follows its samples: origin, direction, interval, colours and their gradients."""
 CHECKPOINT_COPIES = 3
 """A checkpoint holds each parameter and Adam's two moments."""
 MARGIN = 1.25

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
 from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
 from invgraphics.tables import read_arrays
@@ -104,6 +104,9 @@ def _read(path: Path) -> Arrays:
         "bounds": [(2, 3)],
         "test": [(n,)],
     }
+    known = (*_REQUIRED, *allowed, "points", "points_rgb")
+    if unknown := [key for key in arrays if key not in known]:
+        raise InputError(f"{path} has an unknown key '{unknown[0]}'.{did_you_mean(unknown[0], known)}")
     for key, shapes in allowed.items():
         if key in arrays and arrays[key].shape not in shapes:
             expected = " or ".join(map(str, shapes))
@@ -177,7 +180,7 @@ def _parts(similarity: Float[Tensor, "4 4"]) -> tuple[float, Float[Tensor, "3 3"
 def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shape"]:
     if values.dtype == np.uint8:
         return values
-    if values.dtype.kind == "f" and np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1:
+    if values.dtype.kind == "f" and np.isfinite(values).all() and (values >= 0).all() and (values <= 1).all():
         return (values * 255 + 0.5).astype(np.uint8)
     raise InputError(f"'{key}' of {path} holds neither bytes nor finite floats in [0, 1].")
 
