@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_up_runs import made_up_run
 from scipy import stats
 
 from invgraphics.report.data.factors import METHOD, Factor, Observation
