@@ -5,13 +5,15 @@
 >>> fit = ig.fit("splatting/gaussians", scene, budget="30s")           # doctest: +SKIP
 >>> fit.model.render(scene.test[0].camera)                             # doctest: +SKIP
 
-All names below are imported when they are first used: importing the package imports no torch.
+All names below are imported when they are first used: importing the package imports no torch. So are the packages below it:
+``ig.core.transforms``, ``ig.renderers.volumetric``.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 from invgraphics import thread_pools as thread_pools  # sets what torch reads when it is imported
+from invgraphics.lazy import submodules
 
 if TYPE_CHECKING:
     from invgraphics.api import ablate as ablate
@@ -70,7 +72,7 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        raise AttributeError(f"module 'invgraphics' has no attribute '{name}'")
+        return submodules(__name__)(name)
     globals()[name] = value = getattr(importlib.import_module(_HOMES[name]), name)
     return value
 

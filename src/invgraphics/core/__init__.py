@@ -1,5 +1,7 @@
 """The shared scene and camera layer, and the contracts between fields, renderers and training (see CONVENTIONS.md)."""
 
+from typing import TYPE_CHECKING
+
 from invgraphics.core.bounds import Bounds as Bounds
 from invgraphics.core.camera import Camera as Camera
 from invgraphics.core.contributions import Contributions as Contributions
@@ -28,3 +30,7 @@ from invgraphics.core.scene import Mesh as Mesh
 from invgraphics.core.scene import Points as Points
 from invgraphics.core.scene import Scene as Scene
 from invgraphics.core.scene import View as View
+from invgraphics.lazy import submodules
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

@@ -1,5 +1,9 @@
 """Pure functions of a picture and the truth, each with its unit and direction, and the protocols they are used under."""
 
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
 METRICS = {
     "psnr": "invgraphics.metrics.image:PSNR",
     "ssim": "invgraphics.metrics.image:SSIM",
@@ -13,3 +17,6 @@ METRICS = {
     "normal_deg": "invgraphics.metrics.geometry:NORMAL_DEG",
     "alpha_iou": "invgraphics.metrics.geometry:ALPHA_IOU",
 }
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

@@ -1,5 +1,9 @@
 """Ways to make a picture (see `invgraphics.core.Renderer`); each entry is a frozen config with ``build(scene)``."""
 
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
 RENDERERS = {
     "volumetric": "invgraphics.renderers.volumetric:VolumetricConfig",
     "splatting": "invgraphics.renderers.splatting:SplattingConfig",
@@ -12,3 +16,6 @@ SAMPLERS = {
     "hierarchical": "invgraphics.renderers.samplers:HierarchicalConfig",
     "occupancy": "invgraphics.renderers.occupancy:OccupancyConfig",
 }
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

@@ -1,5 +1,9 @@
 """Loaders and makers of `invgraphics.core.Scene`."""
 
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
 LOADERS = {
     "truth": "invgraphics.scenes.truth:Truth",
     "blender": "invgraphics.scenes.blender:Blender",
@@ -10,3 +14,6 @@ LOADERS = {
     "npz": "invgraphics.scenes.npz:Npz",
 }
 """Formats of data sets on disk, in the order in which a folder is tried."""
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

@@ -1,1 +1,8 @@
 """Factorial studies: cells, forecast, record, analyses."""
+
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

@@ -1,5 +1,9 @@
 """What is done with a finished run: films, exports, poses, explanations, scores under other protocols."""
 
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
 _GAUSSIANS = "invgraphics.tools.export:export_gaussians"
 EXPORTERS = {
     "ply": _GAUSSIANS,
@@ -8,3 +12,6 @@ EXPORTERS = {
     "mesh": "invgraphics.tools.mesh:export_mesh",
 }
 """What a run's model can be exported to, and the function that does it (see `invgraphics.tools.export`)."""
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

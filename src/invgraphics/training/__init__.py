@@ -1,5 +1,9 @@
 """Fitting a field by gradient descent through a renderer; losses are callable frozen configs, hooks have a ``build()``."""
 
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
 LOSSES = {
     "photometric": "invgraphics.training.losses:PhotometricLoss",
     "coarse": "invgraphics.training.losses:CoarseLoss",
@@ -16,3 +20,6 @@ HOOKS = {
     "limits": "invgraphics.training.limits:LimitsConfig",
     "sh_degree": "invgraphics.training.hooks:ShDegreeConfig",
 }
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

@@ -1,6 +1,13 @@
 """Position to features (see `invgraphics.core.Encoding`); each entry is a frozen config with ``build()``."""
 
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
 ENCODINGS = {
     "frequency": "invgraphics.fields.encodings.frequency:FrequencyConfig",
     "hash": "invgraphics.fields.encodings.hash:HashConfig",
 }
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

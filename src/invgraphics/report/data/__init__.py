@@ -1,1 +1,8 @@
 """Run, comparison and study folders as the report's records."""
+
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)

@@ -1,1 +1,8 @@
 """Plots and pictures of a report."""
+
+from typing import TYPE_CHECKING
+
+from invgraphics.lazy import submodules
+
+if not TYPE_CHECKING:
+    __getattr__ = submodules(__name__)
