@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
 
-.PHONY: env compare picture bench notebooks test test-notebooks slow check clean
+.PHONY: env compare picture bench notebooks test test-notebooks fuzz slow check clean
 
 env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
@@ -32,6 +32,9 @@ test: env  ## the test suite (under 10 minutes on 2 cores)
 test-notebooks: env  ## every notebook at a small size, and the numbers it prints
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"
 	$(BIN)/python -m pytest -m slow tests/notebooks
+
+fuzz: env  ## 5000 damaged inputs of every reader; INVGRAPHICS_FUZZ_SEED repeats those of a day
+	INVGRAPHICS_FUZZ=$${INVGRAPHICS_FUZZ:-5000} $(BIN)/python -m pytest -s tests/fuzz
 
 slow: env  ## the longer checks
 	$(BIN)/python -m pytest -m slow

@@ -25,6 +25,7 @@ from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.experiments.session import ScoreTable
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.scenes.npz import Npz, save_npz
 from invgraphics.scenes.open import SceneOptions, source_of
 from invgraphics.testing import toy_scene
@@ -90,11 +91,11 @@ def test_fits_in_memory_and_in_a_folder_are_the_same_fit() -> None:
     """A scene that no file holds is fitted as it is; a folder keeps a copy of it."""
     kept = ig.fit(SPLATS, toy_scene(views=8, size=24), budget="20steps", out="run")
     in_memory = ig.fit(SPLATS, kept.scene, budget="20steps")
-    state = checkpoint.load(Path("run") / checkpoint.NAME)["field"]
+    state = checkpoint.load(Path("run") / CHECKPOINT)["field"]
     assert all(torch.equal(value, state[name]) for name, value in in_memory.model.field.state_dict().items())
     assert in_memory.scores["psnr"] == kept.scores["psnr"] == kept.evaluate()["psnr"]
-    assert [line["psnr"] for line in in_memory.history] == [line["psnr"] for line in kept.history]
-    assert in_memory.scores.record["cost"]["steps"] == 20
+    assert [moment.psnr for moment in in_memory.history] == [moment.psnr for moment in kept.history]
+    assert in_memory.scores.record.cost["steps"] == 20
     command = json.loads(Path("run/provenance.json").read_text())["command"]
     assert f"fit {SPLATS.name} run/scene.npz" in command
 
@@ -114,7 +115,7 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(capsys: pytest.CaptureFixture[st
     assert stopped.finished
     assert torch.equal(stopped.model.field.means, whole.model.field.means)
     stopped.resume("30steps")
-    assert stopped.fit.steps == 30 and stopped.history[-1]["step"] == 30
+    assert stopped.fit.steps == 30 and stopped.history[-1].step == 30
     kept = ig.fit(SPLATS, scene, budget="20steps", out="run", on_step=stop)
     assert not kept.finished and kept.scores["psnr"] > 0 and not Path("run/scores.json").exists()
     kept = ig.fit(SPLATS, scene, budget="20steps", out="run")

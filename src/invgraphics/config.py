@@ -8,6 +8,7 @@ filled tree is its ``--set`` key and its name as a study's factor.
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -142,7 +143,7 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
     elif dataclasses.is_dataclass(hint) and isinstance(hint, type):
         if isinstance(value, Mapping):
             return fill(hint, value, path)
-    elif hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+    elif hint is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
         return float(value)
     elif (hint is Any) or (hint in (int, str, bool) and type(value) is hint):
         return value

@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+LONGEST = 1000
+"""Characters of a sentence."""
+
 
 class InputError(Exception):
     """Bad input, said in one clear sentence and, where there is one, the remedy.
@@ -17,9 +20,15 @@ class InputError(Exception):
     """
 
     def __init__(self, sentence: str, remedy: str = "") -> None:
+        sentence, remedy = _shortened(sentence), _shortened(remedy)
         super().__init__(sentence if not remedy else f"{sentence}\n{remedy}")
         self.sentence = sentence
         self.remedy = remedy
+
+
+def _shortened(text: str) -> str:
+    """A text without its middle where it quotes a value of thousands of characters."""
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 200]} ... {text[-200:]}"
 
 
 class NotComposableError(InputError):

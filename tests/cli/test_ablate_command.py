@@ -11,6 +11,7 @@ import pytest
 from invgraphics.cli import arguments, main
 from invgraphics.cli.ablate import Ablate
 from invgraphics.experiments.request import AblateRequest
+from invgraphics.runs.study import CellRecord
 from invgraphics.studies import ablate as module
 from invgraphics.studies.forecast import Forecast
 
@@ -43,7 +44,8 @@ def test_a_short_study_starts_and_ends_with_its_page(study, tmp_path: Path, caps
 
 
 def test_failed_cells_are_named_and_decide_the_status(study, capsys) -> None:
-    cell = {"run": "runs/a", "error": "Step 3: the loss is not finite.\nmore"}
+    error = "Step 3: the loss is not finite.\nmore"
+    cell = CellRecord(id="a", scene="s", method="m", seed=0, run="runs/a", status="failed", error=error)
     assert study(SHORT, failed=(cell,)) == main.FAILED
     assert "runs/a failed: Step 3: the loss is not finite.\n" in capsys.readouterr().out
 

@@ -20,7 +20,7 @@ from invgraphics.experiments import build, fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.formats.base import read_gaussians, write_gaussians
-from invgraphics.report.data.reading import read_run
+from invgraphics.runs.run import read_run
 from invgraphics.tools import EXPORTERS
 from invgraphics.tools.export import ExportRequest, export_run
 from invgraphics.tools.import_gaussians import ImportRequest, import_run

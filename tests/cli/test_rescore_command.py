@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_up_runs import provenance_table
 from PIL import Image
 
 from invgraphics.cli.main import run
@@ -82,8 +83,8 @@ def test_a_damaged_prediction_leaves_nothing_half_written(pictures: Path, tmp_pa
 
 def test_an_unfinished_run_is_refused(tmp_path: Path, capsys) -> None:
     (tmp_path / "provenance.json").write_text("{}")
-    assert "lacks the key 'truth'" in refused(capsys, str(tmp_path))
-    (tmp_path / "provenance.json").write_text('{"truth": "truth/0", "background": [1, 1, 1], "colour": "srgb"}')
+    assert "lacks the key 'cell_sha256'" in refused(capsys, str(tmp_path))
+    (tmp_path / "provenance.json").write_text(json.dumps(provenance_table(truth="truth/0")))
     assert "no saved predictions" in refused(capsys, str(tmp_path))
     (tmp_path / "test").mkdir()
     (tmp_path / "test" / "0000.npz").write_bytes(b"PK broken")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 
 MODULE = '''
 from dataclasses import dataclass, field, replace
@@ -144,7 +145,7 @@ def test_a_strangers_renderer_with_state_takes_part(environment: dict[str, str],
     assert "Exposed fog from a stranger" in (out / "index.html").read_text()
     ours, theirs = (out / "runs" / name / "seed-0" for name in ("volumetric-fog", "exposed-fog"))
     assert json.loads((theirs / "scores.json").read_text())["cost"]["parameters"] == 5
-    state = checkpoint.load(theirs / checkpoint.NAME)
+    state = checkpoint.load(theirs / CHECKPOINT)
     assert abs(float(state["renderer"]["log_exposure"])) > 0.01, "the renderer has learnt nothing"
     # An exposure of 1 stands in, under which our renderer's field looks as it did.
     shown = ours / "rendered" / "exposed-fog"

@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 from invgraphics.experiments.clocks import LEAST_SHARE, disturbance, fit_costs, load_average, processor_share
+from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.schema import from_table
 
 
 @pytest.mark.parametrize(
@@ -19,12 +21,12 @@ from invgraphics.experiments.clocks import LEAST_SHARE, disturbance, fit_costs, 
     ],
 )
 def test_share_of_the_processor(record: dict, share: float | None) -> None:
-    assert processor_share(record) == share
+    assert processor_share(from_table(FitRecord, record, Path("fit.json"))) == share
 
 
 def test_runs_from_before_have_no_share() -> None:
     """Their ``fit.json`` holds steps and seconds only."""
-    assert fit_costs({"steps": 7, "seconds": 1.5}) == {
+    assert fit_costs(FitRecord(steps=7, seconds=1.5)) == {
         "fit_seconds": 1.5,
         "fit_cpu_seconds": None,
         "fit_processor_share": None,

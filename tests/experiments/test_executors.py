@@ -18,8 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.executors.local import LocalExecutor, cores
 from invgraphics.experiments.request import FitRequest
-from invgraphics.runs.checkpoint import NAME
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import CHECKPOINT, RunFolder
 
 METHOD = "splatting/gaussians"
 ENDLESS = {"budget": "1000000steps", "checkpoint_every": "10000s"}
@@ -117,7 +116,7 @@ def test_ctrl_c_stops_the_fit_with_a_checkpoint(request_for, tmp_path: Path) -> 
     threading.Thread(target=interrupt, daemon=True).start()
     with pytest.raises(KeyboardInterrupt):
         next(outcomes)
-    assert (run / NAME).is_file()
+    assert (run / CHECKPOINT).is_file()
     assert not (run / "scores.json").exists()
 
 
@@ -135,7 +134,7 @@ def test_a_fit_does_not_outlive_its_parent(request_for, tmp_path: Path) -> None:
     wait_for(run / "history.jsonl")
     parent.kill()
     parent.wait()
-    wait_for(run / NAME, seconds=60)
+    wait_for(run / CHECKPOINT, seconds=60)
     with RunFolder(run).held():  # comes only once the child is gone
         assert not (run / "scores.json").exists()
 

@@ -14,7 +14,7 @@ from training_fixtures import SMALL, write_blender
 
 from invgraphics.experiments.executors.local import THREAD_VARIABLES
 from invgraphics.experiments.request import AblateRequest
-from invgraphics.runs.checkpoint import NAME
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.studies.ablate import ablate
 from invgraphics.testing import toy_scene
 
@@ -97,7 +97,7 @@ def test_killed_and_resumed_it_has_the_bits_of_the_other_executor(shape: dict, t
     for out in (local, other):
         assert len(cells(out)) == runs and all(cell["status"] == "done" for cell in cells(out))
     for cell in cells(local):
-        assert (local / cell["run"] / NAME).read_bytes() == (other / cell["run"] / NAME).read_bytes(), cell["id"]
+        assert (local / cell["run"] / CHECKPOINT).read_bytes() == (other / cell["run"] / CHECKPOINT).read_bytes(), cell["id"]
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -28,9 +28,11 @@ from invgraphics.recipes.schema import Recipe
 from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
 from invgraphics.renderers.volumetric import Volumetric
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.runs.schema import plain
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.studies.cells import make_plan
-from invgraphics.studies.study import read_study
+from invgraphics.studies.reading import read_study
 from invgraphics.testing import toy_scene
 
 METHOD = "splatting/gaussians"
@@ -82,7 +84,7 @@ def test_differences_are_those_of_the_pictures(run: Path) -> None:
 def test_a_rendering_is_the_fitted_field_through_that_renderer(run: Path, toy_folder: Path) -> None:
     scene = open_scene(str(toy_folder), SceneOptions(test_views=16))
     field = build_model(load_method(METHOD, None, SMALL[METHOD]), scene, 0, torch.device("cpu")).field
-    field.load_state_dict(checkpoint.load(run / checkpoint.NAME)["field"])
+    field.load_state_dict(checkpoint.load(run / CHECKPOINT)["field"])
     with torch.no_grad():
         renderer = GaussianSorted(GaussianSortedConfig("splat"))
         picture, _ = renderer.render_image(field, scene.test[1].camera, Context(scene.bounds))
@@ -97,8 +99,8 @@ def test_a_rendering_is_a_run_that_knows_what_it_shows(run: Path) -> None:
     assert scores["method"] == f"{METHOD} rendered with {OTHERS[2]}"
     assert (folder / provenance["truth"] / "0000.png").is_file()
     assert (folder / provenance["fitted_run"]).resolve() == run.resolve()
-    assert not (folder / checkpoint.NAME).exists()
-    assert evaluate_run(folder)["quality"] == scores["quality"]
+    assert not (folder / CHECKPOINT).exists()
+    assert plain(evaluate_run(folder))["quality"] == scores["quality"]
 
 
 def _stamps(run: Path) -> dict[str, int]:
@@ -148,7 +150,7 @@ def test_constants_stand_in_for_what_another_fit_would_have_learnt(toy_folder: P
         picture = marched.render(fitted.scene.test[0].camera)
         np.testing.assert_allclose(kept["rgb"], picture.rgb.numpy(), atol=1e-3)
     opened = open_fitted(run / record["renderings"][1]["run"])
-    opened.load(checkpoint.load(run / checkpoint.NAME))  # as the viewer does, of a fit that goes on
+    opened.load(checkpoint.load(run / CHECKPOINT))  # as the viewer does, of a fit that goes on
 
 
 def variant_recipe(name: str) -> Recipe:

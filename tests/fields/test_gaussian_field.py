@@ -127,7 +127,12 @@ def test_a_backdrop_lies_behind_the_subject_in_the_colours_of_the_photographs(ma
 @pytest.mark.parametrize(("space", "alpha"), [("box", False), ("contracted", True)])
 def test_no_backdrop_where_there_is_nothing_behind(make_scene, space, alpha):
     scene = _photographs(make_scene(space, points=_points(30)), alpha)
+    torch.manual_seed(3)
     assert GaussianFieldConfig(backdrop=100).build(scene).primitive_count() == 30
+    after = torch.rand(1)
+    torch.manual_seed(3)
+    GaussianFieldConfig().build(scene)
+    assert torch.equal(after, torch.rand(1)), "the fit that follows would see other random numbers than before"
 
 
 def test_a_backdrop_leaves_out_masked_pixels_and_stays_at_a_distance_around_cameras(make_scene):

@@ -39,6 +39,22 @@ def _with_nan(folder: Path) -> bytes:
     return bytes(data)
 
 
+def _claiming(data: bytes, count: int) -> bytes:
+    """An SPZ file whose header names another number of Gaussians."""
+    return data[:8] + struct.pack("<I", count) + data[12:]
+
+
+def _zstd_bomb(count: int) -> bytes:
+    """A well-formed SPZ file of zeros: each stream is 4 bytes for 128 KB."""
+    block, rest = struct.pack("<I", 1 << 17 << 3 | 2)[:3] + b"\0", struct.pack("<I", (1 << 17) << 3 | 3)[:3] + b"\0"
+    streams = []
+    for width in (9, 1, 3, 3, 4):
+        blocks = -(-count * width // (1 << 17))
+        streams.append((b"\x28\xb5\x2f\xfd\x00\x58" + block * (blocks - 1) + rest, blocks << 17))
+    head = struct.pack("<4sIIBBBB", b"NGSP", 4, count, 0, 12, 0, len(streams)) + struct.pack("<I12x", 32)
+    return head + b"".join(struct.pack("<QQ", len(small), large) for small, large in streams) + b"".join(s for s, _ in streams)
+
+
 BAD: dict[str, tuple[str, Callable[[Path], bytes], str]] = {
     "cut PLY": ("a.ply", lambda folder: _ply(folder)[:-100], "cut off: .* bytes are expected"),
     "cut header": ("a.ply", lambda folder: _ply(folder)[:100], "header has no end"),
@@ -73,13 +89,16 @@ BAD: dict[str, tuple[str, Callable[[Path], bytes], str]] = {
     "wrong count": ("a.spz", lambda folder: _spz(folder)[:8] + b"\x0b" + _spz(folder)[9:], "do not hold 11 Gaussians"),
     "absurd SPZ degree": ("a.spz", lambda folder: _spz(folder)[:12] + b"\x0b" + _spz(folder)[13:], "SH degree 11"),
     "no SPZ Gaussians": ("a.spz", lambda _: gzip.compress(LEGACY[:8] + bytes(4) + LEGACY[12:16]), "there are no Gaussians"),
-    "cut gzip": ("a.spz", lambda _: gzip.compress(LEGACY)[:-12], "cannot be decompressed"),
+    "cut gzip": ("a.spz", lambda _: gzip.compress(LEGACY)[:-12], "is cut off"),
     "damaged gzip": (
         "a.spz",
         lambda _: gzip.compress(LEGACY)[:12] + b"\xff\xff" + gzip.compress(LEGACY)[14:],
         "cannot be decompressed",
     ),
     "cut legacy": ("a.spz", lambda _: gzip.compress(LEGACY[:-4]), "cut off: 36 bytes are expected, 32 are there"),
+    "gzip bomb": ("a.spz", lambda _: gzip.compress(LEGACY + bytes(50_000_000)), "goes on after its Gaussians"),
+    "gzip claim": ("a.spz", lambda _: gzip.compress(_claiming(LEGACY, 2_000_000_000) + bytes(1000)), "claims 2,000,000,000"),
+    "zstd claim": ("a.spz", lambda _: _zstd_bomb(60_000_000), "claims 60,000,000 Gaussians"),
     "half a packed PLY": (
         "a.ply",
         lambda folder: _ply(folder).replace(b"float nx", b"float packed_color"),

@@ -5,17 +5,18 @@ import math
 from pathlib import Path
 
 import pytest
+from made_up_runs import provenance_table
 
 from invgraphics.errors import InputError
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest, FitRequest
 from invgraphics.recipes.presets import announcements, preset_for
 from invgraphics.recipes.recipe import load_method
-from invgraphics.report.data.reading import read_run
 from invgraphics.report.pages.facts import preset_facts
+from invgraphics.runs.run import read_run
 from invgraphics.studies.ablate import _kind
 from invgraphics.studies.cells import make_plan
-from invgraphics.studies.study import read_study
+from invgraphics.studies.reading import read_study
 from invgraphics.training.budget import Budget
 
 ALL = ("hour", "laptop", "long", "paper")
@@ -136,7 +137,7 @@ def _run(folder: Path, method: str, preset: str, **provenance: object):
     folder.mkdir()
     scores = {"method": method, "seed": 0, "preset": preset, "views": [], "quality": {}, "cost": {"fit_seconds": math.pi}}
     (folder / "scores.json").write_text(json.dumps(scores))
-    (folder / "provenance.json").write_text(json.dumps({"truth_sha256": "t", "truth": "."} | provenance))
+    (folder / "provenance.json").write_text(json.dumps(provenance_table(**provenance)))
     (folder / "environment.json").write_text("{}")
     (folder / "history.jsonl").write_text("")
     return read_run(folder)

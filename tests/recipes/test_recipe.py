@@ -11,9 +11,9 @@ import torch
 from invgraphics.cli.arguments import parse_list
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
-from invgraphics.experiments.request import slug
 from invgraphics.recipes.recipe import load_method, methods, presets, resolve, split_name
 from invgraphics.testing import check_field, check_renderer, toy_scene
+from invgraphics.text import slug
 
 CELLS = [(name, preset) for name in methods() for preset in (*presets(name), "")]
 
@@ -54,7 +54,7 @@ def test_overrides_take_toml_values() -> None:
         ("volumetric/nerf", None, ["field.width"], "not of the form key=value"),
         ("volumetric/nerf", None, ["field.width=wide"], "'field.width' cannot be 'wide'"),
         ("volumetric/nerf", None, ["losses.7.weight=1"], "Unknown key 'losses.7.weight'"),
-        ("missing.toml", None, [], "missing.toml cannot be read"),
+        ("missing.toml", None, [], "missing.toml does not exist"),
     ],
 )
 def test_bad_requests_get_a_sentence(name: str, preset: str | None, override: list[str], sentence: str) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from made_up_runs import provenance_table
+
 MARKS = (0.0, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 SECONDS = {"60s": 60.0, "5min": 300.0, "20min": 1200.0}
 
@@ -69,8 +71,8 @@ def _write_run(
     table |= {"protocol": "default", "views": [f"{view:04d}" for view in range(len(psnr))], "skipped": {}}
     table |= {"quality": {"psnr": score}, "cost": cost | ({"dead": 0.002} if splats else {})} | (scores or {})
     (run / "scores.json").write_text(json.dumps(table))
-    record = {"truth_sha256": "c0ffee", "truth": "../../truth", "code_version": "0.1.0+abc123def456"}
-    (run / "provenance.json").write_text(json.dumps(record | {"memory_forecast_bytes": 4e8} | (provenance or {})))
+    record = provenance_table(code_version="0.1.0+abc123def456", memory_forecast_bytes=4e8) | (provenance or {})
+    (run / "provenance.json").write_text(json.dumps(record))
     (run / "environment.json").write_text("{}")
     (run / "recipe.toml").write_text("")
     budget = cell["budget_seconds"]

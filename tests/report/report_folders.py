@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from made_up_runs import provenance_table
 from PIL import Image
 
 WIDTH, HEIGHT, VIEWS = 96, 64, 6
@@ -167,17 +168,16 @@ def write_run(
         "skipped": {"ms_ssim": "needs 161 pixels along the shorter side", "lpips": "the lpips extra is not installed"},
     }
     (folder / "scores.json").write_text(json.dumps(scores))
-    provenance = {
-        "truth_sha256": digest,
-        "truth": os.path.relpath(root_of(folder) / "truth" / digest[:16], folder),
-        "cameras_sha256": "c0ffee" * 10,
-        "scene": scene,
-        "recipe_sha256": hashlib.sha256(method.encode()).hexdigest(),
-        "code_version": "0.1.0+abc",
-        "resize": "area",
-        "budget": "60s",
-        "command": f"invgraphics fit {method} balls --budget 60s --seed {seed} --out runs/x",
-    }
+    provenance = provenance_table(
+        method=method,
+        seed=seed,
+        truth_sha256=digest,
+        truth=os.path.relpath(root_of(folder) / "truth" / digest[:16], folder),
+        cameras_sha256="c0ffee" * 10,
+        scene=scene,
+        recipe_sha256=hashlib.sha256(method.encode()).hexdigest(),
+        command=f"invgraphics fit {method} balls --budget 60s --seed {seed} --out runs/x",
+    )
     (folder / "provenance.json").write_text(json.dumps(provenance))
     environment = {"cpu": "A test machine", "threads": 2, "torch": "2.13", "python": "3.11"}
     (folder / "environment.json").write_text(json.dumps(environment))
@@ -251,11 +251,9 @@ def write_comparison(root: Path) -> Path:
             "summary": "8-bit pictures over the scene's background, no crop, mean over views",
         },
         "scene_info": {
-            "summary": "Three striped balls.",
-            "stresses": "Silhouettes.",
             "train": 40,
             "test": VIEWS,
-            "notes": {"resize": "area"},
+            "notes": {"summary": "Three striped balls.", "stresses": "Silhouettes.", "resize": "area"},
         },
         "environment": {
             "cpu": "A test machine",
@@ -351,7 +349,7 @@ def write_scores(root: Path, cells: Sequence[dict[str, Any]], psnr_of: Callable[
         scores |= {"protocol": "default", "views": [f"{view:04d}" for view in range(len(values))]}
         scores |= {"quality": {"psnr": psnr_score}, "cost": {"fit_seconds": 60.0}, "skipped": {}}
         (run / "scores.json").write_text(json.dumps(scores))
-        provenance = {"truth_sha256": hashlib.sha256(cell["scene"].encode()).hexdigest(), "truth": "../../truth"}
+        provenance = provenance_table(truth_sha256=hashlib.sha256(cell["scene"].encode()).hexdigest())
         (run / "provenance.json").write_text(json.dumps(provenance))
         (run / "environment.json").write_text("{}")
         (run / "history.jsonl").write_text("")

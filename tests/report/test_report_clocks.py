@@ -4,23 +4,23 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+from made_up_runs import made_up_run
 from report_folders import write_comparison
 
 from invgraphics.report.build import build_report
-from invgraphics.report.data.records import Comparison, Run, Score
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.statistics.verdict import verdict
+from invgraphics.runs.run import Run
+from invgraphics.runs.scores import Score
 
 TOLD = "had 50 % of the processor time that it was ready to use; other programs had the rest"
 
 
 def _run(method: str, seed: int, fps: float, disturbed: str = "") -> Run:
-    quality = {"psnr": Score(30.0 + fps / 100, "dB", True, ())}
+    quality = {"psnr": Score(mean=30.0 + fps / 100, unit="dB", higher_is_better=True)}
     cost = {"fit_seconds": 60.0, "fit_cpu_seconds": 100.0, "render_fps": fps, "model_bytes": 1e6 * fps}
-    folder = Path("x")
-    return Run(
-        folder, method, seed, "laptop", "s", "default", (), quality, cost, {}, (), {"truth_sha256": "t"}, {}, folder, disturbed
-    )
+    return made_up_run(quality, method, seed, scene="s", preset="laptop", cost=cost, disturbed=disturbed)
 
 
 def test_disturbed_times_are_shown_but_not_ranked() -> None:
@@ -30,7 +30,7 @@ def test_disturbed_times_are_shown_but_not_ranked() -> None:
     quiet = summarise(comparison)
     assert quiet.disturbances == ()
     assert _best(quiet, "render_fps") == ["fast"]
-    disturbed = replace(comparison, runs=(runs[0], replace(runs[1], disturbed=TOLD), *runs[2:]))
+    disturbed = replace(comparison, runs=(runs[0], replace(runs[1], scores=replace(runs[1].scores, disturbed=TOLD)), *runs[2:]))
     summary = summarise(disturbed)
     assert _best(summary, "render_fps") == ["mid"]
     assert _best(summary, "fit_seconds") == ["mid", "slow"]

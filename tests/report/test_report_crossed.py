@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -11,12 +12,13 @@ from report_folders import METHODS, SEEDS, VIEWS, truth_frame, write_run
 from invgraphics.errors import InputError
 from invgraphics.report.build import build_report
 from invgraphics.report.data.assets import Folder
-from invgraphics.report.data.reading import read_comparison
+from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.statistics.cross_render import cross
 from invgraphics.report.study import build_study_report
+from invgraphics.runs.study import Approximation
 
 OWN, OTHER = METHODS[2], "gaussian-volume/exact:opacity=physical"
-PAIR = {"name": "all that is approximate", "exact": OTHER, "approximate": OWN}
+PAIR = Approximation("all that is approximate", OTHER, OWN)
 
 
 def add_renderings(run: Path, method: str, rmse: float) -> None:
@@ -85,7 +87,7 @@ def test_a_broken_record_is_explained(crossed_folder: Path) -> None:
 
 def test_a_study_shows_approximations_and_analyses(small_study: Path) -> None:
     table = json.loads((small_study / "study.json").read_text())
-    table |= {"approximations": [PAIR], "analyses": ["one", "not-yet"]}
+    table |= {"approximations": [asdict(PAIR)], "analyses": ["one", "not-yet"]}
     (small_study / "study.json").write_text(json.dumps(table))
     add_renderings(small_study / table["cells"][0]["run"], METHODS[1], 0.02)
     curve = {"label": "rendered", "x": [0, 1, 2], "y": [0.1, 0.2, 0.4]}

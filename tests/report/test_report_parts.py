@@ -7,6 +7,7 @@ import json
 import random
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,13 +15,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from invgraphics.report.data.reading import read_comparison
-from invgraphics.report.data.records import Run
+from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.figures import views as pictures
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
 from invgraphics.report.statistics.summary import pareto_front, seconds_to_reach, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
-from invgraphics.report.wording import budget_words, duration, listing, significant_decimals, times
+from invgraphics.report.wording import budget_words, listing, significant_decimals, times
+from invgraphics.runs.run import Run
+from invgraphics.text import duration
 
 
 def test_pareto_front_is_what_brute_force_finds() -> None:
@@ -85,7 +87,7 @@ def test_depth_maps_share_the_range_of_the_truth(built_report: Path) -> None:
 
 def test_views_shown_are_spread_and_hold_the_worst(built_report: Path) -> None:
     comparison = read_comparison(built_report)
-    per_view = np.mean([run.quality["psnr"].per_view for run in comparison.runs], axis=0)
+    per_view = np.mean([run.scores.quality["psnr"].per_view for run in comparison.runs], axis=0)
     chosen = dict(pictures.choose_views(comparison.runs))
     assert {0, 2, 3, 5} <= set(chosen)
     assert "worst PSNR" in chosen[int(np.argmin(per_view))]
@@ -139,9 +141,11 @@ def test_labels_are_pushed_apart_no_further_than_needed() -> None:
     assert spread_labels([0.1, 0.2], gap=1.0, low=0.0, high=10.0)[0] == pytest.approx(0.0)
 
 
-def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
-    from dataclasses import replace
+def _with_shortfall(run: Run) -> Run:
+    return replace(run, scores=replace(run.scores, shortfall=f"{run.method}: fog."))
 
+
+def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
     from invgraphics.report.statistics.summary import summarise
 
     comparison = read_comparison(built_report)
@@ -155,16 +159,18 @@ def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
     def scattered(run: Run) -> Run:
         """One method gains 2 dB from one seed to the next, the others nothing."""
         gain = 2.0 * run.seed if run.method == "volumetric/hash" else 0.0
-        views = tuple(20.0 + gain for _ in run.views)
-        return replace(run, quality={"psnr": replace(run.quality["psnr"], mean=20.0 + gain, per_view=views)})
+        views = tuple(20.0 + gain for _ in run.scores.views)
+        psnr = replace(run.scores.quality["psnr"], mean=20.0 + gain, per_view=views)
+        return replace(run, scores=replace(run.scores, quality={"psnr": psnr}))
 
     pair = replace(pair, runs=tuple(map(scattered, pair.runs)))
     told = " ".join(verdict(pair, summarise(pair)))
     # Student's t with one degree of freedom: 12.71 times the standard error of the mean difference, which is 1 dB.
     assert "2 seeds cannot tell that lead from chance: only one above about 12.71 dB" in told
-    bad = replace(comparison, baselines={"nearest view": {"psnr": replace(comparison.runs[0].quality["psnr"], mean=28.0)}})
+    better = replace(comparison.runs[0].scores.quality["psnr"], mean=28.0)
+    bad = replace(comparison, baselines={"nearest view": {"psnr": better}})
     assert "did not beat the trivial baseline 'nearest view'" in " ".join(verdict(bad, summarise(bad)))
-    foggy = replace(comparison, runs=tuple(replace(run, shortfall=f"{run.method}: fog.") for run in comparison.runs))
+    foggy = replace(comparison, runs=tuple(_with_shortfall(run) for run in comparison.runs))
     told = verdict(foggy, summarise(foggy))
     assert [told.count(f"{method}: fog.") for method in comparison.methods] == [1] * len(comparison.methods)
 
@@ -173,7 +179,7 @@ def test_words() -> None:
     assert listing(["a"]) == "a"
     assert listing("abc") == "a, b and c"
     assert [times(ratio) for ratio in (1.44, 14.2, 137.0)] == ["1.4", "14", "140"]
-    assert [duration(s) for s in (12, 412, 7260)] == ["12 s", "6 min 52 s", "2 h 1 min"]
+    assert [duration(s) for s in (12, 412, 600, 7260)] == ["12 s", "6 min 52 s", "10 min", "2 h 1 min"]
     assert [budget_words(b) for b in ("60s", "5000steps", "odd")] == ["60 s", "5,000 steps", "odd"]
     assert [significant_decimals(v) for v in (1234.0, 12.3, 0.0123)] == [0, 1, 4]
 
@@ -184,12 +190,10 @@ def test_report_never_imports_torch() -> None:
 
 
 def test_verdict_says_on_which_side_of_a_line_the_winner_is(built_report: Path) -> None:
-    from dataclasses import replace
-
     from invgraphics.report.statistics.summary import summarise
 
     comparison = read_comparison(built_report)
-    score = comparison.runs[0].quality["psnr"]
+    score = comparison.runs[0].scores.quality["psnr"]
     for ceiling, baseline, words in (
         (41.7, 10.0, ("below the truth", "ahead of the better")),
         (20.0, 50.0, ("above the", "behind the")),

@@ -14,12 +14,14 @@ from invgraphics.report.figures.ray import draw_ray
 KEYS = ("t", "begin", "end", "alpha", "transmittance", "weight", "red", "green", "blue", "counted")
 
 
+PROFILE = {"t": [1.0, 2.0, 3.0], "density": [0.0, 4.0, 0.0], "transmittance": [1.0, 0.5, 0.1]}
+
+
 def _write(folder: Path, rows: list[tuple[float, ...]], **more) -> Path:
     folder.mkdir(exist_ok=True)
     for name in ("picture", "truth"):
         Image.new("RGB", (20, 12), (40, 90, 160)).save(folder / f"{name}.png")
     columns = {key: [row[index] for row in rows] for index, key in enumerate(KEYS)}
-    profile = {"t": [1.0, 2.0, 3.0], "density": [0.0, 4.0, 0.0], "transmittance": [1.0, 0.5, 0.1]}
     pixel = {"column": 3, "row": 4, "alpha": 0.9, "depth": 2.0, "expected": 2.1, "median": 2.0, "true_depth": 1.9}
     facts = {
         "method": "volumetric/nerf",
@@ -34,7 +36,7 @@ def _write(folder: Path, rows: list[tuple[float, ...]], **more) -> Path:
         "space": "box",
         "pixel": pixel | {"rendered": [0.2, 0.3, 0.4], "true": [0.9, 0.9, 0.9]},
         "contributions": columns | {"density": None},
-        "profile": profile if rows else None,
+        "profile": PROFILE if rows else None,
         "marched": None,
         "passes": [],
     }
@@ -49,7 +51,7 @@ ROWS = [(1.5, 1.0, 2.0, 0.5, 1.0, 0.5, 1, 0, 0, 1), (2.5, 2.0, 3.0, 0.8, 0.5, 0.
 @pytest.mark.parametrize("rows", [ROWS, []])
 def test_every_kind_is_drawn(tmp_path: Path, kind: str, rows: list) -> None:
     coarse = [{"t0": [1.0, 2.0], "t1": [2.0, 3.0], "weight": [0.4, 0.3]}] if kind == "samples" and rows else []
-    folder = _write(tmp_path / "ray", rows, kind=kind, passes=coarse, profile=None if kind == "splats" else {})
+    folder = _write(tmp_path / "ray", rows, kind=kind, passes=coarse, profile=None if kind == "splats" or not rows else PROFILE)
     picture = np.asarray(Image.open(draw_ray(folder)).convert("RGB"))
     assert picture.shape == (1280, 2240, 3)
     assert picture.std() > 10
@@ -89,5 +91,5 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"ray\.json' is missing"):
         draw_ray(tmp_path)
     folder = _write(tmp_path / "ray", ROWS, contributions={"t": [1.0]})
-    with pytest.raises(InputError, match="lacks the key 'begin'"):
+    with pytest.raises(InputError, match=r"lacks the key 'contributions\.begin'"):
         draw_ray(folder)

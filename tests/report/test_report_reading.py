@@ -11,7 +11,8 @@ import pytest
 
 from invgraphics.errors import InputError
 from invgraphics.report.build import build_from_runs, build_report
-from invgraphics.report.data.reading import read_comparison, read_run
+from invgraphics.report.data.comparison import read_comparison
+from invgraphics.runs.run import read_run
 
 RUN = "runs/volumetric-hash/seed-0"
 
@@ -67,9 +68,9 @@ def test_folder_without_runs(tmp_path: Path, comparison_folder: Path, edit: Call
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda table: table["quality"]["psnr"].update(mean="high"), "'psnr' cannot be 'high'"),
+        (lambda table: table["quality"]["psnr"].update(mean="high"), "'quality.psnr.mean' cannot be 'high'"),
         (lambda table: table["quality"]["psnr"].update(per_view=[1.0]), "1 values for 6 views"),
-        (lambda table: table["quality"]["psnr"].pop("higher_is_better"), "lacks the key 'higher_is_better'"),
+        (lambda table: table["quality"]["psnr"].pop("higher_is_better"), "lacks the key 'quality.psnr.higher_is_better'"),
         (lambda table: table.update(seed="zero"), "'seed' cannot be 'zero'"),
         (lambda table: table.pop("views"), "lacks the key 'views'"),
     ],
@@ -107,8 +108,8 @@ def test_other_protocols_are_read_from_their_own_scores(comparison_folder: Path,
     run = comparison_folder / RUN
     shutil.copy(run / "scores.json", run / "scores.float.json")
     edit(run / "scores.float.json", lambda table: table["quality"]["psnr"].update(mean=12.5))
-    assert read_run(run, "float").quality["psnr"].mean == 12.5
-    assert read_run(run).quality["psnr"].mean != 12.5
+    assert read_run(run, "float").scores.quality["psnr"].mean == 12.5
+    assert read_run(run).scores.quality["psnr"].mean != 12.5
 
 
 def test_runs_from_anywhere_give_a_folder_that_can_be_moved(comparison_folder: Path, tmp_path: Path) -> None:

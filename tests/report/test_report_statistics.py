@@ -5,19 +5,19 @@ from __future__ import annotations
 import gc
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from invgraphics.report.data.factors import METHOD, Factor, Observation
-from invgraphics.report.data.records import Run, Score
 from invgraphics.report.statistics.effects import Effect, effects_on
 from invgraphics.report.statistics.intervals import ENOUGH, RESAMPLES, Estimate, band, estimate, holm
 from invgraphics.report.wording import quality_quantity
+from invgraphics.runs.run import Run
+from invgraphics.runs.scores import Score
 
-PSNR = quality_quantity("psnr", Score(0.0, "dB", True, ()))
+PSNR = quality_quantity("psnr", Score(mean=0.0, unit="dB", higher_is_better=True))
 FACTORS = (
     Factor(METHOD, ("volumetric/nerf", "volumetric/hash"), "volumetric/nerf"),
     Factor("data.train_views", ("40", "20"), "40"),
@@ -37,9 +37,8 @@ def nested_of(block: np.ndarray) -> list[list[np.ndarray]]:
 
 
 def run_with(scene: str, seed: int, values: np.ndarray) -> Run:
-    score = Score(float(values.mean()), "dB", True, tuple(values.tolist()))
-    views = tuple(map(str, range(len(values))))
-    return Run(Path(), "m", seed, "", scene, "default", views, {"psnr": score}, {}, {}, (), {"truth_sha256": scene}, {}, Path())
+    score = Score(mean=float(values.mean()), unit="dB", higher_is_better=True, per_view=tuple(values.tolist()))
+    return made_up_run({"psnr": score}, "m", seed, scene, scene=scene, views=tuple(map(str, range(len(values)))))
 
 
 def simulated(
@@ -89,7 +88,8 @@ def test_views_as_units_would_call_most_null_studies_an_effect() -> None:
     for _ in range(100):
         table = simulated(rng, FACTORS[1:2], (1, 3, 50))
         sides = [
-            [o.run.quality["psnr"].per_view for o in table if o.levels["data.train_views"] == level] for level in ("40", "20")
+            [o.run.scores.quality["psnr"].per_view for o in table if o.levels["data.train_views"] == level]
+            for level in ("40", "20")
         ]
         false += stats.ttest_rel(np.ravel(sides[1]), np.ravel(sides[0])).pvalue < 0.05
     assert false > 50
@@ -220,7 +220,7 @@ def test_sentences() -> None:
     doubtful = effect_with(-2.1, 0.3, adjusted=0.08)
     assert not doubtful.found
     assert "with 5 comparisons in this study that may be chance (corrected p = 0.08)" in doubtful.sentence
-    flip = quality_quantity("flip", Score(0.0, "", False, ()))
+    flip = quality_quantity("flip", Score(mean=0.0, higher_is_better=False))
     assert "costs 0.030 FLIP [0.020, 0.040]" in effect_with(0.03, 0.01, quantity=flip).sentence
     alone = Estimate(-1.0, -1.0, -1.0, None, "none", False, 1, (1, 1))
     assert "one seed" in effect_with(0, 0, estimate=alone, adjusted=None).sentence

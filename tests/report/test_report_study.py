@@ -140,7 +140,7 @@ def test_a_variant_that_lacks_a_hard_seed_is_never_called_best(built_study: Path
 
 def test_heat_map_averages_over_what_all_fields_share(built_study: Path) -> None:
     study = read_study(built_study)
-    psnr = quality_quantity("psnr", next(o.run for o in study.observations()).quality["psnr"])
+    psnr = quality_quantity("psnr", next(o.run for o in study.observations()).scores.quality["psnr"])
     table = heat_map((study.factors[0], study.factors[1]), psnr, study.observations())
     assert table is not None and table.matched and table.runs == 5
     scores = exported(built_study)
@@ -155,7 +155,7 @@ def test_no_heat_map_of_factors_that_were_never_combined(built_study: Path) -> N
     """One factor at a time: a cross of fields through the base."""
     study = read_study(built_study)
     down, across = study.factors[0], study.factors[1]
-    psnr = quality_quantity("psnr", next(o.run for o in study.observations()).quality["psnr"])
+    psnr = quality_quantity("psnr", next(o.run for o in study.observations()).scores.quality["psnr"])
     base = next(iter(study.observations())).levels
     cross = [o for o in study.observations() if any(o.levels[f.path] == base[f.path] for f in (down, across))]
     assert len({(o.levels[down.path], o.levels[across.path]) for o in cross}) == len(down.levels) + len(across.levels) - 1
@@ -247,7 +247,7 @@ def test_many_variants_show_pictures_of_eight_from_best_to_worst(tmp_path: Path)
     folder = bare_study(tmp_path, {"a.x": list(range(20))}, lambda cell: [20.0 + (7 * cell["levels"]["a.x"]) % 20])
     comparison = scene_comparisons(read_study(folder))[0]
     shown = shown_variants(comparison)
-    quality = [comparison.runs_of(method)[0].quality["psnr"].mean for method in shown]
+    quality = [comparison.runs_of(method)[0].scores.quality["psnr"].mean for method in shown]
     assert len(shown) == 8
     assert quality == sorted(quality, key=lambda value: -(value or 0))
     assert (quality[0], quality[-1]) == (39.0, 20.0)
@@ -258,9 +258,9 @@ def test_many_variants_show_pictures_of_eight_from_best_to_worst(tmp_path: Path)
     [
         (lambda t: t.update(cells=[]), "lists no cells"),
         (lambda t: t.pop("cells"), "lacks the key 'cells'"),
-        (lambda t: t["cells"][0].update(status="gone"), "'status' cannot be 'gone'"),
+        (lambda t: t["cells"][0].update(status="gone"), "'cells.0.status' cannot be 'gone'"),
         (lambda t: t["cells"][0].update(run="runs/nowhere"), "no run at"),
-        (lambda t: t["cells"][0].pop("method"), "lacks the key 'method'"),
+        (lambda t: t["cells"][0].pop("method"), "lacks the key 'cells.0.method'"),
         (lambda t: t.update(protocol=3), "'protocol' cannot be 3"),
     ],
 )

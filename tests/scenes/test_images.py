@@ -209,3 +209,25 @@ def test_only_final_pixels_are_kept_in_memory(tmp_path: Path) -> None:
     small, full = (float(megabytes) for megabytes in done.stdout.split())
     assert small < 150
     assert full < 240
+
+
+def test_no_flipped_bit_of_a_png_passes(tmp_path: Path) -> None:
+    """Pillow alone decodes every sixteenth of them to another picture."""
+    rng = np.random.default_rng(0)
+    picture = (np.linspace(0, 200, 40)[None, :, None] + rng.integers(0, 20, (30, 40, 3))).astype(np.uint8)
+    Image.fromarray(picture).save(tmp_path / "a.png")
+    good = (tmp_path / "a.png").read_bytes()
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png"), picture)
+    for bit in rng.permutation(8 * len(good))[:500]:
+        data = bytearray(good)
+        data[bit // 8] ^= 1 << bit % 8
+        (tmp_path / "a.png").write_bytes(data)
+        with pytest.raises(InputError, match=r"a\.png"):
+            read_pixels(tmp_path / "a.png")
+
+
+def test_a_png_without_its_end_is_cut_off(tmp_path: Path) -> None:
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-12])
+    with pytest.raises(InputError, match="its end is missing"):
+        read_pixels(tmp_path / "a.png")

@@ -128,3 +128,8 @@ def test_damaged_file_is_a_sentence(tmp_path: Path) -> None:
 def test_garden_has_no_photographs(data) -> None:
     with pytest.raises(InputError, match="has no 'images' and no 'cam_to_world'"):
         open_scene(str(data("gsplat_garden/test_garden.npz")))
+
+
+def test_a_misspelt_key_is_not_ignored(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"unknown key 'center'\. Did you mean 'centre'\?"):
+        open_scene(str(write(tmp_path, **arrays(), center=np.array([80.0, 60.0]))))

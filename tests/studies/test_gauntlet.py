@@ -19,7 +19,7 @@ from invgraphics.studies import ablate as module
 from invgraphics.studies.ablate import ablate
 from invgraphics.studies.cells import make_plan, select
 from invgraphics.studies.forecast import Forecast
-from invgraphics.studies.study import locate, read_study
+from invgraphics.studies.reading import locate, read_study, with_request
 from invgraphics.training.budget import Budget
 
 METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians")
@@ -89,17 +89,13 @@ def test_a_small_gauntlet_from_its_file_to_its_verdicts(executor, gauntlet, toy_
     executor.fails = staticmethod(lambda fit: "Step 3: not finite." if fit.size == 16 else "")
     folder, failed = ablate(gauntlet, _yes)
     name = toy_folder.name
-    assert [cell["label"] for cell in failed] == [f"splatting/gaussians {name}@16 3steps seed=0"]
+    assert [cell.label for cell in failed] == [f"splatting/gaussians {name}@16 3steps seed=0"]
     cells = _cells(gauntlet)
     gone = cells["volumetric/hash gone@24 3steps seed=0"]
     assert (gone["status"], gone["error"]) == ("skipped", "gone is not in $TOY_DATA")
     for method in METHODS:
         provenance = json.loads((folder / cells[f"{method} {name}@24 12steps seed=0"]["run"] / "provenance.json").read_text())
-        assert provenance["scene"] == f"$TOY_DATA/{name}" and provenance["options"] == {
-            "size": 24,
-            "test_views": 2,
-            "spp": None,
-        }
+        assert provenance["scene"] == f"$TOY_DATA/{name}" and provenance["options"] == {"size": 24, "test_views": 2}
         assert provenance["memory_forecast_bytes"] > 0
         assert cells[f"{method} {name}@24 12steps seed=0"]["forecast_seconds"] > 0
     build_study_report(folder)
@@ -109,7 +105,7 @@ def test_a_small_gauntlet_from_its_file_to_its_verdicts(executor, gauntlet, toy_
         assert outcomes == dict.fromkeys(outcomes, "ok"), method
         # Fits that share a process share what it has freed: only a fit in its own can be held to its forecast.
         assert found[f"{method} {name}@24 12steps seed=0", "memory"]["outcome"] in ("ok", "red")
-    assert found[failed[0]["label"], "finite"]["outcome"] == "red"
+    assert found[failed[0].label, "finite"]["outcome"] == "red"
     text = (folder / "index.html").read_text() + (folder / "index.md").read_text() + (folder / "results.csv").read_text()
     assert "1 skipped" in text and "Skipped: gone is not in $TOY_DATA." in text
     assert str(toy_folder) not in text
@@ -206,7 +202,7 @@ def test_the_command_line_does_not_overrule_what_cells_say(study) -> None:
     found = study(LIST + "[[cells]]\nsize = 9\nseeds = [0]\n")
     for name, value in (("size", 8), ("seeds", (0,))):
         with pytest.raises(InputError, match=f"--{name}"):
-            found.overridden(AblateRequest(study="trial", out="o", **{name: value}))
+            with_request(found, AblateRequest(study="trial", out="o", **{name: value}))
 
 
 def test_the_gauntlet_covers_what_it_says(tmp_path: Path) -> None:

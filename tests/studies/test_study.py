@@ -10,7 +10,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.recipes.recipe import load_method
 from invgraphics.studies.cells import make_plan
-from invgraphics.studies.study import locate, name_of, read_study
+from invgraphics.studies.reading import locate, name_of, read_study, with_request
 from invgraphics.training.budget import Budget
 
 HEAD = 'question = "Why?"\nscenes = ["a", "b"]\nmethods = ["volumetric/hash", "splatting/gaussians"]\nseeds = [0, 1]\n'
@@ -107,7 +107,7 @@ def test_folders_are_named_by_what_defines_the_run(study, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("question = ", "cannot be read"),
+        ("question = ", "is not valid TOML"),
         (HEAD + "desing = 3\n", r"trial\.toml: Unknown key 'desing'"),
         (HEAD.replace('["a", "b"]', "[]"), "'scenes' has no entries"),
         (HEAD.replace('"b"', '"a"'), "'scenes' has 'a' twice"),
@@ -154,13 +154,13 @@ def test_levels_that_a_method_cannot_take_are_refused(study, tmp_path: Path, tex
 def test_the_command_line_overrides(study) -> None:
     found = study(HEAD)
     request = AblateRequest(study="trial", out="o", seeds=(5,), budget="3s", size=32, test_views="all")
-    changed = found.overridden(request)
+    changed = with_request(found, request)
     assert (changed.seeds, changed.budget, changed.size, changed.test_views) == ((5,), "3s", 32, "all")
-    assert found.overridden(AblateRequest(study="trial", out="o")) == found
+    assert with_request(found, AblateRequest(study="trial", out="o")) == found
     with pytest.raises(InputError, match="1 twice"):
-        found.overridden(AblateRequest(study="trial", out="o", seeds=(1, 1)))
+        with_request(found, AblateRequest(study="trial", out="o", seeds=(1, 1)))
     with pytest.raises(InputError, match="--budget"):
-        study(HEAD + '[factors]\nbudget = ["1s", "2s"]\n').overridden(request)
+        with_request(study(HEAD + '[factors]\nbudget = ["1s", "2s"]\n'), request)
 
 
 def test_studies_are_found_by_name_file_and_folder(tmp_path: Path) -> None:

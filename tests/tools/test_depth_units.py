@@ -14,6 +14,7 @@ from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.report.data.ray import read_ray
+from invgraphics.runs.folder import RunFolder
 from invgraphics.tools import explain as explaining
 from invgraphics.tools import film as filming
 from invgraphics.tools.colorize import colorize
@@ -56,20 +57,22 @@ def test_every_depth_is_in_world_units(runs: dict[str, Path], method: str, tmp_p
     row, column = [int(index) for index in solid.nonzero()[len(solid.nonzero()) // 2]]
     local = float(rendering.depth[row, column])
 
-    evaluation._save_view(tmp_path / "0000", rendering, fitted.scene)
-    with np.load(tmp_path / "0000.npz") as arrays:
+    kept = RunFolder(tmp_path)
+    kept.arrays(0).parent.mkdir()
+    evaluation._save_view(kept, 0, rendering, fitted.scene)
+    with np.load(kept.arrays(0)) as arrays:
         assert arrays["depth"][row, column] == pytest.approx(SCALE * local, rel=1e-5), "what the report shows"
 
     monkeypatch.setattr(explaining, "open_fitted", _enlarged)
     request = explaining.ExplainRequest(run, 0, (column, row), out=tmp_path / "ray")
     explanation = explaining.explain(request)
-    pixel = explanation.facts["pixel"]
-    assert pixel["depth"] == pytest.approx(SCALE * local, rel=1e-4)
+    pixel = explanation.record.pixel
+    assert pixel.depth == pytest.approx(SCALE * local, rel=1e-4)
     ray = read_ray(tmp_path / "ray")
-    assert ray.length_unit == "world"
+    assert ray.record.length_unit == "world"
     weight, t = ray.columns["weight"], ray.columns["t"]
     mean = float((weight * t).sum() / weight.sum())
-    assert mean == pytest.approx(pixel["expected"], rel=1e-5) and mean == pytest.approx(SCALE * local, rel=0.02)
+    assert mean == pytest.approx(pixel.expected, rel=1e-5) and mean == pytest.approx(SCALE * local, rel=0.02)
     if "density" in ray.columns:  # optical depth has no unit
         length = ray.columns["end"] - ray.columns["begin"]
         assert -np.expm1(-ray.columns["density"] * length) == pytest.approx(ray.columns["alpha"], abs=1e-4)
@@ -91,4 +94,4 @@ def test_older_explanations_say_local(runs: dict[str, Path], tmp_path: Path) -> 
     facts = json.loads((tmp_path / "ray.json").read_text())
     del facts["length_unit"]
     (tmp_path / "ray.json").write_text(json.dumps(facts))
-    assert read_ray(tmp_path).length_unit == "local"
+    assert read_ray(tmp_path).record.length_unit == "local"

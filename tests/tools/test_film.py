@@ -16,7 +16,7 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.recipes.recipe import load_method
 from invgraphics.runs import checkpoint
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import CHECKPOINT, RunFolder
 from invgraphics.testing import toy_scene
 from invgraphics.tools.film import FilmRequest, explanation, film
 from invgraphics.tools.paths import classify_capture, interpolate, orbit, spiral
@@ -135,7 +135,7 @@ def test_snapshots_cover_the_fit_and_end_with_its_model(run: Path) -> None:
     assert [path.stem for path in snapshots] == ["0000", "0001", "0002", "0003", "0004"]
     steps = [int(checkpoint.load(path)["fit"]["steps"]) for path in snapshots]
     assert steps == [0, 5, 10, 15, 20]
-    last, whole = checkpoint.load(snapshots[-1]), checkpoint.load(run / checkpoint.NAME)
+    last, whole = checkpoint.load(snapshots[-1]), checkpoint.load(run / CHECKPOINT)
     assert torch.equal(last["field"]["means"], whole["field"]["means"])
 
 

@@ -17,10 +17,11 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.metrics.conventions import PROTOCOLS
 from invgraphics.metrics.protocols import protocol_named
-from invgraphics.report.data.reading import check_comparable, read_run
+from invgraphics.report.data.comparison import check_comparable
+from invgraphics.runs.run import read_run
 from invgraphics.tools.predictions import open_pictures
 from invgraphics.tools.rescore import check_same_truth, protocols_named, rescore, why_unsuited
-from invgraphics.tools.rescoring import labels, rows_of, spread_of, winners, write_scores, write_tables
+from invgraphics.tools.rescoring import Rescored, labels, rows_of, spread_of, winners, write_scores, write_tables
 
 METHOD = "splatting/gaussians"
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -66,10 +67,10 @@ def read(path: Path) -> np.ndarray:
 
 def test_our_protocol_gives_the_very_scores_of_the_fit(run: Path) -> None:
     first = json.loads((run / "scores.json").read_text())["quality"]
-    again = scores_of(run, "default")["quality"]
+    again = scores_of(run, "default").quality
     assert set(again) == {"psnr", "ssim"}  # the others stand in the run's own scores
     for metric, entry in again.items():
-        assert entry["per_view"] == pytest.approx(first[metric]["per_view"], abs=1e-9)
+        assert entry.per_view == pytest.approx(first[metric]["per_view"], abs=1e-9)
 
 
 def test_a_run_keeps_what_other_backgrounds_need(run: Path) -> None:
@@ -86,7 +87,7 @@ def test_a_run_keeps_what_other_backgrounds_need(run: Path) -> None:
 
 def test_a_tools_convention_from_the_files_alone(run: Path) -> None:
     """3DGS's metrics.py on a run, from its arrays by hand."""
-    got = scores_of(run, "3dgs-metrics")["quality"]["psnr"]["per_view"]
+    got = scores_of(run, "3dgs-metrics").quality["psnr"].per_view
     truth_folder = run / json.loads((run / "provenance.json").read_text())["truth"]
     for index, value in enumerate(got):
         saved, truth = (np.load(folder / f"{index:04d}.npz") for folder in (run / "test", truth_folder))
@@ -99,7 +100,7 @@ def test_a_tools_convention_from_the_files_alone(run: Path) -> None:
 def test_all_protocols_stand_in_one_table_with_their_spread(run: Path, tmp_path: Path) -> None:
     result = rescore([open_pictures(run)], protocols_named("all"))[0]
     assert set(result.scores) == set(PROTOCOLS)
-    assert all("psnr" in scores["quality"] for scores in result.scores.values())
+    assert all("psnr" in scores.quality for scores in result.scores.values())
     assert spread_of(result, "psnr") > 0.1
     columns, rows = rows_of(result)
     assert columns == ["protocol", "PSNR (dB)", "SSIM", "background", "prediction", "truth"]
@@ -109,7 +110,7 @@ def test_all_protocols_stand_in_one_table_with_their_spread(run: Path, tmp_path:
     assert PROTOCOLS["multinerf"].source in page.read_text()
     lines = list(csv.DictReader(numbers.open()))
     found = {line["protocol"]: float(line["mean"]) for line in lines if line["metric"] == "psnr"}
-    assert found == {name: scores["quality"]["psnr"]["mean"] for name, scores in result.scores.items()}
+    assert found == {name: scores.quality["psnr"].mean for name, scores in result.scores.items()}
     assert any("lpips" in line["skipped"] for line in lines)
 
 
@@ -119,8 +120,8 @@ def test_scores_go_into_the_run_and_never_replace_its_own(run: Path) -> None:
     assert {path.name for path in write_scores(result, None)} == {"scores.float.json", "scores.gsplat.json"}
     assert (run / "scores.json").read_bytes() == before
     as_read = read_run(run, "gsplat")
-    assert as_read.quality["psnr"].mean == result.scores["gsplat"]["quality"]["psnr"]["mean"]
-    assert {"flip", "alpha_iou"} <= set(read_run(run, "float").quality)
+    assert as_read.scores.quality["psnr"].mean == result.scores["gsplat"].quality["psnr"].mean
+    assert {"flip", "alpha_iou"} <= set(read_run(run, "float").scores.quality)
 
 
 def test_pictures_of_another_tool_score_like_the_run_they_came_from(run: Path, tmp_path: Path) -> None:
@@ -133,12 +134,12 @@ def test_pictures_of_another_tool_score_like_the_run_they_came_from(run: Path, t
     got = scores_of(tmp_path / "model", "default", background=WHITE)
     expected = json.loads((run / "scores.json").read_text())["quality"]
     for metric in ("psnr", "ssim", "flip"):
-        assert got["quality"][metric]["per_view"] == pytest.approx(expected[metric]["per_view"], abs=1e-9)
+        assert got.quality[metric].per_view == pytest.approx(expected[metric]["per_view"], abs=1e-9)
     result = rescore([open_pictures(theirs, background=WHITE)], protocols_named("multinerf,instant-ngp,3dgs-metrics"))[0]
     assert write_scores(result, None) == []  # nothing is written into a stranger's folder
-    assert "psnr" in result.scores["multinerf"]["quality"]
-    assert "in front of black; here it is in front of white already" in result.scores["3dgs-metrics"]["skipped"]["psnr"]
-    assert "unrounded predictions" in result.scores["instant-ngp"]["skipped"]["ssim"]
+    assert "psnr" in result.scores["multinerf"].quality
+    assert "in front of black; here it is in front of white already" in result.scores["3dgs-metrics"].skipped["psnr"]
+    assert "unrounded predictions" in result.scores["instant-ngp"].skipped["ssim"]
 
 
 def test_eight_bits_stand_in_for_floats_only_when_allowed(folders) -> None:
@@ -146,9 +147,9 @@ def test_eight_bits_stand_in_for_floats_only_when_allowed(folders) -> None:
     assert "--allow-8bit" in why_unsuited(pictures, PROTOCOLS["gsplat"])
     assert why_unsuited(pictures, PROTOCOLS["multinerf"]) == ""
     scores = rescore([pictures], protocols_named("gsplat,float,default"), allow_8bit=True)[0].scores
-    assert scores["gsplat"]["quality"]["psnr"]["mean"] == pytest.approx(scores["default"]["quality"]["psnr"]["mean"], abs=1e-6)
-    assert any("8-bit pictures stand in" in note for note in scores["gsplat"]["notes"])
-    assert not any("8-bit" in note for note in scores["default"]["notes"])
+    assert scores["gsplat"].quality["psnr"].mean == pytest.approx(scores["default"].quality["psnr"].mean, abs=1e-6)
+    assert any("8-bit pictures stand in" in note for note in scores["gsplat"].notes)
+    assert not any("8-bit" in note for note in scores["default"].notes)
 
 
 def test_backgrounds_are_never_guessed(folders) -> None:
@@ -171,10 +172,10 @@ def test_a_run_whose_truth_keeps_one_background_only_says_so(run: Path) -> None:
         del arrays["rgb"]
         np.savez_compressed(path, **arrays)
     result = rescore([open_pictures(run)], protocols_named("default,gsplat,multinerf"))[0].scores
-    assert "already, without alpha" in result["gsplat"]["skipped"]["psnr"]
+    assert "already, without alpha" in result["gsplat"].skipped["psnr"]
     first = json.loads((run / "scores.json").read_text())["quality"]["psnr"]["per_view"]
-    assert result["default"]["quality"]["psnr"]["per_view"] == pytest.approx(first, abs=1e-9)
-    assert "psnr" in result["multinerf"]["quality"]
+    assert result["default"].quality["psnr"].per_view == pytest.approx(first, abs=1e-9)
+    assert "psnr" in result["multinerf"].quality
 
 
 def test_wide_runs_are_not_what_3dgs_would_have_fitted(run: Path) -> None:
@@ -198,7 +199,7 @@ def test_only_the_same_truth_is_compared(run: Path, folders) -> None:
 
 def test_reports_refuse_runs_over_different_backgrounds(run: Path) -> None:
     one = read_run(run)
-    other = replace(one, provenance=one.provenance | {"background": [0.0, 0.0, 0.0]})
+    other = replace(one, provenance=replace(one.provenance, background=(0.0, 0.0, 0.0)))
     check_comparable((one, one))
     with pytest.raises(InputError, match="different backgrounds"):
         check_comparable((one, other))
@@ -222,14 +223,21 @@ def test_names_decide_and_else_the_natural_order(folders, tmp_path: Path) -> Non
     assert np.array_equal(by_name.truth(0).image.numpy(), read(truth / "000.png")) and len(by_name.notes) == 1
 
 
+def _gain(rescored: Rescored, protocol: str, gain: float) -> None:
+    scores = rescored.scores[protocol]
+    psnr = scores.quality["psnr"]
+    better = replace(psnr, mean=psnr.mean + gain)
+    rescored.scores[protocol] = replace(scores, quality=scores.quality | {"psnr": better})
+
+
 def test_the_winner_may_depend_on_the_protocol(run: Path) -> None:
     results = [
         replace(one, label=label) for label in "ab" for one in rescore([open_pictures(run)], protocols_named("float,gsplat"))
     ]
-    results[1].scores["float"]["quality"]["psnr"]["mean"] += 1
-    results[0].scores["gsplat"]["quality"]["psnr"]["mean"] += 1
+    _gain(results[1], "float", 1)
+    _gain(results[0], "gsplat", 1)
     assert winners(results, "psnr") == "Best psnr depends on the protocol: b under float; a under gsplat."
-    results[1].scores["gsplat"]["quality"]["psnr"]["mean"] += 2
+    _gain(results[1], "gsplat", 2)
     assert winners(results, "psnr") == "Best psnr: b, whatever the protocol."
     assert winners(results[:1], "psnr") == winners(results, "lpips") == ""
 

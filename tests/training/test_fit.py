@@ -11,6 +11,7 @@ import torch
 
 from invgraphics.errors import NumericalError
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 
 METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
 STEPS = {"volumetric/nerf": 350, "volumetric/hash": 300, "splatting/gaussians": 120}
@@ -69,10 +70,10 @@ def test_resumed_equals_uninterrupted(name: str, scene, make_fit, tmp_path) -> N
     whole.run(lambda loss: False)
     first = make_fit(name, scene, 40)
     first.run(lambda loss: first.steps == 23)
-    checkpoint.save(tmp_path / checkpoint.NAME, first.state())
+    checkpoint.save(tmp_path / CHECKPOINT, first.state())
     torch.manual_seed(99)
     second = make_fit(name, scene, 40)
-    second.load(checkpoint.load(tmp_path / checkpoint.NAME), seconds=1.0)
+    second.load(checkpoint.load(tmp_path / CHECKPOINT), seconds=1.0)
     assert second.steps == 23
     second.run(lambda loss: False)
     assert _equal(whole.state(), second.state())

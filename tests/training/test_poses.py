@@ -20,6 +20,7 @@ from invgraphics.metrics.poses import pose_errors
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.scenes.degrade import TrainingData, degrade
 from invgraphics.testing import toy_cameras
 from invgraphics.training.batches import BatchConfig
@@ -230,9 +231,9 @@ def test_resumed_with_poses_equals_uninterrupted(name: str, scene: Scene, small:
     whole, first, second = fresh(), fresh(), fresh()
     whole.run(lambda loss: False)
     first.run(lambda loss: first.steps == 11)
-    checkpoint.save(tmp_path / checkpoint.NAME, first.state())
+    checkpoint.save(tmp_path / CHECKPOINT, first.state())
     torch.manual_seed(99)
-    second.load(checkpoint.load(tmp_path / checkpoint.NAME), seconds=1.0)
+    second.load(checkpoint.load(tmp_path / CHECKPOINT), seconds=1.0)
     second.run(lambda loss: False)
     assert same(whole.state(), second.state())
     assert whole.plan.poses is not None

@@ -9,6 +9,7 @@ from invgraphics.core import Batch, Bounds, Context, Rays, Rendering, Samples, T
 from invgraphics.core.samples import FieldValues
 from invgraphics.errors import InputError
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.hooks import FitState, Hook, ShDegreeConfig
@@ -217,12 +218,12 @@ def test_progress_is_whichever_is_further() -> None:
 
 
 def test_checkpoint_survives_what_can_happen_to_a_file(tmp_path) -> None:
-    path = tmp_path / checkpoint.NAME
+    path = tmp_path / CHECKPOINT
     state = {"field": {"a.b": torch.randn(3, 2)}, "fit": {"steps": torch.tensor(7)}}
     checkpoint.save(path, state)
     back = checkpoint.load(path)
     assert torch.equal(back["field"]["a.b"], state["field"]["a.b"]) and int(back["fit"]["steps"]) == 7
-    assert [entry.name for entry in tmp_path.iterdir()] == [checkpoint.NAME]
+    assert [entry.name for entry in tmp_path.iterdir()] == [CHECKPOINT]
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputError, match="not a readable checkpoint"):
         checkpoint.load(path)

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.tools.camera_path import read_camera_path
 
 viser = pytest.importorskip("viser")
@@ -333,16 +334,16 @@ def test_a_fit_is_followed(watch: Any, runs: dict[str, Path], tmp_path: Path) ->
     run = Path(shutil.copytree(runs["splatting/gaussians"], tmp_path / "run"))
     watcher = watch(run)
     before = watcher.canvas()
-    state = checkpoint.load(run / checkpoint.NAME)
+    state = checkpoint.load(run / CHECKPOINT)
     state["field"]["means"][:, 2] += 0.4
-    checkpoint.save(run / checkpoint.NAME, state)
+    checkpoint.save(run / CHECKPOINT, state)
     (run / "fit.json").write_text('{"steps": 12345, "seconds": 6.0}')
     watcher.viewer.reload_if_changed()
     watcher.page.get_by_text("step 12,345").wait_for(timeout=PATIENCE)
     watcher.page.wait_for_timeout(500)
     watcher.rest()
     assert _apart(watcher.canvas("followed"), before) > 2
-    (run / checkpoint.NAME).write_bytes(b"broken")
+    (run / CHECKPOINT).write_bytes(b"broken")
     watcher.viewer.reload_if_changed()
     watcher.page.get_by_text("is not a readable checkpoint").wait_for(state="attached", timeout=PATIENCE)
     assert _apart(watcher.canvas()[120:], watcher.canvas()[120:]) < 1

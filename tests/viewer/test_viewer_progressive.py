@@ -14,6 +14,7 @@ from PIL import Image
 
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.tools.colorize import EMPTY, ERROR_LIMIT, resize_image
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera
 from invgraphics.viewer.loaded_run import LoadedRun, open_run
@@ -207,11 +208,11 @@ def test_a_newer_checkpoint_is_noticed_and_shown(runs: dict[str, Path], tmp_path
     loaded = open_run(run, None, live=True, say=print)
     assert not loaded.has_update() and loaded.steps == 60 and "PSNR" in loaded.summary()["test views"]
     before = _composited(loaded, loaded.scene.test[0].camera)
-    state = checkpoint.load(run / checkpoint.NAME)
+    state = checkpoint.load(run / CHECKPOINT)
     keep = len(state["field"]["means"]) // 2  # density control changes the number
     for name, values in state["field"].items():
         state["field"][name] = values[:keep] if values.ndim else values
-    checkpoint.save(run / checkpoint.NAME, state)
+    checkpoint.save(run / CHECKPOINT, state)
     (run / "fit.json").write_text('{"steps": 120, "seconds": 9.5}')
     assert loaded.has_update()
     loaded.reload()
@@ -222,5 +223,5 @@ def test_a_newer_checkpoint_is_noticed_and_shown(runs: dict[str, Path], tmp_path
     assert loaded.has_update()
     loaded.reload()
     assert loaded.summary()["test views"] == "not scored yet" and not loaded.has_update()
-    (run / checkpoint.NAME).unlink()
+    (run / CHECKPOINT).unlink()
     assert not loaded.has_update(), "a fit that starts again removes the file first"

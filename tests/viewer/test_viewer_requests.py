@@ -20,7 +20,7 @@ from invgraphics.cli import main, view
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
-from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.viewer.launch import ViewerConfig, check_address, is_loopback, open_viewer
 from invgraphics.viewer.loaded_run import open_run
 
@@ -59,10 +59,10 @@ def test_without_viser(runs: dict[str, Path], monkeypatch, capsys) -> None:
 
 def test_a_run_without_checkpoint_is_refused_or_awaited(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
     run = Path(shutil.copytree(runs["volumetric/hash"], tmp_path / "run"))
-    (run / checkpoint.NAME).rename(tmp_path / "later")
+    (run / CHECKPOINT).rename(tmp_path / "later")
     _refused([str(run), "--port", "0"], "has no checkpoint yet", capsys)
     said = []
-    timer = threading.Timer(0.3, lambda: (tmp_path / "later").rename(run / checkpoint.NAME))
+    timer = threading.Timer(0.3, lambda: (tmp_path / "later").rename(run / CHECKPOINT))
     timer.start()
     assert open_run(run, None, live=True, say=said.append).steps == 150
     assert len(said) == 1 and "Waiting for a fit" in said[0]
@@ -80,7 +80,7 @@ def test_runs_of_different_scenes(runs: dict[str, Path], toy_folder: Path, tmp_p
 def test_a_checkpoint_of_another_recipe(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
     run = Path(shutil.copytree(runs["volumetric/hash"], tmp_path / "run"))
     loaded = open_run(run, None, live=False, say=print)
-    shutil.copy(runs["volumetric/nerf"] / checkpoint.NAME, run / checkpoint.NAME)
+    shutil.copy(runs["volumetric/nerf"] / CHECKPOINT, run / CHECKPOINT)
     assert loaded.has_update()
     with pytest.raises(InputError, match="has become another run"):
         loaded.reload()

@@ -16,9 +16,9 @@ from invgraphics.experiments.display import table_html
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.experiments.session import FolderRun, ScoreTable
 from invgraphics.report.build import build_report
-from invgraphics.report.data.reading import read_comparison
-from invgraphics.report.data.records import Comparison, Failure
+from invgraphics.report.data.comparison import Comparison, read_comparison
 from invgraphics.report.statistics.summary import summarise
+from invgraphics.runs.comparison import Failure
 from invgraphics.runs.folder import RunFolder
 
 
@@ -65,7 +65,7 @@ class ComparisonResult:
         Raises:
             InputError: there is no such run, or it failed.
         """
-        return ScoreTable(RunFolder(self._place(method, seed)).read_json("scores.json"))
+        return ScoreTable(RunFolder(self._place(method, seed)).read_scores())
 
     def _place(self, method: str, seed: int) -> Path:
         for run in self.record.runs:

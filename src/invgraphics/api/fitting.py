@@ -79,7 +79,7 @@ def fit(
         >>> scene = ig.load_scene("toy.npz", size=16)
         >>> fit = ig.fit("splatting/gaussians", scene, budget="20steps")
         >>> picture = fit.model.render(scene.test[0].camera)
-        >>> picture.rgb.shape, fit.finished, fit.history[-1]["step"]
+        >>> picture.rgb.shape, fit.finished, fit.history[-1].step
         (torch.Size([16, 16, 3]), True, 20)
     """
     scene = opened(scene)

@@ -15,7 +15,7 @@ from invgraphics.experiments.request import AblateRequest
 from invgraphics.report.data.studies import Study, read_study
 from invgraphics.report.study import build_study_report, study_sentences
 from invgraphics.studies import ablate as ablating
-from invgraphics.studies import study as studies
+from invgraphics.studies import reading as studies
 from invgraphics.studies.forecast import Forecast
 from invgraphics.studies.study import Study as Design
 
@@ -131,7 +131,7 @@ def ablate(
         >>> head = 'question = "?"\nscenes = ["toy.npz"]\nmethods = ["splatting/gaussians"]\nbudget = "3steps"\n'
         >>> _ = Path("views.toml").write_text(head + "[factors]\ndata.train_views = [4, 8]\n")
         >>> result = ig.ablate("views.toml", out="views")
-        >>> [(run.levels["data.train_views"], run.run.quality["psnr"].unit) for run in result.record.observations()]
+        >>> [(run.levels["data.train_views"], run.run.scores.quality["psnr"].unit) for run in result.record.observations()]
         [('4', 'dB'), ('8', 'dB')]
     """
     name = os.fspath(study)

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from invgraphics.cli.arguments import parse_samples, parse_seeds, parse_size, parse_views
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
-from invgraphics.studies.study import locate, name_of, read_study
+from invgraphics.studies.reading import locate, name_of, read_study, with_request
 from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
@@ -69,13 +69,13 @@ class Ablate:
     def run(self) -> int:
         """Make what is missing; print what failed, and the page's path."""
         request = self.request()
-        read_study(locate(request.study)).overridden(request)  # refuses most mistakes before torch is imported
+        with_request(read_study(locate(request.study)), request)  # refuses most mistakes before torch is imported
 
         from invgraphics.studies.ablate import ablate
 
         folder, failed = ablate(request, self._confirm)
         for cell in failed:
-            print(f"{cell['run']} failed: {(cell['error'] or 'no message').splitlines()[0]}")
+            print(f"{cell.run} failed: {(cell.error or 'no message').splitlines()[0]}")
 
         from invgraphics.report.study import build_study_report
 

@@ -101,7 +101,7 @@ class Bench:
         from invgraphics.experiments.environment import environment
 
         command = shlex.join(["invgraphics", "bench", *sys.argv[2:]])
-        return {**environment(torch.device("cpu")), "load at the start": _load(), "command": command}
+        return {**environment(torch.device("cpu")).facts(), "load at the start": _load(), "command": command}
 
 
 def _load() -> str:

@@ -12,6 +12,7 @@ from invgraphics.cli.arguments import Shared, parse_list, parse_seeds
 from invgraphics.cli.report import write_report
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.recipes.recipe import presets
+from invgraphics.runs.folder import RUNS, RunFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,5 +55,5 @@ class Compare(Shared):
 
 
 def _report_what_is_finished(folder: Path) -> None:
-    if any(folder.glob("runs/*/*/scores.json")):
+    if any(RunFolder(run).finished for run in folder.glob(f"{RUNS}/*/*")):
         write_report(folder)

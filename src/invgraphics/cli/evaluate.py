@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from invgraphics.cli.output import show_scores
-from invgraphics.errors import InputError
+from invgraphics.runs.folder import check_run
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,7 @@ class Evaluate:
 
     def run(self) -> int:
         """Score; print the scores."""
-        if not (self.folder / "recipe.toml").is_file():
-            raise InputError(
-                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
-            )
+        check_run(self.folder)
 
         from invgraphics.experiments.evaluate import evaluate_run
 

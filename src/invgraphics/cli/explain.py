@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from invgraphics.cli.output import show_table
 from invgraphics.errors import InputError
+from invgraphics.runs.folder import check_run
 
 if TYPE_CHECKING:
     from invgraphics.tools.explain import Explanation
@@ -42,10 +44,7 @@ class Explain:
     def run(self) -> int:
         """Write; print the table and the figure's path."""
         pixel = parse_pixel(self.pixel)
-        if not (self.folder / "recipe.toml").is_file():
-            raise InputError(
-                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
-            )
+        check_run(self.folder)
 
         from invgraphics.report.figures.ray import draw_ray
         from invgraphics.tools.explain import ExplainRequest, explain
@@ -81,29 +80,28 @@ def show_contributions(explanation: Explanation) -> None:
         names.insert(3, "density")
         columns.insert(3, found.density)
     rows = [[str(index), *(f"{float(column[index]):.4g}" for column in columns)] for index in heaviest]
-    facts = explanation.facts
-    what = f"pixel {facts['pixel']['column']},{facts['pixel']['row']} of {facts['split']} view {facts['view']}"
+    record = explanation.record
+    what = f"pixel {record.pixel.column},{record.pixel.row} of {record.split} view {record.view}"
     shown = "" if len(rows) == len(found) else f", the {len(rows)} heaviest"
-    show_table(f"{facts['method']}, {what}: {len(found)} {found.kind}{shown}", ["", *names], rows)
+    show_table(f"{record.method}, {what}: {len(found)} {found.kind}{shown}", ["", *names], rows)
 
 
 def sentences(explanation: Explanation) -> list[str]:
     """What the numbers add up to."""
-    found, pixel = explanation.contributions, explanation.facts["pixel"]
-    background, through = explanation.facts["background"], 1 - found.opacity
+    found, record, pixel = explanation.contributions, explanation.record, explanation.record.pixel
+    through = 1 - found.opacity
     difference = float((explanation.rendered - explanation.composited).abs().max())
     told = [
-        f"Σ T·α·colour = {_colour(found.colour.tolist())}, and {through:.4f} of the background {_colour(background)}",
+        f"Σ T·α·colour = {_colour(found.colour.tolist())}, and {through:.4f} of the background {_colour(record.background)}",
         f"add up to {_colour(explanation.composited.tolist())}; the renderer's picture has "
-        f"{_colour(explanation.rendered.tolist())} (largest difference {difference:.1e}), the truth {_colour(pixel['true'])}.",
+        f"{_colour(explanation.rendered.tolist())} (largest difference {difference:.1e}), the truth {_colour(pixel.true)}.",
     ]
-    if explanation.facts["dead"] is not None:
-        sentence = explanation.facts["dead"]["sentence"]
-        told.append(f"In the whole model, {sentence}")
-    depths = {"mean": pixel["expected"], "median": pixel["median"], "true": pixel["true_depth"]}
+    if record.dead is not None:
+        told.append(f"In the whole model, {record.dead.sentence}")
+    depths = {"mean": pixel.expected, "median": pixel.median, "true": pixel.true_depth}
     known = [f"{name} {value:.4g}" for name, value in depths.items() if value is not None]
     return [*told, f"Depth in world units: {', '.join(known)}."] if known else told
 
 
-def _colour(values: list[float]) -> str:
-    return f"({', '.join(f'{value:.3f}' for value in values)})"
+def _colour(values: Sequence[float | None]) -> str:
+    return f"({', '.join('-' if value is None else f'{value:.3f}' for value in values)})"

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from invgraphics import plugins
 from invgraphics.cli.output import show_table
 from invgraphics.errors import InputError, did_you_mean
+from invgraphics.runs.folder import check_run
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,7 @@ class Export:
             raise InputError(
                 f"--to cannot be '{self.to}'.{did_you_mean(self.to, known)}", f"Expected one of: {', '.join(known)}."
             )
-        if not (self.folder / "recipe.toml").is_file():
-            raise InputError(
-                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
-            )
+        check_run(self.folder)
 
         from invgraphics.tools.export import ExportRequest, export_run
 

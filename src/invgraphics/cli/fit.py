@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,10 @@ from tyro.conf import Positional, arg
 from invgraphics.cli.arguments import Shared
 from invgraphics.cli.output import show_scores
 from invgraphics.errors import InputError
-from invgraphics.experiments.request import FitRequest, slug
+from invgraphics.experiments.request import FitRequest
 from invgraphics.recipes.recipe import presets
+from invgraphics.runs.folder import RunFolder
+from invgraphics.text import slug
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +45,10 @@ class Fit(Shared):
         try:
             folder = fit_run(request)
         except KeyboardInterrupt:
-            if (Path(request.out) / "checkpoint.safetensors").is_file():
+            if RunFolder(Path(request.out)).checkpoint.is_file():
                 print(f"{request.out} holds what was done; --resume goes on from there.", file=sys.stderr)
             raise
-        show_scores(json.loads((folder / "scores.json").read_text()))
+        show_scores(RunFolder(folder).read_scores())
         print(folder)
         return 0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -54,6 +53,7 @@ class ImportFile:
             raise InputError(f"There is no file '{self.file}'.")
 
         from invgraphics.experiments.request import FitRequest
+        from invgraphics.runs.folder import RunFolder
         from invgraphics.tools.import_gaussians import ImportRequest, import_run
 
         out = self.out or Path("runs") / f"{Path(self.scene).resolve().name}-{self.file.name}"
@@ -69,6 +69,6 @@ class ImportFile:
             protocol=self.protocol,
         )
         folder = import_run(ImportRequest(file=str(self.file), run=run, frame=self.frame, world=self.world))
-        show_scores(json.loads((folder / "scores.json").read_text()))
+        show_scores(RunFolder(folder).read_scores())
         print(folder)
         return 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -12,6 +11,7 @@ from invgraphics import plugins
 from invgraphics.cli.output import show_table
 from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
+from invgraphics.tables import read_toml
 
 COMPONENTS = {
     "fields": "fields",
@@ -90,16 +90,13 @@ def _list_methods() -> None:
 def _list_scenes() -> None:
     rows = []
     for path in sorted(find("scenes").glob("*/scene.toml")):
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise InputError(f"{path} is not valid TOML: {error}.") from error
+        table = read_toml(path)
         rows.append((path.parent.name, str(table.get("summary", "")), str(table.get("stresses", ""))))
     show_table("Scenes (rendered by Mitsuba; a path to a data set serves as well)", ("name", "what it shows", "stresses"), rows)
 
 
 def _list_studies() -> None:
-    from invgraphics.studies.study import FILE, read_study
+    from invgraphics.studies.reading import FILE, read_study
 
     rows = []
     for path in sorted(find("studies").glob(f"*/{FILE}")):

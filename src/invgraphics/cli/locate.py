@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from invgraphics.errors import InputError
+from invgraphics.runs.folder import check_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +43,7 @@ class Locate:
 
     def run(self) -> int:
         """Search; print the pose, the loss, and the error where the pose is known."""
-        if not (self.folder / "recipe.toml").is_file():
-            raise InputError(
-                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
-            )
+        check_run(self.folder)
         out = Path(f"{self.photo.stem}-located.json") if self.out is None else self.out
         if out.suffix != ".json":
             raise InputError(f"--out cannot be '{out}'.", "Expected a file name that ends in .json.")
@@ -55,14 +53,13 @@ class Locate:
         options = (self.near, self.start, self.starts, self.steps, self.fov, self.scene, self.seed)
         found = locate(LocateRequest(self.folder, self.photo, out, *options))
         print("camera to world, OpenCV axes:")
-        for row in found["cam_to_world"]:
+        for row in found.cam_to_world:
             print("  " + "  ".join(f"{value:9.5f}" for value in row))
-        print(f"mean squared difference {found['loss']:.6f}, {found['psnr']:.2f} dB")
-        if "error" in found:
-            error = found["error"]
+        print(f"mean squared difference {found.loss:.6f}, {found.psnr:.2f} dB")
+        if found.error is not None:
             print(
-                f"the photograph is test view '{found['test_view']}': off by {error['rotation_deg']:.3f} degrees"
-                f" and {error['translation_percent']:.3f} per cent of the scene"
+                f"the photograph is test view '{found.test_view}': off by {found.error.rotation_deg:.3f} degrees"
+                f" and {found.error.translation_percent:.3f} per cent of the scene"
             )
         print(out)
         return 0

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from invgraphics.runs.scores import Scores
 
 NO_TRUTH = "the scene has no true "
 """How the reason begins for which a metric of geometry has no value."""
@@ -28,20 +31,20 @@ def show_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
     console.print(table)
 
 
-def show_scores(scores: Mapping[str, Any]) -> None:
+def show_scores(scores: Scores) -> None:
     """Print a run's scores, and what could not be computed."""
     rows = [
-        (name, f"{score['mean']:.4g}", score["unit"], "higher" if score["higher_is_better"] else "lower")
-        for name, score in scores["quality"].items()
+        (name, "-" if score.mean is None else f"{score.mean:.4g}", score.unit, "higher" if score.higher_is_better else "lower")
+        for name, score in scores.quality.items()
     ]
-    title = f"{scores['method']} on {scores['scene']}, {len(scores['views'])} test views, protocol {scores['protocol']}"
+    title = f"{scores.method} on {scores.scene}, {len(scores.views)} test views, protocol {scores.protocol}"
     show_table(title, ("metric", "mean", "unit", "better"), rows)
-    if "test_poses" in scores:
-        print(f"Test poses: {scores['test_poses']}. Pose errors are medians over the training views.")
-    if scores["skipped"]:
-        print(not_scored(scores["skipped"]))
-    if "shortfall" in scores:
-        print(scores["shortfall"])
+    if scores.test_poses:
+        print(f"Test poses: {scores.test_poses}. Pose errors are medians over the training views.")
+    if scores.skipped:
+        print(not_scored(scores.skipped))
+    if scores.shortfall:
+        print(scores.shortfall)
 
 
 def not_scored(skipped: Mapping[str, str]) -> str:

@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg
 
 from invgraphics.cli.arguments import parse_size
 from invgraphics.errors import InputError
+from invgraphics.runs.folder import check_run
 
 if TYPE_CHECKING:
     from invgraphics.tools.film import FilmPath
@@ -48,10 +49,7 @@ class Render:
     def run(self) -> int:
         """Film; print the file."""
         size = None if self.size is None else parse_size(self.size)
-        if not (self.folder / "recipe.toml").is_file():
-            raise InputError(
-                f"{self.folder} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
-            )
+        check_run(self.folder)
 
         from invgraphics.tools.film import FilmRequest, film
 

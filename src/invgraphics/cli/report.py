@@ -10,8 +10,8 @@ from tyro.conf import Positional, arg
 
 from invgraphics.cli.output import show_table
 from invgraphics.errors import InputError
-
-COMPARISON = "compare.json"
+from invgraphics.runs.comparison import ComparisonRecord
+from invgraphics.runs.folder import RUNS, RunFolder
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Report:
             out = first.resolve().with_name(f"{first.resolve().name}-public")
         if any(is_study(folder) for folder in self.folders):
             return self._study(first, out)
-        if alone and (first / COMPARISON).is_file():
+        if alone and RunFolder(first).has(ComparisonRecord):
             write_report(first, out, self.public)
             return 0
         runs = [run for folder in self.folders for run in runs_in(folder)]
@@ -66,10 +66,10 @@ def runs_in(folder: Path) -> list[Path]:
     Raises:
         InputError: it is neither.
     """
-    if (folder / "scores.json").is_file():
+    if RunFolder(folder).finished:
         return [folder]
-    runs = sorted(path.parent for path in folder.glob("runs/*/*/scores.json"))
-    if not runs and not (folder / COMPARISON).is_file():
+    runs = sorted(run for run in folder.glob(f"{RUNS}/*/*") if RunFolder(run).finished)
+    if not runs and not RunFolder(folder).has(ComparisonRecord):
         remedy = "Give a folder that `invgraphics fit` or `invgraphics compare` wrote."
         raise InputError(f"There is no finished run in '{folder}'.", remedy)
     return runs
@@ -78,7 +78,7 @@ def runs_in(folder: Path) -> list[Path]:
 def write_report(folder: Path, out: Path | None = None, public: bool = False) -> None:
     """Write the report of a comparison's folder, into itself or into ``out``; print its table and the page's path."""
     from invgraphics.report.build import build_report
-    from invgraphics.report.data.reading import read_comparison
+    from invgraphics.report.data.comparison import read_comparison
     from invgraphics.report.statistics.summary import summarise
 
     page = build_report(folder, out, public)
@@ -90,7 +90,7 @@ def write_report(folder: Path, out: Path | None = None, public: bool = False) ->
         cells = [row.cells[index] for row in summary.rows]
         rows.append([column.heading, *(f"{cell.text} {cell.spread}{' *' if cell.best else ''}".strip() for cell in cells)])
     show_table(f"{comparison.question} (* best)", ["", *(row.label for row in summary.rows)], rows)
-    for sentence in dict.fromkeys(run.shortfall for run in comparison.runs if run.shortfall):
+    for sentence in dict.fromkeys(run.scores.shortfall for run in comparison.runs if run.scores.shortfall):
         print(sentence)
     for failure in comparison.failures:
         print(

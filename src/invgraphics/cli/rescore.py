@@ -9,8 +9,10 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from invgraphics.cli.output import show_table
-from invgraphics.cli.report import COMPARISON, runs_in
+from invgraphics.cli.report import runs_in
 from invgraphics.errors import InputError
+from invgraphics.runs.comparison import ComparisonRecord
+from invgraphics.runs.folder import RunFolder
 
 COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -44,7 +46,8 @@ class Rescore:
         from invgraphics.tools.rescoring import reasons, rows_of, winners, write_scores, write_tables
 
         protocols = protocols_named(self.protocol)
-        folders = [one for folder in self.folders for one in (runs_in(folder) if (folder / COMPARISON).is_file() else [folder])]
+        compared = {folder: RunFolder(folder).has(ComparisonRecord) for folder in self.folders}
+        folders = [one for folder in self.folders for one in (runs_in(folder) if compared[folder] else [folder])]
         results = rescore([open_pictures(folder, self.truth, background) for folder in folders], protocols, self.allow_8bit)
         for one in results:
             width, height = one.pictures.size

@@ -27,8 +27,8 @@ def coverage_and_depth(picture: Rendering, camera: Camera, scene: Scene) -> dict
 
 def below_baseline(
     method: str, quality: Mapping[str, Any], statistics: Sequence[Mapping[str, float]], scene: Scene, protocol: Protocol
-) -> dict[str, str]:
-    """A sentence under ``shortfall`` where the mean PSNR is below that of the mean training image; else nothing.
+) -> str:
+    """A sentence where the mean PSNR is below that of the mean training image; else empty.
 
     Args:
         method: ``renderer/recipe``.
@@ -38,17 +38,17 @@ def below_baseline(
         protocol: of the scores.
     """
     if "psnr" not in quality or not scene.train:
-        return {}
+        return ""
     with torch.no_grad():
         pairs = zip(mean_image(scene), scene.test, strict=True)
         values = [score(picture, view, scene, protocol, only=("psnr",)).values.get("psnr") for picture, view in pairs]
     known = [value for value in values if value is not None]
     if not known or quality["psnr"]["mean"] >= (baseline := sum(known) / len(known)):
-        return {}
+        return ""
     means = {key: sum(view[key] for view in statistics) / len(statistics) for key in ("alpha", "relative_depth")}
     cause, remedy = _diagnose(method, means, opaque=not scene.has_alpha)
     lost = f"{method} reaches {quality['psnr']['mean']:.1f} dB, below the mean training image ({baseline:.1f} dB)"
-    return {"shortfall": f"{lost}: {cause}. Try {remedy}."}
+    return f"{lost}: {cause}. Try {remedy}."
 
 
 def _diagnose(method: str, means: Mapping[str, float], opaque: bool) -> tuple[str, str]:

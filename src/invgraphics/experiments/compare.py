@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
@@ -19,13 +19,14 @@ from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
-from invgraphics.recipes.recipe import Method
+from invgraphics.runs.comparison import ComparisonRecord, Failure, SceneFacts
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.scores import quality_of
 from invgraphics.scenes.degrade import degrade
 
 
 def compare(request: CompareRequest) -> tuple[Path, int]:
-    """Fit and evaluate every cell, then write ``compare.json`` for the report.
+    """Fit and evaluate every cell, then write the comparison's record for the report.
 
     Cells that an earlier, identical command finished are kept; one that it left half done goes on from its checkpoint.
 
@@ -34,13 +35,13 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
 
     Raises:
         InputError: anything that cannot be used; found before the first fit.
-        KeyboardInterrupt: interrupted; ``compare.json`` covers what is finished.
+        KeyboardInterrupt: interrupted; the record covers what is finished.
     """
     began = time.monotonic()
     jobs, scene = _resolve(request)
     folder = RunFolder(Path(request.out))
     folder.create()
-    failures: list[dict[str, Any]] = []
+    failures: list[Failure] = []
     summary = _summary(request, jobs, scene)
     interrupted = False
     try:
@@ -50,14 +51,13 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
                     raise KeyboardInterrupt
                 if outcome.status != 0:
                     fit = outcome.request
-                    failures.append({"method": fit.method, "seed": fit.seed, "error": outcome.error})
+                    failures.append(Failure(method=fit.method, seed=fit.seed, error=outcome.error))
     except KeyboardInterrupt:
         interrupted = True
     done = [fit for fit in request.fits() if RunFolder(Path(fit.out)).finished]
-    summary["runs"] = [Path(fit.out).relative_to(request.out).as_posix() for fit in done]
-    summary["failures"] = failures
-    summary["wall_seconds"] = round(time.monotonic() - began, 1)
-    folder.write_json("compare.json", summary)
+    runs = tuple(Path(fit.out).relative_to(request.out).as_posix() for fit in done)
+    seconds = round(time.monotonic() - began, 1)
+    folder.write(replace(summary, runs=runs, failures=tuple(failures), wall_seconds=seconds))
     if interrupted:
         raise KeyboardInterrupt
     return folder.root, len(failures)
@@ -80,48 +80,50 @@ def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
     return jobs, degrade(scene, jobs[0].data, request.seeds[0])
 
 
-def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> dict[str, Any]:
-    """Everything of ``compare.json`` that is known before the fits."""
+def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> ComparisonRecord:
+    """Everything that is known before the fits."""
     protocol, budget = jobs[0].protocol, jobs[0].budget
     camera = scene.test[0].camera
     names = ", ".join(request.methods)
     methods = [job.method for job in jobs]
     notes = {protocol_note(method) for method in methods} - {""}
-    return {
-        "schema": 1,
-        "scene": scene.name,
-        "question": f"Given {budget} of optimisation each, how well do {names} show new views, at what cost?",
-        "methods": list(request.methods),
-        "summaries": {method.name: method.recipe.summary for method in methods},
-        "seeds": list(request.seeds),
-        "budget": request.budget,
-        "size": [camera.width, camera.height],
-        **_preset_facts(methods),
-        "render_with": list(request.render_with),
-        "command": request.shell(),
-        "baselines": baseline_scores(scene, protocol),
-        "noise_ceiling": scene.noise_ceiling,
-        "protocol": protocol.record() | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
-        "scene_info": {
-            "train": len(scene.train),
-            "val": len(scene.val),
-            "test": len(scene.test),
-            "colour": scene.colour,
-            "background": scene.background.tolist(),
-            "space": scene.bounds.space,
-            "notes": scene.notes,
-        },
-        "environment": environment(jobs[0].device),
-    }
+    baselines = baseline_scores(scene, protocol)
+    return ComparisonRecord(
+        scene=scene.name,
+        question=f"Given {budget} of optimisation each, how well do {names} show new views, at what cost?",
+        methods=request.methods,
+        summaries={method.name: method.recipe.summary for method in methods},
+        seeds=request.seeds,
+        budget=request.budget,
+        size=(camera.width, camera.height),
+        preset=_common([method.preset for method in methods]),
+        presets={method.name: method.preset for method in methods},
+        preset_choice=_common([method.preset_choice for method in methods]),
+        preset_chosen_on={method.name: method.chosen_on for method in methods if method.chosen_on},
+        render_with=request.render_with,
+        command=request.shell(),
+        baselines={name: quality_of(quality) for name, quality in baselines.items()},
+        noise_ceiling=scene.noise_ceiling,
+        protocol=protocol.record() | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
+        scene_info=_scene_facts(scene),
+        environment=environment(jobs[0].device),
+        runs=(),
+    )
 
 
-def _preset_facts(methods: Sequence[Method]) -> dict[str, Any]:
-    """Which presets the fits take: the common one, empty where they differ; each method's; what chose them."""
-    names = {method.name: method.preset for method in methods}
-    choices = {method.preset_choice for method in methods}
-    return {
-        "preset": next(iter(names.values())) if len(set(names.values())) == 1 else "",
-        "presets": names,
-        "preset_choice": next(iter(choices)) if len(choices) == 1 else "",
-        "preset_chosen_on": {method.name: list(method.chosen_on) for method in methods if method.chosen_on},
-    }
+def _scene_facts(scene: Scene) -> SceneFacts:
+    red, green, blue = scene.background.tolist()
+    return SceneFacts(
+        train=len(scene.train),
+        val=len(scene.val),
+        test=len(scene.test),
+        colour=scene.colour,
+        background=(red, green, blue),
+        space=scene.bounds.space,
+        notes=scene.notes,
+    )
+
+
+def _common(texts: Sequence[str]) -> str:
+    """What all agree on; empty where they differ."""
+    return texts[0] if len(set(texts)) == 1 else ""

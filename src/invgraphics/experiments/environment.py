@@ -14,6 +14,11 @@ from pathlib import Path
 import torch
 
 from invgraphics import kernels
+from invgraphics.runs.environment import Environment
+
+PACKAGES = ("numpy", "numba", "mitsuba", "pycolmap", "scikit-image")
+CUDA_PACKAGES = ("triton", "gsplat")
+"""Packages that decide numbers, besides torch; of the latter some may be missing."""
 
 
 @cache
@@ -37,26 +42,25 @@ def cpu_name() -> str:
     return names[0] if names else platform.machine()
 
 
-def environment(device: torch.device) -> dict[str, object]:
-    """A record for ``environment.json``."""
-    record: dict[str, object] = {
-        "invgraphics": code_version(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "platform": platform.platform(),
-        "cpu": cpu_name(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "kernels": kernels.in_use(device),
-        "device": str(device),
-        "deterministic": device.type == "cpu",
-        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-    }
-    for package in ("numpy", "numba", "mitsuba", "pycolmap", "scikit-image"):
-        record[package] = version(package)
-    if device.type == "cuda":
-        record["gpu"] = torch.cuda.get_device_name(device)
-        record["note"] = "Atomic sums on a GPU are not ordered: repeating a run gives close, not equal, bits."
-        for package in ("triton", "gsplat"):
-            record[package] = version(package) if find_spec(package) else None
-    return record
+def environment(device: torch.device) -> Environment:
+    """This machine and its software, for a device."""
+    cuda = device.type == "cuda"
+    packages: dict[str, str | None] = {name: version(name) for name in PACKAGES}
+    if cuda:
+        packages |= {name: version(name) if find_spec(name) else None for name in CUDA_PACKAGES}
+    return Environment(
+        invgraphics=code_version(),
+        python=platform.python_version(),
+        torch=torch.__version__,
+        platform=platform.platform(),
+        cpu=cpu_name(),
+        cores=os.cpu_count(),
+        threads=torch.get_num_threads(),
+        kernels=kernels.in_use(device),
+        device=str(device),
+        deterministic=not cuda,
+        date=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        packages=packages,
+        gpu=torch.cuda.get_device_name(device) if cuda else "",
+        note="Atomic sums on a GPU are not ordered: repeating a run gives close, not equal, bits." if cuda else "",
+    )

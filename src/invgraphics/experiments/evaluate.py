@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,11 @@ from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
+from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.run import truth_arrays, truth_picture
+from invgraphics.runs.scores import Scores, quality_of
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
 
@@ -46,37 +51,33 @@ def evaluate(
     scene: Scene,
     model: Model,
     protocol: str,
-    costs: dict[str, Any],
+    costs: dict[str, float | None],
     method: Method,
     poses: Poses | None = None,
-) -> dict[str, Any]:
-    """Render, keep and score all test views of ``scene``; writes ``test/`` and the scores file, returns the scores.
+) -> Scores:
+    """Render, keep and score all test views of ``scene``; writes the pictures and the scores, returns the scores.
 
     Where the fit has refined its training poses, test poses are aligned and refined first (see `experiments.posed`).
     """
-    (folder.root / "test").mkdir(exist_ok=True)
+    folder.arrays(0).parent.mkdir(exist_ok=True)
     found = score_model(
         model,
         scene,
         protocol,
         method.name,
         poses,
-        keep=lambda index, picture: _save_view(folder.root / "test" / f"{index:04d}", picture, scene),
+        keep=lambda index, picture: _save_view(folder, index, picture, scene),
     )
-    result = {
-        "schema": 1,
-        "method": method.name,
-        "preset": method.preset,
-        "preset_choice": method.preset_choice,
-        "seed": folder.read_json("provenance.json")["seed"],
-        **found,
-        "cost": costs | found["cost"],
-    }
-    if disturbed := disturbance(costs.get("fit_processor_share")):
-        result["disturbed"] = disturbed
-    if poses is not None:
-        result["test_poses"] = protocol_note(method)
-    folder.write_json("scores.json" if protocol == "default" else f"scores.{protocol}.json", result)
+    result = replace(
+        found,
+        preset=method.preset,
+        preset_choice=method.preset_choice,
+        seed=folder.read(Provenance).seed,
+        cost=costs | found.cost,
+        disturbed=disturbance(costs.get("fit_processor_share")),
+        test_poses="" if poses is None else protocol_note(method),
+    )
+    folder.write(result)
     return result
 
 
@@ -87,14 +88,14 @@ def score_model(
     title: str,
     poses: Poses | None = None,
     keep: Callable[[int, Rendering], None] = lambda index, picture: None,
-) -> dict[str, Any]:
+) -> Scores:
     """Render and score all test views of ``scene``; the part of the scores that needs no run folder.
 
     Args:
         model: what is scored.
         scene: as loaded.
         protocol: name of the rules.
-        title: what the model is called, on the progress bar and in sentences.
+        title: what the model is called, on the progress bar, in sentences and in the scores.
         poses: of the training views, where the fit has refined them: test poses are then aligned and refined first.
         keep: is given each picture with the number of its view.
     """
@@ -114,18 +115,20 @@ def score_model(
             statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
-    return {
-        "scene": scene.name,
-        "protocol": protocol,
-        "views": [view.name for view in scene.test],
-        "cost": _model_costs(model, scene, statistics.median(seconds)),
-        "quality": quality if posed is None else quality | posed.quality(),
-        "skipped": skipped,
-        **below_baseline(title, quality, statistics_of_views, scene, rules),
-    }
+    joined = quality_of(quality)
+    return Scores(
+        method=title,
+        scene=scene.name,
+        protocol=protocol,
+        views=tuple(view.name for view in scene.test),
+        cost=_model_costs(model, scene, statistics.median(seconds)),
+        quality=joined if posed is None else joined | posed.quality(),
+        skipped=skipped,
+        shortfall=below_baseline(title, quality, statistics_of_views, scene, rules),
+    )
 
 
-def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, Any]:
+def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, float | None]:
     """What a fitted model costs, and warns of primitives that no gradient could change; ``seconds`` are those of one view."""
     dead = dead_gaussians(model.field, [view.camera for view in scene.train])
     if dead is not None and dead.share > DEAD_SHARE:
@@ -150,7 +153,7 @@ def _picture(model: Model, camera: Camera, *, normals: bool, timed: bool) -> tup
     return (model.render(camera) if normals else picture), seconds
 
 
-def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> dict[str, Any]:
+def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> Scores:
     """Score a finished run or rendering again from its checkpoint, on its own scene or on another copy of it.
 
     Raises:
@@ -159,7 +162,7 @@ def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "defa
     return _evaluate_fitted(open_fitted(run, scene_spec), protocol)
 
 
-def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> dict[str, Any]:
+def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> Scores:
     """Score the model of a run from its checkpoint; a rendering's is that of the run it shows (see `experiments.renderings`).
 
     Raises:
@@ -168,12 +171,12 @@ def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> dict[str, 
     return _evaluate_fitted(load_fitted(folder, scene), protocol)
 
 
-def _evaluate_fitted(fitted: Fitted, protocol: str) -> dict[str, Any]:
-    fit = fitted.source.read_json("fit.json")
-    return evaluate(fitted.folder, fitted.scene, fitted.model, protocol, fit_costs(fit), fitted.method, fitted.poses)
+def _evaluate_fitted(fitted: Fitted, protocol: str) -> Scores:
+    costs = fit_costs(fitted.source.read(FitRecord))
+    return evaluate(fitted.folder, fitted.scene, fitted.model, protocol, costs, fitted.method, fitted.poses)
 
 
-def _save_view(stem: Path, picture: Rendering, scene: Scene) -> None:
+def _save_view(folder: RunFolder, index: int, picture: Rendering, scene: Scene) -> None:
     """Keep a prediction: float16 premultiplied with geometry, and an 8-bit picture over the declared background."""
     arrays: dict[str, Any] = {
         "rgb": picture.rgb.numpy().astype(np.float16),
@@ -182,8 +185,8 @@ def _save_view(stem: Path, picture: Rendering, scene: Scene) -> None:
     }
     if picture.normal is not None:
         arrays["normal"] = picture.normal.numpy().astype(np.float16)
-    np.savez_compressed(stem.with_suffix(".npz"), **arrays)
-    Image.fromarray(display(picture.over(scene.background), scene).numpy()).save(stem.with_suffix(".png"))
+    np.savez_compressed(folder.arrays(index), **arrays)
+    Image.fromarray(display(picture.over(scene.background), scene).numpy()).save(folder.picture(index))
 
 
 def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
@@ -192,16 +195,15 @@ def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
 
 
 def save_truth(scene: Scene, root: Path) -> Path:
-    """Keep the test views' truth once per content: ``root/<sha>/0000.png`` and, for what it cannot hold, ``0000.npz``."""
+    """Keep the test views' truth once per content, in ``root/<sha>``: pictures and, for what they cannot hold, arrays."""
     folder = root / scene.digest("test")[:16]
     folder.mkdir(parents=True, exist_ok=True)
     for index, view in enumerate(scene.test):
-        stem = folder / f"{index:04d}"
-        if not stem.with_suffix(".png").is_file():
-            Image.fromarray(display(view.over(scene.background), scene).numpy()).save(stem.with_suffix(".png"))
+        if not truth_picture(folder, index).is_file():
+            Image.fromarray(display(view.over(scene.background), scene).numpy()).save(truth_picture(folder, index))
         arrays = _truth_arrays(view, scene)
-        if arrays and not stem.with_suffix(".npz").is_file():
-            np.savez_compressed(stem.with_suffix(".npz"), **arrays)
+        if arrays and not truth_arrays(folder, index).is_file():
+            np.savez_compressed(truth_arrays(folder, index), **arrays)
     return folder
 
 

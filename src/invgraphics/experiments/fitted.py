@@ -19,6 +19,7 @@ from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.poses import Poses
 
@@ -66,11 +67,10 @@ def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
         InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe.
     """
     folder = RunFolder(run)
-    provenance = folder.read_json("provenance.json")
-    chosen = provenance["options"]
-    size = tuple(chosen["size"]) if isinstance(chosen["size"], list) else chosen["size"]
-    options = SceneOptions(size, chosen["test_views"], spp=None if scene_spec else chosen.get("spp"))
-    return load_fitted(folder, open_scene(scene_spec or provenance["scene"], options))
+    provenance = folder.read(Provenance)
+    chosen = provenance.options
+    options = SceneOptions(chosen.size, chosen.test_views, spp=None if scene_spec else chosen.spp)
+    return load_fitted(folder, open_scene(scene_spec or provenance.scene, options))
 
 
 def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
@@ -81,11 +81,11 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     """
     keep_freed_memory()
     limit_spinning()
-    provenance = folder.read_json("provenance.json")
-    method = replace(_method(folder, provenance), preset_choice=str(provenance.get("preset_choice", "")))
-    device = device_of("cuda" if provenance["device"].startswith("cuda") and torch.cuda.is_available() else "cpu")
-    model = build_model(method, scene, provenance["seed"], device)
-    shown = provenance.get("fitted_run")
+    provenance = folder.read(Provenance)
+    method = replace(_method(folder, provenance), preset_choice=provenance.preset_choice)
+    device = device_of("cuda" if provenance.device.startswith("cuda") and torch.cuda.is_available() else "cpu")
+    model = build_model(method, scene, provenance.seed, device)
+    shown = provenance.fitted_run
     if shown is not None:
         model = replace(model, renderer=model.renderer.untrained())
     source = folder if shown is None else RunFolder(folder.root / shown)
@@ -100,16 +100,16 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     return replace(fitted, poses=poses)
 
 
-def _method(folder: RunFolder, provenance: Mapping[str, Any]) -> Method:
+def _method(folder: RunFolder, provenance: Provenance) -> Method:
     """The run's recipe.
 
     Raises:
         InputError: it cannot be resolved here; where packages are missing that the run was made with, the sentence names them.
     """
     try:
-        return resolve(provenance["method"], provenance["preset"], folder.read_recipe())
+        return resolve(provenance.method, provenance.preset, folder.read_recipe())
     except InputError as error:
-        used: Mapping[str, str] = provenance.get("plugins", {})
+        used = provenance.plugins
         missing = sorted({package for package in used.values() if not plugins.installed(package)})
         if not missing:
             raise

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from invgraphics.core import Scene
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.job import Job
 from invgraphics.runs.folder import RunFolder
+from invgraphics.text import sha256_of
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
     method = job.method
     source = getattr(method.recipe.field, "source", "")
     started_from = {"source": RunFolder(Path(source)).identity} if source else {}
-    return _sha256(
+    return sha256_of(
         started_from
         | {
             "method": method.name,
@@ -65,14 +64,10 @@ def define(job: Job) -> str:
     scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}
     scene |= {} if request.spp is None else {"spp": request.spp}  # so that studies without keep their folders' names
     parts = {"method": job.method.name, "recipe": job.method.digest, "data": job.data.changes()}
-    return _sha256(_asked(job) | scene | parts)
+    return sha256_of(_asked(job) | scene | parts)
 
 
 def _asked(job: Job) -> dict[str, Any]:
     """Settings that decide a result; a budget counts, not its spelling."""
     settings = {key: getattr(job.request, key) for key in ("seed", "device", "kernels", "protocol")}
     return settings | {"budget": str(job.budget)}
-
-
-def _sha256(parts: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

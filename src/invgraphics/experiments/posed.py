@@ -8,7 +8,6 @@ to its photograph before it is scored (BARF, §4.1).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from torch import Tensor
 from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.metrics.poses import PoseErrors, Similarity, pose_errors
 from invgraphics.recipes.recipe import Method
+from invgraphics.runs.scores import Score
 from invgraphics.training.localise import PoseDescent, refine_pose
 from invgraphics.training.poses import Poses, PosesConfig
 
@@ -108,20 +108,20 @@ class PosedEvaluation:
         normal: Tensor | None = None if picture.normal is None else picture.normal @ turn.T
         return replace(picture, depth=picture.depth * self.errors.scale, normal=normal)
 
-    def quality(self) -> dict[str, dict[str, Any]]:
-        """Entries of ``scores.json``: medians over the training views, with their largest values."""
+    def quality(self) -> dict[str, Score]:
+        """Scores of the poses: medians over the training views, with their largest values."""
         found = {
             "pose_rotation_deg": (self.errors.rotation_degrees, "deg"),
             "pose_translation_percent": (self.errors.translation_per_cent, "%"),
         }
         return {
-            name: {
-                "mean": float(values.quantile(0.5)),
-                "joined": "median over training views",
-                "max": float(values.max()),
-                "unit": unit,
-                "higher_is_better": False,
-                "per_training_view": values.tolist(),
-            }
+            name: Score(
+                mean=float(values.quantile(0.5)),
+                joined="median over training views",
+                max=float(values.max()),
+                unit=unit,
+                higher_is_better=False,
+                per_training_view=tuple(values.tolist()),
+            )
             for name, (values, unit) in found.items()
         }

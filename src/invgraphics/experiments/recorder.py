@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
+from invgraphics.experiments.clocks import fit_record
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.history import Moment
 from invgraphics.training.budget import Cadence
 from invgraphics.training.fit import Fit
 from invgraphics.training.limits import dead_gaussians
@@ -81,7 +83,7 @@ class Recorder:
         on_step: is given the fit before its first step and after each one, on no clock.
 
     Attributes:
-        history: a table for each moment at which the monitor looked.
+        history: each moment at which the monitor looked.
     """
 
     def __init__(
@@ -95,7 +97,7 @@ class Recorder:
     ) -> None:
         self._fit, self._folder, self._cadence, self._title = fit, folder, cadence, title
         self._on_step = on_step
-        self.history: list[dict[str, object]] = []
+        self.history: list[Moment] = []
         self._monitor = Monitor(fit.plan.scene, fit.plan.device)
         self._saved_at = (fit.steps, time.monotonic())
         self._marks = [mark for mark in MARKS if mark > fit.progress]
@@ -158,7 +160,7 @@ class Recorder:
     def _save(self) -> None:
         if self._folder is not None:
             checkpoint.save(self._folder.checkpoint, self._fit.state())
-            self._folder.write_json("fit.json", {"steps": self._fit.steps, **self._fit.clocks()})
+            self._folder.write(fit_record(self._fit.steps, self._fit.clocks()))
         self._saved_at = (self._fit.steps, time.monotonic())
 
     def _keep_snapshot(self, progress: float) -> None:
@@ -174,17 +176,17 @@ class Recorder:
     def _record(self) -> float:
         fit = self._fit
         psnr = self._monitor.psnr(fit)
-        line: dict[str, object] = {"step": fit.steps, "seconds": round(fit.seconds, 4), "progress": round(fit.progress, 6)}
-        line["psnr"] = psnr
-        if math.isfinite(self._loss):
-            line["loss"] = self._loss
-        count = fit.plan.model.field.primitive_count()
-        if count is not None:
-            line["primitives"] = count
         dead = dead_gaussians(fit.plan.model.field, [view.camera for view in fit.plan.scene.train])
-        if dead is not None:
-            line["dead"] = round(dead.share, 6)
-        self.history.append(line)
+        moment = Moment(
+            step=fit.steps,
+            seconds=round(fit.seconds, 4),
+            progress=round(fit.progress, 6),
+            psnr=psnr,
+            loss=self._loss if math.isfinite(self._loss) else None,
+            primitives=fit.plan.model.field.primitive_count(),
+            dead=None if dead is None else round(dead.share, 6),
+        )
+        self.history.append(moment)
         if self._folder is not None:
-            self._folder.append_history(line)
+            self._folder.append_history(moment)
         return psnr

@@ -1,17 +1,15 @@
 """The same fitted field through other renderers: what of a picture is the representation, and what is the renderer.
 
-A rendering is a run folder without a fit, ``RUN/rendered/NAME``; it knows the run whose checkpoint it shows. What the pictures
-of one fit differ in is in ``RUN/renderings.json``.
+A rendering is a run folder without a fit, ``RUN/rendered/NAME``; it knows the run whose checkpoint it shows. The run holds what
+the pictures of one fit differ in (`invgraphics.runs.renderings`).
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,10 +23,12 @@ from invgraphics.experiments.evaluate import evaluate_saved
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.variants import RendererVariant, with_renderer
 from invgraphics.recipes.recipe import Method
+from invgraphics.runs.environment import Environment
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.renderings import OWN, Difference, Rendering, Renderings
+from invgraphics.text import sha256_of
 
-RECORD = "renderings.json"
-"""What a fit's folder holds about its renderings."""
 FOLDER = "rendered"
 
 
@@ -57,10 +57,10 @@ def rendered(job: Job) -> bool:
     if not job.variants:
         return True
     try:
-        record = job.folder.read_json(RECORD)
+        record = job.folder.read(Renderings)
     except InputError:
         return False
-    return record.get("identity") == _identity(job.folder, job.variants, job.method)
+    return record.identity == _identity(job.folder, job.variants, job.method)
 
 
 def render_missing(job: Job, scene: Scene) -> None:
@@ -73,29 +73,23 @@ def render_missing(job: Job, scene: Scene) -> None:
     if rendered(job):
         return
     folder, method = job.folder, job.method
-    (folder.root / RECORD).unlink(missing_ok=True)
+    folder.remove(Renderings)
     shown = {}
     for variant in _with_own(job.variants, method):
         if variant.table == method.table["renderer"]:
-            shown[variant.name] = "."
+            shown[variant.name] = OWN
         else:
             shown[variant.name] = f"{FOLDER}/{variant.folder}"
             _render(RunFolder(folder.root / FOLDER / variant.folder), folder, (method, variant), scene, job.protocols)
     pictures = {name: _pictures(folder.root / place, scene) for name, place in shown.items()}
-    folder.write_json(
-        RECORD,
-        {
-            "schema": 1,
-            "identity": _identity(folder, job.variants, method),
-            "fitted_by": method.name,
-            "views": [view.name for view in scene.test],
-            "renderings": [{"renderer": name, "run": place} for name, place in shown.items()],
-            "differences": [
-                {"renderers": [one, other], **_difference(pictures[one], pictures[other])}
-                for one, other in combinations(shown, 2)
-            ],
-        },
+    record = Renderings(
+        identity=_identity(folder, job.variants, method),
+        fitted_by=method.name,
+        views=tuple(view.name for view in scene.test),
+        renderings=tuple(Rendering(renderer=name, run=place) for name, place in shown.items()),
+        differences=tuple(_difference(pair, *(pictures[name] for name in pair)) for pair in combinations(shown, 2)),
     )
+    folder.write(record)
 
 
 def _render(
@@ -104,27 +98,27 @@ def _render(
     """Make one rendering, unless it is there."""
     method, variant = model
     seen = with_renderer(method, variant)
-    identity = _sha256([fit.identity, variant.digest])
+    identity = sha256_of([fit.identity, variant.digest])
     if folder.finished and folder.identity == identity:
         return
     folder.create()
     folder.clear()
-    (folder.root / "test").mkdir(exist_ok=True)
     folder.write_recipe(seen.table)
-    folder.write_json("environment.json", fit.read_json("environment.json"))
+    folder.write(fit.read(Environment))
     folder.history.write_text("")
-    provenance = fit.read_json("provenance.json")
+    provenance = fit.read(Provenance)
     up = Path(*[".."] * len(folder.root.relative_to(fit.root).parts))
-    changed = {
-        "cell_sha256": identity,
-        "method": seen.name,
-        "recipe_sha256": seen.digest,
-        "truth": (up / provenance["truth"]).as_posix(),
-        "fitted_run": up.as_posix(),
-        "fitted_by": method.name,
-        "rendered_by": variant.name,
-    }
-    folder.write_json("provenance.json", provenance | changed)
+    changed = replace(
+        provenance,
+        cell_sha256=identity,
+        method=seen.name,
+        recipe_sha256=seen.digest,
+        truth=(up / provenance.truth).as_posix(),
+        fitted_run=up.as_posix(),
+        fitted_by=method.name,
+        rendered_by=variant.name,
+    )
+    folder.write(changed)
     for rules in protocols:
         evaluate_saved(folder, scene, rules)
 
@@ -139,11 +133,7 @@ def _with_own(variants: Sequence[RendererVariant], method: Method) -> list[Rende
 
 
 def _identity(folder: RunFolder, variants: Sequence[RendererVariant], method: Method) -> str:
-    return _sha256([folder.identity, *([variant.name, variant.digest] for variant in _with_own(variants, method))])
-
-
-def _sha256(parts: Any) -> str:
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return sha256_of([folder.identity, *([variant.name, variant.digest] for variant in _with_own(variants, method))])
 
 
 def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:
@@ -151,13 +141,16 @@ def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:
     background = scene.background.numpy()
     pictures = []
     for index in range(len(scene.test)):
-        with np.load(run / "test" / f"{index:04d}.npz", allow_pickle=False) as arrays:
+        with np.load(RunFolder(run).arrays(index), allow_pickle=False) as arrays:
             clear = 1 - arrays["alpha"].astype(np.float64)[..., None]
             pictures.append((arrays["rgb"].astype(np.float64) + clear * background).clip(0, 1))
     return pictures
 
 
-def _difference(one: Sequence[Float[ndarray, "h w 3"]], other: Sequence[Float[ndarray, "h w 3"]]) -> dict[str, list[float]]:
-    """Per view, between pictures of one fit by two renderers: root of the mean square and the largest, colours in [0, 1]."""
+def _difference(
+    renderers: tuple[str, str], one: Sequence[Float[ndarray, "h w 3"]], other: Sequence[Float[ndarray, "h w 3"]]
+) -> Difference:
+    """Per view, between pictures of one fit by two renderers."""
     gaps = [a - b for a, b in zip(one, other, strict=True)]
-    return {"rmse": [float(np.sqrt((gap**2).mean())) for gap in gaps], "largest": [float(np.abs(gap).max()) for gap in gaps]}
+    rmse, largest = [float(np.sqrt((gap**2).mean())) for gap in gaps], [float(np.abs(gap).max()) for gap in gaps]
+    return Difference(renderers=renderers, rmse=tuple(rmse), largest=tuple(largest))

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from invgraphics.text import slug
+
 Existing = Literal["refuse", "resume", "reuse"]
 
 DATA = "data."
@@ -203,8 +205,3 @@ class AblateRequest:
         words = [word for flag, value in given.items() if value is not None for word in (flag, str(value))]
         words += ["--keep"] if self.keep else []
         return shlex.join(["invgraphics", "ablate", self.study, *words])
-
-
-def slug(method: str) -> str:
-    """A method's name as one folder name."""
-    return method.removesuffix(".toml").strip("/").replace("/", "-").replace(":", "-")

@@ -8,9 +8,9 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -23,7 +23,7 @@ from invgraphics.experiments.build import (
     repeatable,
     use_kernels,
 )
-from invgraphics.experiments.clocks import disturbance, fit_costs, load_average, processor_share
+from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average, processor_share
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import WITH_PARENT, cores
@@ -38,7 +38,10 @@ from invgraphics.experiments.start import MemoryForecast, memory_forecast, start
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs import checkpoint
-from invgraphics.runs.folder import RunFolder, write_json
+from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.folder import TRUTH, RunFolder
+from invgraphics.runs.provenance import LoadAverage, Options, Provenance
+from invgraphics.runs.schema import write_json
 from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import choices
 from invgraphics.training.fit import Fit
@@ -89,21 +92,23 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
         with PeakMemory(job.device) as memory:
             fit = prepare(job, shown)
             if same and folder.resumable:
-                clocks = folder.read_json("fit.json")
-                fit.load(checkpoint.load(folder.checkpoint, job.device), float(clocks["seconds"]))
-                fit.resume_clocks(clocks)
+                earlier = folder.read(FitRecord)
+                fit.load(checkpoint.load(folder.checkpoint, job.device), earlier.seconds or 0.0)
+                fit.resume_clocks(asdict(earlier))
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            describe(job, (scene, shown), identity)
+            folder.write(describe(job, (scene, shown), identity))
             forecast = _warm_up(job, fit, memory)
             if "suspicion" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
             for sentence in (*announcements([method.choice]), _prediction(job, fit, forecast)):
                 print(sentence, file=sys.stderr)
             Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots, on_step).run()
-        spent = {"steps": fit.steps, **fit.clocks(), "peak_memory_bytes": memory.peak_bytes, "cores": cores()}
-        spent |= {"load_average": {"start": began_at, "end": load_average()}}
+        load = LoadAverage(start=began_at, end=load_average())
+        spent = replace(
+            fit_record(fit.steps, fit.clocks()), peak_memory_bytes=memory.peak_bytes, cores=cores(), load_average=load
+        )
         _declare_clocks(folder, spent)
         _evaluate(job, scene, fit, spent)
         render_missing(job, scene)
@@ -120,7 +125,7 @@ def prepare(job: Job, shown: Scene) -> Fit:
 
 
 def _check_existing(folder: RunFolder, request: FitRequest) -> None:
-    present = (folder.root / "provenance.json").is_file()
+    present = folder.has(Provenance)
     if request.existing == "refuse" and present:
         raise InputError(f"{folder.root} already holds a run.", "Add --resume to go on with it, or choose another --out.")
     if request.existing == "resume" and not present:
@@ -138,7 +143,7 @@ def _warm_up(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
     Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
     folder = job.folder
     forecast = memory_forecast(fit.plan, job.method, memory.peak_bytes)
-    folder.write_json("provenance.json", folder.read_json("provenance.json") | {"memory_forecast_bytes": forecast.bytes})
+    folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
     return forecast
 
 
@@ -151,63 +156,59 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
 
 
-def _declare_clocks(folder: RunFolder, spent: Mapping[str, Any]) -> None:
+def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
     """Write how busy the machine was beside the run's provenance, and warn where others had the fit's cores."""
-    machine = {"threads": torch.get_num_threads(), "load_average": spent["load_average"]}
-    folder.write_json("provenance.json", folder.read_json("provenance.json") | machine)
+    folder.write(replace(folder.read(Provenance), threads=torch.get_num_threads(), load_average=spent.load_average))
     if disturbed := disturbance(processor_share(spent)):
         warn(f"The fit {disturbed}. Its times are not to be compared.")
 
 
-def _evaluate(job: Job, scene: Scene, fit: Fit, spent: dict[str, Any]) -> None:
-    """Score the fit on the scene as loaded. ``scores.json`` comes last, because a run that has it is finished."""
-    job.folder.write_json("fit.json", spent)
+def _evaluate(job: Job, scene: Scene, fit: Fit, spent: FitRecord) -> None:
+    """Score the fit on the scene as loaded. The default protocol's scores come last: a run that has them is finished."""
+    job.folder.write(spent)
     for protocol in job.protocols:
         evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
 
 
-def describe(job: Job, scenes: tuple[Scene, Scene], identity: str, origin: Mapping[str, Any] | None = None) -> None:
-    """Write what can be known before the fit, of the scene as it was loaded and as the fit sees it.
+def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance:
+    """Write recipe, machine and truth, and return what can be known before the fit of where the run comes from.
 
     Args:
         job: of the run.
         scenes: as loaded, and as the fit sees it.
         identity: of the run.
-        origin: provenance that takes precedence, of a model that was not fitted here.
     """
     request, method, folder = job.request, job.method, job.folder
     scene, shown = scenes
     folder.write_recipe(method.table)
-    folder.write_json("environment.json", environment(job.device))
-    truth_root = Path(request.truth) if request.truth else folder.root / "truth"
-    truth = save_truth(scene, truth_root)
-    provenance = {
-        "schema": 1,
-        "cell_sha256": identity,
-        "method": method.name,
-        "preset": method.preset,
-        "preset_choice": method.preset_choice,
-        "preset_chosen_on": list(method.chosen_on),
-        "recipe_sha256": method.digest,
-        "scene": request.scene,
-        "seed": request.seed,
-        "budget": request.budget,
-        "truth_sha256": scene.digest("test"),
-        "train_sha256": shown.digest("train"),
-        "cameras_sha256": scene.camera_digest(),
-        "truth": Path(*_relative(truth, folder.root)).as_posix(),
-        "background": scene.background.tolist(),
-        "colour": scene.colour,
-        "data": job.data.changes(),
-        "notes": shown.notes,
-        "code_version": code_version(),
-        "plugins": plugins.brought(method.table, method.name),
-        "command": request.shell(),
-        "options": {"size": request.size, "test_views": request.test_views, "spp": request.spp},
-        "device": str(job.device),
-    }
-    note = protocol_note(method)
-    folder.write_json("provenance.json", provenance | ({"test_poses": note} if note else {}) | dict(origin or {}))
+    folder.write(environment(job.device))
+    truth = save_truth(scene, Path(request.truth) if request.truth else folder.root / TRUTH)
+    red, green, blue = scene.background.tolist()
+    return Provenance(
+        cell_sha256=identity,
+        method=method.name,
+        preset=method.preset,
+        preset_choice=method.preset_choice,
+        preset_chosen_on=method.chosen_on,
+        recipe_sha256=method.digest,
+        scene=request.scene,
+        seed=request.seed,
+        budget=request.budget,
+        truth_sha256=scene.digest("test"),
+        train_sha256=shown.digest("train"),
+        cameras_sha256=scene.camera_digest(),
+        truth=Path(*_relative(truth, folder.root)).as_posix(),
+        background=(red, green, blue),
+        colour=scene.colour,
+        data=job.data.changes(),
+        notes=shown.notes,
+        code_version=code_version(),
+        plugins=plugins.brought(method.table, method.name),
+        command=request.shell(),
+        options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
+        device=str(job.device),
+        test_poses=protocol_note(method),
+    )
 
 
 def _relative(target: Path, start: Path) -> tuple[str, ...]:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
+import math
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 from invgraphics.core import Model, Scene
 from invgraphics.experiments.build import repeatable, use_kernels
-from invgraphics.experiments.clocks import fit_costs
+from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.display import curve_svg, table_html
 from invgraphics.experiments.evaluate import score_model
 from invgraphics.experiments.fitted import Fitted
@@ -24,6 +24,8 @@ from invgraphics.experiments.start import memory_forecast
 from invgraphics.experiments.variants import variant_named, with_renderer
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
+from invgraphics.runs.history import Moment, read_history
+from invgraphics.runs.scores import Scores
 from invgraphics.scenes.degrade import degrade
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -38,7 +40,7 @@ class ScoreTable(Mapping[str, float]):
     """Scores of a model on a scene's test views: metric -> mean over the views.
 
     Attributes:
-        record: everything, as ``scores.json`` holds it: ``quality``, ``cost``, ``views``, ``skipped``, ``protocol``.
+        record: everything, as a run folder holds it: ``quality``, ``cost``, ``views``, ``skipped``, ``protocol``.
 
     Example:
         >>> import invgraphics as ig
@@ -50,27 +52,28 @@ class ScoreTable(Mapping[str, float]):
         True
     """
 
-    record: Mapping[str, Any]
+    record: Scores
 
     def __getitem__(self, metric: str) -> float:
-        return self.record["quality"][metric]["mean"]
+        mean = self.record.quality[metric].mean
+        return math.nan if mean is None else mean
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.record["quality"])
+        return iter(self.record.quality)
 
     def __len__(self) -> int:
-        return len(self.record["quality"])
+        return len(self.record.quality)
 
     def per_view(self, metric: str) -> tuple[float, ...]:
-        """One value for each test view, in the scene's order."""
-        return tuple(self.record["quality"][metric]["per_view"])
+        """One value for each test view, in the scene's order; NaN where a view has none."""
+        return tuple(math.nan if value is None else value for value in self.record.quality[metric].per_view)
 
     def unit(self, metric: str) -> str:
         """The metric's unit; empty where it has none."""
-        return self.record["quality"][metric]["unit"]
+        return self.record.quality[metric].unit
 
     def _title(self) -> str:
-        return f"{self.record['scene']}, {len(self.record['views'])} test views, protocol {self.record['protocol']}"
+        return f"{self.record.scene}, {len(self.record.views)} test views, protocol {self.record.protocol}"
 
     def __repr__(self) -> str:
         return "\n".join([self._title(), *(f"  {name:20} {value:10.4g} {self.unit(name)}" for name, value in self.items())])
@@ -78,7 +81,7 @@ class ScoreTable(Mapping[str, float]):
     def _repr_html_(self) -> str:
         better = {True: "higher", False: "lower"}
         rows = [
-            (name, f"{value:.4g}", self.unit(name), better[self.record["quality"][name]["higher_is_better"]])
+            (name, f"{value:.4g}", self.unit(name), better[self.record.quality[name].higher_is_better])
             for name, value in self.items()
         ]
         return table_html(self._title(), ("metric", "mean", "unit", "better"), rows)
@@ -107,8 +110,8 @@ class FittedRun(ABC):
 
     @property
     @abstractmethod
-    def history(self) -> list[dict[str, Any]]:
-        """The fit's course: tables with ``step``, ``seconds``, ``progress``, and ``psnr`` on views that are not trained on."""
+    def history(self) -> tuple[Moment, ...]:
+        """The fit's course: moments with ``step``, ``seconds``, ``progress``, and ``psnr`` on views that are not trained on."""
 
     @property
     @abstractmethod
@@ -147,12 +150,12 @@ class FittedRun(ABC):
         return replace(self.model, renderer=other.to(self.model.device))
 
     def __repr__(self) -> str:
-        last = self.history[-1] if self.history else {}
+        last = self.history[-1] if self.history else Moment(step=0, seconds=0.0)
         state = "finished" if self.finished else "not finished"
-        return f"{self.method.name} on {self.scene.name}: {state}, {last.get('step', 0)} steps, {last.get('seconds', 0):.1f} s"
+        return f"{self.method.name} on {self.scene.name}: {state}, {last.step} steps, {last.seconds:.1f} s"
 
     def _repr_svg_(self) -> str:
-        points = [(float(line["seconds"]), float(line["psnr"])) for line in self.history if "psnr" in line]
+        points = [(moment.seconds, moment.psnr) for moment in self.history if moment.psnr is not None]
         return curve_svg(points, repr(self), ("s", "monitor PSNR in dB"))
 
 
@@ -173,7 +176,7 @@ class MemoryRun(FittedRun):
     def __init__(self, job: Job, scene: Scene, on_step: OnStep | None = None) -> None:
         self.method, self.scene = job.method, scene
         self._job, self._on_step = job, on_step
-        self._history: list[dict[str, Any]] = []
+        self._history: list[Moment] = []
         self._scores: ScoreTable | None = None
         repeatable(job.device)
         use_kernels(job.request.kernels)
@@ -219,9 +222,9 @@ class MemoryRun(FittedRun):
         return self.fit.plan.poses
 
     @property
-    def history(self) -> list[dict[str, Any]]:
+    def history(self) -> tuple[Moment, ...]:
         """See `FittedRun.history`."""
-        return list(self._history)
+        return tuple(self._history)
 
     @property
     def finished(self) -> bool:
@@ -233,8 +236,8 @@ class MemoryRun(FittedRun):
         """Scores under the default protocol, computed when they are first asked for."""
         if self._scores is None:
             scores = self.evaluate()
-            costs = fit_costs({"steps": self.fit.steps, **self.fit.clocks()})
-            self._scores = ScoreTable({**scores.record, "cost": costs | scores.record["cost"]})
+            costs = fit_costs(fit_record(self.fit.steps, self.fit.clocks()))
+            self._scores = ScoreTable(replace(scores.record, cost=costs | scores.record.cost))
         return self._scores
 
 
@@ -264,9 +267,9 @@ class FolderRun(FittedRun):
         return self._fitted.poses
 
     @property
-    def history(self) -> list[dict[str, Any]]:
+    def history(self) -> tuple[Moment, ...]:
         """See `FittedRun.history`."""
-        return [json.loads(line) for line in self._fitted.source.history.read_text().splitlines()]
+        return read_history(self._fitted.source.history)
 
     @property
     def finished(self) -> bool:
@@ -276,4 +279,4 @@ class FolderRun(FittedRun):
     @property
     def scores(self) -> ScoreTable:
         """The scores that the folder keeps; those of the last checkpoint where the run was interrupted."""
-        return ScoreTable(self._fitted.folder.read_json("scores.json")) if self.finished else self.evaluate()
+        return ScoreTable(self._fitted.folder.read_scores()) if self.finished else self.evaluate()

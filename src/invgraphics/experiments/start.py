@@ -11,20 +11,18 @@ import torch
 from invgraphics.core import RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
+from invgraphics.experiments.requested import COPIES, RAY_BYTES
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
 from invgraphics.training.batches import Batches
 from invgraphics.training.fit import Plan
 
-COPIES = 6
-"""Of each primitive's values during a step: parameter, gradient, Adam's two moments; activated, and the gradient of that."""
 SCREEN_BYTES = 300
 """Of a primitive on the screen: footprint, its gradients, packed row and sums; rounded up from two threads."""
 PICTURE_BYTES = 300
 """Of a pixel of a training picture: rendering, truth, SSIM's moments, and their gradients."""
-RAY_BYTES = 512
-"""Of a ray of a batch that follows its samples: origin, direction, interval, colours and their gradients."""
 CHECKPOINT_COPIES = 3
 """A checkpoint holds each parameter and Adam's two moments."""
 MARGIN = 1.25
@@ -45,7 +43,7 @@ def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
     if not source:
         return plan
     folder = RunFolder(Path(source))
-    shown = str(folder.read_json("provenance.json")["scene"])
+    shown = folder.read(Provenance).scene
     if Path(shown).resolve() != Path(scene_spec).resolve():
         raise InputError(f"field.source: {source} is a run on '{shown}', not on '{scene_spec}'.")
     source_field = load_fitted(folder, plan.scene).model.field

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from dataclasses import dataclass
 from typing import Any
 
-from invgraphics.experiments.request import slug
 from invgraphics.recipes.recipe import Method, load_method, resolve
+from invgraphics.text import sha256_of, slug
 
 _SETTING = r":(?=[\w.]+=)"
 
@@ -29,7 +27,7 @@ class RendererVariant:
     @property
     def digest(self) -> str:
         """SHA-256 of the settings."""
-        return hashlib.sha256(json.dumps(self.table, sort_keys=True).encode()).hexdigest()
+        return sha256_of(self.table)
 
     @property
     def folder(self) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from invgraphics import plugins
 from invgraphics.core import Gaussians
+from invgraphics.core.believable import check_gaussians
 from invgraphics.errors import InputError
 
 HEAD_BYTES = 1 << 16
@@ -103,27 +104,15 @@ def write_gaussians(path: Path, name: str, splats: Splats) -> None:
 
 
 def checked(splats: Splats, path: Path) -> Splats:
-    """Validate: at least one Gaussian, finite numbers; quaternions of length zero become the identity.
+    """Validate: at least one Gaussian, believable numbers; quaternions of length zero become the identity.
 
     Raises:
-        InputError: there are no Gaussians, or some are not finite.
+        InputError: there are no Gaussians, or some are not believable (`core.believable`).
     """
     gaussians = splats.gaussians
     if len(gaussians) == 0:
         raise InputError(f"'{path}': there are no Gaussians.")
-    for what, values in (
-        ("centres", gaussians.means),
-        ("rotations", gaussians.quaternions),
-        ("scales", gaussians.scales),
-        ("opacities", gaussians.opacities),
-        ("colours", gaussians.sh),
-    ):
-        bad = int((~torch.isfinite(values.reshape(len(values), -1))).any(dim=1).sum())
-        if bad:
-            raise InputError(
-                f"'{path}': the {what} of {bad} of {len(gaussians)} Gaussians are not finite numbers.",
-                "The fit that made them diverged, or the file is damaged; remove these Gaussians.",
-            )
+    check_gaussians(gaussians, f"'{path}'")
     still = gaussians.quaternions.norm(dim=1) == 0
     if not bool(still.any()):
         return splats

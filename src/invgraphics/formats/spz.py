@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import struct
 import zlib
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from invgraphics.core import harmonics
 from invgraphics.errors import InputError
 from invgraphics.formats.base import Splats, cut_off
 from invgraphics.formats.spz_attributes import Bytes, fraction_bits, pack, unpack, widths
+from invgraphics.memory import check_fits, spelt
 
 MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 VERSION = 4
@@ -35,6 +35,13 @@ AXES = "RUB"
 AXES_EXTENSION = 0xADBE0003
 AXES_CODES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU")
 """Values 1 to 16 of the extension SPZ_ADOBE_coordinate_system."""
+
+UNSUSPICIOUS, MOST_PACKED = 64 << 20, 100
+"""Bytes that any file may unpack to (a million Gaussians), and how many times its size a longer one; scenes reach about 4."""
+MOST_EXTENSIONS = 1 << 20
+"""Bytes of all extensions."""
+COPIES = 3
+"""Largest number of copies of all Gaussians in float32 while they are unpacked."""
 
 LEVEL = 12
 """Zstandard's compression level, that of the format's authors."""
@@ -79,9 +86,11 @@ class Spz:
             InputError: it is cut off or damaged, or of an unknown version.
         """
         data = path.read_bytes()
+        packed = len(data)
         if data.startswith(GZIP):
             data = _gunzip(path, data)
         header = _header(path, data)
+        _bounded(path, header, packed)
         attributes, extensions = (_streams if header.version >= VERSION else _single_stream)(path, data, header)
         notes = [f"SPZ version {header.version}."]
         if header.degree > harmonics.MAX_DEGREE:
@@ -111,10 +120,36 @@ class Spz:
 
 
 def _gunzip(path: Path, data: bytes) -> bytes:
+    """The content of versions 1 to 3, at most as long as its header honestly claims."""
+    inflate = zlib.decompressobj(wbits=31)
     try:
-        return gzip.decompress(data)
-    except (EOFError, OSError, zlib.error) as error:
+        head = inflate.decompress(data, HEADER.size)
+        most = _bounded(path, _header(path, head), len(data)) + MOST_EXTENSIONS
+        result = head + inflate.decompress(inflate.unconsumed_tail, most)
+    except zlib.error as error:
         raise InputError(f"'{path}' cannot be decompressed: {error}.", "Copy the file again.") from error
+    if not inflate.eof:
+        longer = len(result) == HEADER.size + most
+        wrong = f"it goes on after its Gaussians and {spelt(MOST_EXTENSIONS)} of extensions" if longer else "it is cut off"
+        raise InputError(f"'{path}' cannot be decompressed: {wrong}.", "Copy the file again.")
+    return result
+
+
+def _bounded(path: Path, header: Header, packed: int) -> int:
+    """Bytes of all attributes of a file of ``packed`` bytes.
+
+    Raises:
+        InputError: they are more than such a file honestly holds, or than there is memory for.
+    """
+    claimed = sum(header.sizes.values())
+    if claimed > max(UNSUSPICIOUS, MOST_PACKED * packed):
+        raise InputError(
+            f"'{path}' claims {header.count:,} Gaussians in {packed:,} bytes, more than {MOST_PACKED} times as many unpacked.",
+            "The file is damaged, or made to fill the memory.",
+        )
+    floats = header.count * 4 * (11 + 3 * harmonics.count(header.degree))
+    check_fits(claimed + COPIES * floats, f"'{path}', with {header.count:,} Gaussians,", "Use a machine with more memory.")
+    return claimed
 
 
 def _header(path: Path, data: bytes) -> Header:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +14,8 @@ from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.presets import select_preset
 from invgraphics.recipes.renamed import with_current_names, with_first_names
+from invgraphics.tables import LIMITS, parse_toml, read_text
+from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
 if TYPE_CHECKING:
@@ -48,11 +47,6 @@ class Method:
     chosen_on: tuple[str, ...] = ()
 
     @property
-    def slug(self) -> str:
-        """The name as one folder name."""
-        return self.name.removesuffix(".toml").strip("/").replace("/", "-")
-
-    @property
     def choice(self) -> tuple[str, str, str]:
         """Name, preset and what chose the preset, for `recipes.presets.announcements`."""
         return self.name, self.preset, self.preset_choice
@@ -60,7 +54,7 @@ class Method:
     @property
     def digest(self) -> str:
         """SHA-256 of the resolved table, the same whatever its keys are called by now."""
-        return hashlib.sha256(json.dumps(with_first_names(self.table), sort_keys=True).encode()).hexdigest()
+        return sha256_of(with_first_names(self.table))
 
 
 def methods() -> dict[str, str]:
@@ -161,10 +155,7 @@ def source(name: str) -> dict[str, Any]:
         if not path.is_file():
             sentence = f"There is no method '{name}'.{did_you_mean(name, methods())}"
             raise InputError(sentence, f"Known methods: {', '.join(methods())}; or the path of a .toml.")
-    try:
-        return _parse(path.read_text(), str(path))
-    except OSError as error:
-        raise InputError(f"The recipe {path} cannot be read: {error.strerror}.") from error
+    return _parse(read_text(path, LIMITS.toml_bytes), str(path))
 
 
 def _foreign_text(name: str) -> str:
@@ -172,14 +163,15 @@ def _foreign_text(name: str) -> str:
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"The recipe {where} is not valid TOML: {error}.") from error
+    table = parse_toml(text, f"The recipe {where}")
+    known = table.get("presets", {})
+    if not isinstance(known, dict) or not all(isinstance(preset, dict) for preset in known.values()):
+        raise InputError(f"The 'presets' of {where} are no tables.", "Expected: [presets.NAME], and settings below it.")
+    return table
 
 
 def _value(text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return parse_toml(f"value = {text}", "--set")["value"]
+    except InputError:
         return text

@@ -8,22 +8,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.errors import InputError
-from invgraphics.report.data.assets import Folder, read_picture
-from invgraphics.report.data.reading import check_comparable, read_comparison, read_run
-from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.comparison import Comparison, check_comparable, read_comparison
+from invgraphics.report.data.pictures import read_picture
 from invgraphics.report.data.redact import check_apart, redactor_for
 from invgraphics.report.pages.comparison import write_html, write_markdown
 from invgraphics.report.pages.longtable import write_comparison_table
 from invgraphics.report.pages.parts import draw_part, method_contrasts
 from invgraphics.report.pages.tables import effects_caption, write_latex, write_latex_effects
 from invgraphics.report.wording import listing
+from invgraphics.runs.run import Run, read_run, truth_picture
 
 
 def build_report(folder: Path, out: Path | None = None, public: bool = False) -> Path:
     """Write the report of a comparison into its own folder, or into another one.
 
     Args:
-        folder: what ``compare`` wrote: ``compare.json``, ``truth/`` and ``runs/``.
+        folder: what ``compare`` wrote.
         out: where to write; ``None`` for the comparison's own folder.
         public: leave out everything private, which needs a folder of its own.
 
@@ -58,16 +59,16 @@ def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Pa
     labelled = _tell_apart(read)
     methods = tuple(dict.fromkeys(run.method for run in labelled))
     first = labelled[0]
-    picture = read_picture(first.truth / "0000.png")
+    picture = read_picture(truth_picture(first.truth, 0))
     comparison = Comparison(
-        scene=_common([run.scene for run in labelled]),
+        scene=_common([run.scores.scene for run in labelled]),
         question=f"How {'does' if len(methods) == 1 else 'do'} {listing(methods)} show new views, and at what cost?",
         methods=methods,
         runs=tuple(labelled),
-        budget=_common([str(run.provenance.get("budget", "")) for run in labelled]),
-        preset=_common([run.preset for run in labelled]),
+        budget=_common([run.provenance.budget for run in labelled]),
+        preset=_common([run.scores.preset for run in labelled]),
         size=(picture.shape[1], picture.shape[0]),
-        protocol={"name": first.protocol},
+        protocol={"name": first.scores.protocol},
     )
     base = Path(os.path.commonpath([path.resolve().parent for path in folders])) if public else out
     return _write(comparison, out, base, public)
@@ -107,7 +108,7 @@ def _tell_apart(runs: Sequence[Run]) -> list[Run]:
     if len(set(cells)) == len(cells):
         return list(runs)
     for detail in ("preset", "budget"):
-        details = [run.preset if detail == "preset" else str(run.provenance.get("budget", "")) for run in runs]
+        details = [run.scores.preset if detail == "preset" else run.provenance.budget for run in runs]
         named = [(f"{run.method} ({what})", run.seed) for run, what in zip(runs, details, strict=True)]
         if len(set(named)) == len(named):
             return [replace(run, method=name) for run, (name, _) in zip(runs, named, strict=True)]

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from invgraphics.errors import InputError
 from invgraphics.report.data.assets import Folder
-from invgraphics.report.data.records import Comparison
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.redact import check_apart, redactor_for
 from invgraphics.report.data.studies import Study, read_study, scene_comparisons
 from invgraphics.report.figures.analyses import draw_analyses
-from invgraphics.report.figures.effects import draw_heat_maps, file_name
+from invgraphics.report.figures.effects import draw_heat_maps
 from invgraphics.report.pages.longtable import write_study_table
 from invgraphics.report.pages.parts import draw_contrasts, draw_part
 from invgraphics.report.pages.study import StudyPage, write_study_html, write_study_markdown
@@ -23,6 +23,7 @@ from invgraphics.report.statistics.effects import effects_on
 from invgraphics.report.statistics.rules import headline, judge
 from invgraphics.report.statistics.summary import quality_columns, table_columns, value_of
 from invgraphics.report.wording import Quantity
+from invgraphics.text import file_name
 
 MOST_PICTURES = 8
 """Variants of a scene that get pictures and curves; there are as many colours."""
@@ -32,7 +33,7 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
     """Write the report of a study, finished or not.
 
     Args:
-        folder: what ``ablate`` wrote: ``study.json`` and ``runs/``.
+        folder: what ``ablate`` wrote.
         out: where to write; ``None`` for the study's own folder.
         public: leave out everything private, which needs a folder of its own.
 

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from invgraphics.errors import InputError
 
-NAME = "checkpoint.safetensors"
-
 
 def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
     """Write ``parts`` (section -> name -> tensor) so that an interruption leaves either the old file or the new one."""

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import tomlkit
-from tomlkit.exceptions import ParseError
+from typing import Any, TypeVar
 
 from invgraphics.errors import InputError
-from invgraphics.runs import checkpoint
+from invgraphics.runs import history
+from invgraphics.runs.environment import Environment
+from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.history import Moment
+from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.renderings import Renderings
+from invgraphics.runs.schema import Record
+from invgraphics.runs.scores import DEFAULT, Scores, read_scores, scores_file
+from invgraphics.tables import read_toml
+
+R = TypeVar("R", bound=Record)
+
+RECIPE = "recipe.toml"
+"""The resolved recipe."""
+CHECKPOINT = "checkpoint.safetensors"
+"""Everything a resumed fit needs, see `invgraphics.runs.checkpoint`."""
+RUNS = "runs"
+"""Folder of the runs, in a comparison or study."""
+TRUTH = "truth"
+"""Folder of the true pictures, once per content; in a comparison or study they are shared by its runs."""
+PUBLISHED = (RECIPE, scores_file(), history.FILE, Provenance.FILE, Environment.FILE)
+"""Files of a run that a report links."""
 
 
 def make_parent(out: Path) -> None:
@@ -29,6 +46,17 @@ def make_parent(out: Path) -> None:
         out.absolute().parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"The folder of '{out}' cannot be made: {error.strerror}.", "Choose another --out.") from error
+
+
+def check_run(folder: Path) -> None:
+    """Refuse a folder that holds no run.
+
+    Raises:
+        InputError: it lacks a recipe or its provenance.
+    """
+    for name in (RECIPE, Provenance.FILE):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder} is not a run: it has no {name}.", "Give a folder that `invgraphics fit` wrote.")
 
 
 class RunFolder:
@@ -62,17 +90,35 @@ class RunFolder:
                 fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
+    def has(self, kind: type[Record]) -> bool:
+        """Whether the file of a record is there."""
+        return (self.root / kind.FILE).is_file()
+
+    def read(self, kind: type[R]) -> R:
+        """Read a record from its file.
+
+        Raises:
+            InputError: the file is missing or broken; the sentence names file and key.
+        """
+        return kind.read(self.root / kind.FILE)
+
+    def write(self, record: Record) -> None:
+        """Write a record to its file, atomically."""
+        record.write(self.root / record.file)
+
+    def remove(self, kind: type[Record]) -> None:
+        """Remove the file of a record, if it is there."""
+        (self.root / kind.FILE).unlink(missing_ok=True)
+
     @property
     def identity(self) -> str:
         """Identity of the run that is here, finished or not; empty where there is none."""
-        if not (self.root / "provenance.json").is_file():
-            return ""
-        return str(self.read_json("provenance.json").get("cell_sha256", ""))
+        return self.read(Provenance).cell_sha256 if self.has(Provenance) else ""
 
     @property
     def checkpoint(self) -> Path:
         """Everything a resumed fit needs."""
-        return self.root / checkpoint.NAME
+        return self.root / CHECKPOINT
 
     def snapshot(self, index: int) -> Path:
         """The model at one moment of the fit, for time-lapses."""
@@ -83,97 +129,75 @@ class RunFolder:
         """The kept states of the model, first to last."""
         return sorted((self.root / "snapshots").glob("*.safetensors"))
 
+    def picture(self, index: int) -> Path:
+        """The model's picture of a test view, 8 bits, over the scene's background."""
+        return self.root / "test" / f"{index:04d}.png"
+
+    def arrays(self, index: int) -> Path:
+        """The model's picture of a test view, not rounded: colour, alpha, depth and normals."""
+        return self.root / "test" / f"{index:04d}.npz"
+
+    @property
+    def predictions(self) -> list[Path]:
+        """The arrays of all test views that there are."""
+        return sorted((self.root / "test").glob("*.npz"))
+
     @property
     def history(self) -> Path:
         """One JSON line for each recorded moment of the fit."""
-        return self.root / "history.jsonl"
+        return self.root / history.FILE
 
     @property
     def finished(self) -> bool:
         """Whether the run has its scores."""
-        return (self.root / "scores.json").is_file()
+        return self.scores_path().is_file()
 
     @property
     def resumable(self) -> bool:
         """Whether a fit can go on: from a checkpoint, and the seconds that it had taken."""
-        return self.checkpoint.is_file() and (self.root / "fit.json").is_file()
+        return self.checkpoint.is_file() and self.has(FitRecord)
+
+    def scores_path(self, protocol: str = DEFAULT) -> Path:
+        """The file of a protocol's scores."""
+        return self.root / scores_file(protocol)
+
+    def read_scores(self, protocol: str = DEFAULT) -> Scores:
+        """The scores under a protocol.
+
+        Raises:
+            InputError: they are missing or broken.
+        """
+        return read_scores(self.root, protocol)
 
     def clear(self) -> None:
         """Remove the files of an earlier run, and nothing else."""
-        names = [
-            "recipe.toml",
-            "history.jsonl",
-            "fit.json",
-            "error.txt",
-            "environment.json",
-            "provenance.json",
-            "renderings.json",
-            checkpoint.NAME,
-        ]
-        patterns = ("scores*.json", "test/*", "snapshots/*")
+        kinds = (FitRecord, Environment, Provenance, Renderings)
+        names = [RECIPE, history.FILE, CHECKPOINT, *(kind.FILE for kind in kinds)]
+        patterns = (Scores.FILES, "test/*", "snapshots/*")
         found = [path for pattern in patterns for path in self.root.glob(pattern)]
         for path in [*(self.root / name for name in names), *found]:
             path.unlink(missing_ok=True)
 
-    def write_json(self, name: str, content: Any) -> None:
-        """Write one JSON file, atomically."""
-        write_json(self.root / name, content)
-
-    def read_json(self, name: str) -> dict[str, Any]:
-        """Read one JSON file of the run.
-
-        Raises:
-            InputError: it is missing or broken.
-        """
-        return read_json(self.root / name)
-
     def write_recipe(self, table: dict[str, Any]) -> None:
         """Write the resolved recipe."""
-        (self.root / "recipe.toml").write_text(tomlkit.dumps(table))
+        import tomlkit
+
+        (self.root / RECIPE).write_text(tomlkit.dumps(table))
 
     def read_recipe(self) -> dict[str, Any]:
-        """Read the resolved recipe."""
-        try:
-            return tomlkit.parse((self.root / "recipe.toml").read_text()).unwrap()
-        except FileNotFoundError:
-            raise InputError(f"{self.root} is not a run: it has no recipe.toml.") from None
-        except ParseError as error:
-            raise InputError(f"{self.root / 'recipe.toml'} is not valid TOML: {error}.") from error
+        """Read the resolved recipe.
 
-    def append_history(self, line: dict[str, Any]) -> None:
+        Raises:
+            InputError: it is missing or is not TOML.
+        """
+        if not (self.root / RECIPE).is_file():
+            raise InputError(f"{self.root} is not a run: it has no {RECIPE}.")
+        return read_toml(self.root / RECIPE)
+
+    def append_history(self, moment: Moment) -> None:
         """Add one moment to the history."""
-        with self.history.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        history.append_history(self.history, moment)
 
     def cut_history(self, step: int) -> None:
         """Drop what came after ``step``: a resumed fit will live it again."""
-        if self.history.is_file():
-            kept = [line for line in self._history_lines() if line["step"] <= step]
-            self.history.write_text("".join(json.dumps(line) + "\n" for line in kept))
-
-    def _history_lines(self) -> Iterable[dict[str, Any]]:
-        for line in self.history.read_text().splitlines():
-            try:
-                yield json.loads(line)
-            except json.JSONDecodeError:
-                return  # the line that an interruption cut off
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON beside ``path`` and rename it."""
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file, with a sentence where it is missing or broken."""
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist.") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path} cannot be read as JSON: {error}.") from error
+        history.cut_history(self.history, step)

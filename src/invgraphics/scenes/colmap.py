@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from invgraphics.core import Camera, Points, Scene
+from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap_workspace import find_model, model_folders
@@ -47,11 +48,16 @@ class Colmap:
 
 
 def _photo(image: Any, folder: Path) -> Photo:
-    lens = Lens(image.camera.model_name, tuple(float(v) for v in image.camera.params), image.camera.width, image.camera.height)
     where = f"image '{image.name}'"
+    lens = Lens(image.camera.model_name, tuple(float(v) for v in image.camera.params), image.camera.width, image.camera.height)
     if not np.isfinite(lens.params).all() or image.camera.focal_length_x <= 0 or image.camera.focal_length_y <= 0:
         raise InputError(f"The camera of {where} has parameters {lens.params}, which no lens has.")
     world_to_cam = torch.from_numpy(np.array(image.cam_from_world().matrix(), dtype=np.float64))
+    norm = float(np.linalg.norm(image.cam_from_world().rotation.quat))
+    if abs(norm - 1) > 1e-3:  # COLMAP normalises what it reads, and what it cannot normalise counts as no rotation
+        raise InputError(f"The rotation of {where} is a quaternion of norm {norm:.2g}.")
+    if not (1 <= lens.width <= LONGEST_SIDE and 1 <= lens.height <= LONGEST_SIDE):
+        raise InputError(f"The camera of {where} has {lens.width}x{lens.height} pixels.")
     camera = Camera(
         cam_to_world=pose(colmap_to_opencv(world_to_cam), where),
         focal=torch.tensor([image.camera.focal_length_x, image.camera.focal_length_y], dtype=torch.float64),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
+from invgraphics.scenes.colmap_sizes import check_sizes
 from invgraphics.scenes.layout import IMAGE_FOLDERS, is_image_folder
 
 PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse", "colmap/sparse/*", ".", "[0-9]")
@@ -101,6 +102,7 @@ def _holds_model(folder: Path) -> bool:
 def _read(folder: Path) -> Model:
     from invgraphics.scenes.colmap_library import pycolmap
 
+    check_sizes(folder)
     try:
         reconstruction = pycolmap.Reconstruction(str(folder))
     except (ValueError, IndexError, RuntimeError, MemoryError) as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,13 +11,16 @@ from typing import Any
 import torch
 
 from invgraphics.core import Camera
+from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import focal_from_fov, opengl_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import SUFFIXES, Photo, image_size
 from invgraphics.scenes.layout import pose
 from invgraphics.scenes.lens import Lens
+from invgraphics.tables import read_json
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
+_LONGEST_PATH = 1000
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
 
@@ -43,14 +45,7 @@ class Frames:
         Raises:
             InputError: it is missing, no JSON (line and column are given), or has no frames.
         """
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(f"{path} does not exist.") from None
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path} is not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.") from error
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{path} cannot be read: {error}.") from error
+        table = read_json(path)
         frames = table.get("frames") if isinstance(table, dict) else None
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise InputError(
@@ -73,8 +68,8 @@ class Frames:
 
     def _text(self, index: int) -> str:
         value = self.frames[index].get("file_path")
-        if not isinstance(value, str) or not value:
-            raise InputError(f"{self.path}, frame {index}, has no 'file_path'.")
+        if not isinstance(value, str) or not value.strip("./\\") or "\0" in value or len(value) > _LONGEST_PATH:
+            raise InputError(f"{self.path}, frame {index}, has no 'file_path' that could be one.")
         return value
 
     def _number(self, index: int, key: str) -> float | None:
@@ -104,7 +99,7 @@ class Frames:
         w, h = self._number(index, "w"), self._number(index, "h")
         if w is None or h is None:
             return image_size(existing) if existing is not None else (1, 1)
-        if w < 1 or h < 1:
+        if not (1 <= w <= LONGEST_SIDE and 1 <= h <= LONGEST_SIDE):
             raise InputError(f"'w' and 'h' of {self._where(index)} are {w:g} and {h:g}, not a size in pixels.")
         return round(w), round(h)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files, image_size
 from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth, pose
-from invgraphics.scenes.npz import DAMAGED
+from invgraphics.tables import read_arrays
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 
@@ -62,15 +63,13 @@ def _source(path: Path) -> Path | None:
 
 
 def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], list[Camera]]:
-    try:
-        with np.load(source, allow_pickle=False) as table:
-            arrays = {key: np.asarray(table[key], dtype=np.float64) for key in table.files if "_mat_" in key}
-    except DAMAGED as error:
-        raise InputError(f"{source} cannot be read: {error}.") from error
+    arrays = read_arrays(source)
     sphere = _matrix(arrays, "scale_mat_0", source)
     world_from_local = torch.from_numpy(sphere)
     # The sphere's matrix is a similarity exactly if its linear part without the scale is rigid.
     scale = torch.linalg.det(world_from_local[:3, :3]).abs() ** (1 / 3)
+    if not 0 < float(scale) < math.inf or not np.array_equal(sphere[3], [0, 0, 0, 1]):
+        raise InputError(f"The scale_mat_0 of {source} is no similarity: its determinant is {float(scale) ** 3:g}.")
     pose(torch.cat([world_from_local[:3, :3] / scale, world_from_local[:3, 3:]], dim=1), f"{source}, scale_mat_0")
     cameras = []
     for index, file in enumerate(files):
@@ -84,9 +83,9 @@ def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], lis
 def _matrix(arrays: Mapping[str, np.ndarray], key: str, source: Path) -> Float[np.ndarray, "4 4"]:
     if key not in arrays:
         raise InputError(f"{source} has no '{key}'.", "One world_mat and one scale_mat per picture are expected.")
-    if arrays[key].shape != (4, 4) or not np.isfinite(arrays[key]).all():
+    if arrays[key].shape != (4, 4) or arrays[key].dtype.kind not in "fiu" or not np.isfinite(arrays[key]).all():
         raise InputError(f"'{key}' of {source} is not a finite 4x4 matrix.")
-    return arrays[key]
+    return arrays[key].astype(np.float64)
 
 
 def decompose(projection: Float[np.ndarray, "3 4"], size: tuple[int, int], where: str) -> Camera:

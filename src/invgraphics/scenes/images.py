@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 
 from invgraphics.core import Camera, View
 from invgraphics.errors import InputError
+from invgraphics.scenes import png
 from invgraphics.scenes.lens import Lens, straighten, undistort
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -82,6 +83,8 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
     from PIL import ImageOps
 
     with _open(path) as image, _naming_damaged_file(path, image):
+        if wrong := png.damage(path):
+            raise ValueError(wrong)
         upright = ImageOps.exif_transpose(image) if _is_turned(image, like) or not _is_sideways(image) else image
         if upright.mode.startswith("I"):
             grey = (np.asarray(upright).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)

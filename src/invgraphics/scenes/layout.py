@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -205,6 +206,8 @@ def contracted_frame(
         ahead = ((focus - position) * forward).sum(dim=1).median()
         centre = focus if float(ahead) > 0 else middle
     radius = float((position - centre).norm(dim=1).max()) or 1.0
+    if not math.isfinite(radius):
+        raise InputError("The cameras are farther apart than numbers reach.", "Check the positions of the poses.")
     world_from_local = torch.eye(4, dtype=poses.dtype)
     world_from_local[:3, :3] = radius * _turn_z_to(-poses[:, :3, 1].mean(dim=0))
     world_from_local[:3, 3] = centre

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -14,6 +15,11 @@ from invgraphics.errors import InputError
 
 WIDEST = 2.0
 """Largest |x/z| and |y/z| kept of a fisheye picture (a field of view of 127°): beyond it a pinhole image is mostly stretch."""
+
+MOST_STRETCH = 100.0
+"""Ratio of the areas of pixels within an undistorted picture; that of a fisheye is 9 at `WIDEST`."""
+SHRINKS = 60
+"""How often a rectangle that a lens folds is made 5% smaller before the lens is refused."""
 
 
 @dataclass(frozen=True)
@@ -96,18 +102,56 @@ def _inner_rectangle(camera: Any, width: int, height: int) -> tuple[float, float
     # Half a pixel inside the border, so that bilinear interpolation never asks for a pixel that is not there.
     x, y = np.linspace(0.5, width - 0.5, 129), np.linspace(0.5, height - 0.5, 129)
     sides = [(np.full_like(y, x[0]), y), (np.full_like(y, x[-1]), y), (x, np.full_like(x, y[0])), (x, np.full_like(x, y[-1]))]
-    limits = []
+    limits, trusted = [], 0
     for side, (axis, sign) in zip(sides, [(0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0)], strict=True):
         border = np.stack(side, axis=1)
         plane = camera.cam_from_img(border)
         # COLMAP gives back nonsense where its iteration fails (a fisheye beyond 180°): believe only what maps back.
         back = camera.img_from_cam(np.concatenate([plane, np.ones((len(plane), 1))], axis=1))
         believable = np.abs(back - border).max(axis=1) < 0.01
-        reach = np.append(sign * plane[believable, axis], WIDEST)
-        limits.append(sign * reach.min())
-    if not (limits[0] < limits[1] and limits[2] < limits[3]):
-        raise InputError(f"The distortion parameters of a {camera.model_name} camera fold its picture.", "Check their signs.")
+        trusted += int(believable.sum())
+        reach = plane[believable, axis] * sign if believable.any() else [_reach(camera, axis, sign)]
+        limits.append(sign * min(float(np.min(reach)), WIDEST))
+    for _ in range(SHRINKS):
+        if limits[0] < limits[1] and limits[2] < limits[3] and (areas := _areas(camera, limits)).min() > 0:
+            break
+        limits = [0.95 * limit for limit in limits]
+    else:
+        raise _folded(camera)
+    # Without any border there must at least be a picture up to WIDEST, as of a fisheye beyond 180 degrees.
+    if not (trusted or min(map(abs, limits)) == WIDEST):
+        raise _folded(camera)
+    if areas.max() > MOST_STRETCH * areas.min():
+        raise InputError(
+            f"The distortion parameters of a {camera.model_name} camera smear its picture: the areas of its pixels differ "
+            f"{areas.max() / areas.min():.2g} times.",
+            "Check the order and the units of the parameters.",
+        )
     return limits[0], limits[1], limits[2], limits[3]
+
+
+def _reach(camera: Any, axis: int, sign: float) -> float:
+    """How far from the optical axis along x or y the projection does not turn back, on the plane z = 1; up to `WIDEST`."""
+    plane = np.zeros((257, 3))
+    plane[:, axis], plane[:, 2] = sign * np.linspace(0, WIDEST, 257), 1
+    growing = sign * np.diff(camera.img_from_cam(plane)[:, axis]) > 0  # not of NaN either
+    return float(abs(plane[-1 if growing.all() else int(growing.argmin()), axis]))
+
+
+def _areas(camera: Any, limits: Sequence[float]) -> Float[np.ndarray, " n"]:
+    """Determinants of the projection's Jacobian on a lattice in left, right, top and bottom; -1 where one is not finite."""
+    left, right, top, bottom = limits
+    corners = np.stack([*np.meshgrid(np.linspace(left, right, 33), np.linspace(top, bottom, 33)), np.ones((33, 33))], axis=-1)
+    step = 1e-4 * min(right - left, bottom - top)
+    offsets = np.array([[0.0, 0, 0], [step, 0, 0], [0, step, 0]])
+    origin, along, down = (camera.img_from_cam(corners.reshape(-1, 3) + offset) for offset in offsets)
+    along, down = along - origin, down - origin
+    area = along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0]
+    return np.where(np.isfinite(area), area, -1.0)
+
+
+def _folded(camera: Any) -> InputError:
+    return InputError(f"The distortion parameters of a {camera.model_name} camera fold its picture.", "Check their signs.")
 
 
 def undistort(values: Float[np.ndarray, "h w c"], straight: Straight) -> Float[np.ndarray, "h w c"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,12 @@ import torch
 from jaxtyping import Float
 
 from invgraphics.core import Camera, Scene
+from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files
 from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, scene_name
-from invgraphics.scenes.npz import DAMAGED
+from invgraphics.tables import read_array
 
 
 class Llff:
@@ -42,7 +44,7 @@ class Llff:
             _photo(row, file, f"{source}, row {index}") for index, (row, file) in enumerate(zip(table, files, strict=True))
         ]
         near, far = float(table[:, 15].min()), float(table[:, 16].max())
-        if not 0 < near < far:
+        if not 0 < near < far < math.inf:
             raise InputError(f"The depth bounds of {source} are {near:g} and {far:g}, not positive and increasing.")
         poses = torch.stack([photo.camera.cam_to_world for photo in photos])
         # LLFF's own numbers: 10% in front of the nearest bound; focus between that and five times the farthest.
@@ -51,12 +53,7 @@ class Llff:
 
 
 def _read(source: Path) -> Float[np.ndarray, "n 17"]:
-    try:
-        table = np.load(source, allow_pickle=False)
-    except DAMAGED as error:
-        raise InputError(f"{source} cannot be read: {error}.") from error
-    if not isinstance(table, np.ndarray):
-        raise InputError(f"{source} is an archive, not one array.")
+    table = read_array(source)
     if table.ndim != 2 or table.shape[1] != 17 or len(table) == 0 or table.dtype.kind != "f":
         raise InputError(f"{source} has shape {table.shape}, expected n rows of 17 numbers.")
     return table.astype(np.float64)
@@ -64,7 +61,7 @@ def _read(source: Path) -> Float[np.ndarray, "n 17"]:
 
 def _pictures(path: Path) -> list[Path]:
     """The photographs at the highest resolution there is: ``images``, or else ``images_4`` and the like."""
-    scaled = sorted((int(f.name[7:]), f) for f in path.glob("images_*") if f.is_dir() and f.name[7:].isdigit())
+    scaled = sorted((int(f.name[7:]), f) for f in path.glob("images_*") if f.is_dir() and f.name[7:].isdecimal())
     for folder in (path / "images", *(folder for _, folder in scaled)):
         if files := image_files(folder):
             return files
@@ -74,7 +71,7 @@ def _pictures(path: Path) -> list[Path]:
 def _photo(row: Float[np.ndarray, 17], file: Path, where: str) -> Photo:
     values = torch.from_numpy(row[:15].reshape(3, 5))
     height, width, focal = values[:, 4].tolist()
-    if not (height >= 1 and width >= 1 and focal > 0):
+    if not (1 <= height <= LONGEST_SIDE and 1 <= width <= LONGEST_SIDE and 0 < focal < math.inf):
         raise InputError(f"Height, width and focal length of {where} are {height:g}, {width:g} and {focal:g}.")
     cam_to_world = pose(llff_to_opencv(values[:, :4]), where)
     centre = torch.tensor([width / 2, height / 2], dtype=torch.float64)

@@ -19,8 +19,6 @@ bounds         (2, 3), optional               lowest and highest corner of a box
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -32,14 +30,12 @@ from torch import Tensor
 
 from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
 from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
+from invgraphics.tables import read_arrays
 
 Arrays = Mapping[str, np.ndarray]
-
-DAMAGED = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""What `numpy.load` raises about a file that is damaged or holds pickled objects."""
 
 _REQUIRED = ("images", "cam_to_world", "focal")
 
@@ -90,11 +86,7 @@ class Npz:
 
 def _read(path: Path) -> Arrays:
     """All arrays, with the shapes that the convention asks for."""
-    try:
-        with np.load(path, allow_pickle=False) as table:
-            arrays = {key: table[key] for key in table.files}
-    except DAMAGED as error:
-        raise InputError(f"{path} cannot be read: {error}.", "Write or copy the file again.") from error
+    arrays = read_arrays(path)
     missing = [key for key in _REQUIRED if key not in arrays]
     if missing:
         raise InputError(f"{path} has no {' and no '.join(map(repr, missing))}.", f"It has: {', '.join(arrays) or 'nothing'}.")
@@ -112,6 +104,9 @@ def _read(path: Path) -> Arrays:
         "bounds": [(2, 3)],
         "test": [(n,)],
     }
+    known = (*_REQUIRED, *allowed, "points", "points_rgb")
+    if unknown := [key for key in arrays if key not in known]:
+        raise InputError(f"{path} has an unknown key '{unknown[0]}'.{did_you_mean(unknown[0], known)}")
     for key, shapes in allowed.items():
         if key in arrays and arrays[key].shape not in shapes:
             expected = " or ".join(map(str, shapes))
@@ -132,14 +127,15 @@ def _frame(arrays: Arrays, poses: Float[Tensor, "n 4 4"], path: Path) -> Frame:
         rgb = arrays.get("points_rgb", np.full(position.shape, 0.5))
         if position.ndim != 2 or position.shape[1] != 3 or rgb.shape != position.shape:
             raise InputError(f"'points' of {path} has shape {position.shape}, its colours {rgb.shape}; expected (m, 3) twice.")
-        if not np.isfinite(position).all():
-            raise InputError(f"'points' of {path} has entries that are not finite.")
+        if position.dtype.kind not in "fiu" or not np.isfinite(position).all():
+            raise InputError(f"'points' of {path} has entries that are not finite numbers.")
         points = Points(
             torch.from_numpy(position.astype(np.float64)), torch.from_numpy(_bytes(rgb, "points_rgb", path)).float() / 255
         )
     if "bounds" not in arrays:
         return contracted_frame(poses, points)
-    lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32))
+    with np.errstate(over="ignore"):  # infinite bounds are refused with the scene
+        lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32))
     if not bool((lo < hi).all()):
         raise InputError(f"'bounds' of {path} is {arrays['bounds'].tolist()}: the first corner must be below the second.")
     return Frame(Bounds(lo, hi), points=points)
@@ -184,7 +180,7 @@ def _parts(similarity: Float[Tensor, "4 4"]) -> tuple[float, Float[Tensor, "3 3"
 def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shape"]:
     if values.dtype == np.uint8:
         return values
-    if values.dtype.kind == "f" and np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1:
+    if values.dtype.kind == "f" and np.isfinite(values).all() and (values >= 0).all() and (values <= 1).all():
         return (values * 255 + 0.5).astype(np.uint8)
     raise InputError(f"'{key}' of {path} holds neither bytes nor finite floats in [0, 1].")
 

@@ -13,6 +13,7 @@ import torch
 
 from invgraphics import plugins
 from invgraphics.core import Scene, View
+from invgraphics.core.believable import check_scene
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions, pose
 
@@ -186,8 +187,8 @@ def validate(scene: Scene) -> Scene:
     """Check what everything later relies on; returns the scene.
 
     Raises:
-        InputError: a pose is not finite or not rigid, a focal length is not positive, pixels are not finite or not of the
-            camera's size, a split is empty, or a test camera is also a training camera. The sentence names the view.
+        InputError: a pose is not rigid, pixels are not finite or not of the camera's size, a split is empty, a test camera is
+            also a training camera, or something is not believable (`core.believable`). The sentence names the view.
     """
     for split in ("train", "test"):
         if not getattr(scene, split):
@@ -197,6 +198,7 @@ def validate(scene: Scene) -> Scene:
     for split in ("train", "val", "test"):
         for view in getattr(scene, split):
             _validate_view(view, f"{split} view '{view.name}' of '{scene.name}'")
+    check_scene(scene)
     tested = torch.stack([_flat(view) for view in scene.test])
     for split in ("train", "val"):
         for view in getattr(scene, split):
@@ -214,9 +216,6 @@ def _flat(view: View) -> torch.Tensor:
 def _validate_view(view: View, what: str) -> None:
     camera = view.camera
     pose(camera.cam_to_world, what)
-    intrinsics = torch.cat([camera.focal, camera.centre])
-    if not bool(intrinsics.isfinite().all()) or float(camera.focal.min()) <= 0:
-        raise InputError(f"The {what} has focal length {camera.focal.tolist()} and centre {camera.centre.tolist()} pixels.")
     for name, values in (("image", view.image), ("alpha", view.alpha), ("depth", view.depth), ("normal", view.normal)):
         if values is None:
             continue

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
@@ -15,6 +14,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, Photo, load_view
 from invgraphics.scenes.layout import SceneOptions, evenly, pose
 from invgraphics.scenes.mitsuba import cache, ply
+from invgraphics.tables import read_arrays
 
 LINEAR_RESIZE = "area average of linear light"
 """The filter from a larger rendering to the folder's pictures, see `invgraphics.scenes.mitsuba.average`."""
@@ -77,8 +77,8 @@ def _view(path: Path, split: str, index: int, table: Mapping[str, Any], options:
     view = load_view(Photo(picture, camera, name), options.size)
     if (view.camera.width, view.camera.height) != (camera.width, camera.height):
         return view
-    with np.load(picture.with_suffix(".npz"), allow_pickle=False) as arrays:
-        depth, normal = (torch.from_numpy(arrays[key]) for key in ("depth", "normal"))
+    arrays = read_arrays(picture.with_suffix(".npz"))
+    depth, normal = (torch.from_numpy(arrays[key]) for key in ("depth", "normal"))
     # Fog has no surface: its truth is in the pictures only.
     return replace(view, depth=depth, normal=normal) if bool(depth.isfinite().any()) else view
 
@@ -86,8 +86,8 @@ def _view(path: Path, split: str, index: int, table: Mapping[str, Any], options:
 def _points(path: Path) -> Points | None:
     if not path.is_file():
         return None
-    with np.load(path, allow_pickle=False) as arrays:
-        return Points(torch.from_numpy(arrays["position"]), torch.from_numpy(arrays["rgb"]))
+    arrays = read_arrays(path)
+    return Points(torch.from_numpy(arrays["position"]), torch.from_numpy(arrays["rgb"]))
 
 
 def _mesh(path: Path) -> Mesh | None:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -25,14 +24,16 @@ from invgraphics.experiments.renderings import check_variants, rendered
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.study import CellRecord
 from invgraphics.scenes.open import absent_data
 from invgraphics.studies.analyses import write_analyses
 from invgraphics.studies.cells import Planned, make_plan, select
-from invgraphics.studies.forecast import Cost, Forecast, duration, total, try_method
-from invgraphics.studies.record import RECORD, CellState, Record, summarise_study
-from invgraphics.studies.study import Study, locate, name_of, read_study
-
-__all__ = ["RECORD", "ablate"]
+from invgraphics.studies.forecast import Cost, Forecast, total, try_method
+from invgraphics.studies.reading import locate, name_of, read_study, with_request
+from invgraphics.studies.record import CellState, StudyRecorder, summarise_study
+from invgraphics.studies.study import Study
+from invgraphics.text import duration
 
 Size = int | tuple[int, int] | None
 """Longest side in pixels, or (width, height)."""
@@ -60,22 +61,22 @@ class _Progress:
         return share, f"{self.done} of {len(self.expected)} runs{failures}, about {duration(left)} left"
 
 
-def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple[Path, list[dict[str, Any]]]:
-    """Make every run of a study that is missing; ``study.json`` is true at any moment.
+def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple[Path, list[CellRecord]]:
+    """Make every run of a study that is missing; the study's record is true at any moment.
 
     Args:
         request: the study, and where and how to run it.
         confirm: is shown the forecast before the first run, and may raise to call it off.
 
     Returns:
-        The study's folder, and the entries of ``study.json`` of the cells that failed.
+        The study's folder, and the cells that failed.
 
     Raises:
         InputError: anything that cannot be used; found before the first run.
         KeyboardInterrupt: interrupted; the runs that were under way have checkpoints.
     """
     path = locate(request.study)
-    study = read_study(path).overridden(request)
+    study = with_request(read_study(path), request)
     # Pinned also where a run has the machine to itself, so that its bits do not depend on who starts it.
     threads = torch.get_num_threads() if request.jobs == 1 else max(1, cores() // request.jobs)
     resources = Resources(jobs=request.jobs, threads=threads, gpus=request.gpus, address=request.address, logs=True)
@@ -85,7 +86,7 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
     folder = RunFolder(Path(request.out))
     folder.create()
     with folder.held():
-        record = Record(folder, summarise_study(study, name_of(path), (request, resources), plan[0].job), plan)
+        record = StudyRecorder(folder, summarise_study(study, name_of(path), (request, resources), plan[0].job), plan)
         fits = {planned.id: planned for planned in plan}
         states = {name: _state(planned, request.keep, name in chosen) for name, planned in fits.items()}
         samples, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
@@ -128,7 +129,7 @@ def _is_kept(planned: Planned) -> bool:
     run = planned.job.folder
     if not run.finished or not rendered(planned.job):
         return False
-    return run.read_json("provenance.json").get("recipe_sha256") == planned.method.digest
+    return run.read(Provenance).recipe_sha256 == planned.method.digest
 
 
 def _place(planned: Planned) -> tuple[str, Size]:
@@ -190,7 +191,7 @@ def _check_disk(forecast: Forecast, folder: Path) -> None:
         raise InputError(f"The study will write {forecast.size / 1e9:.2g} GB, and {folder} has {free / 1e9:.2g} GB left.")
 
 
-def _run(executor: Executor, missing: list[Planned], expected: dict[str, float], files: tuple[Record, Path]) -> None:
+def _run(executor: Executor, missing: list[Planned], expected: dict[str, float], files: tuple[StudyRecorder, Path]) -> None:
     """Run what is missing; ``files`` are the record, and the folder for jobs and their logs."""
     record, jobs = files
     progress = _Progress({p.fit.out: expected[p.id] for p in missing}, time.monotonic())

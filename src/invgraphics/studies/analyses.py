@@ -1,16 +1,18 @@
 """Small computations that a study sets beside its fits: a known case, where a single effect can be seen alone.
 
-An analysis is a function that returns `Analysis`; ``study.toml`` names it, and its curves are kept as JSON for the report.
+An analysis is a function that returns an `invgraphics.runs.analysis.Analysis`; ``study.toml`` names it, and its curves are kept
+for the report.
 """
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.errors import InputError
+from invgraphics.runs.analysis import Analysis, analysis_path
 
 ANALYSES = {
     "affine-projection": "invgraphics.studies.approximations:affine_projection",
@@ -19,37 +21,6 @@ ANALYSES = {
     "opacity-convention": "invgraphics.studies.approximations:opacity_convention",
 }
 """Name -> ``module:function``."""
-FOLDER = "analyses"
-
-
-@dataclass(frozen=True)
-class Curve:
-    """One line of a plot: ``y`` over ``x``."""
-
-    label: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Analysis:
-    """What was computed, in words and as curves.
-
-    Attributes:
-        title: a few words.
-        sentence: what a reader should take away; the numbers in it are computed.
-        x: name and unit of the horizontal axis.
-        y: of the vertical axis.
-        curves: all of them.
-        logarithmic: whether the vertical axis is.
-    """
-
-    title: str
-    sentence: str
-    x: str
-    y: str
-    curves: tuple[Curve, ...]
-    logarithmic: bool = False
 
 
 def check_analyses(names: Sequence[str], where: str) -> None:
@@ -68,14 +39,11 @@ def write_analyses(names: Sequence[str], root: Path) -> None:
     from invgraphics.experiments.environment import code_version
     from invgraphics.runs.folder import RunFolder
 
-    if not names:
-        return
-    folder = RunFolder(root / FOLDER)
-    folder.create()
     for name in names:
-        file = f"{name}.json"
-        if (folder.root / file).is_file() and folder.read_json(file).get("code") == code_version():
+        path = analysis_path(root, name)
+        if path.is_file() and Analysis.read(path).code == code_version():
             continue
         module, _, function = ANALYSES[name].partition(":")
         compute: Callable[[], Analysis] = getattr(importlib.import_module(module), function)
-        folder.write_json(file, {"schema": 1, "name": name, "code": code_version(), **asdict(compute())})
+        RunFolder(path.parent).create()
+        replace(compute(), name=name, code=code_version()).write(path)

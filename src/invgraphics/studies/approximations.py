@@ -17,7 +17,7 @@ from invgraphics.fields.gaussian import GaussianField
 from invgraphics.renderers.gaussian_rays import Opacity
 from invgraphics.renderers.gaussian_volume import GaussianExact, GaussianExactConfig, GaussianSorted, GaussianSortedConfig
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
-from invgraphics.studies.analyses import Analysis, Curve
+from invgraphics.runs.analysis import Analysis, Curve
 
 UP = (0.0, 0.0, 1.0)
 PATCH = 96

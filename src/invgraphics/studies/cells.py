@@ -11,11 +11,12 @@ from typing import Any
 from invgraphics.errors import InputError
 from invgraphics.experiments.identity import define
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.request import AblateRequest, FitRequest, slug
+from invgraphics.experiments.request import AblateRequest, FitRequest
 from invgraphics.recipes.recipe import Method
 from invgraphics.scenes.open import is_rendered
 from invgraphics.studies.factors import BUDGET, SIZE, in_scope, path_of
 from invgraphics.studies.study import Cell, Study
+from invgraphics.text import slug
 
 LONGEST_NAME = 100
 """Characters of a run's folder name, its hash left out."""

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.studies.analyses import check_analyses
 from invgraphics.studies.factors import BUDGET, NARROWING, PRESET, SETTINGS, SIZE, in_scope, levels_of, path_of
+from invgraphics.studies.study import Study
 from invgraphics.training.budget import Budget
 
-if TYPE_CHECKING:
-    from invgraphics.studies.study import Study
+MOST_CELLS = 10_000
+"""Runs of a study: as many take a week at a minute each."""
 
 
 def completed(study: Study, where: str) -> Study:
@@ -52,6 +53,7 @@ def checked(study: Study, where: str) -> Study:
     for what in NARROWING:
         _check_list(getattr(study, what), f"{where}: '{what}'")
     _check_narrowing(study, where)
+    _check_count(study, where)
     for name, levels in study.factors.items():
         _check_list(levels, f"{where}: the factor '{name}'")
         if study.base[name] not in levels:
@@ -79,6 +81,18 @@ def checked(study: Study, where: str) -> Study:
     if any(seed < 0 for seed in study.seeds) or (views != "all" and views < 1):
         raise InputError(f"{where}: seeds must be 0 or more, and 'test_views' 1 or more or 'all'.")
     return study
+
+
+def _check_count(study: Study, where: str) -> None:
+    """Refuse a study that is too large to be expanded, whatever its runs would take."""
+    levels = [len(levels) for levels in study.factors.values()]
+    points = {"factorial": math.prod(levels), "one-at-a-time": 1 + sum(levels), "list": len(study.cells)}[study.design]
+    count = points * len(study.scenes) * len(study.methods) * len(study.seeds)
+    if count > MOST_CELLS:
+        raise InputError(
+            f"{where} asks for {count:,} cells; a study has at most {MOST_CELLS:,}.",
+            "Give fewer levels in [factors], or the design 'one-at-a-time'.",
+        )
 
 
 def _check_narrowing(study: Study, where: str) -> None:

@@ -15,6 +15,7 @@ from invgraphics.experiments.start import CHECKPOINT_COPIES
 from invgraphics.experiments.variants import with_renderer
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.scenes.degrade import degrade
+from invgraphics.text import duration
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 
@@ -110,8 +111,3 @@ def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int, later: int
     """The forecast for missing runs with these costs, ``jobs`` at a time; a study has ``runs``, ``later`` of them left out."""
     seconds = sum(cost.seconds(budget) for cost, budget in costs) / jobs
     return Forecast(runs, len(costs), seconds, sum(cost.size for cost, _ in costs), later)
-
-
-def duration(seconds: float) -> str:
-    """A length of time in the unit that suits it."""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -1,23 +1,21 @@
-"""``study.json``: what a study is, and how far each of its cells is, true at any moment."""
+"""Keeps a study's record true at any moment: what the study is, and how far each of its cells is."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from invgraphics.errors import InputError
 from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import RUNS, RunFolder
+from invgraphics.runs.study import CellRecord, Status, StudyRecord
 from invgraphics.studies.cells import Planned
 from invgraphics.studies.study import Study
-
-RECORD = "study.json"
-"""What a study's folder holds beside its runs: the design, and the state of every cell."""
 
 
 @dataclass(frozen=True)
@@ -36,88 +34,103 @@ class CellState:
     forecast: float | None = None
 
 
-class Record:
-    """``study.json``: what the study is, and how far each of its cells is."""
+class StudyRecorder:
+    """Writes `StudyRecord` whenever a cell's state changes.
 
-    def __init__(self, folder: RunFolder, summary: dict[str, Any], plan: list[Planned]) -> None:
-        """Take over what an earlier run of the same study recorded.
+    Args:
+        folder: of the study.
+        summary: its record without cells.
+        plan: all of its cells.
 
-        Raises:
-            InputError: the folder holds another study.
-        """
-        self._folder = folder
-        old = folder.read_json(RECORD) if (folder.root / RECORD).is_file() else {}
-        if old and old.get("name") != summary["name"]:
-            raise InputError(f"{folder.root} holds the study '{old.get('name')}'.", "Choose another --out.")
-        before = {entry["id"]: entry for entry in old.get("cells", [])}
-        self._cells = [_entry(planned, before.get(planned.id, {})) for planned in plan]
-        self._summary = summary
+    Raises:
+        InputError: the folder holds another study.
+    """
+
+    def __init__(self, folder: RunFolder, summary: StudyRecord, plan: list[Planned]) -> None:
+        self._folder, self._summary = folder, summary
+        old = folder.read(StudyRecord) if folder.has(StudyRecord) else summary
+        if old.name != summary.name:
+            raise InputError(f"{folder.root} holds the study '{old.name}'.", "Choose another --out.")
+        before = {cell.id: cell for cell in old.cells}
+        self._cells = [_cell_record(planned, before.get(planned.id)) for planned in plan]
 
     def start(self, states: Mapping[str, CellState]) -> None:
         """Take over how far each run is, and write."""
-        for entry in self._cells:
-            state = states[entry["id"]]
-            if state.status == "missing":
-                entry |= {"status": "missing", "error": None, "seconds": None, "forecast_seconds": state.forecast}
-            elif state.status == "done":
-                entry |= {"status": "done", "error": None}
-            elif state.status == "skipped":
-                entry |= {"status": "skipped", "error": state.reason, "seconds": None}
+        self._cells = [_started(cell, states[cell.id]) for cell in self._cells]
         self._write()
 
     def note(self, outcome: Outcome) -> None:
         """Write how a run ended into all cells that share it."""
-        for entry in self._cells:
-            if entry["id"] == Path(outcome.request.out).name:
-                entry["status"] = "failed" if outcome.status else "done"
-                entry["error"] = outcome.error or None
-                entry["seconds"] = round(outcome.seconds, 3)
+        status: Status = "failed" if outcome.status else "done"
+        ended = {"status": status, "error": outcome.error or None, "seconds": round(outcome.seconds, 3)}
+        name = Path(outcome.request.out).name
+        self._cells = [replace(cell, **ended) if cell.id == name else cell for cell in self._cells]
         self._write()
 
-    def failed(self) -> list[dict[str, Any]]:
+    def failed(self) -> list[CellRecord]:
         """The cells that failed."""
-        return [entry for entry in self._cells if entry["status"] == "failed"]
+        return [cell for cell in self._cells if cell.status == "failed"]
 
     def _write(self) -> None:
-        self._folder.write_json(RECORD, self._summary | {"cells": self._cells})
+        self._folder.write(replace(self._summary, cells=tuple(self._cells)))
 
 
-def _entry(planned: Planned, before: dict[str, Any]) -> dict[str, Any]:
+def _started(cell: CellRecord, state: CellState) -> CellRecord:
+    """A cell's record when the study starts."""
+    if state.status == "missing":
+        return replace(cell, status="missing", error=None, seconds=None, forecast_seconds=state.forecast)
+    if state.status == "done":
+        return replace(cell, status="done", error=None)
+    return cell if state.status == "later" else replace(cell, status="skipped", error=state.reason, seconds=None)
+
+
+def _cell_record(planned: Planned, before: CellRecord | None) -> CellRecord:
+    """A cell's record, with what an earlier command knew of its run."""
     cell, budget = planned.cell, planned.job.budget
-    ended = before.get("status") == "failed" or (before.get("status") == "done" and planned.job.folder.finished)
-    return {
-        "id": planned.id,
-        "label": planned.label,
-        "scene": cell.scene,
-        "method": cell.method,
-        "seed": cell.seed,
-        "levels": cell.levels,
-        "size": planned.fit.size,
-        "budget": str(budget),
-        "budget_seconds": budget.seconds,
-        "budget_steps": budget.steps,
-        "run": f"runs/{planned.id}",
-        "status": before["status"] if ended else "missing",
-        "error": before.get("error") if ended else None,
-        "seconds": before.get("seconds"),
-        "forecast_seconds": before.get("forecast_seconds"),
-    }
+    ended = before is not None and (before.status == "failed" or (before.status == "done" and planned.job.folder.finished))
+    return CellRecord(
+        id=planned.id,
+        label=planned.label,
+        scene=cell.scene,
+        method=cell.method,
+        seed=cell.seed,
+        levels=cell.levels,
+        size=planned.fit.size,
+        budget=str(budget),
+        budget_seconds=budget.seconds,
+        budget_steps=budget.steps,
+        run=f"{RUNS}/{planned.id}",
+        status=before.status if before is not None and ended else "missing",
+        error=before.error if before is not None and ended else None,
+        seconds=None if before is None else before.seconds,
+        forecast_seconds=None if before is None else before.forecast_seconds,
+    )
 
 
-def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resources], job: Job) -> dict[str, Any]:
-    """Everything of ``study.json`` but the cells; ``job`` is one of theirs."""
+def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resources], job: Job) -> StudyRecord:
+    """A study's record, without its cells; ``job`` is one of theirs."""
     request, resources = asked
-    keys = ("question", "design", "factors", "base", "scenes", "methods", "seeds", "budget", "preset", "size", "test_views")
-    keys += ("render_with", "analyses", "report")
     machine = environment(job.device)
-    machine |= {"threads": resources.threads, "executor": request.executor, "jobs": resources.jobs}
-    return {
-        "schema": 1,
-        "name": name,
-        **{key: getattr(study, key) for key in keys},
-        "approximations": [asdict(pair) for pair in study.approximations],
-        "known": [asdict(deviation) for deviation in study.known],
-        "protocol": job.protocol.record(),
-        "command": request.shell(),
-        "environment": machine,
-    }
+    return StudyRecord(
+        name=name,
+        question=study.question,
+        design=study.design,
+        factors=study.factors,
+        base=study.base,
+        scenes=study.scenes,
+        methods=study.methods,
+        seeds=study.seeds,
+        budget=study.budget,
+        preset=study.preset,
+        size=study.size,
+        test_views=study.test_views,
+        render_with=study.render_with,
+        analyses=study.analyses,
+        report=study.report,
+        approximations=study.approximations,
+        known=study.known,
+        protocol=job.protocol.record(),
+        command=request.shell(),
+        environment=replace(machine, threads=resources.threads, executor=request.executor, jobs=resources.jobs),
+        cells=(),
+    )

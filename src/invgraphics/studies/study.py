@@ -10,17 +10,13 @@ from __future__ import annotations
 
 import itertools
 import json
-import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from dataclasses import field as default
 from pathlib import Path
 from typing import Any, Literal
 
-from invgraphics.config import fill
-from invgraphics.data import find
-from invgraphics.errors import InputError, did_you_mean
 from invgraphics.experiments.request import AblateRequest, FitRequest
-from invgraphics.studies.checks import checked, completed
+from invgraphics.runs.study import Approximation, KnownDeviation
 from invgraphics.studies.factors import (
     BUDGET,
     PRESET,
@@ -33,40 +29,6 @@ from invgraphics.studies.factors import (
     override,
     path_of,
 )
-
-FILE = "study.toml"
-
-
-@dataclass(frozen=True)
-class Approximation:
-    """Two renderers that differ in one approximation only, to be compared on every fit.
-
-    Attributes:
-        name: of the approximation.
-        exact: renderer without it, one of the study's ``render_with``.
-        approximate: renderer with it, likewise.
-    """
-
-    name: str
-    exact: str
-    approximate: str
-
-
-@dataclass(frozen=True)
-class KnownDeviation:
-    """A verdict that is expected to be red, with its cause; the page still shows it.
-
-    Attributes:
-        cells: pattern of the cells' labels, for instance ``splatting/* fence@800 *`` (see `Cell.label`).
-        rule: that they break, one of `invgraphics.report.statistics.rules.RULES`.
-        cause: why, one sentence.
-        issue: where it is followed up: a number or a link.
-    """
-
-    cells: str
-    rule: Literal["budget", "monitor", "views", "dead", "memory", "finite", "late"]
-    cause: str
-    issue: int | str = ""
 
 
 @dataclass(frozen=True)
@@ -166,19 +128,6 @@ class Study:
             render_with=self.render_with,
         )
 
-    def overridden(self, request: AblateRequest) -> Study:
-        """The study with what the command line says instead.
-
-        Raises:
-            InputError: it names a budget, a size or seeds, and the study itself varies them; or a seed twice.
-        """
-        varied = {path_of(name) for name in self.base} | {name for cell in self.cells for name in cell}
-        names = ("seeds", "budget", "size", "test_views", "spp")
-        given = {name: getattr(request, name) for name in names if getattr(request, name) is not None}
-        if refused := [name for name in given if name in varied]:
-            raise InputError(f"--{refused[0]} cannot be given: the study itself says it in its factors, base or cells.")
-        return checked(replace(self, **given), f"The study '{request.study}'")
-
 
 @dataclass(frozen=True)
 class Cell:
@@ -200,42 +149,3 @@ class Cell:
     def scene_name(self) -> str:
         """The scene without its path."""
         return Path(self.scene).name if self.scene.startswith("$") else Path(self.scene).resolve().name
-
-
-def locate(name: str) -> Path:
-    """The file of a built-in study, or of one's own: the path of a TOML file or of its folder.
-
-    Raises:
-        InputError: there is none; the built-in studies are listed.
-    """
-    for path in (Path(name), Path(name) / FILE):
-        if path.suffix == ".toml" and path.is_file():
-            return path
-    known = [path.parent.name for path in sorted(find("studies").glob(f"*/{FILE}"))]
-    if name in known:
-        return find("studies", name) / FILE
-    guess = did_you_mean(name, known)
-    raise InputError(f"There is no study '{name}'.{guess}", f"Built-in studies: {', '.join(known)}; or the path of a {FILE}.")
-
-
-def name_of(path: Path) -> str:
-    """A study's name: that of its folder, or of its file where that has a name of its own."""
-    return path.resolve().parent.name if path.name == FILE else path.stem
-
-
-def read_study(path: Path) -> Study:
-    """Read a study and check all that can be checked without its methods and scenes.
-
-    Raises:
-        InputError: not TOML; a key is unknown, missing or of the wrong type; a factor is empty or repeats a level; a design
-            lacks what it needs. The sentence names the file.
-    """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}.") from error
-    try:
-        study = fill(Study, table)
-    except InputError as error:
-        raise InputError(f"{path}: {error.sentence}", error.remedy) from error
-    return checked(completed(study, str(path)), str(path))

@@ -6,7 +6,7 @@ import csv
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from PIL import Image
 from torch import Tensor
@@ -15,13 +15,14 @@ from invgraphics.core import Camera, Contributions, Profile, Rendering, Scene, V
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.runs.folder import write_json
+from invgraphics.runs.explanation import CSV, PICTURE, TRUTH, DeadPrimitives, ExplanationRecord, Pixel, SamplerPass
+from invgraphics.runs.explanation import Contributions as Columns
+from invgraphics.runs.explanation import Profile as ProfileRecord
+from invgraphics.runs.schema import plain
 from invgraphics.training.limits import dead_gaussians
 
 Split = Literal["test", "train"]
 
-TABLE, FACTS, PICTURE, TRUTH = "ray.csv", "ray.json", "picture.png", "truth.png"
-"""Files of an explanation."""
 DIGITS = 7
 """Significant digits of numbers in files, as many as float32 has."""
 
@@ -58,18 +59,18 @@ class Explanation:
     """A pixel and what it is made of.
 
     Attributes:
-        folder: holds `TABLE`, `FACTS`, `PICTURE` and `TRUTH`.
+        folder: holds the record, the contributions as a table, the picture and the photograph.
         contributions: in the order in which they are composited, world units.
         rendered: colour of the pixel as `render` shows it, in front of the scene's background.
         composited: the same from the contributions.
-        facts: what else there is to know, as in the file.
+        record: everything, as in the file.
     """
 
     folder: Path
     contributions: Contributions
     rendered: Tensor
     composited: Tensor
-    facts: dict[str, Any]
+    record: ExplanationRecord
 
 
 def explain(request: ExplainRequest) -> Explanation:
@@ -87,9 +88,8 @@ def explain(request: ExplainRequest) -> Explanation:
     background = fitted.scene.background
     rendered = picture.over(background)[row, column]
     composited = found.colour + (1 - found.opacity) * background
-    facts = _facts(fitted, request, view, found, picture)
-    facts["pixel"] |= {"rendered": _row(rendered), "composited": _row(composited)}
-    explanation = Explanation(request.folder, found, rendered, composited, facts)
+    record = _record(fitted, request, view, found, picture)
+    explanation = Explanation(request.folder, found, rendered, composited, record)
     _write(explanation, view, picture, fitted.scene)
     return explanation
 
@@ -134,74 +134,93 @@ def _view(scene: Scene, request: ExplainRequest) -> View:
     return views[request.view]
 
 
-def _facts(fitted: Fitted, request: ExplainRequest, view: View, found: Contributions, picture: Rendering) -> dict[str, Any]:
-    """Everything that the figure says, except for the pixel's two colours."""
+def _record(fitted: Fitted, request: ExplainRequest, view: View, found: Contributions, picture: Rendering) -> ExplanationRecord:
+    """Everything that the figure says."""
     scene, (column, row) = fitted.scene, request.pixel
     ray = scene.bounds.clip(view.camera.rays(view.camera.focal.new_tensor([[column + 0.5, row + 0.5]])))
-    return {
-        "schema": 1,
-        "method": fitted.method.name,
-        "scene": scene.name,
-        "split": request.split,
-        "view": request.view,
-        "name": view.name,
-        "colour": scene.colour,
-        "background": _row(scene.background),
-        "kind": found.kind,
-        "length_unit": "world",
-        "near": _number(ray.near[0] * scene.scale),
-        "far": _number(ray.far[0] * scene.scale),
-        "space": scene.bounds.space,
-        "pixel": {
-            "column": column,
-            "row": row,
-            "alpha": _number(found.opacity),
-            "depth": _number(picture.depth[row, column] * scene.scale),
-            "expected": _number(found.expected_depth),
-            "median": _number(found.median_depth),
-            "true": _row(view.over(scene.background)[row, column]),
-            "true_alpha": None if view.alpha is None else _number(view.opacity()[row, column]),
-            "true_depth": None if view.depth is None else _number(view.depth[row, column] * scene.scale),
-        },
-        "contributions": _columns(found),
-        "dead": _dead(fitted),
-        "profile": _profile(found.profile),
-        "marched": _profile(found.marched),
-        "passes": [{name: _row(value) for name, value in vars(one).items()} for one in found.passes],
-    }
+    red, green, blue = scene.background.double().tolist()
+    return ExplanationRecord(
+        method=fitted.method.name,
+        scene=scene.name,
+        split=request.split,
+        view=request.view,
+        name=view.name,
+        colour=scene.colour,
+        background=(_rounded(red), _rounded(green), _rounded(blue)),
+        kind=found.kind,
+        length_unit="world",
+        near=_number(ray.near[0] * scene.scale),
+        far=_number(ray.far[0] * scene.scale),
+        space=scene.bounds.space,
+        pixel=_pixel(request, view, found, picture, scene),
+        contributions=_columns(found),
+        dead=_dead(fitted),
+        profile=_profile(found.profile),
+        marched=_profile(found.marched),
+        passes=tuple(SamplerPass(t0=_row(one.t0), t1=_row(one.t1), weight=_row(one.weight)) for one in found.passes),
+    )
 
 
-def _dead(fitted: Fitted) -> dict[str, Any] | None:
+def _pixel(request: ExplainRequest, view: View, found: Contributions, picture: Rendering, scene: Scene) -> Pixel:
+    """The pixel in the picture, in the photograph, and as the contributions have it."""
+    (column, row), background = request.pixel, scene.background
+    return Pixel(
+        column=column,
+        row=row,
+        alpha=_number(found.opacity),
+        depth=_number(picture.depth[row, column] * scene.scale),
+        expected=_number(found.expected_depth),
+        median=_number(found.median_depth),
+        true=_row(view.over(background)[row, column]),
+        true_alpha=None if view.alpha is None else _number(view.opacity()[row, column]),
+        true_depth=None if view.depth is None else _number(view.depth[row, column] * scene.scale),
+        rendered=_row(picture.over(background)[row, column]),
+        composited=_row(found.colour + (1 - found.opacity) * background),
+    )
+
+
+def _dead(fitted: Fitted) -> DeadPrimitives | None:
     """Share, number and causes of primitives that no gradient can change; ``None`` for fields without Gaussians."""
     dead = dead_gaussians(fitted.model.field, [view.camera for view in fitted.scene.train])
-    return None if dead is None else {"share": _number(dead.share), "sentence": dead.sentence()}
+    return None if dead is None else DeadPrimitives(share=_number(dead.share), sentence=dead.sentence())
 
 
-def _columns(found: Contributions) -> dict[str, list[Any] | None]:
-    """Name -> values of all contributions."""
-    columns: dict[str, list[Any] | None] = {
-        name: _row(getattr(found, name)) for name in ("t", "begin", "end", "alpha", "transmittance", "weight")
-    }
-    columns["density"] = None if found.density is None else _row(found.density)
-    columns |= {name: _row(found.rgb[:, index]) for index, name in enumerate(("red", "green", "blue"))}
-    columns["counted"] = found.counted.int().tolist()
-    return columns
+def _columns(found: Contributions) -> Columns:
+    red, green, blue = (_row(found.rgb[:, index]) for index in range(3))
+    return Columns(
+        t=_row(found.t),
+        begin=_row(found.begin),
+        end=_row(found.end),
+        alpha=_row(found.alpha),
+        transmittance=_row(found.transmittance),
+        weight=_row(found.weight),
+        density=None if found.density is None else _row(found.density),
+        red=red,
+        green=green,
+        blue=blue,
+        counted=tuple(found.counted.int().tolist()),
+    )
 
 
-def _profile(profile: Profile | None) -> dict[str, list[Any] | None] | None:
+def _profile(profile: Profile | None) -> ProfileRecord | None:
     if profile is None:
         return None
-    return {name: None if value is None else _row(value) for name, value in vars(profile).items()}
+    density = None if profile.density is None else _row(profile.density)
+    return ProfileRecord(t=_row(profile.t), density=density, transmittance=_row(profile.transmittance))
 
 
-def _row(values: Tensor) -> list[float | None]:
-    return [_number(value) for value in values.double().tolist()]
+def _row(values: Tensor) -> tuple[float | None, ...]:
+    return tuple(_number(value) for value in values.double().tolist())
 
 
 def _number(value: Tensor | float) -> float | None:
     """A number of as many digits as it has, ``None`` where it is not finite."""
     number = float(value)
-    return float(f"{number:.{DIGITS}g}") if math.isfinite(number) else None
+    return _rounded(number) if math.isfinite(number) else None
+
+
+def _rounded(number: float) -> float:
+    return float(f"{number:.{DIGITS}g}")
 
 
 def _write(explanation: Explanation, view: View, picture: Rendering, scene: Scene) -> None:
@@ -217,9 +236,9 @@ def _write(explanation: Explanation, view: View, picture: Rendering, scene: Scen
         raise InputError(f"The folder {folder} cannot be written: {error.strerror}.", "Choose another --out.") from error
     for name, colour in ((PICTURE, picture.over(scene.background)), (TRUTH, view.over(scene.background))):
         Image.fromarray(display(colour, scene).numpy()).save(folder / name)
-    columns = {name: values for name, values in explanation.facts["contributions"].items() if values is not None}
-    with (folder / TABLE).open("w", newline="") as file:
+    columns = {name: values for name, values in plain(explanation.record.contributions).items() if values is not None}
+    with (folder / CSV).open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(zip(*columns.values(), strict=True))
-    write_json(folder / FACTS, explanation.facts)
+    explanation.record.write(folder / ExplanationRecord.FILE)

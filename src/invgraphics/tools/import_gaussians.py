@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shlex
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from invgraphics.core import Gaussians, Scene, harmonics
 from invgraphics.errors import InputError
@@ -24,6 +22,10 @@ from invgraphics.formats.base import Splats, read_gaussians
 from invgraphics.formats.ply import OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
+from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.history import Moment
+from invgraphics.runs.provenance import ImportedFile, Provenance
+from invgraphics.text import sha256_of
 from invgraphics.tools.file_frames import WORLD, local_from_file
 
 IMPORTED = "imported"
@@ -70,29 +72,29 @@ def import_run(request: ImportRequest) -> Path:
     job = replace(job, method=method_for(job.method, request.file, splats.gaussians))
     axes = request.frame or splats.axes
     folder = job.folder
-    if (folder.root / "provenance.json").is_file():
+    if folder.has(Provenance):
         raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
     scene = open_with_progress(job.request.scene, job.options)
     gaussians = transform_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()
     repeatable(job.device)
     use_kernels(job.request.kernels)
-    origin = {"imported": _origin(request, name, splats, axes)}
+    origin = _origin(request, name, splats, axes)
     if splats.antialiased and not getattr(job.method.recipe.renderer, "antialiased", False):
         print(
             "The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true shows it so.", file=sys.stderr
         )
     with folder.held():
         folder.clear()
-        identity = _identity(job.method, scene, origin)
-        describe(job, (scene, scene), identity, origin | {"budget": IMPORTED, "command": request.shell()})
+        provenance = describe(job, (scene, scene), _identity(job.method, scene, origin))
+        folder.write(replace(provenance, budget=IMPORTED, command=request.shell(), imported=origin))
         model = build_model(job.method, scene, job.request.seed, job.device)
         assert isinstance(model.field, GaussianField)
         fill(model.field, gaussians)
         checkpoint.save(folder.checkpoint, model.state_dict())
-        folder.append_history({"step": 0, "seconds": 0.0, "progress": 1.0, "primitives": len(gaussians)})
-        costs = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}
-        folder.write_json("fit.json", {"steps": None, "seconds": None})
+        folder.append_history(Moment(step=0, seconds=0.0, progress=1.0, primitives=len(gaussians)))
+        costs: dict[str, float | None] = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}
+        folder.write(FitRecord())
         for protocol in job.protocols:
             evaluate(folder, scene, model, protocol, costs, job.method)
     return folder.root
@@ -133,22 +135,29 @@ def fill(field: GaussianField, gaussians: Gaussians) -> None:
     field.active_degree = field.sh_degree
 
 
-def _origin(request: ImportRequest, name: str, splats: Splats, axes: str | None) -> dict[str, Any]:
+def _origin(request: ImportRequest, name: str, splats: Splats, axes: str | None) -> ImportedFile:
     path = Path(request.file)
-    return {
-        "file": request.file,
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-        "bytes": path.stat().st_size,
-        "format": name,
-        "axes": axes or "those of the data set's world",
-        "world": request.world,
-        "gaussians": len(splats.gaussians),
-        "sh_degree": harmonics.degree_of(splats.gaussians.sh.shape[1]),
-        "antialiased": splats.antialiased,
-        "notes": list(splats.notes),
-    }
+    return ImportedFile(
+        file=request.file,
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        bytes=path.stat().st_size,
+        format=name,
+        axes=axes or "those of the data set's world",
+        world=request.world,
+        gaussians=len(splats.gaussians),
+        sh_degree=harmonics.degree_of(splats.gaussians.sh.shape[1]),
+        antialiased=splats.antialiased,
+        notes=splats.notes,
+    )
 
 
-def _identity(method: Method, scene: Scene, origin: dict[str, Any]) -> str:
-    parts = [method.name, method.digest, scene.digest("test"), scene.camera_digest(), origin, code_version()]
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+def _identity(method: Method, scene: Scene, origin: ImportedFile) -> str:
+    parts = [
+        method.name,
+        method.digest,
+        scene.digest("test"),
+        scene.camera_digest(),
+        {"imported": asdict(origin)},
+        code_version(),
+    ]
+    return sha256_of(parts)

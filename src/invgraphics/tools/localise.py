@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,7 +19,8 @@ from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.poses import Similarity, rotation_angle
-from invgraphics.runs.folder import make_parent, write_json
+from invgraphics.runs.folder import make_parent
+from invgraphics.runs.location import Location, PoseError, Start
 from invgraphics.scenes.images import make_view, read_pixels
 from invgraphics.training.localise import PoseDescent, photometric_error, refine_pose
 
@@ -68,7 +69,7 @@ class LocateRequest:
             raise InputError(f"--fov cannot be {self.fov:g}.", "Expected the horizontal field of view in degrees, 1 to 170.")
 
 
-def locate(request: LocateRequest) -> dict[str, Any]:
+def locate(request: LocateRequest) -> Location:
     """Find the pose; writes it and the pictures, returns what was written.
 
     Raises:
@@ -132,55 +133,52 @@ def _starts(request: LocateRequest, scene: Scene) -> list[torch.Tensor]:
     return poses
 
 
-def _search(
-    fitted: Fitted, starts: list[View], request: LocateRequest, reporter: Reporter
-) -> tuple[View, list[dict[str, Any]]]:
+def _search(fitted: Fitted, starts: list[View], request: LocateRequest, reporter: Reporter) -> tuple[View, list[Start]]:
     """The best view after every round; each round keeps half of those it got. Also what became of the starts."""
     model, scene = fitted.model, fitted.scene
     coarse = min(1.0, COARSEST / max(starts[0].camera.width, starts[0].camera.height))
     losses = [photometric_error(model, view, scene, coarse) for view in starts]
     order = sorted(range(len(starts)), key=losses.__getitem__)[: request.starts]
     kept = [(starts[i], i) for i in order]
-    tried = [{"start": i, "loss_at_start": losses[i]} for i in order]
+    rounds: dict[int, dict[str, float]] = {i: {} for i in order}
     for number, (scale, share, lr, final) in enumerate(LEVELS):
         fine = max(scale, coarse)
         descent = PoseDescent(max(1, round(request.steps * share)), lr, final, fine)
         kept = [(replace(view, camera=refine_pose(model, view, scene, descent)), i) for view, i in kept]
         ranked = sorted((photometric_error(model, view, scene, fine), place) for place, (view, _) in enumerate(kept))
         for loss, place in ranked:
-            next(entry for entry in tried if entry["start"] == kept[place][1])[f"loss_at_scale_{fine:g}"] = loss
+            rounds[kept[place][1]][f"{fine:g}"] = loss
         kept = [kept[place] for _, place in ranked[: max(1, len(ranked) // 2)]]
         reporter.show((number + 1) / len(LEVELS), f"round {number + 1}, loss {ranked[0][0]:.5f}")
-    return kept[0][0], tried
+    return kept[0][0], [Start(start=i, loss_at_start=losses[i], rounds=rounds[i]) for i in order]
 
 
-def _written(
-    request: LocateRequest, fitted: Fitted, result: tuple[View, list[dict[str, Any]]], back: Similarity
-) -> dict[str, Any]:
+def _written(request: LocateRequest, fitted: Fitted, result: tuple[View, list[Start]], back: Similarity) -> Location:
     found, tried = result
     scene = fitted.scene
     loss = photometric_error(fitted.model, found, scene)
     pose = transform_camera(found.camera, back).cam_to_world
-    record: dict[str, Any] = {
-        "schema": 1,
-        "photo": str(request.photo),
-        "run": str(request.run),
-        "method": fitted.method.name,
-        "cam_to_world": apply_similarity(scene.world_from_local, pose).tolist(),
-        "axes": "OpenCV: +x right, +y down, +z forward; the data set's world",
-        "focal": found.camera.focal.tolist(),
-        "size": [found.camera.width, found.camera.height],
-        "loss": loss,
-        "psnr": -10 * math.log10(max(loss, 1e-10)),
-        "starts": tried,
-    }
-    truth = _test_view_like(found, scene)
+    truth, error = _test_view_like(found, scene), None
     if truth is not None:
         turn = rotation_angle(pose[:3, :3], truth.camera.cam_to_world[:3, :3])
         shift = (pose[:3, 3] - truth.camera.position).norm()
-        record["test_view"] = truth.name
-        record["error"] = {"rotation_deg": float(turn), "translation_percent": 100 * float(shift) / scene.extent}
-    write_json(request.out, record)
+        error = PoseError(rotation_deg=float(turn), translation_percent=100 * float(shift) / scene.extent)
+    first, second, third, last = (tuple(row) for row in apply_similarity(scene.world_from_local, pose).tolist())
+    fx, fy = found.camera.focal.tolist()
+    record = Location(
+        photo=str(request.photo),
+        run=str(request.run),
+        method=fitted.method.name,
+        cam_to_world=(first, second, third, last),
+        focal=(fx, fy),
+        size=(found.camera.width, found.camera.height),
+        loss=loss,
+        psnr=-10 * math.log10(max(loss, 1e-10)),
+        starts=tuple(tried),
+        test_view=None if truth is None else truth.name,
+        error=error,
+    )
+    record.write(request.out)
     _draw(request.out.with_suffix(".png"), fitted, found)
     return record
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,7 +15,8 @@ import torch
 from invgraphics.core import Bounds, Rendering, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.metrics.conventions import BLACK, Colour
-from invgraphics.runs.folder import read_json
+from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.images import image_files, read_pixels
 from invgraphics.tools.saved_pictures import is_baked, is_clear, read_picture, read_saved, read_truth
 
@@ -40,7 +41,7 @@ class PictureSet:
             those of its 8-bit picture.
         sha256: of the truth's pixels, all views; made like `Scene.digest`.
         size: width and height of the first view.
-        provenance: the run's, empty for other folders.
+        provenance: the run's, ``None`` for other folders.
         notes: what was assumed, in sentences.
     """
 
@@ -54,7 +55,7 @@ class PictureSet:
     prediction: Callable[[int, bool], Rendering]
     sha256: str
     size: tuple[int, int]
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: Provenance | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -71,20 +72,17 @@ def open_pictures(folder: Path, truth: Path | None = None, background: Colour | 
     """
     if not folder.is_dir():
         raise InputError(f"There is no folder '{folder}'.", "Give a run, or a folder of predicted pictures.")
-    return _open_run(folder, truth) if (folder / "provenance.json").is_file() else _open_folder(folder, truth, background)
+    return _open_run(folder, truth) if RunFolder(folder).has(Provenance) else _open_folder(folder, truth, background)
 
 
 def _open_run(folder: Path, truth: Path | None) -> PictureSet:
-    provenance = read_json(folder / "provenance.json")
-    missing = [key for key in ("truth", "background", "colour") if key not in provenance]
-    if missing:
-        raise InputError(f"'{folder / 'provenance.json'}' lacks the key '{missing[0]}'.", "Fit the run again.")
-    predictions = sorted((folder / "test").glob("*.npz"))
+    run = RunFolder(folder)
+    provenance, predictions = run.read(Provenance), run.predictions
     if not predictions:
         raise InputError(f"The run '{folder}' has no saved predictions (test/*.npz).", "Let it finish: fit --resume.")
-    matched, notes = _match(predictions, _pictures_in(truth or folder / str(provenance["truth"])))
-    names = tuple(read_json(folder / "scores.json")["views"]) if (folder / "scores.json").is_file() else ()
-    scene = _scene(provenance["background"], provenance["colour"])
+    matched, notes = _match(predictions, _pictures_in(truth or folder / provenance.truth))
+    names = run.read_scores().views if run.finished else ()
+    scene = _scene(provenance.background, provenance.colour)
 
     def true_view(index: int) -> View:
         return read_truth(matched[index][1], scene)
@@ -98,7 +96,7 @@ def _open_run(folder: Path, truth: Path | None) -> PictureSet:
         folder=folder,
         names=names if len(names) == len(matched) else tuple(path.stem for path, _ in matched),
         scene=scene,
-        background=_colour(provenance["background"]),
+        background=provenance.background,
         transparency="open" if transparent else "fixed" if baked else "opaque",
         eight_bit=False,
         truth=true_view,
@@ -217,8 +215,3 @@ def _survey(true_view: Callable[[int], View], count: int) -> tuple[str, bool, tu
 def _scene(background: Sequence[float], colour: Literal["srgb", "linear"]) -> Scene:
     cube = Bounds(-torch.ones(3), torch.ones(3))
     return Scene("pictures", (), (), torch.tensor(list(background), dtype=torch.float32), cube, colour=colour)
-
-
-def _colour(values: Sequence[float]) -> Colour:
-    red, green, blue = (float(value) for value in values)
-    return red, green, blue

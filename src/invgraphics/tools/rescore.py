@@ -11,6 +11,7 @@ from invgraphics.errors import InputError, did_you_mean
 from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.conventions import PROTOCOLS, Protocol
 from invgraphics.metrics.protocols import ViewScore, score, summarise
+from invgraphics.runs.scores import DEFAULT, ScoredTruth, Scores, quality_of
 from invgraphics.tools.predictions import PictureSet
 from invgraphics.tools.rescoring import Rescored, background_name, evaluated, labels, scores_of
 
@@ -100,7 +101,7 @@ def rescore(sets: Sequence[PictureSet], protocols: Sequence[Protocol], allow_8bi
                     views.append(score(rendering, truth, pictures.scene, PROTOCOLS[name], only[name]))
                 done += 1
                 reporter.show(done / total, f"{label}, view {index + 1} of {len(pictures.names)}")
-            tables = {one.name: _table(pictures, one, scores.get(one.name), lacking[one.name]) for one in protocols}
+            tables = {one.name: _scores(pictures, one, scores.get(one.name), lacking[one.name]) for one in protocols}
             result.append(Rescored(pictures, label, tables))
     return result
 
@@ -134,34 +135,30 @@ def _checked(pictures: PictureSet, index: int, exact: bool) -> Rendering:
     return rendering
 
 
-def _table(pictures: PictureSet, protocol: Protocol, views: Sequence[ViewScore] | None, lacking: str) -> dict[str, Any]:
-    """The content of a scores file."""
+def _scores(pictures: PictureSet, protocol: Protocol, views: Sequence[ViewScore] | None, lacking: str) -> Scores:
+    """Scores of a set of pictures, from those of its views."""
     if views is None:
         quality, skipped = {}, dict.fromkeys(SHARED if protocol.measures is None else protocol.measures, lacking)
     else:
         quality, skipped = summarise(views, protocol)
-    run = pictures.provenance
-    own = scores_of(pictures, "default") or {}
+    run, own = pictures.provenance, scores_of(pictures, DEFAULT)
     eight_bit = pictures.eight_bit and protocol.prediction == "none"
     caution = ("Unrounded predictions are wanted; 8-bit pictures stand in for them.",) if eight_bit and not lacking else ()
-    return {
-        "schema": 1,
-        "method": run.get("method", pictures.folder.name),
-        "preset": run.get("preset", ""),
-        "scene": own.get("scene", run.get("scene", "")),
-        "seed": run.get("seed"),
-        "protocol": protocol.name,
-        "views": list(pictures.names),
-        "cost": own.get("cost", {}),
-        "quality": quality,
-        "skipped": skipped,
-        "rescored": True,
-        "conventions": protocol.record(),
-        "truth": {
-            "sha256": pictures.sha256,
-            "size": list(pictures.size),
-            "background": pictures.background,
-            "transparency": pictures.transparency,
-        },
-        "notes": [*pictures.notes, *caution],
-    }
+    truth = ScoredTruth(
+        sha256=pictures.sha256, size=pictures.size, background=pictures.background, transparency=pictures.transparency
+    )
+    return Scores(
+        method=pictures.folder.name if run is None else run.method,
+        preset="" if run is None else run.preset,
+        scene=own.scene if own is not None else "" if run is None else run.scene,
+        seed=None if run is None else run.seed,
+        protocol=protocol.name,
+        views=pictures.names,
+        cost={} if own is None else own.cost,
+        quality=quality_of(quality),
+        skipped=skipped,
+        rescored=True,
+        conventions=protocol.record(),
+        truth=truth,
+        notes=(*pictures.notes, *caution),
+    )

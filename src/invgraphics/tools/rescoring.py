@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from invgraphics.errors import InputError
 from invgraphics.metrics.conventions import PROTOCOLS, Colour, Protocol
-from invgraphics.runs.folder import write_json
+from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.scores import Score, Scores
 from invgraphics.tools.predictions import PictureSet
 
 COLUMNS = {"psnr": ("PSNR (dB)", 3), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4), "lpips_vgg": ("LPIPS (VGG)", 4)}
@@ -25,12 +23,12 @@ class Rescored:
     Attributes:
         pictures: what was scored.
         label: short name, unique among those scored together.
-        scores: protocol -> content of its scores file.
+        scores: protocol -> scores.
     """
 
     pictures: PictureSet
     label: str
-    scores: dict[str, dict[str, Any]]
+    scores: dict[str, Scores]
 
 
 def background_name(colour: Colour | None) -> str:
@@ -62,35 +60,27 @@ def write_scores(rescored: Rescored, out: Path | None) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for protocol, scores in rescored.scores.items():
-        if not scores["quality"] or (out is None and evaluated(pictures, protocol)):
+        if not scores.quality or (out is None and evaluated(pictures, protocol)):
             continue
-        written.append(folder / _file_of(protocol))
-        write_json(written[-1], scores)
+        written.append(folder / scores.file)
+        scores.write(written[-1])
     return written
 
 
-def _file_of(protocol: str) -> str:
-    return "scores.json" if protocol == "default" else f"scores.{protocol}.json"
-
-
-def scores_of(pictures: PictureSet, protocol: str) -> dict[str, Any] | None:
-    """The run's scores file for a protocol; ``None`` where there is none.
+def scores_of(pictures: PictureSet, protocol: str) -> Scores | None:
+    """The run's scores under a protocol; ``None`` where there are none.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: they cannot be read.
     """
-    path = pictures.folder / _file_of(protocol)
-    if not pictures.provenance or not path.is_file():
-        return None
-    try:
-        return json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path} cannot be read as JSON: {error}.", "Remove it, or score the run again.") from error
+    run = RunFolder(pictures.folder)
+    return run.read_scores(protocol) if pictures.provenance and run.scores_path(protocol).is_file() else None
 
 
 def evaluated(pictures: PictureSet, protocol: str) -> bool:
     """Whether the run has scores under a protocol that were made from its model."""
-    return "rescored" not in (scores_of(pictures, protocol) or {"rescored": True})
+    scores = scores_of(pictures, protocol)
+    return scores is not None and not scores.rescored
 
 
 def rows_of(rescored: Rescored) -> tuple[list[str], list[list[str]]]:
@@ -98,7 +88,7 @@ def rows_of(rescored: Rescored) -> tuple[list[str], list[list[str]]]:
     shown = {key: column for key, column in COLUMNS.items() if _values(rescored, key)}
     rows = []
     for name, scores in rescored.scores.items():
-        cells = [_cell(scores["quality"].get(key), decimals) for key, (_, decimals) in shown.items()]
+        cells = [_cell(scores.quality.get(key), decimals) for key, (_, decimals) in shown.items()]
         rows.append([name, *cells, *stated(PROTOCOLS[name])])
     if len(rows) > 1 and shown:
         spread = [f"{spread_of(rescored, key):.{decimals}f}" for key, (_, decimals) in shown.items()]
@@ -123,11 +113,11 @@ def winners(results: Sequence[Rescored], metric: str) -> str:
     """Who is best under each protocol, in a sentence; empty where a single set was scored, or the metric is missing."""
     best: dict[str, list[str]] = {}
     for protocol in results[0].scores:
-        found = {one.label: one.scores[protocol]["quality"].get(metric) for one in results}
-        known = {label: entry for label, entry in found.items() if entry is not None}
+        found = {one.label: one.scores[protocol].quality.get(metric) for one in results}
+        known = {label: score.mean for label, score in found.items() if score is not None and score.mean is not None}
         if len(known) == len(results) > 1:
-            sign = 1 if next(iter(known.values()))["higher_is_better"] else -1
-            best.setdefault(max(known, key=lambda label: sign * known[label]["mean"]), []).append(protocol)
+            sign = 1 if all(score is not None and score.higher_is_better for score in found.values()) else -1
+            best.setdefault(max(known, key=lambda label: sign * known[label]), []).append(protocol)
     if not best:
         return ""
     if len(best) == 1:
@@ -141,9 +131,9 @@ def reasons(rescored: Rescored) -> list[str]:
     skipped: dict[str, dict[str, list[str]]] = {}
     noted: dict[str, list[str]] = {}
     for protocol, scores in rescored.scores.items():
-        for metric, reason in scores["skipped"].items():
+        for metric, reason in scores.skipped.items():
             skipped.setdefault(reason, {}).setdefault(protocol, []).append(metric)
-        for note in scores["notes"]:
+        for note in scores.notes:
             noted.setdefault(note, []).append(protocol)
     lines = []
     for reason, where in skipped.items():
@@ -181,19 +171,20 @@ def _write_csv(results: Sequence[Rescored], path: Path) -> Path:
         for one in results:
             for protocol, scores in one.scores.items():
                 rest = stated(PROTOCOLS[protocol])
-                for metric, entry in scores["quality"].items():
-                    writer.writerow([one.label, protocol, metric, repr(entry["mean"]), entry["unit"], *rest, ""])
-                for metric, reason in scores["skipped"].items():
+                for metric, entry in scores.quality.items():
+                    writer.writerow([one.label, protocol, metric, repr(entry.mean), entry.unit, *rest, ""])
+                for metric, reason in scores.skipped.items():
                     writer.writerow([one.label, protocol, metric, "", "", *rest, reason])
     return path
 
 
 def _values(rescored: Rescored, metric: str) -> list[float]:
-    return [scores["quality"][metric]["mean"] for scores in rescored.scores.values() if metric in scores["quality"]]
+    found = [scores.quality[metric].mean for scores in rescored.scores.values() if metric in scores.quality]
+    return [value for value in found if value is not None]
 
 
-def _cell(entry: dict[str, Any] | None, decimals: int) -> str:
-    return "-" if entry is None else f"{entry['mean']:.{decimals}f}"
+def _cell(entry: Score | None, decimals: int) -> str:
+    return "-" if entry is None or entry.mean is None else f"{entry.mean:.{decimals}f}"
 
 
 def _markdown(cells: Sequence[str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,9 @@ from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs import checkpoint
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.folder import RunFolder, check_run
+from invgraphics.runs.provenance import Provenance
 from invgraphics.viewer.crop import CropBox, crop_model, crop_obstacle
 
 Stamp = tuple[int, int, int]
@@ -131,24 +132,24 @@ class LoadedRun:
     def _progress(self) -> tuple[int, float]:
         """Steps and seconds of the fit, from its folder."""
         try:
-            fit = self.fitted.source.read_json("fit.json")
-            return int(fit["steps"]), float(fit["seconds"])
-        except (InputError, KeyError):
+            fit = self.fitted.source.read(FitRecord)
+        except InputError:
             return 0, 0.0
+        return fit.steps or 0, fit.seconds or 0.0
 
 
 def _scores(folder: RunFolder) -> str:
     try:
-        quality = folder.read_json("scores.json")["quality"]
+        quality = folder.read_scores().quality
     except InputError:
         return ""
     said = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}"}
-    return ", ".join(words.format(quality[name]["mean"]) for name, words in said.items() if name in quality)
+    return ", ".join(words.format(quality[name].mean) for name, words in said.items() if name in quality)
 
 
 def file_stamps(folder: RunFolder, source: RunFolder) -> Stamps:
     """Stamps of a run's checkpoint, in ``source``, and scores; ``None`` for missing files."""
-    return _stamp(source.checkpoint), _stamp(folder.root / "scores.json")
+    return _stamp(source.checkpoint), _stamp(folder.scores_path())
 
 
 def _stamp(path: Path) -> Stamp | None:
@@ -184,8 +185,10 @@ def open_run(run: Path, scene: str | None, live: bool, say: Callable[[str], None
 
 def missing_file(run: Path) -> tuple[str, str] | None:
     """Sentence and remedy for a folder that cannot be viewed; ``None`` if it can."""
-    if not (run / "recipe.toml").is_file() or not (run / "provenance.json").is_file():
-        return f"{run} is not a run: it has no recipe.toml.", "Give a folder that `invgraphics fit` wrote."
+    try:
+        check_run(run)
+    except InputError as error:
+        return error.sentence, error.remedy
     if not _source(run).checkpoint.is_file():
         return f"{run} has no checkpoint yet.", "`invgraphics view --live` waits for the first one."
     return None
@@ -194,7 +197,7 @@ def missing_file(run: Path) -> tuple[str, str] | None:
 def _source(run: Path) -> RunFolder:
     """Folder of a run's checkpoint: its own, or that of the fit it is a rendering of."""
     try:
-        fitted = json.loads((run / "provenance.json").read_text()).get("fitted_run")
-    except (OSError, ValueError, AttributeError):
+        fitted = RunFolder(run).read(Provenance).fitted_run
+    except InputError:
         fitted = None  # opening the run reports the error
     return RunFolder(run if fitted is None else run / fitted)

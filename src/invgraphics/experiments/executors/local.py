@@ -15,7 +15,7 @@ from pathlib import Path
 from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import INTERRUPTED, Outcome, Resources
 from invgraphics.experiments.request import FitRequest
-from invgraphics.runs.folder import write_json
+from invgraphics.runs.schema import write_json
 
 WITH_PARENT = "--while-stdin-is-open"
 """Argument of `invgraphics.experiments.run` as a program that ties its life to that of the process that started it."""

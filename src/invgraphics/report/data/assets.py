@@ -1,4 +1,4 @@
-"""Files that a page shows: arrays and pictures read with care, maps written small, links kept inside the folder."""
+"""Files that a page shows: maps written small, links kept inside the folder."""
 
 from __future__ import annotations
 
@@ -8,17 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
-from zipfile import BadZipFile
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from invgraphics.errors import InputError
 from invgraphics.report.data.redact import Redactor
-
-Arrays = dict[str, Float[ndarray, "..."]]
-"""What an ``.npz`` holds: alpha, depth, normal and so on."""
 
 MASKED = 255
 """Palette entry of transparent pixels."""
@@ -65,38 +61,6 @@ class Folder:
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, copy)
         return self.url(copy)
-
-
-def read_picture(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """An 8-bit colour picture.
-
-    Raises:
-        InputError: it is missing or broken.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-    except FileNotFoundError:
-        raise InputError(f"'{path}' is missing.") from None
-    except (OSError, SyntaxError, ValueError, UnidentifiedImageError) as error:
-        raise InputError(f"'{path}' is not a readable picture: {error}.") from None
-
-
-def read_arrays(path: Path) -> Arrays:
-    """All arrays of an ``.npz``, as float32; objects are refused.
-
-    Raises:
-        InputError: it is missing or broken.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name].astype(np.float32) for name in archive.files}
-    except FileNotFoundError:
-        raise InputError(f"'{path}' is missing.") from None
-    except (OSError, ValueError, EOFError, BadZipFile, AttributeError) as error:
-        raise InputError(f"'{path}' is not a readable .npz archive: {error}.") from None
 
 
 def save_scalar(path: Path, unit: Float[ndarray, "h w"], mask: Bool[ndarray, "h w"], colours: str) -> None:

@@ -1,4 +1,4 @@
-"""Factors of a study and the runs that observe their levels."""
+"""Factors of a study, its cells, and the runs that observe the factors' levels."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from invgraphics.report.data.records import Run
+from invgraphics.runs.run import Run
+from invgraphics.runs.study import Status
 
 METHOD = "method"
 """The method is a factor like any other, under this name."""
@@ -45,6 +46,45 @@ class Observation:
     run: Run
     scene: str
     levels: dict[str, str]
+
+
+@dataclass(frozen=True)
+class StudyCell:
+    """One cell of a study.
+
+    Attributes:
+        id: name of its run; cells that come to the same settings share one.
+        scene: its scene.
+        method: ``renderer/recipe``.
+        seed: its seed.
+        levels: factor -> level as written, the method included.
+        variant: method and levels in words, the same for all scenes and seeds.
+        status: ``done``, ``failed``, ``missing``, or ``skipped`` where its data was not there.
+        error: why it failed or was skipped; empty otherwise.
+        seconds: what it took; ``None`` where unknown.
+        run: its run, where it is done.
+        label: method, scene@size, budget and seed in a line.
+        size: of its pictures: the longest side, or width × height, px; empty for the scene's own.
+        budget: of its fit, in words.
+        amount: of its budget: (unit, seconds or steps); ``None`` where unknown.
+        forecast: seconds that it was expected to take; ``None`` where unknown.
+    """
+
+    id: str
+    scene: str
+    method: str
+    seed: int
+    levels: dict[str, str]
+    variant: str
+    status: Status
+    error: str
+    seconds: float | None
+    run: Run | None
+    label: str = ""
+    size: str = ""
+    budget: str = ""
+    amount: tuple[str, float] | None = None
+    forecast: float | None = None
 
 
 def level_text(value: Any) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,14 +11,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from invgraphics.core.colour import linear_to_srgb
-from invgraphics.report.data.reading import need, number, optional, read_table
+from invgraphics.runs.explanation import Contributions, ExplanationRecord, Profile
+from invgraphics.runs.schema import plain
 
-NAME = "ray"
-"""Of the files, less their suffixes."""
 DEPTHS = ("true_depth", "expected", "median")
-"""Depths of a pixel, as the file calls them."""
-NUMBERS = ("t", "begin", "end", "alpha", "transmittance", "weight", "red", "green", "blue")
-"""What is known of every contribution."""
+"""Depths of a pixel, as the record calls them."""
 TAIL, FAINT, SMALL = 0.02, 0.02, 0.6
 """A close-up leaves out this share of the light at either end; it is for rays that meet more than `FAINT`, and shows less than
 `SMALL` of the ray."""
@@ -30,50 +26,27 @@ class Ray:
     """What `invgraphics.tools.explain` wrote: contributions in the order in which they are composited.
 
     Attributes:
-        facts: the file's table.
-        source: the file.
+        record: the file's content.
         columns: name -> values of the contributions.
         rgb: their colours, for display.
         background: for display.
     """
 
-    facts: dict[str, Any]
-    source: Path
+    record: ExplanationRecord
     columns: dict[str, Float[ndarray, " k"]]
     rgb: Float[ndarray, "k 3"]
     background: Float[ndarray, " 3"]
 
     @property
-    def kind(self) -> str:
-        """``samples``, ``splats`` or ``gaussians``."""
-        return need(self.facts, "kind", str, self.source)
-
-    @property
-    def pixel(self) -> dict[str, Any]:
-        """Facts of the pixel."""
-        return need(self.facts, "pixel", dict, self.source)
-
-    @property
     def depths(self) -> dict[str, float]:
         """Those of `DEPTHS` that are known."""
-        known = {key: number(self.pixel.get(key), key, self.source) for key in DEPTHS}
+        known = {key: getattr(self.record.pixel, key) for key in DEPTHS}
         return {key: value for key, value in known.items() if value is not None}
-
-    @property
-    def length_unit(self) -> str:
-        """``world``, or ``local`` for files from before lengths were stored in the data set's units."""
-        return optional(self.facts, "length_unit", str, self.source, "local")
-
-    def curve(self, name: str) -> dict[str, Float[ndarray, " p"]]:
-        """``profile`` or ``marched``, empty where there is none; what it lacks is left out."""
-        table = optional(self.facts, name, dict, self.source, {})
-        return {key: np.array(values, float) for key, values in table.items() if values is not None}
 
     def shown(self, colour: Float[ndarray, "*p 3"]) -> Float[ndarray, "*p 3"]:
         """Colours of the scene's colour space as a screen shows them."""
-        linear = need(self.facts, "colour", str, self.source) == "linear"
         values = torch.from_numpy(np.asarray(colour, float))
-        return (linear_to_srgb(values) if linear else values.clamp(0, 1)).numpy()
+        return (linear_to_srgb(values) if self.record.colour == "linear" else values.clamp(0, 1)).numpy()
 
 
 def read_ray(folder: Path) -> Ray:
@@ -82,22 +55,23 @@ def read_ray(folder: Path) -> Ray:
     Raises:
         InputError: a file is missing or broken.
     """
-    source = folder / f"{NAME}.json"
-    facts = read_table(source)
-    table = need(facts, "contributions", dict, source)
-    for key in (*NUMBERS, "counted"):
-        need(table, key, list, source)
-    columns = {str(key): np.array(values, float) for key, values in table.items() if values is not None}
+    record = ExplanationRecord.read(folder / ExplanationRecord.FILE)
+    columns = curve_of(record.contributions)
     rgb = np.stack([columns[key] for key in ("red", "green", "blue")], axis=1)
-    return Ray(facts, source, columns, rgb, np.array(need(facts, "background", list, source), float))
+    return Ray(record, columns, rgb, np.array(record.background, float))
+
+
+def curve_of(table: Contributions | Profile | None) -> dict[str, Float[ndarray, " p"]]:
+    """Columns as arrays, empty where there is no table; what it lacks is left out."""
+    return {} if table is None else {key: np.array(values, float) for key, values in plain(table).items()}
 
 
 def whole_ray(ray: Ray) -> tuple[float, float]:
     """The distances of the whole ray: all that was sampled, or where the Gaussians lie."""
-    near, far = (number(ray.facts.get(key), key, ray.source) for key in ("near", "far"))
+    near, far = ray.record.near, ray.record.far
     ends = np.concatenate([ray.columns["begin"], ray.columns["end"], list(ray.depths.values())])
-    if ray.kind == "samples" and near is not None and far is not None and far > near:
-        unbounded = optional(ray.facts, "space", str, ray.source, "box") == "contracted"
+    if ray.record.kind == "samples" and near is not None and far is not None and far > near:
+        unbounded = ray.record.space == "contracted"
         return near, min(far, 1.5 * float(ends.max())) if unbounded and len(ends) else far
     if not len(ends):
         return 0.0, 1.0

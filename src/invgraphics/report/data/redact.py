@@ -13,6 +13,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
 
 from invgraphics.errors import InputError
+from invgraphics.report.data.pictures import read_picture
 
 T = TypeVar("T")
 
@@ -77,8 +78,6 @@ class Redactor:
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.suffix == ".png":
             from PIL import Image
-
-            from invgraphics.report.data.assets import read_picture
 
             Image.fromarray(read_picture(source)).save(target, optimize=True)
         elif source.suffix == ".json":

@@ -2,69 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.report.data.factors import METHOD, Factor, Observation, level_text
-from invgraphics.report.data.reading import need, number, optional, read_run, read_table
-from invgraphics.report.data.records import Comparison, Failure, Run
+from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.data.factors import METHOD, Factor, Observation, StudyCell, level_text
 from invgraphics.report.data.variants import find_factors, variant_name
-
-STUDY = "study.json"
-STATUSES = ("done", "failed", "missing", "skipped")
-
-
-@dataclass(frozen=True)
-class StudyCell:
-    """One cell of a study.
-
-    Attributes:
-        id: name of its run; cells that come to the same settings share one.
-        scene: its scene.
-        method: ``renderer/recipe``.
-        seed: its seed.
-        levels: factor -> level as written, the method included.
-        variant: method and levels in words, the same for all scenes and seeds.
-        status: ``done``, ``failed``, ``missing``, or ``skipped`` where its data was not there.
-        error: why it failed or was skipped; empty otherwise.
-        seconds: what it took; ``None`` where unknown.
-        run: its run, where it is done.
-        label: method, scene@size, budget and seed in a line.
-        size: of its pictures: the longest side, or width × height, px; empty for the scene's own.
-        budget: of its fit, in words.
-        amount: of its budget: (unit, seconds or steps); ``None`` where unknown.
-        forecast: seconds that it was expected to take; ``None`` where unknown.
-    """
-
-    id: str
-    scene: str
-    method: str
-    seed: int
-    levels: dict[str, str]
-    variant: str
-    status: str
-    error: str
-    seconds: float | None
-    run: Run | None
-    label: str = ""
-    size: str = ""
-    budget: str = ""
-    amount: tuple[str, float] | None = None
-    forecast: float | None = None
-
-
-@dataclass(frozen=True)
-class Known:
-    """A red verdict whose cause is known: pattern of the cells' labels, rule, cause, and issue or empty."""
-
-    cells: str
-    rule: str
-    cause: str
-    issue: str
+from invgraphics.runs.comparison import Failure
+from invgraphics.runs.environment import Environment
+from invgraphics.runs.run import Run, read_run
+from invgraphics.runs.scores import DEFAULT
+from invgraphics.runs.study import Approximation, CellRecord, KnownDeviation, StudyRecord
 
 
 @dataclass(frozen=True)
@@ -87,7 +38,7 @@ class Study:
         command: reproduces the study.
         environment: machine and versions.
         cells: all of them, in order.
-        approximations: ``name``, and the renderers ``exact`` and ``approximate`` that are compared on every fit.
+        approximations: pairs of renderers that are compared on every fit.
         analyses: names of the computations beside the fits.
         report: what its page is about: ``effects`` or ``verdicts``.
         known: red verdicts whose causes are known.
@@ -106,12 +57,12 @@ class Study:
     size: str
     protocol: dict[str, Any]
     command: str
-    environment: dict[str, Any]
+    environment: Environment
     cells: tuple[StudyCell, ...]
-    approximations: tuple[dict[str, Any], ...] = ()
+    approximations: tuple[Approximation, ...] = ()
     analyses: tuple[str, ...] = ()
     report: str = "effects"
-    known: tuple[Known, ...] = ()
+    known: tuple[KnownDeviation, ...] = ()
 
     @property
     def variants(self) -> tuple[str, ...]:
@@ -134,7 +85,7 @@ class Study:
 
 def is_study(folder: Path) -> bool:
     """Whether ``folder`` holds a study."""
-    return (folder / STUDY).is_file()
+    return (folder / StudyRecord.FILE).is_file()
 
 
 def read_study(folder: Path) -> Study:
@@ -143,36 +94,34 @@ def read_study(folder: Path) -> Study:
     Raises:
         InputError: a file is missing or broken; the sentence names it.
     """
-    source = folder / STUDY
-    table = read_table(source)
-    protocol = _protocol(table.get("protocol"), source)
-    entries = need(table, "cells", list, source)
-    if not entries:
+    source = folder / StudyRecord.FILE
+    record = StudyRecord.read(source)
+    if not record.cells:
         raise InputError(f"'{source}' lists no cells.", "Give a study with at least one scene, method and seed.")
-    base = {str(key): level_text(value) for key, value in optional(table, "base", dict, source, {}).items()}
-    cells = [_cell(entry, base, folder, str(protocol.get("name", "default"))) for entry in entries]
-    declared = optional(table, "factors", dict, source, {})
-    factors = find_factors(declared, base, cells)
+    base = {key: level_text(value) for key, value in record.base.items()}
+    protocol = str(record.protocol.get("name", DEFAULT))
+    cells = [_cell(cell, base, folder, protocol) for cell in record.cells]
+    factors = find_factors(record.factors, base, cells)
     return Study(
-        name=optional(table, "name", str, source, folder.resolve().name),
-        question=optional(table, "question", str, source, ""),
-        design=optional(table, "design", str, source, ""),
+        name=record.name,
+        question=record.question,
+        design=record.design,
         factors=factors,
         base=base,
-        scenes=_listed(table.get("scenes"), (cell.scene for cell in cells)),
-        methods=_listed(table.get("methods"), (cell.method for cell in cells)),
+        scenes=_listed(record.scenes, (cell.scene for cell in cells)),
+        methods=_listed(record.methods, (cell.method for cell in cells)),
         seeds=tuple(sorted({cell.seed for cell in cells})),
-        budget=_written(table.get("budget")),
-        preset=_written(table.get("preset")),
-        size=_written(table.get("size")),
-        protocol=protocol,
-        command=optional(table, "command", str, source, ""),
-        environment=optional(table, "environment", dict, source, {}),
+        budget=record.budget,
+        preset=record.preset or "",
+        size=_written(record.size),
+        protocol=record.protocol,
+        command=record.command,
+        environment=record.environment,
         cells=tuple(replace(cell, variant=variant_name(cell, factors)) for cell in cells),
-        approximations=tuple(_approximations(table, source)),
-        analyses=tuple(str(name) for name in optional(table, "analyses", list, source, [])),
-        report=optional(table, "report", str, source, "effects"),
-        known=tuple(_known(entry, source) for entry in optional(table, "known", list, source, [])),
+        approximations=record.approximations,
+        analyses=record.analyses,
+        report=record.report,
+        known=record.known,
     )
 
 
@@ -194,7 +143,7 @@ def scene_comparisons(study: Study) -> list[Comparison]:
 
 def _truth_of(run: Run) -> tuple[Any, ...]:
     """What two runs must share to be shown side by side."""
-    return run.truth_hash, run.views, json.dumps(run.provenance.get("background"))
+    return run.provenance.truth_sha256, run.scores.views, run.provenance.background
 
 
 def _comparison(
@@ -205,7 +154,7 @@ def _comparison(
         question=study.question,
         methods=variants,
         runs=runs,
-        failures=tuple(Failure(cell.variant, cell.seed, cell.error) for cell in failures),
+        failures=tuple(Failure(method=cell.variant, seed=cell.seed, error=cell.error) for cell in failures),
         budget=study.budget,
         preset=study.preset,
         protocol=study.protocol,
@@ -213,70 +162,35 @@ def _comparison(
     )
 
 
-def _cell(entry: Any, base: Mapping[str, str], folder: Path, protocol: str) -> StudyCell:
-    source = folder / STUDY
-    method, status = need(entry, "method", str, source), need(entry, "status", str, source)
-    if status not in STATUSES:
-        raise InputError(f"'{source}': 'status' cannot be {status!r}.", f"Expected one of: {', '.join(STATUSES)}.")
-    own = {str(key): level_text(value) for key, value in optional(entry, "levels", dict, source, {}).items()}
-    run = read_run(folder / need(entry, "run", str, source), protocol) if status == "done" else None
-    scene, size = need(entry, "scene", str, source), _written(entry.get("size"))
+def _cell(record: CellRecord, base: Mapping[str, str], folder: Path, protocol: str) -> StudyCell:
+    own = {key: level_text(value) for key, value in record.levels.items()}
+    amounts = (("seconds", record.budget_seconds), ("steps", record.budget_steps))
     return StudyCell(
-        id=need(entry, "id", str, source),
-        scene=scene,
-        method=method,
-        seed=need(entry, "seed", int, source),
-        levels={METHOD: method} | dict(base) | own,
+        id=record.id,
+        scene=record.scene,
+        method=record.method,
+        seed=record.seed,
+        levels={METHOD: record.method} | dict(base) | own,
         variant="",
-        status=status,
-        error=optional(entry, "error", str, source, "") or ("no message" if status == "failed" else ""),
-        seconds=number(entry.get("seconds"), "seconds", source),
-        run=run,
-        label=optional(entry, "label", str, source, f"{method} {scene}"),
-        size=size,
-        budget=optional(entry, "budget", str, source, ""),
-        amount=_amount(entry, source),
-        forecast=number(entry.get("forecast_seconds"), "forecast_seconds", source),
+        status=record.status,
+        error=record.error or ("no message" if record.status == "failed" else ""),
+        seconds=record.seconds,
+        run=read_run(folder / record.run, protocol) if record.status == "done" else None,
+        label=record.label or f"{record.method} {record.scene}",
+        size=_written(record.size),
+        budget=record.budget,
+        amount=next(((unit, float(amount)) for unit, amount in amounts if amount is not None), None),
+        forecast=record.forecast_seconds,
     )
 
 
-def _amount(entry: Mapping[str, Any], source: Path) -> tuple[str, float] | None:
-    """A budget's unit and amount."""
-    for unit in ("seconds", "steps"):
-        amount = number(entry.get(f"budget_{unit}"), f"budget_{unit}", source)
-        if amount is not None:
-            return unit, amount
-    return None
-
-
-def _known(entry: Any, source: Path) -> Known:
-    cells, rule, cause = (need(entry, key, str, source) for key in ("cells", "rule", "cause"))
-    return Known(cells, rule, cause, str(entry.get("issue") or ""))
-
-
-def _approximations(table: Mapping[str, Any], source: Path) -> list[dict[str, Any]]:
-    pairs = optional(table, "approximations", list, source, [])
-    return [{key: need(pair, key, str, source) for key in ("name", "exact", "approximate")} for pair in pairs]
-
-
-def _protocol(value: Any, source: Path) -> dict[str, Any]:
-    if value is None or isinstance(value, str):
-        return {"name": value or "default"}
-    if not isinstance(value, Mapping):
-        raise InputError(f"'{source}': 'protocol' cannot be {value!r}.")
-    return dict(value)
-
-
-def _listed(value: Any, found: Iterable[str]) -> tuple[str, ...]:
+def _listed(stated: Sequence[str], found: Iterable[str]) -> tuple[str, ...]:
     """Those of ``found`` in the order that the study states, then the rest."""
     present = list(dict.fromkeys(found))
-    stated = [str(item) for item in value if str(item) in present] if isinstance(value, list) else []
-    return tuple(dict.fromkeys([*stated, *present]))
+    return tuple(dict.fromkeys([*(item for item in stated if item in present), *present]))
 
 
-def _written(value: Any) -> str:
-    if value is None:
+def _written(size: int | tuple[int, int] | None) -> str:
+    if size is None:
         return ""
-    if isinstance(value, list):
-        return " × ".join(str(item) for item in value)
-    return str(value)
+    return str(size) if isinstance(size, int) else f"{size[0]} × {size[1]}"

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from invgraphics.report.data.factors import METHOD, Factor, level_text
-
-if TYPE_CHECKING:
-    from invgraphics.report.data.studies import StudyCell
+from invgraphics.report.data.factors import METHOD, Factor, StudyCell, level_text
 
 
 def find_factors(declared: Mapping[str, Any], base: Mapping[str, str], cells: Sequence[StudyCell]) -> tuple[Factor, ...]:

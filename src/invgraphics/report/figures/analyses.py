@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from invgraphics.report.data.reading import need, optional, read_table
 from invgraphics.report.figures.style import Figure, canvas, save, series_style
+from invgraphics.runs.analysis import Analysis, analysis_path
 
 SIZE = (460.0, 380.0)
 MARKED = 40
@@ -32,33 +32,32 @@ def draw_analyses(root: Path, names: Sequence[str], figures: Path) -> list[Analy
     """
     parts = []
     for name in names:
-        source = root / "analyses" / f"{name}.json"
+        source = analysis_path(root, name)
         if source.is_file():
-            parts.append(_draw(read_table(source), source, figures / f"analysis-{source.stem}"))
+            parts.append(_draw(Analysis.read(source), figures / f"analysis-{name}"))
     return parts
 
 
-def _draw(table: dict[str, Any], source: Path, stem: Path) -> AnalysisPart:
-    title, sentence = need(table, "title", str, source), need(table, "sentence", str, source)
+def _draw(analysis: Analysis, stem: Path) -> AnalysisPart:
+    title, sentence = analysis.title, analysis.sentence
     with canvas(*SIZE) as (figure, axes):
-        for index, curve in enumerate(need(table, "curves", list, source)):
-            x, y = need(curve, "x", list, source), need(curve, "y", list, source)
+        for index, curve in enumerate(analysis.curves):
             look = series_style(index)
-            marker: dict[str, Any] = {"marker": look.marker, "markersize": 5} if len(x) <= MARKED else {}
+            marker: dict[str, Any] = {"marker": look.marker, "markersize": 5} if len(curve.x) <= MARKED else {}
             axes.plot(
-                x,
-                y,
+                curve.x,
+                curve.y,
                 color=look.colour,
                 zorder=4 - 0.1 * index,
                 linewidth=1.8,
-                label=need(curve, "label", str, source),
+                label=curve.label,
                 **marker,
             )
-        if optional(table, "logarithmic", bool, source, False):
+        if analysis.logarithmic:
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")  # as text: labels are not typeset
-        axes.set_xlabel(need(table, "x", str, source))
-        axes.set_ylabel(need(table, "y", str, source))
+        axes.set_xlabel(analysis.x)
+        axes.set_ylabel(analysis.y)
         figure.legend(loc="outside upper left", ncols=1, frameon=False, fontsize=11)
         path = save(figure, stem)
     return AnalysisPart(title, sentence, Figure(path, None, title, f"{title}. {sentence}"))

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from invgraphics.report.figures.effects import file_name
 from invgraphics.report.figures.style import PAGE, PANEL, Figure, canvas, save, series_style
 from invgraphics.report.statistics.rules import JudgedCell
+from invgraphics.text import file_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

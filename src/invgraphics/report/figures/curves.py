@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.figures.style import MUTED, Figure, SeriesStyle, canvas, save, series_style, spread_labels
 from invgraphics.report.statistics.intervals import band
 from invgraphics.report.statistics.summary import Summary
+from invgraphics.runs.run import Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

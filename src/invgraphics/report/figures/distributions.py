@@ -8,10 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.figures.style import GRID, INK, PAGE, PANEL, Figure, canvas, save, series_style
 from invgraphics.report.statistics.summary import Summary
 from invgraphics.report.wording import Quantity
+from invgraphics.runs.run import Run
+from invgraphics.text import file_name
 
 
 def draw_distributions(comparison: Comparison, summary: Summary, folder: Path) -> list[tuple[Quantity, Figure]]:
@@ -20,25 +22,22 @@ def draw_distributions(comparison: Comparison, summary: Summary, folder: Path) -
     for column in (column for column in summary.columns if column.group != "cost"):
         values = {row.series: per_view(comparison.runs_of(row.label), column.key) for row in summary.methods}
         if any(values.values()):
-            stem = folder / f"views-{_file_name(column.key)}"
+            stem = folder / f"views-{file_name(column.key)}"
             figures.append((column, _draw(summary, column, values, stem)))
     return figures
 
 
 def per_view(runs: Sequence[Run], key: str) -> list[float]:
     """A metric on each test view, averaged over ``runs``; views without a finite score are left out."""
-    columns = [run.quality[key].per_view for run in runs if key in run.quality and run.quality[key].per_view]
+    columns = [
+        run.scores.quality[key].per_view for run in runs if key in run.scores.quality and run.scores.quality[key].per_view
+    ]
     means = []
     for values in zip(*columns, strict=True):
         finite = [value for value in values if value is not None and math.isfinite(value)]
         if finite:
             means.append(statistics.fmean(finite))
     return means
-
-
-def _file_name(key: str) -> str:
-    """A plug-in may call its metric anything; a file may not."""
-    return "".join(letter if letter.isalnum() else "-" for letter in key)
 
 
 def _draw(summary: Summary, column: Quantity, values: dict[int, list[float]], stem: Path) -> Figure:

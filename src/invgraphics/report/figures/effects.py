@@ -15,6 +15,7 @@ from invgraphics.report.figures.style import INK, MUTED, Figure, canvas, save, s
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.summary import value_of
 from invgraphics.report.wording import Quantity
+from invgraphics.text import file_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,11 +40,6 @@ def draw_intervals(effects: Sequence[Effect], folder: Path) -> Figure | None:
     wide = _draw_intervals(shown, title, folder / f"effects-{file_name(quantity.key)}", WIDE)
     narrow = _draw_intervals(shown, title, folder / f"effects-{file_name(quantity.key)}-narrow", NARROW)
     return Figure(wide, narrow, title, " ".join(effect.sentence for effect in shown))
-
-
-def file_name(key: str) -> str:
-    """A plug-in may call its metric anything; a file may not."""
-    return "".join(letter if letter.isalnum() else "-" for letter in key)
 
 
 def _draw_intervals(effects: Sequence[Effect], title: str, stem: Path, width: float) -> Path:

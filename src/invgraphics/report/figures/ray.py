@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from invgraphics.report.data.assets import read_picture
-from invgraphics.report.data.ray import NAME, Ray, close_up, read_ray, whole_ray
-from invgraphics.report.data.reading import need, optional
+from invgraphics.report.data.pictures import read_picture
+from invgraphics.report.data.ray import Ray, close_up, curve_of, read_ray, whole_ray
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, POINTS, SERIES, canvas, save, spread_labels
+from invgraphics.runs.explanation import FIGURE, PICTURE, TRUTH
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,19 +65,19 @@ def draw_ray(folder: Path) -> Path:
         _depths((strip, main, below), ray)
         for axes in (strip, main, below):
             axes.tick_params(labelbottom=False, bottom=False)
-        total.set_xlabel(f"distance along the ray ({ray.length_unit} units)")
+        total.set_xlabel(f"distance along the ray ({ray.record.length_unit} units)")
         _pictures(figure, grid[:, 1].subgridspec(2, 1), ray, folder)
         figure.suptitle(_title(ray), x=0.01, ha="left", fontsize=14, fontweight="bold")
-        png = folder / f"{NAME}.png"
+        png = folder / f"{FIGURE}.png"
         figure.savefig(png, dpi=POINTS * SHARPNESS, facecolor=PAGE.light)
-        save(figure, folder / NAME)
+        save(figure, folder / FIGURE)
     return png
 
 
 def _title(ray: Ray) -> str:
-    facts, pixel = ray.facts, ray.pixel
-    where = f"{facts['scene']}, {facts['split']} view {facts['view']}, pixel ({pixel['column']}, {pixel['row']})"
-    return f"{facts['method']} on {where}: {len(ray.rgb)} {ray.kind}"
+    record, pixel = ray.record, ray.record.pixel
+    where = f"{record.scene}, {record.split} view {record.view}, pixel ({pixel.column}, {pixel.row})"
+    return f"{record.method} on {where}: {len(ray.rgb)} {record.kind}"
 
 
 def _set_span(axes: Axes, low: float, high: float) -> None:
@@ -100,7 +100,7 @@ def _nearest_colours(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
     at, t = _cells(axes), ray.columns["t"]
     if not len(t):
         return np.zeros((CELLS, 4))
-    if ray.kind == "samples":
+    if ray.record.kind == "samples":
         which = (np.searchsorted(ray.columns["begin"], at, side="right") - 1).clip(min=0)
         there = (at >= ray.columns["begin"][which]) & (at <= ray.columns["end"][which])
     else:
@@ -152,7 +152,7 @@ def _shares(axes: Axes, ray: Ray) -> None:
     edge = {"edgecolor": MUTED.light, "linewidth": 0.5}
     if not len(t):
         axes.text(0.5, 0.5, "nothing on this ray: it shows the background", ha="center", transform=axes.transAxes)
-    elif ray.kind == "samples":
+    elif ray.record.kind == "samples":
         axes.bar(begin, columns["alpha"], end - begin, align="edge", facecolor="none", **edge, label="α")
         axes.bar(begin, columns["weight"], end - begin, align="edge", color=filled, **edge, label="weight T·α", zorder=3)
         _gaps(axes, ray)
@@ -161,8 +161,8 @@ def _shares(axes: Axes, ray: Ray) -> None:
         axes.plot(t, columns["alpha"], "_", color=MUTED.light, markersize=6, zorder=2)
         axes.vlines(t, 0, columns["weight"], color=INK.light, linewidth=5.4, zorder=2.9)
         axes.vlines(t, 0, columns["weight"], color=filled, linewidth=4.2, label="weight T·α", zorder=3)
-    for index, earlier in enumerate(optional(ray.facts, "passes", list, ray.source, [])):
-        edges, weight = [*earlier["t0"], earlier["t1"][-1]], np.array(earlier["weight"], float)
+    for index, earlier in enumerate(ray.record.passes):
+        edges, weight = np.array([*earlier.t0, earlier.t1[-1]], float), np.array(earlier.weight, float)
         axes.stairs(weight, edges, color=PASS, linewidth=1.4, zorder=3.5, label=f"weights of pass {index + 1}, coarser")
     _light(axes, ray)
     axes.set_ylim(0, 1.06)
@@ -175,7 +175,7 @@ def _shares(axes: Axes, ray: Ray) -> None:
 
 def _light(axes: Axes, ray: Ray) -> None:
     """Transmittance: a curve where the medium is known in between, else stairs."""
-    profile, marched = ray.curve("profile"), ray.curve("marched")
+    profile, marched = curve_of(ray.record.profile), curve_of(ray.record.marched)
     if profile:
         axes.plot(profile["t"], profile["transmittance"], color=LIGHT, linewidth=2.2, label="transmittance T", zorder=4)
     elif len(ray.rgb):
@@ -184,7 +184,7 @@ def _light(axes: Axes, ray: Ray) -> None:
         left = np.append(left, left[-1] * (1 - ray.columns["alpha"][-1]))
         low, high = axes.get_xlim()
         x, y = np.concatenate([[low], np.repeat(t, 2), [high]]), np.repeat(left, 2)
-        order = "T, in the order of centres" if ray.kind == "splats" else "transmittance T"
+        order = "T, in the order of centres" if ray.record.kind == "splats" else "transmittance T"
         axes.plot(x, y, color=LIGHT, linewidth=1.8, label=order, zorder=4)
     if marched:
         style: dict[str, Any] = {"color": LIGHT, "linewidth": 1.4, "linestyle": (0, (4, 2)), "zorder": 3.8}
@@ -206,15 +206,15 @@ def _gaps(axes: Axes, ray: Ray) -> None:
 
 def _densities(axes: Axes, ray: Ray) -> None:
     """Density along the ray, and where it was looked at."""
-    curve = ray.curve("profile") or ray.curve("marched")
+    curve = curve_of(ray.record.profile) or curve_of(ray.record.marched)
     if "density" in curve:
         axes.fill_between(curve["t"], 0, curve["density"], color=DENSITY, alpha=0.25, linewidth=0)
         axes.plot(curve["t"], curve["density"], color=DENSITY, linewidth=1.2)
         axes.set_ylim(0, 1.08 * max(float(curve["density"].max()), 1e-9))
-    if ray.kind == "samples" and "density" in ray.columns:
+    if ray.record.kind == "samples" and "density" in ray.columns:
         axes.plot(ray.columns["t"], ray.columns["density"], ".", color=DENSITY, markersize=4)
-    unit = f"\nper {ray.length_unit} unit"
-    axes.set_ylabel(f"density{unit}" if ray.kind != "splats" else f"density{unit}\nif marched")
+    unit = f"\nper {ray.record.length_unit} unit"
+    axes.set_ylabel(f"density{unit}" if ray.record.kind != "splats" else f"density{unit}\nif marched")
 
 
 def _depths(panels: tuple[Axes, ...], ray: Ray) -> None:
@@ -238,26 +238,28 @@ def _depths(panels: tuple[Axes, ...], ray: Ray) -> None:
 
 def _pictures(figure: Canvas, places: Any, ray: Ray, folder: Path) -> None:
     """The picture and the truth, each with the pixel in a cross-hair and its colour below."""
-    for place, name, key, title in zip(places, ("picture", "truth"), ("rendered", "true"), ("rendered", "truth"), strict=True):
+    pixel = ray.record.pixel
+    shown = ((PICTURE, pixel.rendered, "rendered"), (TRUTH, pixel.true, "truth"))
+    for place, (name, values, title) in zip(places, shown, strict=True):
         axes = figure.add_subplot(place)
-        _cross_hair(axes, read_picture(folder / f"{name}.png"), ray)
+        _cross_hair(axes, read_picture(folder / name), ray)
         axes.set_title(title)
-        colour = np.array(need(ray.pixel, key, list, ray.source), float)
-        shown = ray.shown(colour)
+        colour = np.array(values, float)
+        tone = ray.shown(colour)
         swatch = axes.inset_axes((0.0, -0.17, 1.0, 0.14))
-        swatch.set_facecolor(tuple(shown))
+        swatch.set_facecolor(tuple(tone))
         swatch.set(xticks=[], yticks=[])
         swatch.grid(False)
         swatch.spines[:].set_visible(True)
-        ink = INK.light if shown @ LUMINANCE > 0.5 else PAGE.light
-        values = ", ".join(f"{value:.3f}" for value in colour)
-        swatch.text(0.5, 0.5, values, color=ink, ha="center", va="center", transform=swatch.transAxes, fontsize=11.5)
+        ink = INK.light if tone @ LUMINANCE > 0.5 else PAGE.light
+        words = ", ".join(f"{value:.3f}" for value in colour)
+        swatch.text(0.5, 0.5, words, color=ink, ha="center", va="center", transform=swatch.transAxes, fontsize=11.5)
 
 
 def _cross_hair(axes: Axes, picture: UInt8[ndarray, "h w 3"], ray: Ray) -> None:
     height, width = picture.shape[:2]
     axes.imshow(picture, interpolation="nearest", extent=(0, width, height, 0))
-    x, y, gap = ray.pixel["column"] + 0.5, ray.pixel["row"] + 0.5, max(width, height) / 28
+    x, y, gap = ray.record.pixel.column + 0.5, ray.record.pixel.row + 0.5, max(width, height) / 28
     for tone, thickness in ((PAGE.light, 3.2), (SERIES[1].light, 1.4)):
         style: dict[str, Any] = {"color": tone, "linewidth": thickness}
         axes.plot([0, max(x - gap, 0), np.nan, min(x + gap, width), width], [y] * 5, **style)

@@ -15,9 +15,11 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from invgraphics.errors import InputError
-from invgraphics.report.data.assets import Arrays, Folder, gradient, read_arrays, read_picture, save_normals, save_scalar
-from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.data.assets import Folder, gradient, save_normals, save_scalar
+from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.data.pictures import Arrays, read_arrays, read_picture
 from invgraphics.report.wording import Quantity, quality_quantity
+from invgraphics.runs.run import Run, truth_picture
 
 ERROR_COLOURS, DEPTH_COLOURS = "magma", "viridis_r"
 EVENLY_SPACED = 4
@@ -98,12 +100,12 @@ class _Shown:
 
 def choose_views(runs: Sequence[Run]) -> list[tuple[int, str]]:
     """(index, why) of the views to show: evenly spaced ones, and the one with the worst first metric over all runs."""
-    total = len(runs[0].views)
+    total = len(runs[0].scores.views)
     count = min(EVENLY_SPACED, total)
     chosen = {round(i * (total - 1) / max(1, count - 1)): "" for i in range(count)}
-    key = next((key for key, score in runs[0].quality.items() if score.per_view), None)
+    key = next((key for key, score in runs[0].scores.quality.items() if score.per_view), None)
     if key is not None:
-        quantity = quality_quantity(key, runs[0].quality[key])
+        quantity = quality_quantity(key, runs[0].scores.quality[key])
         worst = max(range(total), key=lambda view: quantity.sort_key(_mean_over(runs, key, view, quantity)))
         chosen[worst] = f"worst {quantity.label} over all methods"
     return sorted(chosen.items())
@@ -119,11 +121,13 @@ def draw_views(comparison: Comparison, folder: Folder) -> tuple[ViewPage, ...]:
 
 def publish_truth(run: Run, index: int, folder: Folder) -> str:
     """Link to the truth's picture of a test view."""
-    return folder.publish(run.truth / f"{index:04d}.png", f"pictures/truth-{index:04d}.png")
+    return folder.publish(truth_picture(run.truth, index), f"pictures/truth-{index:04d}.png")
 
 
 def _mean_over(runs: Sequence[Run], key: str, view: int, quantity: Quantity) -> float:
-    found = [run.quality[key].per_view[view] for run in runs if key in run.quality and run.quality[key].per_view]
+    found = [
+        run.scores.quality[key].per_view[view] for run in runs if key in run.scores.quality and run.scores.quality[key].per_view
+    ]
     known = [value for value in found if value is not None]
     return statistics.fmean(known) if known else (math.inf if quantity.better == "higher" else -math.inf)
 
@@ -147,7 +151,7 @@ def _draw_view(firsts: Sequence[tuple[Run, int]], index: int, why: str, folder: 
         _depth_layer(shown, geometry, index, folder, target),
         _normal_layer(shown, geometry, index, folder, target),
     )
-    name = firsts[0][0].views[index]
+    name = firsts[0][0].scores.views[index]
     return ViewPage(index, name, why, truth.shape[1], truth.shape[0], tuple(layer for layer in layers if _any(layer)))
 
 
@@ -165,7 +169,7 @@ def _captioned(shown: Sequence[_Shown], pictures: Sequence[Picture], keys: Seque
         known = [value for value in values if value is not None]
         if not known:
             continue
-        quantity = quality_quantity(key, next(one.run.quality[key] for one in shown if key in one.run.quality))
+        quantity = quality_quantity(key, next(one.run.scores.quality[key] for one in shown if key in one.run.scores.quality))
         best = quantity.text(min(known, key=quantity.sort_key))
         for i, value in enumerate(values):
             if value is not None:
@@ -183,7 +187,7 @@ def _unit(quantity: Quantity) -> str:
 
 
 def _view_score(run: Run, key: str, index: int) -> float | None:
-    score = run.quality.get(key)
+    score = run.scores.quality.get(key)
     return score.per_view[index] if score is not None and score.per_view else None
 
 
@@ -195,7 +199,7 @@ def _colour_layer(shown: Sequence[_Shown], index: int, folder: Folder) -> Layer:
     pictures = []
     for one in shown:
         place = f"pictures/method-{one.series}-{index:04d}.png"
-        pictures.append(Picture(folder.publish(one.run.folder / "test" / f"{index:04d}.png", place)))
+        pictures.append(Picture(folder.publish(one.run.files.picture(index), place)))
     captioned = _captioned(shown, pictures, ("psnr", "ssim"), index)
     truth = Picture(publish_truth(shown[0].run, index, folder))
     return Layer("colour", "Picture", "", "", "", "", truth, _with_methods(shown, captioned))

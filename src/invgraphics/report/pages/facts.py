@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from invgraphics.report.data.assets import Folder
-from invgraphics.report.data.records import Comparison, Run
-from invgraphics.report.wording import budget_words, duration, listing
-
-RUN_FILES = ("recipe.toml", "scores.json", "history.jsonl", "provenance.json", "environment.json")
+from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.wording import budget_words, listing
+from invgraphics.runs.folder import PUBLISHED
+from invgraphics.runs.run import Run
+from invgraphics.runs.schema import plain
+from invgraphics.text import duration
 
 Facts = tuple[tuple[str, str], ...]
 """(name, value) in the order in which they are shown."""
@@ -45,7 +47,7 @@ def protocol_facts(comparison: Comparison) -> Facts:
     if comparison.size:
         facts["picture size"] = f"{comparison.size[0]} × {comparison.size[1]}"
     if comparison.runs:
-        facts["test views"] = str(len(comparison.runs[0].views))
+        facts["test views"] = str(len(comparison.runs[0].scores.views))
         facts["seeds"] = ", ".join(str(seed) for seed in sorted({run.seed for run in comparison.runs}))
     facts |= preset_facts(comparison.runs, comparison.preset)
     for key, value in comparison.protocol.items():
@@ -61,11 +63,11 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
         runs: the fits.
         stated: preset of the whole comparison, for where no run says more.
     """
-    presets = _grouped([(run.preset or stated, run.method) for run in runs]) or stated
-    choices = {str(run.provenance.get("preset_choice") or "") for run in runs}
+    presets = _grouped([(run.scores.preset or stated, run.method) for run in runs]) or stated
+    choices = {run.provenance.preset_choice for run in runs}
     if choices - {""}:
         presets += f", {choices.pop()}" if len(choices) == 1 else ", chosen from each fit's budget"
-    scenes = _grouped([(_text(run.provenance.get("preset_chosen_on") or []), run.method) for run in runs])
+    scenes = _grouped([(_text(run.provenance.preset_chosen_on), run.method) for run in runs])
     return {name: text for name, text in (("preset", presets), ("preset chosen on", scenes)) if text}
 
 
@@ -82,30 +84,25 @@ def _grouped(pairs: Sequence[tuple[str, str]]) -> str:
 def scene_facts(comparison: Comparison) -> Facts:
     """What is known about the scene, notes included."""
     facts: dict[str, str] = {}
-    for key, value in comparison.scene_info.items():
-        if key in ("summary", "stresses", "notes"):
-            continue
+    for key, value in plain(replace(comparison.scene_info, notes={})).items():
         facts[{"train": "training views", "val": "validation views", "test": "test views"}.get(key, _words(key))] = _text(value)
     if comparison.noise_ceiling is not None:
         facts["noise ceiling of the truth"] = f"{comparison.noise_ceiling:.2f} dB PSNR"
-    notes = comparison.scene_info.get("notes")
-    if isinstance(notes, Mapping):
-        facts |= {_words(str(key)): _text(value) for key, value in notes.items() if key not in ("summary", "stresses")}
+    notes = comparison.scene_info.notes
+    facts |= {_words(key): _text(value) for key, value in notes.items() if key not in ("summary", "stresses")}
     return tuple((key, value) for key, value in facts.items() if value)
 
 
 def scene_sentence(comparison: Comparison, key: str) -> str:
-    """What the scene's description says under ``key``, wherever it stands."""
-    notes = comparison.scene_info.get("notes")
-    found = comparison.scene_info.get(key) or (notes.get(key) if isinstance(notes, Mapping) else None)
-    return str(found) if found else ""
+    """What the scene's description says under ``key``."""
+    return str(comparison.scene_info.notes.get(key) or "")
 
 
 def shared_facts(comparison: Comparison) -> Facts:
     """Provenance and machine facts on which all runs agree, and what is known of the whole comparison."""
     tables = [_run_facts(run) for run in comparison.runs]
     shared = {key: value for key, value in tables[0].items() if all(t.get(key) == value for t in tables)} if tables else {}
-    for key, value in comparison.environment.items():
+    for key, value in comparison.environment.facts().items():
         shared.setdefault(_words(str(key)), _text(value))
     if comparison.wall_seconds is not None:
         shared["whole command took"] = duration(comparison.wall_seconds)
@@ -119,9 +116,9 @@ def reproduction(comparison: Comparison, folder: Folder) -> tuple[Cell, ...]:
     for series, method in enumerate(comparison.methods):
         for run in comparison.runs_of(method):
             own = {key: value for key, value in _run_facts(run).items() if shared.get(key) != value}
-            command = str(run.provenance.get("command", ""))
+            command = run.provenance.command
             files = []
-            for name in RUN_FILES:
+            for name in PUBLISHED:
                 if (run.folder / name).is_file():
                     files.append((name, folder.publish(run.folder / name, f"runs/{series}-seed-{run.seed}/{name}")))
             cells.append(Cell(method, series, run.seed, command, tuple(own.items()), tuple(files)))
@@ -135,19 +132,18 @@ def plain_facts(table: Mapping[str, Any]) -> Facts:
 
 def _run_facts(run: Run) -> dict[str, str]:
     """Hashes, versions and machine of one run, under the names that people read."""
-    names = {
-        "truth_sha256": "truth SHA-256",
-        "train_sha256": "training images SHA-256",
-        "cameras_sha256": "cameras SHA-256",
-        "recipe_sha256": "recipe SHA-256",
-        "code_version": "code version",
-        "resize": "resampling filter",
-        "budget": "budget",
-        "test_poses": "test poses",
-        "load_average": "load average",
+    known = run.provenance
+    facts = {
+        "truth SHA-256": known.truth_sha256,
+        "training images SHA-256": known.train_sha256,
+        "cameras SHA-256": known.cameras_sha256,
+        "recipe SHA-256": known.recipe_sha256,
+        "code version": known.code_version,
+        "budget": known.budget,
+        "test poses": known.test_poses,
+        "load average": _text(plain(known.load_average)),
     }
-    facts = {label: _text(run.provenance[key]) for key, label in names.items() if run.provenance.get(key)}
-    for key, value in run.environment.items():
+    for key, value in run.environment.facts().items():
         facts.setdefault(_words(str(key)), _text(value))
     return {key: value for key, value in facts.items() if value}
 

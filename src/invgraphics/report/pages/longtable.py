@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD
-from invgraphics.report.data.records import Comparison, Run
 from invgraphics.report.data.studies import Study
 from invgraphics.report.wording import COSTS
+from invgraphics.runs.run import Run
+from invgraphics.runs.scores import COST_UNITS
 
 Kind = Literal["text", "int", "float", "bool"]
 
@@ -52,15 +54,6 @@ STUDY_TAIL: Columns = {
     "note": "text",
 }
 
-_COST_UNITS = {
-    "fit_seconds": "s",
-    "fit_cpu_seconds": "s",
-    "render_seconds_per_view": "s",
-    "render_fps": "1/s",
-    "peak_memory_bytes": "bytes",
-    "model_bytes": "bytes",
-}
-
 
 def write_table(columns: Columns, rows: Sequence[Row], stem: Path) -> None:
     """Write ``stem.csv`` and ``stem.parquet``."""
@@ -85,8 +78,8 @@ def write_comparison_table(comparison: Comparison, stem: Path, base: Path) -> No
     rows: list[Row] = []
     for method in comparison.methods:
         for run in comparison.runs_of(method):
-            common: Row = {"scene": comparison.scene, "method": run.method, "seed": run.seed, "views": len(run.views)}
-            common |= {"protocol": run.protocol, "run": relative(run.folder, base)}
+            common: Row = {"scene": comparison.scene, "method": run.method, "seed": run.seed, "views": len(run.scores.views)}
+            common |= {"protocol": run.scores.protocol, "run": relative(run.folder, base)}
             rows += [common | row for row in (*_mean_rows(run), *_skipped_rows(run), *_cost_rows(run))]
         for failure in comparison.failures_of(method):
             row = {"scene": comparison.scene, "method": method, "seed": failure.seed, "status": "failed", "note": failure.error}
@@ -120,36 +113,36 @@ def write_study_table(study: Study, stem: Path, base: Path) -> None:
 
 
 def _mean_rows(run: Run) -> list[Row]:
-    return [_quality_row(key, run) | {"value": score.mean} for key, score in run.quality.items()]
+    return [_quality_row(key, run) | {"value": score.mean} for key, score in run.scores.quality.items()]
 
 
 def _view_rows(run: Run) -> list[Row]:
     rows = []
-    for key, score in run.quality.items():
+    for key, score in run.scores.quality.items():
         row = _quality_row(key, run)
         if score.per_view:
-            rows += [row | {"view": view, "value": value} for view, value in zip(run.views, score.per_view, strict=True)]
+            rows += [row | {"view": view, "value": value} for view, value in zip(run.scores.views, score.per_view, strict=True)]
         else:
             rows.append(row | {"value": score.mean})
     return rows
 
 
 def _quality_row(key: str, run: Run) -> Row:
-    score = run.quality[key]
+    score = run.scores.quality[key]
     row = {"status": "ok", "group": "quality", "metric": key, "unit": score.unit}
     return row | {"higher_is_better": score.higher_is_better}
 
 
 def _skipped_rows(run: Run) -> list[Row]:
-    return [{"status": "skipped", "group": "quality", "metric": key, "note": why} for key, why in run.skipped.items()]
+    return [{"status": "skipped", "group": "quality", "metric": key, "note": why} for key, why in run.scores.skipped.items()]
 
 
 def _cost_rows(run: Run) -> list[Row]:
     directions = {cost.key: cost.better for cost in COSTS}
     rows = []
-    for key, value in run.cost.items():
+    for key, value in run.scores.cost.items():
         better = directions.get(key, "none")
-        row = {"status": "ok", "group": "cost", "metric": key, "value": value, "unit": _COST_UNITS.get(key, "")}
+        row = {"status": "ok", "group": "cost", "metric": key, "value": value, "unit": COST_UNITS.get(key, "")}
         rows.append(row | {"higher_is_better": None if better == "none" else better == "higher"})
     return rows
 

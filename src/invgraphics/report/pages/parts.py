@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD, Factor, Observation
-from invgraphics.report.data.records import Comparison
 from invgraphics.report.figures.curves import draw_curves
 from invgraphics.report.figures.distributions import draw_distributions
 from invgraphics.report.figures.effects import draw_intervals
@@ -20,6 +19,7 @@ from invgraphics.report.statistics.effects import Effect, effects_on
 from invgraphics.report.statistics.summary import Reach, Row, Summary, quality_columns, summarise, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import Quantity
+from invgraphics.runs.study import Approximation
 
 TINY = 320
 """Pictures narrower than this are enlarged on the page, with hard pixel edges: what is compared is pixels."""
@@ -128,7 +128,7 @@ class Part:
         return f"{self.key}-{name}" if self.key else name
 
 
-def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[dict[str, Any]] = ()) -> Part:
+def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[Approximation] = ()) -> Part:
     """Draw a scene's plots and pictures below ``folder.figures``, and say what its numbers mean.
 
     Args:
@@ -176,5 +176,5 @@ def _thumbnails(comparison: Comparison, drawn: Drawn, folder: Folder) -> list[Th
     prefix = f"{folder.part}-" if folder.part else ""
     return [
         Thumbnail(publish_truth(run, index, folder), name, f"{prefix}view-{index}" if index in shown else "")
-        for index, name in enumerate(run.views)
+        for index, name in enumerate(run.scores.views)
     ]

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from invgraphics.report.data.assets import Folder
-from invgraphics.report.data.factors import METHOD
-from invgraphics.report.data.studies import Study, StudyCell
+from invgraphics.report.data.factors import METHOD, StudyCell
+from invgraphics.report.data.studies import Study
 from invgraphics.report.figures.analyses import AnalysisPart
 from invgraphics.report.figures.style import Figure
 from invgraphics.report.pages import facts
@@ -16,7 +16,8 @@ from invgraphics.report.pages.parts import Contrasts, Part
 from invgraphics.report.pages.tables import escape_markdown, markdown_effects
 from invgraphics.report.statistics.intervals import CONFIDENCE, ENOUGH, RESAMPLES
 from invgraphics.report.statistics.summary import value_of
-from invgraphics.report.wording import Quantity, budget_words, duration, listing
+from invgraphics.report.wording import Quantity, budget_words, listing
+from invgraphics.text import duration
 
 DESIGNS = {
     "factorial": "full factorial: every combination of all levels",
@@ -83,7 +84,7 @@ def write_study_html(page: StudyPage, folder: Folder) -> None:
         "matrix": _matrix(page, folder),
         "failures": [(index, cell) for index, cell in enumerate(study.cells) if cell.status == "failed"],
         "design": DESIGNS.get(study.design, study.design),
-        "machine": facts.plain_facts(study.environment),
+        "machine": facts.plain_facts(study.environment.facts()),
         "cells": {
             part.key: facts.reproduction(part.comparison, Folder(folder.root, part.key, folder.redactor)) for part in page.parts
         },
@@ -157,7 +158,7 @@ def _field(cell: StudyCell, index: int, quantity: Quantity | None, folder: Folde
     if cell.run is None:
         return MatrixCell("missing", "–", "", f"{where}: has not run")
     value = value_of(cell.run, quantity) if quantity is not None else None
-    scores = cell.run.folder / ("scores.json" if cell.run.protocol == "default" else f"scores.{cell.run.protocol}.json")
+    scores = cell.run.folder / cell.run.scores.file
     text = "done" if value is None or quantity is None else quantity.text(value)
     return MatrixCell("done", text, folder.publish(scores, f"cells/{index:04d}.json"), f"{where}: done{took}")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from invgraphics.report.data.records import Comparison
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.summary import Cell, Row, Summary
 from invgraphics.report.wording import Quantity, budget_words
@@ -74,7 +74,7 @@ def escape_latex(text: str) -> str:
 def write_latex(comparison: Comparison, summary: Summary, path: Path) -> None:
     """The summary as a ``booktabs`` table, with what a caption must say."""
     budget = f", {budget_words(comparison.budget)} each" if comparison.budget else ""
-    views = f"{len(comparison.runs[0].views)} test views" if comparison.runs else "no test views"
+    views = f"{len(comparison.runs[0].scores.views)} test views" if comparison.runs else "no test views"
     protocol = str(comparison.protocol.get("name", "default"))
     caption = f"Scene {comparison.scene}{budget}; {views}, protocol {protocol}. Best values are bold."
     lines = [

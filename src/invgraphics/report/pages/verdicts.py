@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.report.data.assets import Folder
-from invgraphics.report.data.studies import STUDY, Known, Study, StudyCell
+from invgraphics.report.data.factors import StudyCell
+from invgraphics.report.data.studies import Study
 from invgraphics.report.figures.curve_grid import draw_curve_panels
 from invgraphics.report.figures.style import Figure
 from invgraphics.report.pages import facts
@@ -28,7 +29,10 @@ from invgraphics.report.statistics.rules import (
     unused,
     worst_view,
 )
-from invgraphics.report.wording import ABSENT, duration
+from invgraphics.report.wording import ABSENT
+from invgraphics.runs.folder import PUBLISHED
+from invgraphics.runs.study import KnownDeviation, StudyRecord
+from invgraphics.text import duration
 
 COLUMNS = ("PSNR", "Budget", "Steps", "Fit", "Cell took", "Forecast", "Primitives", "Dead", "Memory", "Forecast")
 COLUMNS += ("Worst view", "Code")
@@ -94,7 +98,7 @@ class VerdictPage:
     fields: tuple[Field, ...]
     rows: tuple[tuple[str, str, tuple[Field | None, ...]], ...]
     figures: list[Figure]
-    stale: tuple[Known, ...]
+    stale: tuple[KnownDeviation, ...]
 
     @property
     def headline(self) -> list[str]:
@@ -132,10 +136,10 @@ def write_verdict_report(study: Study, folder: Folder, source: Path) -> None:
         panels.setdefault(_place(one.cell), []).append(one)
     figures = draw_curve_panels(panels, study.methods, folder.figures)
     page = VerdictPage(study, fields, _matrix(study, fields), figures, unused(judged, study.known))
-    folder.publish(source / STUDY, STUDY)
+    folder.publish(source / StudyRecord.FILE, StudyRecord.FILE)
     _write_verdicts(page, folder.root / "verdicts")
     _write_markdown(page, folder)
-    machine = facts.plain_facts(study.environment)
+    machine = facts.plain_facts(study.environment.facts())
     context: dict[str, Any] = {"page": page, "study": study, "environment": study.environment, "machine": machine}
     context |= {"facts_of_study": study_facts(study), "columns": list(zip(COLUMNS, UNITS, strict=True)), "standings": STANDINGS}
     render("verdicts.html", context | {"rules": RULES, "series": {name: i for i, name in enumerate(study.methods)}}, folder)
@@ -165,22 +169,21 @@ def _field(one: JudgedCell, name: str, anchor: str, folder: Folder) -> Field:
         rest = [ABSENT] * (len(COLUMNS) - 6)
         return Field(one, name, anchor, text, (ABSENT, cell.budget, ABSENT, ABSENT, took, forecast, *rest), ())
     worst, share = worst_view(run), dead_share(run)
-    forecast_bytes = run.provenance.get("memory_forecast_bytes")
     numbers = (
         text,
         cell.budget,
-        _number(run.cost.get("steps")),
-        _number(run.cost.get("fit_seconds")),
+        _number(run.scores.cost.get("steps")),
+        _number(run.scores.cost.get("fit_seconds")),
         took,
         forecast,
-        _number(run.cost.get("primitives")),
+        _number(run.scores.cost.get("primitives")),
         ABSENT if share is None else f"{100 * share:.2g}%",
-        _number(run.cost.get("peak_memory_bytes"), 1e-6),
-        _number(forecast_bytes if isinstance(forecast_bytes, int | float) else None, 1e-6),
+        _number(run.scores.cost.get("peak_memory_bytes"), 1e-6),
+        _number(run.provenance.memory_forecast_bytes, 1e-6),
         ABSENT if worst is None else f"{worst[1]:.2f} ({worst[0]})",
-        str(run.provenance.get("code_version", "")).rpartition("+")[2] or ABSENT,
+        run.provenance.code_version.rpartition("+")[2] or ABSENT,
     )
-    names = [name for name in facts.RUN_FILES if (run.folder / name).is_file()]
+    names = [name for name in PUBLISHED if (run.folder / name).is_file()]
     files = tuple((name, folder.publish(run.folder / name, f"runs/{cell.id}/{name}")) for name in names)
     return Field(one, name, anchor, text, numbers, files)
 

@@ -6,15 +6,16 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from invgraphics.report.data.assets import Folder
-from invgraphics.report.data.reading import need, read_run, read_table
-from invgraphics.report.data.records import Comparison, Run
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.summary import quality_columns, value_of
 from invgraphics.report.wording import Quantity
+from invgraphics.runs.renderings import OWN, Renderings
+from invgraphics.runs.run import Run, read_run
+from invgraphics.runs.study import Approximation
+from invgraphics.text import file_name
 
-RECORD = "renderings.json"
 IDENTICAL = 90.0
 """Pictures closer than this many dB are called the same: they are kept as float16, whose rounding alone is above 75 dB."""
 SHOWN_VIEW = 0
@@ -22,7 +23,7 @@ SHOWN_VIEW = 0
 
 
 @dataclass(frozen=True)
-class Renderings:
+class CrossRendered:
     """A fit through several renderers.
 
     Attributes:
@@ -93,7 +94,7 @@ class Crossed:
     seeds: int
 
 
-def read_renderings(run: Run, clean: Callable[[str], str] = str) -> Renderings | None:
+def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendered | None:
     """The renderings of a fit; ``None`` where there are none.
 
     Args:
@@ -103,22 +104,18 @@ def read_renderings(run: Run, clean: Callable[[str], str] = str) -> Renderings |
     Raises:
         InputError: a file is missing or broken; the sentence names it.
     """
-    source = run.folder / RECORD
-    if not source.is_file():
+    if not run.files.has(Renderings):
         return None
-    table = read_table(source)
-    seen = {}
-    for entry in need(table, "renderings", list, source):
-        place, name = need(entry, "run", str, source), clean(need(entry, "renderer", str, source))
-        seen[name] = run if place == "." else read_run(run.folder / place, run.protocol)
-    differences = {}
-    for entry in need(table, "differences", list, source):
-        pair = frozenset(clean(str(name)) for name in need(entry, "renderers", list, source))
-        differences[pair] = tuple(float(value) for value in need(entry, "rmse", list, source))
-    return Renderings(run, seen, differences)
+    record = run.files.read(Renderings)
+    seen = {
+        clean(one.renderer): run if one.run == OWN else read_run(run.folder / one.run, run.scores.protocol)
+        for one in record.renderings
+    }
+    differences = {frozenset(clean(name) for name in one.renderers): one.rmse for one in record.differences}
+    return CrossRendered(run, seen, differences)
 
 
-def cross(comparison: Comparison, approximations: Sequence[dict[str, Any]], folder: Folder) -> Crossed | None:
+def cross(comparison: Comparison, approximations: Sequence[Approximation], folder: Folder) -> Crossed | None:
     """The fit x render table of a scene; ``None`` where nothing was rendered twice."""
     clean = folder.redactor.text if folder.redactor is not None else str
     fits = [found for run in comparison.runs if (found := read_renderings(run, clean)) is not None]
@@ -134,33 +131,33 @@ def cross(comparison: Comparison, approximations: Sequence[dict[str, Any]], fold
             rows.append(CrossRow(method, series, _mark_best(own, renderers, cells, columns[0])))
     groups = [[fit for fit in fits if fit.fit.method == row.method] for row in rows]
     steps = tuple(
-        StepRow(str(pair["name"]), exact, other, tuple(_decibels(group, frozenset((exact, other))) for group in groups))
+        StepRow(pair.name, exact, other, tuple(_decibels(group, frozenset((exact, other))) for group in groups))
         for pair in approximations
-        for exact, other in [(clean(str(pair["exact"])), clean(str(pair["approximate"])))]
+        for exact, other in [(clean(pair.exact), clean(pair.approximate))]
     )
     return Crossed(columns[0], renderers, tuple(rows), steps, max(map(len, groups)))
 
 
-def _score(fits: Sequence[Renderings], name: str, quantity: Quantity) -> float | None:
+def _score(fits: Sequence[CrossRendered], name: str, quantity: Quantity) -> float | None:
     values = [value for fit in fits if name in fit.seen and (value := value_of(fit.seen[name], quantity)) is not None]
     return statistics.fmean(values) if values else None
 
 
-def _cell(fits: Sequence[Renderings], name: str, quantity: Quantity, folder: Folder) -> CrossCell | None:
+def _cell(fits: Sequence[CrossRendered], name: str, quantity: Quantity, folder: Folder) -> CrossCell | None:
     score = _score(fits, name, quantity)
     if score is None:
         return None
     first = next(fit for fit in fits if name in fit.seen)
     own = first.seen[name] is first.fit
     difference = "" if own else _decibels(fits, None, name)
-    path = first.seen[name].folder / "test" / f"{SHOWN_VIEW:04d}.png"
-    place = f"crossed/{_file(first.fit.method)}-{_file(name)}.png"
+    path = first.seen[name].files.picture(SHOWN_VIEW)
+    place = f"crossed/{file_name(first.fit.method)}-{file_name(name)}.png"
     picture = folder.publish(path, place) if path.is_file() else ""
     return CrossCell(quantity.text(score), difference, own, best=False, picture=picture)
 
 
 def _mark_best(
-    fits: Sequence[Renderings], renderers: Sequence[str], cells: Sequence[CrossCell | None], quantity: Quantity
+    fits: Sequence[CrossRendered], renderers: Sequence[str], cells: Sequence[CrossCell | None], quantity: Quantity
 ) -> tuple[CrossCell | None, ...]:
     scores = {
         cell.text: quantity.sort_key(_score(fits, name, quantity) or 0.0)
@@ -171,7 +168,7 @@ def _mark_best(
     return tuple(cell and replace(cell, best=cell.text == best) for cell in cells)
 
 
-def _decibels(fits: Sequence[Renderings], pair: frozenset[str] | None, name: str = "") -> str:
+def _decibels(fits: Sequence[CrossRendered], pair: frozenset[str] | None, name: str = "") -> str:
     """PSNR between two renderers' pictures, from the mean square over all views and fits; of ``name`` and the fit's own."""
     squares: list[float] = []
     for fit in fits:
@@ -184,7 +181,3 @@ def _decibels(fits: Sequence[Renderings], pair: frozenset[str] | None, name: str
     mean = statistics.fmean(squares)
     decibels = math.inf if mean == 0 else -10 * math.log10(mean)
     return "same" if decibels > IDENTICAL else f"{decibels:.1f}"
-
-
-def _file(name: str) -> str:
-    return "".join(letter if letter.isalnum() else "-" for letter in name)

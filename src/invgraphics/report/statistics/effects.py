@@ -140,7 +140,9 @@ def _effect(quantity: Quantity, path: str, levels: tuple[str, str], observations
         pairs=len(differences),
         by_scene=_known(by_scene) if len(scenes) > 1 else {},
         by_method=_known(by_method) if path != METHOD and len(methods) > 1 else {},
-        truths_differ=any(one.run.truth_hash != other.run.truth_hash for (one, other), _ in differences),
+        truths_differ=any(
+            one.run.provenance.truth_sha256 != other.run.provenance.truth_sha256 for (one, other), _ in differences
+        ),
     )
 
 
@@ -151,11 +153,13 @@ def _known(table: Mapping[str, Estimate | None]) -> dict[str, Estimate]:
 def _difference(pair: Pair, quantity: Quantity) -> Float[ndarray, " view"] | None:
     """After minus before on every view that both have, in the order of the first; one value where views were not scored."""
     one, other = (observation.run for observation in pair)
-    if quantity.group != "cost" and quantity.key in one.quality and quantity.key in other.quality:
-        left, right = one.quality[quantity.key].per_view, other.quality[quantity.key].per_view
+    if quantity.group != "cost" and quantity.key in one.scores.quality and quantity.key in other.scores.quality:
+        left, right = one.scores.quality[quantity.key].per_view, other.scores.quality[quantity.key].per_view
         if left and right:
-            there = dict(zip(other.views, _numbers(right), strict=True))
-            shared = [(value, there[name]) for name, value in zip(one.views, _numbers(left), strict=True) if name in there]
+            there = dict(zip(other.scores.views, _numbers(right), strict=True))
+            shared = [
+                (value, there[name]) for name, value in zip(one.scores.views, _numbers(left), strict=True) if name in there
+            ]
             with np.errstate(invalid="ignore"):
                 return np.array([b - a for a, b in shared])
     before, after = value_of(one, quantity), value_of(other, quantity)

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Literal
 
-from invgraphics.report.data.factors import METHOD
-from invgraphics.report.data.records import Run
-from invgraphics.report.data.studies import Known, StudyCell
-from invgraphics.report.wording import duration, listing
+from invgraphics.report.data.factors import METHOD, StudyCell
+from invgraphics.report.wording import listing
+from invgraphics.runs.run import Run
+from invgraphics.runs.study import KnownDeviation
+from invgraphics.text import duration
 
 RULES = {
     "budget": "A longer budget never scores lower (0.2 dB)",
@@ -88,12 +89,12 @@ class JudgedCell:
         return "red" if "red" in outcomes else "known" if outcomes else "green"
 
 
-def judge(cells: Sequence[StudyCell], known: Sequence[Known] = ()) -> tuple[JudgedCell, ...]:
+def judge(cells: Sequence[StudyCell], known: Sequence[KnownDeviation] = ()) -> tuple[JudgedCell, ...]:
     """The verdict of every rule on every cell that has run."""
     return tuple(JudgedCell(cell, tuple(_excused(cell, one, known) for one in _verdicts(cell, cells))) for cell in cells)
 
 
-def unused(judged: Sequence[JudgedCell], known: Sequence[Known]) -> tuple[Known, ...]:
+def unused(judged: Sequence[JudgedCell], known: Sequence[KnownDeviation]) -> tuple[KnownDeviation, ...]:
     """Known deviations that no cell shows, although all cells that they name have run."""
     left = []
     for entry in known:
@@ -117,15 +118,17 @@ def headline(judged: Sequence[JudgedCell]) -> list[str]:
 
 def psnr_of(cell: StudyCell) -> float | None:
     """The cell's PSNR over its test views, dB."""
-    score = None if cell.run is None else cell.run.quality.get("psnr")
+    score = None if cell.run is None else cell.run.scores.quality.get("psnr")
     return None if score is None else score.mean
 
 
 def worst_view(run: Run) -> tuple[str, float, float] | None:
     """(name, PSNR, PSNR below the median) of the worst view, dB; ``None`` where single views have no scores."""
-    score = run.quality.get("psnr")
+    score = run.scores.quality.get("psnr")
     values = [
-        (value, view) for value, view in zip(score.per_view if score else (), run.views, strict=False) if value is not None
+        (value, view)
+        for value, view in zip(score.per_view if score else (), run.scores.views, strict=False)
+        if value is not None
     ]
     if not values:
         return None
@@ -135,7 +138,7 @@ def worst_view(run: Run) -> tuple[str, float, float] | None:
 
 def dead_share(run: Run) -> float | None:
     """Share of primitives that can no longer change at the end of the fit; ``None`` where none were counted."""
-    if (share := run.cost.get("dead")) is not None:
+    if (share := run.scores.cost.get("dead")) is not None:
         return share
     return next((entry.dead for entry in reversed(run.history) if entry.dead is not None), None)
 
@@ -150,12 +153,12 @@ def _verdicts(cell: StudyCell, cells: Sequence[StudyCell]) -> list[Verdict]:
     return [_budget(cell, cells), *(rule(cell.run) for rule in of_run), _late(cell)]
 
 
-def _excused(cell: StudyCell, verdict: Verdict, known: Sequence[Known]) -> Verdict:
+def _excused(cell: StudyCell, verdict: Verdict, known: Sequence[KnownDeviation]) -> Verdict:
     if verdict.outcome != "red":
         return verdict
     for entry in known:
         if entry.rule == verdict.rule and fnmatchcase(cell.label, entry.cells):
-            return replace(verdict, outcome="known", cause=entry.cause, issue=entry.issue)
+            return replace(verdict, outcome="known", cause=entry.cause, issue=str(entry.issue or ""))
     return verdict
 
 
@@ -196,7 +199,7 @@ def _monitor(run: Run) -> Verdict:
         if best - psnr > fall:
             fall, place = (
                 best - psnr,
-                f"at {entry.share:.0%} of the budget" if entry.share is not None else f"at step {entry.step}",
+                f"at {entry.progress:.0%} of the budget" if entry.progress is not None else f"at step {entry.step}",
             )
     ended = best - curve[-1][1]
     end = f"ended {ended:.2f} dB below its best of {best:.2f} dB" if ended > 0 else f"ended at its best, {best:.2f} dB"
@@ -214,7 +217,7 @@ def _views(run: Run) -> Verdict:
 
 
 def _dead(run: Run) -> Verdict:
-    share, count = dead_share(run), run.cost.get("primitives")
+    share, count = dead_share(run), run.scores.cost.get("primitives")
     if share is None:
         return Verdict("dead", "none", "The field has no primitives." if not count else "Dead primitives were not counted.")
     total = f" of {count:,.0f}" if count else ""
@@ -222,8 +225,8 @@ def _dead(run: Run) -> Verdict:
 
 
 def _memory(run: Run) -> Verdict:
-    peak, forecast = run.cost.get("peak_memory_bytes"), run.provenance.get("memory_forecast_bytes")
-    if peak is None or not isinstance(forecast, int | float) or isinstance(forecast, bool):
+    peak, forecast = run.scores.cost.get("peak_memory_bytes"), run.provenance.memory_forecast_bytes
+    if peak is None or forecast is None:
         return Verdict("memory", "none", "The run holds no forecast of its memory.")
     sentence = f"Peak of {peak / 1e6:,.0f} MB, forecast {forecast / 1e6:,.0f} MB."
     return _verdict("memory", peak > forecast, sentence, peak, float(forecast))
@@ -231,10 +234,10 @@ def _memory(run: Run) -> Verdict:
 
 def _finite(run: Run) -> Verdict:
     """Metrics that were left out because they are not finite count, as do lines of the history."""
-    found = [name for name, score in run.quality.items() if not _all_finite([score.mean, *score.per_view])]
-    found += [name for name, why in run.skipped.items() if "finite" in why]
-    found += [name for name, value in run.cost.items() if value is not None and not math.isfinite(value)]
-    found += [f"{name} at step {entry.step}" for entry in run.history for name in entry.broken]
+    found = [name for name, score in run.scores.quality.items() if not _all_finite([score.mean, *score.per_view])]
+    found += [name for name, why in run.scores.skipped.items() if "finite" in why]
+    found += [name for name, value in run.scores.cost.items() if value is not None and not math.isfinite(value)]
+    found += [f"{name} at step {entry.step}" for entry in run.history for name in entry.not_finite]
     if found:
         return Verdict(
             "finite", "red", f"Not finite: {listing(found[:5])}{' and more' if len(found) > 5 else ''}.", len(found), 0.0

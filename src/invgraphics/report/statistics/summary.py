@@ -8,9 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from invgraphics.report.data.records import Comparison, Failure, Run, Score
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.intervals import mean_half_width
 from invgraphics.report.wording import ABSENT, COSTS, TIMES, Quantity, budget_words, metric_label, quality_quantity
+from invgraphics.runs.comparison import Failure
+from invgraphics.runs.run import Run
+from invgraphics.runs.scores import Score
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,7 @@ def summarise(comparison: Comparison) -> Summary:
 def quality_columns(comparison: Comparison) -> tuple[Quantity, ...]:
     """Every quality metric that at least one run or baseline has, in the order of the first that has it."""
     found: dict[str, Score] = {}
-    for quality in [run.quality for run in comparison.runs] + list(comparison.baselines.values()):
+    for quality in [run.scores.quality for run in comparison.runs] + list(comparison.baselines.values()):
         for key, score in quality.items():
             found.setdefault(key, score)
     return tuple(quality_quantity(key, score) for key, score in found.items())
@@ -201,7 +204,7 @@ def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
     costs = []
     for cost in COSTS:
         redundant = cost.key == "render_seconds_per_view"
-        if redundant or all(run.cost.get(cost.key) is None for run in comparison.runs):
+        if redundant or all(run.scores.cost.get(cost.key) is None for run in comparison.runs):
             continue
         given = cost.key == "fit_seconds" and time_budget  # what every method was given is no merit of any
         costs.append(replace(cost, better="none") if given else cost)
@@ -218,7 +221,7 @@ def _known(values: Sequence[float | None]) -> list[float]:
 
 def value_of(run: Run, column: Quantity) -> float | None:
     """A run's value of a quantity, in stored units."""
-    return _mean(run.quality.get(column.key)) if column.group != "cost" else run.cost.get(column.key)
+    return _mean(run.scores.quality.get(column.key)) if column.group != "cost" else run.scores.cost.get(column.key)
 
 
 def _method_cell(column: Quantity, runs: Sequence[Run], notes: list[str]) -> Cell:
@@ -238,9 +241,9 @@ def _method_cell(column: Quantity, runs: Sequence[Run], notes: list[str]) -> Cel
 def _absence(run: Run, column: Quantity) -> str:
     if column.group == "cost":
         return ""  # NeRFs have no primitives; that needs no apology
-    if column.key in run.quality:
+    if column.key in run.scores.quality:
         return "the score is not a number"
-    return run.skipped.get(column.key, "the run does not report it")
+    return run.scores.skipped.get(column.key, "the run does not report it")
 
 
 def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
@@ -269,14 +272,14 @@ def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, .
 
 def _disturbed(runs: Sequence[Run]) -> str:
     """Whose clocks were disturbed among a method's fits, and how."""
-    seeds = {run.seed: run.disturbed for run in runs if run.disturbed}
+    seeds = {run.seed: run.scores.disturbed for run in runs if run.scores.disturbed}
     return "; ".join(f"seed {seed} {how}" for seed, how in seeds.items())
 
 
 def _skipped(comparison: Comparison) -> dict[str, list[str]]:
     reasons: dict[str, list[str]] = {}
     for run in comparison.runs:
-        for key, why in run.skipped.items():
+        for key, why in run.scores.skipped.items():
             reasons.setdefault(key, []).append(why)
     present = {column.key for column in quality_columns(comparison)}
     labels: dict[str, list[str]] = {}

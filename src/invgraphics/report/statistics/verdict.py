@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD, Factor, Observation
-from invgraphics.report.data.records import Comparison
 from invgraphics.report.statistics.effects import effects_on
 from invgraphics.report.statistics.rules import DEAD_SHARE
 from invgraphics.report.statistics.summary import Row, Summary
@@ -136,14 +136,14 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
         ]
         if below:
             sentences.append(f"{listing(below)} did not beat the trivial baseline '{reference[1].label}' in {column.label}.")
-    dead = [run for run in comparison.runs if (run.cost.get("dead") or 0) > DEAD_SHARE]
+    dead = [run for run in comparison.runs if (run.scores.cost.get("dead") or 0) > DEAD_SHARE]
     for run in dead:
-        share = f"{100 * (run.cost['dead'] or 0):.2g} %"
+        share = f"{100 * (run.scores.cost['dead'] or 0):.2g} %"
         sentences.append(f"No gradient can change {share} of the primitives of {run.method} (seed {run.seed}).")
     told: dict[str, str] = {}
     for run in comparison.runs:
-        if run.shortfall:
-            told.setdefault(run.method, run.shortfall)
+        if run.scores.shortfall:
+            told.setdefault(run.method, run.scores.shortfall)
     sentences += told.values()
     short = [row.label for row in summary.methods if not row.complete]
     if short:

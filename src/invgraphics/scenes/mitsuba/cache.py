@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
+from invgraphics.tables import read_json
 
 VARIABLE = "INVGRAPHICS_CACHE"
 TRUTH = "truth.json"
@@ -46,9 +46,9 @@ def unwritable(folder: Path, error: OSError) -> InputError:
 def read_truth(folder: Path) -> dict[str, Any] | None:
     """The content of a folder's ``truth.json``; ``None`` where it is missing, broken, or a listed file has lost bytes."""
     try:
-        content = json.loads((folder / TRUTH).read_text(encoding="utf-8"))
+        content = read_json(folder / TRUTH)
         whole = content["schema"] == SCHEMA and all((folder / path).stat().st_size == n for path, n in content["files"].items())
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (InputError, OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     return content if whole else None
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from invgraphics.config import fill, to_table
 from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel, SceneSpec
+from invgraphics.text import sha256_of
 
 # The sources that decide pixels, relative to the package; the rest (caching, messages) does not.
 _SOURCES = (
@@ -84,7 +85,7 @@ class Job:
     def key(self) -> str:
         """Hash of everything the pixels depend on: description, options, our sources, Mitsuba's version and variant."""
         content = {"job": self.table(), "sources": _source_hash(), "mitsuba": version("mitsuba"), "drjit": version("drjit")}
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+        return sha256_of(content)[:16]
 
 
 def _source_hash() -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 from invgraphics import data
 from invgraphics.config import fill
 from invgraphics.errors import InputError, did_you_mean
+from invgraphics.tables import read_toml
 
 FILE = "scene.toml"
 
@@ -121,10 +120,7 @@ def read(path: Path) -> SceneSpec:
     Raises:
         InputError: not TOML, or a key is unknown, missing or wrong.
     """
-    try:
-        table: Mapping[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}.") from error
+    table = read_toml(path)
     try:
         return fill(SceneSpec, table)
     except InputError as error:

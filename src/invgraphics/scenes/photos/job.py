@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -11,6 +10,7 @@ from typing import Literal, get_args
 
 from invgraphics.config import fill
 from invgraphics.errors import InputError
+from invgraphics.text import sha256_of
 
 SCHEMA = 2
 DATABASE = "database.db"
@@ -97,4 +97,4 @@ class PhotoJob:
         files = sorted(path for path in self.path.rglob("*") if path.is_file())
         listing = [(path.relative_to(self.path).as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
         content = [SCHEMA, settings, listing, version("pycolmap")]
-        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+        return sha256_of(content)[:16]

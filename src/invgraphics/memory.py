@@ -1,0 +1,63 @@
+"""Memory of the machine and of the container around the process, bytes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from invgraphics.errors import InputError
+
+_CGROUP = Path("/sys/fs/cgroup")
+_SHARE = 0.8  # of the available memory that one request may take: the rest is for what it forgets to count
+
+
+def total_bytes() -> int:
+    """Physical memory, or less where a container (cgroup v2) has a smaller limit."""
+    limit = _number(_CGROUP / "memory.max")
+    physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return physical if limit is None else min(limit, physical)
+
+
+def available_bytes() -> int:
+    """What new allocations can have without swapping: the kernel's estimate, within the container's limit."""
+    free = [total_bytes()]
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        free += [int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable:")]
+    except (OSError, ValueError, IndexError):
+        pass  # not Linux: the physical memory is all that is known
+    limit, used = _number(_CGROUP / "memory.max"), _number(_CGROUP / "memory.current")
+    if limit is not None and used is not None:
+        free.append(limit - used)
+    return max(0, min(free))
+
+
+def check_fits(needed: float, what: str, remedy: str) -> None:
+    """Refuse a request that needs more memory than there is, before any of it is allocated.
+
+    Args:
+        needed: bytes at the peak.
+        what: beginning of the sentence: "The field of 'x' with field.count = 1e9".
+        remedy: which value to change.
+
+    Raises:
+        InputError: it does not fit.
+    """
+    free = available_bytes()
+    if needed > _SHARE * free:
+        raise InputError(f"{what} needs about {spelt(needed)} of memory, and {spelt(free)} are free.", remedy)
+
+
+def spelt(size: float) -> str:
+    """A number of bytes in GB or MB, two digits."""
+    if size >= 1e11:
+        return f"{size / 1e9:,.0f} GB"
+    return f"{size / 1e9:.2g} GB" if size >= 1e9 else f"{size / 1e6:.2g} MB"
+
+
+def _number(path: Path) -> int | None:
+    """A limit of the container; ``None`` where there is none."""
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):  # no container, or "max"
+        return None

@@ -1,0 +1,36 @@
+"""``fit.json``: how far a fit is, and what its clocks say; written with every checkpoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from invgraphics.runs.provenance import LoadAverage
+from invgraphics.runs.schema import Record
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitRecord(Record):
+    """What a resumed fit and its scores need besides the checkpoint.
+
+    Attributes:
+        steps: optimisation steps taken; ``None`` for a model that was fitted elsewhere.
+        seconds: time of these steps; ``None`` for a model that was fitted elsewhere.
+        cpu_seconds: of all threads together.
+        ran_seconds: that busy threads had a core; ``None`` where the system does not say.
+        waited_seconds: that busy threads waited for a core.
+        peak_memory_bytes: most memory above what the process held before the fit; known at its end.
+        cores: that the process may use; known at the end.
+        load_average: known at the end.
+    """
+
+    FILE: ClassVar[str] = "fit.json"
+
+    steps: int | None = None
+    seconds: float | None = None
+    cpu_seconds: float | None = None
+    ran_seconds: float | None = None
+    waited_seconds: float | None = None
+    peak_memory_bytes: int | None = None
+    cores: int | None = None
+    load_average: LoadAverage | None = None

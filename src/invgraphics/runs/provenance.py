@@ -1,0 +1,131 @@
+"""``provenance.json``: what a run was asked for, and hashes of everything that decides its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+from invgraphics.runs.schema import Record
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """How the scene was opened.
+
+    Attributes:
+        size: longest side in pixels, or (width, height); ``None`` for the scene's own.
+        test_views: number of test views; ``None`` for all.
+        spp: samples per pixel of a rendered scene; ``None`` for its own.
+    """
+
+    size: int | tuple[int, int] | None = None
+    test_views: int | None = None
+    spp: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadAverage:
+    """Processes that ran or were ready to, mean over the minute before the fit began and before it ended."""
+
+    start: float | None = None
+    end: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedFile:
+    """A model that was fitted elsewhere.
+
+    Attributes:
+        file: its path, as given.
+        sha256: of its bytes.
+        bytes: its size.
+        format: its name, see ``invgraphics list model-formats``.
+        axes: of the coordinates in it, in words.
+        world: how the axes of the data set's world point.
+        gaussians: how many it holds.
+        sh_degree: of their spherical harmonics, upper bands that are zero left out.
+        antialiased: whether it was fitted with anti-aliasing; ``None`` where the file does not say.
+        notes: what was assumed, in sentences.
+    """
+
+    file: str
+    sha256: str
+    bytes: int
+    format: str
+    axes: str
+    world: str
+    gaussians: int
+    sh_degree: int
+    antialiased: bool | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance(Record):
+    """Where a run comes from.
+
+    Attributes:
+        cell_sha256: identity of the run: equal for equal bits, on one machine.
+        method: ``renderer/recipe``.
+        preset: of the recipe; empty for none.
+        preset_choice: what chose the preset, in words; empty where it was asked for.
+        preset_chosen_on: scenes on which the preset's values were chosen.
+        recipe_sha256: of the resolved recipe.
+        scene: built-in scene, or path of the data set, as given.
+        seed: of initial values and of the fit.
+        budget: of the fit, as given.
+        truth_sha256: of the test views' pixels.
+        train_sha256: of the training views' pixels, as the fit saw them.
+        cameras_sha256: of all cameras.
+        truth: folder of the true test pictures, relative to the run.
+        background: of the scene, in [0, 1], in its colour space.
+        colour: the scene's colour space, ``srgb`` or ``linear``.
+        data: what was changed of the training data: key -> value.
+        notes: on the scene, by topic.
+        code_version: version and hash of the package's sources.
+        plugins: name of a component -> package that brought it.
+        command: makes the run again.
+        options: how the scene was opened.
+        device: that computed.
+        test_poses: how test poses are found; empty where they are taken as given.
+        memory_forecast_bytes: memory that the fit was expected to hold at most; written after its first step.
+        threads: of the process; written after the fit.
+        load_average: of the machine; written after the fit.
+        imported: the file, of a model that was fitted elsewhere.
+        fitted_run: of a rendering: folder of the fit, relative.
+        fitted_by: of a rendering: the method that fitted.
+        rendered_by: of a rendering: the renderer, as it was named.
+    """
+
+    FILE: ClassVar[str] = "provenance.json"
+
+    cell_sha256: str
+    method: str
+    preset: str = ""
+    preset_choice: str = ""
+    preset_chosen_on: tuple[str, ...] = ()
+    recipe_sha256: str
+    scene: str
+    seed: int
+    budget: str
+    truth_sha256: str
+    train_sha256: str
+    cameras_sha256: str
+    truth: str
+    background: tuple[float, float, float]
+    colour: Literal["srgb", "linear"]
+    data: dict[str, Any] = field(default_factory=dict)
+    notes: dict[str, Any] = field(default_factory=dict)
+    code_version: str
+    plugins: dict[str, str] = field(default_factory=dict)
+    command: str
+    options: Options
+    device: str
+    test_poses: str = ""
+    memory_forecast_bytes: int | None = None
+    threads: int | None = None
+    load_average: LoadAverage | None = None
+    imported: ImportedFile | None = None
+    fitted_run: str | None = None
+    fitted_by: str | None = None
+    rendered_by: str | None = None

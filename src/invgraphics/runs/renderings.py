@@ -1,0 +1,55 @@
+"""``renderings.json``: one fitted field through several renderers, and what their pictures differ in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from invgraphics.runs.schema import Record
+
+OWN = "."
+"""Folder of the fit itself, as a rendering."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendering:
+    """A renderer as it was named, and the folder of the run that shows the fit with it, relative (`OWN`: the fit itself)."""
+
+    renderer: str
+    run: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """Pictures of one fit by two renderers, over the scene's background and before rounding; colours in [0, 1].
+
+    Attributes:
+        renderers: as they were named.
+        rmse: per test view, root of the mean square over pixels and channels.
+        largest: per test view, largest absolute difference.
+    """
+
+    renderers: tuple[str, str]
+    rmse: tuple[float, ...]
+    largest: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Renderings(Record):
+    """All renderings of a fit.
+
+    Attributes:
+        identity: hash of the fit and of all renderers.
+        fitted_by: the method.
+        views: names of the test views.
+        renderings: the fit's own renderer first.
+        differences: of each pair of them.
+    """
+
+    FILE: ClassVar[str] = "renderings.json"
+
+    identity: str = ""
+    fitted_by: str = ""
+    views: tuple[str, ...] = ()
+    renderings: tuple[Rendering, ...]
+    differences: tuple[Difference, ...]

@@ -1,0 +1,135 @@
+"""``study.json``: what a study is, and how far each of its cells is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+from invgraphics.runs.environment import Environment
+from invgraphics.runs.schema import Record
+
+Status = Literal["done", "failed", "missing", "skipped"]
+
+
+@dataclass(frozen=True)
+class Approximation:
+    """Two renderers that differ in one approximation only, to be compared on every fit.
+
+    Attributes:
+        name: of the approximation.
+        exact: renderer without it, one of the study's ``render_with``.
+        approximate: renderer with it, likewise.
+    """
+
+    name: str
+    exact: str
+    approximate: str
+
+
+@dataclass(frozen=True)
+class KnownDeviation:
+    """A verdict that is expected to be red, with its cause; the page still shows it.
+
+    Attributes:
+        cells: pattern of the cells' labels, for instance ``splatting/* fence@800 *``.
+        rule: that they break, one of `invgraphics.report.statistics.rules.RULES`.
+        cause: why, one sentence.
+        issue: where it is followed up: a number or a link.
+    """
+
+    cells: str
+    rule: Literal["budget", "monitor", "views", "dead", "memory", "finite", "late"]
+    cause: str
+    issue: int | str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellRecord:
+    """A cell of a study.
+
+    Attributes:
+        id: name of its run's folder; cells that come to the same settings share one.
+        label: method, scene@size, other levels, budget and seed in a line.
+        scene: built-in scene or path of a data set, as given.
+        method: ``renderer/recipe``.
+        seed: its seed.
+        levels: factor -> level.
+        size: longest side in pixels, or (width, height); ``None`` for the scene's own.
+        budget: in words.
+        budget_seconds: of the fit; ``None`` where the budget counts steps.
+        budget_steps: likewise.
+        run: folder, relative to the study.
+        status: ``done``, ``failed``, ``missing``, or ``skipped`` where its data was not there.
+        error: why it failed or was skipped.
+        seconds: that the run took, start and evaluation included.
+        forecast_seconds: that it was expected to take.
+    """
+
+    id: str
+    label: str = ""
+    scene: str
+    method: str
+    seed: int
+    levels: dict[str, Any] = field(default_factory=dict)
+    size: int | tuple[int, int] | None = None
+    budget: str = ""
+    budget_seconds: float | None = None
+    budget_steps: int | None = None
+    run: str
+    status: Status
+    error: str | None = None
+    seconds: float | None = None
+    forecast_seconds: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyRecord(Record):
+    """A study: its design, the conditions, and the state of every cell.
+
+    Attributes:
+        name: of the study.
+        question: that it answers, one sentence.
+        design: ``factorial``, ``one-at-a-time`` or ``list``.
+        factors: factor -> its levels.
+        base: key -> level that the design varies around.
+        scenes: built-in scenes or paths of data sets, as given.
+        methods: ``renderer/recipe``.
+        seeds: each cell is fitted once per seed.
+        budget: of each fit, where no factor says otherwise.
+        preset: of the recipes; ``None`` for the one that suits each cell's budget.
+        size: longest side in pixels, or (width, height); ``None`` for the scenes' own.
+        test_views: number of test views, or ``all``.
+        render_with: renderers that show every fitted field besides its own.
+        analyses: computations beside the fits.
+        report: what the page is about, ``effects`` or ``verdicts``.
+        approximations: pairs of renderers that are compared on every fit.
+        known: red verdicts whose causes are known.
+        protocol: how scores were made: ``name``, ``summary`` and further facts.
+        command: makes the study again.
+        environment: machine and versions.
+        cells: all of them, in order.
+    """
+
+    FILE: ClassVar[str] = "study.json"
+
+    name: str
+    question: str = ""
+    design: Literal["factorial", "one-at-a-time", "list"] = "factorial"
+    factors: dict[str, Any] = field(default_factory=dict)
+    base: dict[str, Any] = field(default_factory=dict)
+    scenes: tuple[str, ...]
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...] = ()
+    budget: str = ""
+    preset: str | None = None
+    size: int | tuple[int, int] | None = None
+    test_views: int | str | None = None
+    render_with: tuple[str, ...] = ()
+    analyses: tuple[str, ...] = ()
+    report: Literal["effects", "verdicts"] = "effects"
+    approximations: tuple[Approximation, ...] = ()
+    known: tuple[KnownDeviation, ...] = ()
+    protocol: dict[str, Any] = field(default_factory=dict)
+    command: str = ""
+    environment: Environment = field(default_factory=Environment)
+    cells: tuple[CellRecord, ...]

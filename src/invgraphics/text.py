@@ -1,0 +1,32 @@
+"""Texts that several packages need: names of folders and files, lengths of time, hashes of plain values."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+
+def slug(method: str) -> str:
+    """A method's name, ``renderer/recipe`` or the path of a recipe, as one folder name."""
+    return method.removesuffix(".toml").strip("/").replace("/", "-").replace(":", "-")
+
+
+def file_name(key: str) -> str:
+    """A key, a scene's or a metric's name as part of a file's name: letters and digits stay, all else becomes a hyphen."""
+    return "".join(letter if letter.isalnum() else "-" for letter in key)
+
+
+def duration(seconds: float) -> str:
+    """A length of time: ``12 s``, ``6 min 52 s``, ``10 min``, ``2 h 1 min``."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    parts = ((hours, "h"), (minutes, "min")) if hours else ((minutes, "min"), (rest, "s"))
+    return " ".join(f"{amount} {unit}" for amount, unit in parts if amount)
+
+
+def sha256_of(value: Any) -> str:
+    """SHA-256 (hex) of plain values: of their JSON with sorted keys, so that the order of a table does not count."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,117 @@
+"""A process that reads inputs, one line of JSON each way, so that the fuzzer can watch and end it.
+
+What is accepted is checked here by numpy alone: rays of every camera, pixels, points and Gaussians are finite and sensible.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import resource
+import sys
+import traceback
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from invgraphics.errors import InputError
+
+MEMORY = 1 << 30
+"""Bytes that reading one input may take, beyond what the process holds when it is ready."""
+
+
+def read_scene(path: Path) -> str:
+    """Open a scene; returns a digest of what was read."""
+    from invgraphics.scenes.open import open_scene
+
+    scene = open_scene(str(path))
+    views = [*scene.train, *scene.val, *scene.test]
+    sha = hashlib.sha256()
+    for view in views:
+        rays = view.camera.rays()
+        directions, origins = rays.directions.double().numpy(), rays.origins.double().numpy()
+        assert np.isfinite(directions).all() and np.isfinite(origins).all(), "rays are not finite"
+        assert np.abs(np.linalg.norm(directions, axis=1) - 1).max() < 1e-3, "directions are no unit vectors"
+        assert np.abs(origins).max() < 1e6, "a camera is out of this world"
+        assert len(np.unique(directions, axis=0)) == len(directions), "pixels share a ray"
+        image = view.image.numpy()
+        assert image.shape == (view.camera.height, view.camera.width, 3) and image.dtype == np.uint8, "no picture"
+        assert len(np.unique(image.reshape(-1, 3), axis=0)) > 3, "a picture is smeared"
+        for values in (directions.astype(np.float32), origins.astype(np.float32), image):
+            sha.update(values.tobytes())
+    assert np.isfinite(scene.extent) and np.isfinite(scene.scale), "the extent is not finite"
+    for values in (scene.bounds.lo, scene.bounds.hi, scene.world_from_local):
+        assert bool(values.isfinite().all()), "bounds or frame are not finite"
+        sha.update(values.numpy().tobytes())
+    assert np.isfinite(scene.bounds.near), "no near plane"
+    if scene.points is not None:
+        squared = (scene.points.position**2).sum(dim=1)
+        assert bool(squared.isfinite().all()) and bool(scene.points.rgb.isfinite().all()), "points are not finite"
+        sha.update(scene.points.position.numpy().tobytes())
+    return sha.hexdigest()
+
+
+def read_gaussians(path: Path) -> str:
+    """Read a file of Gaussians; returns a digest of them."""
+    from invgraphics.formats.base import read_gaussians as read
+
+    _, splats = read(path)
+    gaussians, sha = splats.gaussians, hashlib.sha256()
+    norm = np.linalg.norm(gaussians.quaternions.numpy(), axis=1)  # in float32, as kernels do it
+    assert np.isfinite(norm).all() and norm.min() > 0, "a rotation cannot be normalised"
+    assert bool(((gaussians.scales**2).isfinite() & (gaussians.scales >= 0)).all()), "scales have no squares"
+    assert 0 <= float(gaussians.opacities.min()) <= float(gaussians.opacities.max()) <= 1, "opacities beyond [0, 1]"
+    for values in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.sh):
+        assert bool(values.isfinite().all()) and float(values.abs().max()) < 1e12, "not finite"
+        sha.update(values.numpy().tobytes())
+    return sha.hexdigest()
+
+
+def read_recipe(path: Path) -> str:
+    """Read a recipe; returns its digest."""
+    from invgraphics.recipes.recipe import load_method
+
+    method = load_method(str(path))
+    json.dumps(method.table, allow_nan=False)
+    return method.digest
+
+
+def read_study(path: Path) -> str:
+    """Read a study and expand it; returns a digest."""
+    from invgraphics.studies.study import read_study as read
+
+    cells = read(path).expand()
+    assert 0 < len(cells) <= 100_000, "no study has as many cells"
+    return hashlib.sha256(repr(cells).encode()).hexdigest()
+
+
+def main() -> None:
+    """Answer requests ``[kind, path]`` with ``[outcome, what]`` until there are none."""
+    import torch
+
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    readers = {"scene": read_scene, "gaussians": read_gaussians, "recipe": read_recipe, "study": read_study}
+    answers, sys.stdout = sys.stdout, sys.stderr
+    for number, line in enumerate(sys.stdin):
+        kind, path = json.loads(line)
+        try:
+            answer: Any = ["accepted", readers[kind](Path(path))]
+        except InputError as error:
+            answer = ["refused", str(error)]
+        except BaseException:
+            answer = ["raised", traceback.format_exc()]
+        print(json.dumps(answer), file=answers, flush=True)
+        if number == 0:  # the first input is a good one, after which all libraries are loaded
+            resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + MEMORY,) * 2)
+
+
+def _data_bytes() -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:"))
+
+
+if __name__ == "__main__":
+    main()

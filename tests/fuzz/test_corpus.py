@@ -1,0 +1,197 @@
+"""The smallest inputs that once hung, filled the memory, ended in a traceback or were read as something else."""
+
+import json
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import seeds
+
+from invgraphics.config import InputError
+from invgraphics.formats.base import read_gaussians
+from invgraphics.recipes.recipe import load_method
+from invgraphics.scenes.open import open_scene
+from invgraphics.studies.study import read_study
+
+
+def table(change: Callable[[dict], object]) -> Callable[[Path], Path]:
+    """A ``transforms.json`` after ``change``."""
+
+    def make(root: Path) -> Path:
+        path = root / seeds.nerfstudio(root)
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content).replace('"DIGITS"', "9" * 400))
+        return root
+
+    return make
+
+
+def first(key: str, value: object) -> Callable[[Path], Path]:
+    """A ``transforms.json`` whose first frame says something else."""
+    return table(lambda content: content["frames"][0].update({key: value}))
+
+
+def rows(change: Callable[[np.ndarray], object]) -> Callable[[Path], Path]:
+    """A ``poses_bounds.npy`` after ``change``."""
+
+    def make(root: Path) -> Path:
+        path = root / seeds.llff(root)
+        array = np.load(path)
+        change(array)
+        np.save(path, array)
+        return root
+
+    return make
+
+
+def archive(seed: Callable[[Path], str], **values: object) -> Callable[[Path], Path]:
+    """An NPZ file with other arrays."""
+
+    def make(root: Path) -> Path:
+        path = root / seed(root)
+        with np.load(path) as file:
+            arrays = dict(file)
+        np.savez(path, **(arrays | values))  # type: ignore[arg-type]
+        return path if seed is seeds.npz else root
+
+    return make
+
+
+def text(name: str, old: str, new: str) -> Callable[[Path], Path]:
+    """A COLMAP model in text with a word replaced."""
+
+    def make(root: Path) -> Path:
+        seeds.colmap_text(root)
+        path = root / "sparse" / "0" / name
+        assert old in path.read_text()
+        path.write_text(path.read_text().replace(old, new, 1))
+        return root
+
+    return make
+
+
+def far_pose(distance: float) -> list[list[float]]:
+    """OpenGL pose of a camera very far away."""
+    pose = np.eye(4)
+    pose[0, 3] = distance
+    return pose.tolist()
+
+
+def numbered(root: Path) -> Path:
+    """A folder whose name's digit is no number, as `str.isdigit` has it."""
+    seeds.llff(root)
+    (root / "images").rename(root / "images_²")
+    return root
+
+
+def points_at(value: float) -> np.ndarray:
+    """Points of which one is elsewhere."""
+    points = np.zeros((4, 3))
+    points[0] = value
+    return points
+
+
+poses = np.stack([eye.cam_to_world for eye in seeds.eyes()])
+poses_far = poses.copy()
+poses_far[0, 0, 3] = 1e30
+
+BAD_SCENES: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "k1 = 1e30": (table(lambda t: t.update(k1=1e30)), "smear its picture"),
+    "k1 = -9": (table(lambda t: t.update(k1=-900.0)), "fold its picture"),
+    "cx = 1e30": (table(lambda t: t.update(cx=1e30, k1=0)), "centre 1e\\+30"),
+    "fl_x = 1e-30": (table(lambda t: t.update(fl_x=1e-30, k1=0)), "focal length"),
+    "fl_x = fl_y = 1e-30": (table(lambda t: t.update(fl_x=1e-30, fl_y=1e-30, k1=0)), "look backwards"),
+    "fl_x = 1e30": (table(lambda t: t.update(fl_x=1e30, fl_y=1e30, k1=0)), "field of view is zero"),
+    "pose at 1e30": (first("transform_matrix", far_pose(1e30)), "units of the data set's world|as far away"),
+    "pose at 1e300": (first("transform_matrix", far_pose(1e300)), "farther apart"),
+    "file_path = /": (first("file_path", "/"), "no 'file_path'"),
+    "file_path with NUL": (first("file_path", "a\0b"), "no 'file_path'"),
+    "long file_path": (first("file_path", "x" * 5000), "no 'file_path'"),
+    "400 digits": (table(lambda t: t.update(w="DIGITS")), "400 digits"),
+    "h = 1e300": (table(lambda t: t.update(h=1e300)), "not a size in pixels"),
+    "deep JSON": (table(lambda t: t.update(deep=json.loads("[" * 300 + "]" * 300))), "64 deep"),
+    "H = inf": (rows(lambda a: a.__setitem__((0, 4), np.inf)), "Height, width"),
+    "far = inf": (rows(lambda a: a.__setitem__((0, 16), np.inf)), "depth bounds"),
+    "images_²": (numbered, "no pictures"),
+    "singular scale": (archive(seeds.idr, **{f"scale_mat_{i}": np.diag([0.0, 1, 1, 1]) for i in range(3)}), "no similarity"),
+    "text points": (archive(seeds.npz, points=np.array([["a", "b", "c"]])), "'points'"),
+    "points of 1e300": (archive(seeds.npz, points=points_at(1e300)), "points"),
+    "points of 1e30": (archive(seeds.npz, points=points_at(1e30)), "points"),
+    "infinite bounds": (archive(seeds.npz, bounds=np.array([[-np.inf] * 3, [np.inf] * 3])), "bounds"),
+    "bounds of 1e300": (archive(seeds.npz, bounds=np.array([[-1e300] * 3, [1e300] * 3])), "bounds"),
+    "camera far from its box": (archive(seeds.npz, cam_to_world=poses_far), "far away"),
+    "0 x 0": (text("cameras.txt", "12 9 11 11", "0 0 11 11"), "0x0 pixels"),
+    "COLMAP quaternion of 1e200": (text("images.txt", "1 ", "1 1e200 1e200 "), "."),
+    "COLMAP point of NaN": (text("points3D.txt", " 0.0 0.0 0.0 ", " nan 0.0 0.0 "), "cannot be read"),
+    "COLMAP point of 1e300": (text("points3D.txt", " 0.0 0.0 0.0 ", " 1e300 0.0 0.0 "), "points|near plane"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_SCENES)
+def test_scenes_are_refused(tmp_path: Path, name: str) -> None:
+    make, sentence = BAD_SCENES[name]
+    with pytest.raises(InputError, match=sentence) as caught:
+        open_scene(str(make(tmp_path)))
+    assert len(str(caught.value).splitlines()) <= 2
+
+
+def with_floats(values: dict[str, float]) -> Callable[[Path], Path]:
+    """A PLY file whose first Gaussian has other properties."""
+
+    def make(root: Path) -> Path:
+        path = root / seeds.ply(root)
+        data = bytearray(path.read_bytes())
+        start = data.index(b"end_header\n") + len(b"end_header\n")
+        names = [line.split()[-1].decode() for line in bytes(data[:start]).splitlines() if line.startswith(b"property")]
+        for name, value in values.items():
+            struct.pack_into("<f", data, start + 4 * names.index(name), value)
+        path.write_bytes(data)
+        return path
+
+    return make
+
+
+BAD_GAUSSIANS = {
+    "quaternion of 1e30": (with_floats({"rot_0": 1e30, "rot_1": 1e30}), "the rotations of 1 of 20"),
+    "scale of exp(80)": (with_floats({"scale_0": 80.0}), "the scales of 1 of 20"),
+    "centre at 1e30": (with_floats({"x": 1e30}), "the centres of 1 of 20"),
+    "colour of 1e30": (with_floats({"f_dc_0": 1e30}), "the colours of 1 of 20"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_GAUSSIANS)
+def test_gaussians_are_refused(tmp_path: Path, name: str) -> None:
+    make, sentence = BAD_GAUSSIANS[name]
+    with pytest.raises(InputError, match=sentence):
+        read_gaussians(make(tmp_path))
+
+
+BAD_RECIPES = {
+    "presets = 5": (lambda body: "presets = 5\n" + body, "'presets'"),
+    "presets.laptop = 5": (lambda body: "[presets]\nlaptop = 5\n", "'presets'"),
+    "eps = nan": (lambda body: re.sub(r"(?m)^eps = .*$", "eps = nan", body), "'optimiser.eps' cannot be nan"),
+    "no UTF-8": (lambda body: body + "\udcff", "UTF-8"),
+    "deep": (lambda body: body + "\nx = " + "[" * 200 + "]" * 200, "64 deep"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_RECIPES)
+def test_recipes_are_refused(tmp_path: Path, name: str) -> None:
+    change, sentence = BAD_RECIPES[name]
+    path = tmp_path / seeds.recipe(tmp_path)
+    body = path.read_text().partition("[presets")[0] if name.startswith("presets") else path.read_text()
+    path.write_bytes(change(body).encode("utf-8", errors="surrogateescape"))
+    with pytest.raises(InputError, match=sentence):
+        load_method(str(path))
+
+
+def test_a_study_of_too_many_cells_is_refused_before_it_is_expanded(tmp_path: Path) -> None:
+    path = tmp_path / seeds.study(tmp_path)
+    levels = ", ".join(map(str, range(1, 1001)))
+    path.write_text(path.read_text() + f'"a.b" = [{levels}]\n"a.c" = [{levels}]\n"a.d" = [{levels}]\n')
+    with pytest.raises(InputError, match="16,000,000,000 cells"):
+        read_study(path)

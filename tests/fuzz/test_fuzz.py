@@ -1,0 +1,121 @@
+"""Damaged inputs of every reader: refused in one sentence, or read and right; nothing else.
+
+``INVGRAPHICS_FUZZ`` is the number of mutations per reader, ``INVGRAPHICS_FUZZ_SEED`` repeats a day's (YYYYMMDD).
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hypothesis")
+pytest.importorskip("resource", reason="limits of memory are POSIX's")
+
+import mutations
+import seeds
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from watched import Reader
+
+COUNT = int(os.environ.get("INVGRAPHICS_FUZZ", "200"))
+SEED = int(os.environ.get("INVGRAPHICS_FUZZ_SEED", f"{datetime.datetime.now(datetime.UTC):%Y%m%d}"))
+CHECKED = {("images", "*"), ("npz", "flip"), ("idr", "flip"), ("old_spz", "flip")}
+"""Readers of files with checksums, and mutations: what is accepted after them reads as if nothing had happened."""
+
+
+class Drawn:
+    """Decisions that Hypothesis makes and shrinks."""
+
+    def __init__(self, data: st.DataObject) -> None:
+        self._data = data
+
+    def index(self, count: int) -> int:
+        """One of 0 .. count - 1."""
+        return self._data.draw(st.integers(0, max(count - 1, 0)))
+
+
+def kind_of(name: str) -> str:
+    """Which reader reads a seed."""
+    if name in ("recipe", "study"):
+        return name
+    return "gaussians" if name in {make.__name__ for make in seeds.GAUSSIANS} else "scene"
+
+
+def spec_of(root: Path, pattern: str, name: str) -> Path:
+    """What a person would name: the folder of a scene, or the file."""
+    return root if kind_of(name) == "scene" and name != "npz" else root / pattern
+
+
+@pytest.fixture(scope="module", params=list(seeds.SEEDS))
+def good(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path, str, Reader]]:
+    """Name, folder and pattern of a good input, and the process that has read it."""
+    root = tmp_path_factory.mktemp(request.param) / "good"
+    root.mkdir()
+    pattern = seeds.SEEDS[request.param](root)
+    reader = Reader(kind_of(request.param), spec_of(root, pattern, request.param))
+    yield request.param, root, pattern, reader
+    reader.close()
+
+
+def expect_fine(reader: Reader, path: Path, what: str, unchanged: bool) -> str:
+    """Refused in one sentence (and at most a line of remedy), or accepted and right; returns which."""
+    outcome, answer = reader.read(path)
+    if outcome == "refused":
+        assert len(answer.splitlines()) <= 2 and len(answer) < 2000, f"{what}: not one sentence: {answer}"
+    else:
+        assert outcome == "accepted", f"{what}: {outcome}: {answer}"
+        assert not unchanged or answer == reader.digest, f"{what}: accepted, and read as something else"
+    return outcome
+
+
+@pytest.mark.timeout(3600)
+def test_damaged_inputs_are_refused_or_right(good: tuple[str, Path, str, Reader]) -> None:
+    name, root, pattern, reader = good
+    print(f"INVGRAPHICS_FUZZ_SEED={SEED} INVGRAPHICS_FUZZ={COUNT}")
+    bad = root.with_name("bad")
+    shutil.copytree(root, bad)
+    files = sorted(bad.glob(pattern))
+    outcomes: Counter[str] = Counter()
+
+    @seed(SEED)
+    @settings(
+        max_examples=COUNT,
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+        phases=[Phase.generate, Phase.shrink],
+    )
+    @given(st.data())
+    def search(data: st.DataObject) -> None:
+        choose = Drawn(data)
+        path = mutations.pick(choose, files)
+        before = path.read_bytes()
+        try:
+            change = mutations.mutate(path, choose)
+            outcomes[
+                expect_fine(
+                    reader, spec_of(bad, pattern, name), f"{path.name}, {change}", bool({(name, "*"), (name, change)} & CHECKED)
+                )
+            ] += 1
+        finally:
+            path.write_bytes(before)
+
+    search()
+    print(f"{name}: {outcomes['refused']} refused, {outcomes['accepted']} accepted")
+
+
+def test_harmless_changes_are_accepted_as_the_same(good: tuple[str, Path, str, Reader]) -> None:
+    name, root, pattern, reader = good
+    for path in sorted(root.glob(pattern)):
+        before = path.read_bytes()
+        try:
+            if mutations.harmless(path):
+                assert reader.read(spec_of(root, pattern, name)) == ("accepted", reader.digest)
+        finally:
+            path.write_bytes(before)
