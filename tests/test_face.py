@@ -22,7 +22,7 @@ from training_fixtures import SMALL
 
 import invgraphics as ig
 from invgraphics.core.transforms import look_at
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, NotComposableError
 from invgraphics.experiments.session import ScoreTable
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
@@ -32,7 +32,18 @@ from invgraphics.testing import toy_scene
 
 SPLATS = ig.load_method("splatting/gaussians", set={"field.count": 60, "field.max_init": 60, "field.sh_degree": 0})
 ROOT = Path(__file__).parents[1]
-EXAMPLES = ("load_scene", "load_method", "fit", "evaluate", "load_run", "compare", "ablate", "Model")
+EXAMPLES = (
+    "load_scene",
+    "save_scene",
+    "load_method",
+    "fit",
+    "evaluate",
+    "load_run",
+    "compare",
+    "load_study",
+    "ablate",
+    "Model",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -183,6 +194,30 @@ def test_a_scene_that_cannot_be_kept_is_refused_but_fitted(change: Callable[[ig.
     with pytest.raises(InputError, match=f"cannot be kept as a data set: it has {what}"):
         ig.compare(scene, [SPLATS], budget="2steps", out="report")
     assert ig.fit(SPLATS, scene, "2steps").finished
+
+
+def test_scenes_are_saved_where_they_can_be() -> None:
+    with pytest.raises(InputError, match=r"Expected a file name that ends in \.npz"):
+        ig.save_scene(toy_scene(views=2, size=8), "toy.zip")
+    with pytest.raises(InputError, match=r"cannot be written to 'toy\.npz/kept\.npz'"):
+        ig.save_scene(toy_scene(views=2, size=8), "toy.npz/kept.npz")
+
+
+def test_a_study_shows_its_figures() -> None:
+    head = 'question = "?"\nscenes = ["toy.npz"]\nmethods = ["splatting/gaussians"]\nseeds = [0, 1]\nbudget = "3steps"\n'
+    Path("views.toml").write_text(head + "[factors]\ndata.train_views = [4, 8]\n")
+    result = ig.ablate("views.toml", out="views")
+    assert ElementTree.fromstring(result.figure("effects-psnr")._repr_svg_()).tag.endswith("svg")
+    with pytest.raises(InputError, match=r"no figure 'effects-nothing'.\nIt has: effects-psnr, "):
+        result.figure("effects-nothing")
+
+
+def test_gaussians_of_a_model_are_those_that_it_renders() -> None:
+    model = ig.fit(SPLATS, "toy.npz", "2steps").model
+    assert torch.allclose(model.gaussians().opacities, model.field.opacity_logits.sigmoid())
+    field = ig.fit("volumetric/hash", "toy.npz", "1steps").model
+    with pytest.raises(NotComposableError, match="has no gaussians"):
+        field.gaussians()
 
 
 def test_a_changed_scene_is_not_the_one_that_was_opened() -> None:

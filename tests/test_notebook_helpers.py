@@ -1,5 +1,10 @@
 """The helpers of the teaching notebooks, without a kernel."""
 
+import base64
+import subprocess
+import sys
+from pathlib import Path
+
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import pytest
@@ -47,6 +52,25 @@ def test_sliders_begin_at_the_defaults_and_draw_again() -> None:
     redraw(**{name: control.value for name, control in controls.items()})
     controls["count"].value = 100
     assert drawn == [(4, 1.5, 10)] and controls["count"].value == 10
+
+
+def test_what_a_notebook_writes_is_gone_with_its_process() -> None:
+    code = "from invgraphics import notebook; folder = notebook.scratch(); open('kept', 'w').close(); print(folder)"
+    code += "; print((folder / 'kept').is_file())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    folder, written = done.stdout.split()
+    assert written == "True" and not Path(folder).exists()
+
+
+def test_a_film_becomes_part_of_the_page(tmp_path: Path) -> None:
+    display = pytest.importorskip("IPython.display", reason="needs the extra 'notebooks'")
+    film, shown = tmp_path / "film.mp4", []
+    film.write_bytes(b"pictures")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(display, "display", shown.append)
+        notebook.video(film, width=320)
+    page = shown[0]._repr_html_()
+    assert base64.b64encode(b"pictures").decode() in page and 'width="320"' in page
 
 
 def test_psnr_is_the_one_that_scores_a_fit() -> None:

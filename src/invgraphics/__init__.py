@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from invgraphics.api import load_method as load_method
     from invgraphics.api import load_run as load_run
     from invgraphics.api import load_scene as load_scene
+    from invgraphics.api import load_study as load_study
+    from invgraphics.api import save_scene as save_scene
     from invgraphics.core import Camera as Camera
     from invgraphics.core import Gaussians as Gaussians
     from invgraphics.core import Model as Model
@@ -44,6 +46,8 @@ __all__ = [
     "load_method",
     "load_run",
     "load_scene",
+    "load_study",
+    "save_scene",
 ]
 
 _HOMES = {
@@ -60,6 +64,8 @@ _HOMES = {
     "load_method": "invgraphics.api",
     "load_run": "invgraphics.api",
     "load_scene": "invgraphics.api",
+    "load_study": "invgraphics.api",
+    "save_scene": "invgraphics.api",
 }
 """Public name -> the module that has it."""
 

@@ -1,4 +1,4 @@
-"""What the teaching notebooks share: the look of their plots, rows of pictures, sliders, and the score of one picture.
+"""What the teaching notebooks share: the look of their plots, rows of pictures, sliders, films, and the score of one picture.
 
 >>> from invgraphics import notebook
 >>> notebook.style()                                                    # doctest: +SKIP
@@ -7,9 +7,13 @@
 
 from __future__ import annotations
 
+import atexit
 import inspect
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import matplotlib.pyplot as plt
@@ -116,6 +120,26 @@ def sliders(**positions: Range) -> Callable[[Callable[..., None]], Callable[...,
         return draw
 
     return attach
+
+
+def scratch() -> Path:
+    """Make a folder for what a notebook writes, and work in it; it is removed when the kernel ends."""
+    folder = tempfile.TemporaryDirectory(prefix="invgraphics-notebook-")
+    atexit.register(folder.cleanup)
+    os.chdir(folder.name)
+    return Path(folder.name)
+
+
+def video(path: Path, width: int) -> None:
+    """Show a film, which becomes part of the page.
+
+    Args:
+        path: of an mp4.
+        width: on the page, px.
+    """
+    from IPython.display import Video, display
+
+    display(Video(str(path), embed=True, width=width))
 
 
 def psnr(rendering: Rendering, view: View, scene: Scene) -> float:

@@ -101,6 +101,24 @@ def test_transparent_gaussians_are_pruned_but_for_one() -> None:
     assert state.field.primitive_count() == 1
 
 
+def test_a_round_says_what_became_of_each_gaussian() -> None:
+    state = _state(5)
+    with torch.no_grad():
+        state.field.opacity_logits[3] = -9.0
+        state.field.log_scales[1] = math.log(0.5)
+    hook = DensityControlConfig(every=10, threshold=1.0).build()
+    assert hook.last_round is None
+    _gradients(state, hook, [9.0, 9.0, 0.0, 9.0, 9.0])
+    before = state.field.means.detach().clone()
+    hook.after_step(state)
+    found = hook.last_round
+    assert found is not None and found.step == 10
+    copies = (before[:, None] == state.field.means[None]).all(dim=2).sum(dim=1)
+    assert (copies == 2).tolist() == found.cloned.tolist() == [True, False, False, False, True]
+    assert (copies == 0).tolist() == (found.split | found.pruned).tolist()
+    assert found.split.tolist() == [False, True, False, False, False]
+
+
 def test_the_cap_leaves_the_largest_gradients() -> None:
     state = _state(6)
     hook = DensityControlConfig(every=10, threshold=0.1, max_primitives=8).build()

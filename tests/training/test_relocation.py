@@ -115,5 +115,5 @@ def test_refusals(make_fit, scene) -> None:
         RelocationConfig(every=0)
     with pytest.raises(ValueError, match="dead"):
         RelocationConfig(dead=0.0)
-    with pytest.raises(InputError, match="relocation"):
-        RelocationConfig().build().check(make_fit("volumetric/hash", scene, 1).plan.model.field, None)
+    with pytest.raises(InputError, match="'relocation' needs Gaussians, which NeuralField does not have"):
+        RelocationConfig().build().check(make_fit("volumetric/hash", scene, 1).plan.model.field)

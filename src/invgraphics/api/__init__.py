@@ -6,4 +6,6 @@ from invgraphics.api.fitting import fit as fit
 from invgraphics.api.loading import load_method as load_method
 from invgraphics.api.loading import load_run as load_run
 from invgraphics.api.loading import load_scene as load_scene
+from invgraphics.api.loading import save_scene as save_scene
 from invgraphics.api.studying import ablate as ablate
+from invgraphics.api.studying import load_study as load_study

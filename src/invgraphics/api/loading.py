@@ -54,6 +54,36 @@ def load_scene(
     return open_with_progress(os.fspath(spec), SceneOptions(size=size, test_views=test_views, spp=spp))
 
 
+def save_scene(scene: Scene, path: str | os.PathLike[str]) -> Path:
+    """Write a scene as one ``.npz`` that `load_scene` opens: views, cameras, bounds and points.
+
+    Args:
+        scene: of sRGB pictures, without validation views.
+        path: to write, ending in ``.npz``.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: the format cannot hold what the scene has, or the file cannot be written.
+
+    Example:
+        >>> import invgraphics as ig
+        >>> scene = ig.load_scene("toy.npz", size=16)
+        >>> kept = ig.load_scene(ig.save_scene(scene, "small.npz"))
+        >>> kept.digest("train") == scene.digest("train")
+        True
+    """
+    target = Path(path)
+    if target.suffix != ".npz":
+        raise InputError(f"A scene cannot be saved as '{target}'.", "Expected a file name that ends in .npz.")
+    try:
+        save_npz(scene, target)
+    except OSError as error:
+        raise InputError(f"The scene cannot be written to '{target}': {error}.", "Choose another place.") from error
+    return target
+
+
 def load_method(method: str | os.PathLike[str], *, preset: str | None = None, set: Mapping[str, Any] | None = None) -> Method:
     """Read a method's recipe, with values of it changed.
 

@@ -5,16 +5,33 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.report.data.studies import Study, read_study
 from invgraphics.report.study import build_study_report, study_sentences
 from invgraphics.studies import ablate as ablating
 from invgraphics.studies import reading as studies
 from invgraphics.studies.forecast import Forecast
+from invgraphics.studies.study import Study as Design
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A drawing of a report; in a notebook, a picture.
+
+    Attributes:
+        path: of the SVG file.
+    """
+
+    path: Path
+
+    def _repr_svg_(self) -> str:
+        return self.path.read_text(encoding="utf-8")
 
 
 class StudyResult:
@@ -31,6 +48,18 @@ class StudyResult:
     def __init__(self, folder: Path) -> None:
         self.folder, self.page = folder, build_study_report(folder)
 
+    def figure(self, name: str) -> Figure:
+        """One of the report's drawings, ``effects-psnr`` for instance; in a notebook, a picture.
+
+        Raises:
+            InputError: the report has no such drawing; it names those that there are.
+        """
+        path = self.folder / "figures" / f"{name}.svg"
+        if not path.is_file():
+            known = ", ".join(sorted(file.stem for file in path.parent.glob("*.svg")))
+            raise InputError(f"The report in {self.folder} has no figure '{name}'.", f"It has: {known or 'none'}.")
+        return Figure(path)
+
     @cached_property
     def record(self) -> Study:
         """Everything that the report knows: design, cells and scores."""
@@ -42,6 +71,27 @@ class StudyResult:
 
     def _repr_markdown_(self) -> str:
         return "\n".join(f"- {sentence}" for sentence in self.sentences())
+
+
+def load_study(study: str | os.PathLike[str]) -> Design:
+    r"""Read a study and check it, without running anything.
+
+    Args:
+        study: a built-in study's name, or the path of a ``study.toml``.
+
+    Raises:
+        InputError: there is none, or it is not a study; the sentence names the key.
+
+    Example:
+        >>> import invgraphics as ig
+        >>> from pathlib import Path
+        >>> head = 'question = "?"\nscenes = ["toy.npz"]\nmethods = ["splatting/gaussians"]\nseeds = [0, 1]\n'
+        >>> _ = Path("views.toml").write_text(head + "[factors]\ndata.train_views = [4, 8]\n")
+        >>> study = ig.load_study("views.toml")
+        >>> len(study.points()), [(cell.seed, cell.levels) for cell in study.expand()][:2]
+        (2, [(0, {'data.train_views': 4}), (0, {'data.train_views': 8})])
+    """
+    return studies.read_study(studies.locate(os.fspath(study)))
 
 
 def _announce(forecast: Forecast) -> None:

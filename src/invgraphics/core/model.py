@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.contributions import Contributions
-from invgraphics.core.field import Field
+from invgraphics.core.field import Field, Gaussians, Quantity
 from invgraphics.core.renderer import Renderer, check
 from invgraphics.core.rendering import Context, Rendering
 
@@ -84,6 +84,15 @@ class Model:
         """
         found = self.renderer.contributions(self.field, camera.to(self.device), pixel, self.context())
         return found.to(camera.focal.device)
+
+    @torch.no_grad()
+    def gaussians(self) -> Gaussians:
+        """The field's Gaussians, activated and smoothed as the renderer reads them.
+
+        Raises:
+            NotComposableError: it is not made of Gaussians.
+        """
+        return self.field.primitives(Quantity.GAUSSIANS, self.context())
 
     def context(self, *, normals: bool = False) -> Context:
         """The circumstances of an evaluation; ``normals`` as for `render`."""

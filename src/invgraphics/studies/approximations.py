@@ -5,14 +5,16 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core import Bounds, Camera, Context, Gaussians, Renderer, Rendering, harmonics
+from invgraphics.core import Bounds, Camera, Gaussians, Model, Renderer, harmonics
 from invgraphics.core.transforms import look_at
 from invgraphics.fields.gaussian import GaussianField
+from invgraphics.renderers.gaussian_rays import Opacity
 from invgraphics.renderers.gaussian_volume import GaussianExact, GaussianExactConfig, GaussianSorted, GaussianSortedConfig
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.runs.analysis import Analysis, Curve
@@ -43,9 +45,14 @@ def splat() -> Splatting:
     return Splatting(SplattingConfig(dilation=0.0))
 
 
-def along_rays(order: str = "centre") -> GaussianSorted:
+def along_rays(order: Literal["centre", "ray"] = "centre", opacity: Opacity = "splat") -> GaussianSorted:
     """The same opacities in the same order, but with responses measured on each pixel's own ray."""
-    return GaussianSorted(GaussianSortedConfig("splat", "ray" if order == "ray" else "centre"))
+    return GaussianSorted(GaussianSortedConfig(opacity, order))
+
+
+def integrated(opacity: Literal["peak", "physical"] = "peak", steps: int = 64) -> GaussianExact:
+    """Densities that overlap, integrated along each ray; nothing of the splatter's is left."""
+    return GaussianExact(GaussianExactConfig(opacity, steps))
 
 
 def affine_projection() -> Analysis:
@@ -81,8 +88,8 @@ def affine_error(angle: float, size: float, opacity: float = 0.9) -> float:
     principal = torch.tensor([PATCH / 2 - focal * math.tan(angle), PATCH / 2], dtype=torch.float64)
     lens = torch.full((2,), focal, dtype=torch.float64)
     camera = Camera(torch.eye(4, dtype=torch.float64), lens, principal, PATCH, PATCH)
-    field = field_of(round_ones(centre[None], torch.tensor([size]), torch.tensor([opacity])))
-    return _largest_gap(*(_show(renderer, field, camera) for renderer in (splat(), along_rays())))
+    one = round_ones(centre[None], torch.tensor([size]), torch.tensor([opacity]))
+    return _largest_gap(one, camera, splat(), along_rays())
 
 
 def field_of_view() -> Analysis:
@@ -119,7 +126,7 @@ def cloud_error(view: float, scale: float) -> float:
     pose = look_at(torch.tensor([0.0, -distance, 0.0]), torch.zeros(3), torch.tensor(UP)).double()
     lens = torch.full((2,), PATCH / 2 / math.tan(view / 2), dtype=torch.float64)
     camera = Camera(pose, lens, torch.full((2,), PATCH / 2, dtype=torch.float64), PATCH, PATCH)
-    one, other = (_show(renderer, field_of(cloud), camera) for renderer in (splat(), along_rays()))
+    one, other = (model_of(cloud, renderer).render(camera, normals=False) for renderer in (splat(), along_rays()))
     return float((one.rgb - other.rgb).square().mean().sqrt())
 
 
@@ -128,7 +135,7 @@ def sorting_by_centre() -> Analysis:
     renderers = {
         "sorted by centre": along_rays(),
         "sorted along the ray": along_rays("ray"),
-        "integrated": GaussianExact(GaussianExactConfig(steps=64)),
+        "integrated": integrated(),
     }
     curves, jumps = [], {}
     for label, renderer in renderers.items():
@@ -147,29 +154,27 @@ def sorting_by_centre() -> Analysis:
 
 def crossing(renderer: Renderer, turns: int = TURNS) -> tuple[list[float], list[float]]:
     """Turns of the camera in degrees, and the share of red in the light of a red and a blue Gaussian that cross."""
-    gaussians = replace(
-        round_ones(
-            torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]]),
-            torch.tensor([1.0, 1.0]),
-            torch.tensor([0.8, 0.8]),
-            torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-        ),
-        quaternions=torch.tensor(
-            [[math.cos(0.2), 0.0, 0.0, math.sin(0.2)], [math.cos(0.2), 0.0, 0.0, -math.sin(0.2)]]
-        ).double(),
-        scales=torch.tensor([[0.5, 0.1, 0.1], [0.5, 0.1, 0.1]]).double(),
-    )
-    field, size = field_of(gaussians), PATCH // 2
+    pair = crossing_pair(torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    model, size = model_of(pair, renderer), PATCH // 2
     angles = torch.linspace(-TURN, TURN, turns, dtype=torch.float64)
     shares = []
     for angle in angles.deg2rad().tolist():
         eye = torch.tensor([4 * math.sin(angle), -4 * math.cos(angle), 0.0])
         pose = look_at(eye, torch.zeros(3), torch.tensor(UP)).double()
         lens, centre = torch.full((2,), 1.5 * size), torch.full((2,), size / 2)
-        picture = _show(renderer, field, Camera(pose, lens.double(), centre.double(), size, size))
+        picture = model.render(Camera(pose, lens.double(), centre.double(), size, size), normals=False)
         red, _, blue = picture.rgb.sum(dim=(0, 1)).tolist()
         shares.append(red / (red + blue))
     return angles.tolist(), shares
+
+
+def crossing_pair(rgb: Float[Tensor, "2 3"]) -> Gaussians:
+    """Two long Gaussians of these colours that cross at the origin, turned by 0.4 rad about z to either side of x."""
+    means = torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
+    pair = round_ones(means, torch.tensor([0.1, 0.1]), torch.tensor([0.8, 0.8]), rgb)
+    scales = torch.tensor([[0.5, 0.1, 0.1], [0.5, 0.1, 0.1]]).double()
+    turns = torch.tensor([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)], [math.cos(0.2), 0.0, 0.0, -math.sin(0.2)]]).double()
+    return replace(pair, quaternions=turns, scales=scales)
 
 
 def opacity_convention() -> Analysis:
@@ -189,13 +194,12 @@ def opacity_convention() -> Analysis:
 
 def opacity_gap(opacity: float) -> float:
     """Largest difference of alpha over the pixels of one round Gaussian, splatted and marched along the same rays."""
-    field = field_of(round_ones(torch.zeros(1, 3), torch.tensor([0.1]), torch.tensor([opacity])))
+    one = round_ones(torch.zeros(1, 3), torch.tensor([0.1]), torch.tensor([opacity]))
     pose = look_at(torch.tensor([0.0, -5.0, 0.0]), torch.zeros(3), torch.tensor(UP)).double()
     focal = RESPONSES / (3 * 0.1 / 5)
     centre = torch.tensor([0.0, 0.5], dtype=torch.float64)
     camera = Camera(pose, torch.full((2,), focal, dtype=torch.float64), centre, RESPONSES, 1)
-    marched = GaussianSorted(GaussianSortedConfig("peak"))
-    return _largest_gap(*(_show(renderer, field, camera) for renderer in (along_rays("ray"), marched)))
+    return _largest_gap(one, camera, along_rays("ray"), along_rays("ray", "peak"))
 
 
 def opacity_gap_formula(opacity: float) -> float:
@@ -233,12 +237,13 @@ def field_of(gaussians: Gaussians) -> GaussianField:
     )
 
 
-def _largest_gap(one: Rendering, other: Rendering) -> float:
-    """Largest difference of alpha where both see something: that splatters skip alphas below 1/255 is another matter."""
-    return float(torch.where((one.alpha > 0) & (other.alpha > 0), one.alpha - other.alpha, 0.0).abs().max())
-
-
-def _show(renderer: Renderer, field: GaussianField, camera: Camera) -> Rendering:
+def model_of(gaussians: Gaussians, renderer: Renderer) -> Model:
+    """Given Gaussians seen through a renderer, nothing of them cut off near the camera."""
     ball = torch.full((3,), 1.5, dtype=torch.float64)
-    with torch.no_grad():
-        return renderer.render_image(field, camera, Context(Bounds(-ball, ball, near=1e-3)))[0]
+    return Model(field_of(gaussians), renderer, Bounds(-ball, ball, near=1e-3))
+
+
+def _largest_gap(gaussians: Gaussians, camera: Camera, one: Renderer, two: Renderer) -> float:
+    """Largest difference of alpha where both see something: that splatters skip alphas below 1/255 is another matter."""
+    first, second = (model_of(gaussians, renderer).render(camera, normals=False).alpha for renderer in (one, two))
+    return float(torch.where((first > 0) & (second > 0), first - second, 0.0).abs().max())

@@ -111,9 +111,8 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
         )
     scene = fitted.scene
     axes = plugins.load("formats", request.to).axes
-    with torch.no_grad():
-        local = fitted.model.field.primitives(Quantity.GAUSSIANS, fitted.model.context())
-    placed = on_cpu(transform_gaussians(on_cpu(local), file_from_local(scene, axes, request.world).float()))
+    local = on_cpu(fitted.model.gaussians())
+    placed = on_cpu(transform_gaussians(local, file_from_local(scene, axes, request.world).float()))
     expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
     placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
     shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"

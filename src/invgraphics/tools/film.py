@@ -10,7 +10,6 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 import numpy as np
-import torch
 
 from invgraphics.core import Camera, Quantity, Rendering
 from invgraphics.errors import InputError
@@ -167,9 +166,7 @@ def _picture(fitted: Fitted, camera: Camera) -> np.ndarray:
 
 
 def _ellipsoids(fitted: Fitted, camera: Camera) -> np.ndarray:
-    model = fitted.model
-    with torch.no_grad():
-        drawn = draw_ellipsoids(model.field.primitives(Quantity.GAUSSIANS, model.context()), camera.to(model.device))
+    drawn = draw_ellipsoids(fitted.model.gaussians(), camera.to(fitted.model.device))
     rendering = replace(drawn, rgb=drawn.rgb.cpu(), alpha=drawn.alpha.cpu())
     return display(rendering.over(fitted.scene.background), fitted.scene).numpy()
 

@@ -74,6 +74,23 @@ class DensityControlConfig:
         return DensityControl(self)
 
 
+@dataclass(frozen=True, eq=False)
+class GrowthRound:
+    """What a round of growing and pruning did to each of the n Gaussians before it; all others were kept.
+
+    Attributes:
+        step: steps of the fit when it was over.
+        cloned: those that got a copy.
+        split: those that were replaced by smaller ones.
+        pruned: those that were removed.
+    """
+
+    step: int
+    cloned: Bool[Tensor, " n"]
+    split: Bool[Tensor, " n"]
+    pruned: Bool[Tensor, " n"]
+
+
 _FIRST_NAMES = {"gradient_sum": "pull", "views": "seen", "max_radius": "radius", "first_count": "first"}
 """Tensors of a checkpoint -> what they were called in those of earlier versions."""
 
@@ -82,6 +99,9 @@ class DensityControl(Hook):
     """Accumulates screen-space gradients, then grows, prunes and resets the Gaussians on schedule.
 
     The gradient is 3DGS's: dL/d(NDC xy), the pixel gradient times (W/2, H/2), averaged over the views that see the Gaussian.
+
+    Attributes:
+        last_round: the latest round in this process; ``None`` before the first.
     """
 
     name = "density_control"
@@ -97,6 +117,7 @@ class DensityControl(Hook):
         self._resets_done = 0
         self._started = -1.0
         self._first_count = 0
+        self.last_round: GrowthRound | None = None
 
     @override
     def after_backward(self, state: FitState) -> None:
@@ -156,6 +177,8 @@ class DensityControl(Hook):
         keep[split] = False
         if not bool(keep.any()) and len(split) == 0:
             keep[torch.argmax(field.opacity_logits)] = True  # a field of nothing could never grow again
+        divided = grows & ~small
+        self.last_round = GrowthRound(state.step + 1, grows & small, divided, ~(keep | divided))
         self._rebuild(state, keep.nonzero()[:, 0], cloned, split)
 
     def _cap(self, progress: float, count: int) -> int:
