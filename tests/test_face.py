@@ -87,6 +87,16 @@ def test_names_are_lazy_and_typed() -> None:
         ig.render  # noqa: B018
 
 
+def test_packages_load_on_first_use_at_any_depth() -> None:
+    code = "import invgraphics as ig; print(ig.fields.encodings.frequency.FrequencyConfig(octaves=2).build().width)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "15"  # x, and sine and cosine of two octaves, of three coordinates
+    with pytest.raises(AttributeError, match=r"'invgraphics\.core' has no attribute 'optics'"):
+        ig.core.optics  # noqa: B018
+    with pytest.raises(ImportError, match="cannot import name 'optics'"):
+        from invgraphics.core import optics  # noqa: F401
+
+
 def test_fits_in_memory_and_in_a_folder_are_the_same_fit() -> None:
     """A scene that no file holds is fitted as it is; a folder keeps a copy of it."""
     kept = ig.fit(SPLATS, toy_scene(views=8, size=24), budget="20steps", out="run")
