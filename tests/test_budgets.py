@@ -1,4 +1,4 @@
-"""Size budgets that keep the code readable: lines per file and function, parameters, public names."""
+"""Size budgets that keep the code readable: lines per file and function, parameters, public names, files per folder."""
 
 import ast
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "src" / "invgraphics"
 FILES = sorted(ROOT.rglob("*.py"))
-FILE_LINES, FUNCTION_LINES, PARAMETERS, PUBLIC_NAMES = 300, 60, 8, 40
+FILE_LINES, FUNCTION_LINES, PARAMETERS, PUBLIC_NAMES, FOLDER_FILES = 300, 60, 8, 40, 25
 
 
 def _id(path: Path) -> str:
@@ -40,3 +40,8 @@ def test_packages_export_few_names(path: Path) -> None:
     defined = [node.name for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
     imported = [alias.asname or alias.name for node in body if isinstance(node, ast.ImportFrom) for alias in node.names]
     assert len({name for name in defined + imported if not name.startswith("_")}) <= PUBLIC_NAMES
+
+
+@pytest.mark.parametrize("path", [path for path in FILES if path.name == "__init__.py"], ids=_id)
+def test_folders_stay_small(path: Path) -> None:
+    assert len(list(path.parent.glob("*.py"))) <= FOLDER_FILES

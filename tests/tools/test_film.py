@@ -203,7 +203,7 @@ def test_gaussians_start_from_another_run(toy_folder: Path, tmp_path: Path) -> N
         again[seed] = config.converted(fitted.model.field, fitted.scene).means
     assert torch.equal(means, again[0])
     assert not torch.equal(means, again[1])
-    for wrong, words in ((tmp_path / "none", "does not exist"), (folder, "not density and radiance")):
+    for wrong, words in ((tmp_path / "none", "is not a run"), (folder, "not density and radiance")):
         items = (*SMALL[METHOD], "field.init=field", f"field.source={wrong}")
         with pytest.raises(InputError, match=words):
             fit_run(_request(toy_folder, tmp_path / "other", budget="1steps", overrides=items))

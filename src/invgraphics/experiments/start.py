@@ -14,7 +14,7 @@ from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.requested import COPIES, RAY_BYTES
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.runs.provenance import Provenance
 from invgraphics.training.batches import Batches
 from invgraphics.training.fit import Plan
@@ -42,6 +42,7 @@ def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
     source = getattr(config, "source", "")
     if not source:
         return plan
+    check_run(Path(source))
     folder = RunFolder(Path(source))
     shown = folder.read(Provenance).scene
     if Path(shown).resolve() != Path(scene_spec).resolve():
