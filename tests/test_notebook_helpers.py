@@ -34,7 +34,7 @@ def test_a_row_of_pictures_fills_the_figure_with_square_cells() -> None:
     assert axes[1].images[0].get_array()[0, 0].tolist() == [0.5, 0.5, 0.5]
     figure = axes[0].figure
     assert len(figure.axes) == 4 and not any(axis.axison for axis in figure.axes)
-    assert figure.get_size_inches().tolist() == pytest.approx([6, 2 * (6 / 2 / 2 + notebook.TITLE)])
+    assert figure.get_size_inches().tolist() == pytest.approx([6, 2 * (6 / 2 / 2) + notebook.TITLE])
 
 
 def test_sliders_begin_at_the_defaults_and_draw_again() -> None:

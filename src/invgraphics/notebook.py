@@ -71,7 +71,8 @@ def row(
     columns = columns or len(images)
     rows = -(-len(images) // columns)
     height, wide = images[0].shape[:2]
-    tall = rows * (width / columns * height / wide + TITLE * any(titles))
+    titled = min(rows, -(-len(titles) // columns))
+    tall = rows * width / columns * height / wide + TITLE * titled
     _, grid = plt.subplots(rows, columns, figsize=(width, tall), squeeze=False)
     axes = grid.ravel()
     for axis in axes:
