@@ -80,7 +80,7 @@ def read_recipe(path: Path) -> str:
 
 def read_study(path: Path) -> str:
     """Read a study and expand it; returns a digest."""
-    from invgraphics.studies.study import read_study as read
+    from invgraphics.studies.reading import read_study as read
 
     cells = read(path).expand()
     assert 0 < len(cells) <= 100_000, "no study has as many cells"

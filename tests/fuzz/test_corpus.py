@@ -14,7 +14,7 @@ from invgraphics.config import InputError
 from invgraphics.formats.base import read_gaussians
 from invgraphics.recipes.recipe import load_method
 from invgraphics.scenes.open import open_scene
-from invgraphics.studies.study import read_study
+from invgraphics.studies.reading import read_study
 
 
 def table(change: Callable[[dict], object]) -> Callable[[Path], Path]:
