@@ -142,7 +142,7 @@ def test_a_fixed_background_is_what_a_photograph_would_show(scene: Scene) -> Non
     [
         ({"train_views": 0}, "'train_views' must be at least 1"),
         ({"pose_noise": -1.0}, "'pose_noise' must be 0 or more"),
-        ({"photo_noise": float("nan")}, "'photo_noise' must be 0 or more"),
+        ({"photo_noise": float("nan")}, "'data.photo_noise' cannot be nan"),
         ({"background": "pink"}, "not 'pink'"),
         ({"background": [0.0, 2.0, 0.0]}, "channels in"),
         ({"viewz": 3}, "Unknown key 'data.viewz'"),
