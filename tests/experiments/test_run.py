@@ -201,5 +201,5 @@ def test_a_damaged_run_gets_a_sentence(run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not a run|is missing"):
         evaluate_run(tmp_path)
     (tmp_path / "provenance.json").write_text("{")
-    with pytest.raises(InputError, match="cannot be read as JSON"):
+    with pytest.raises(InputError, match="is not valid JSON"):
         evaluate_run(tmp_path)
