@@ -198,7 +198,7 @@ def test_a_full_disk_is_said_and_keeps_the_last_checkpoint(toy_folder: Path, tmp
 
 
 def test_a_damaged_run_gets_a_sentence(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is not a run|is missing"):
+    with pytest.raises(InputError, match=r"is not a run|is missing"):
         evaluate_run(tmp_path)
     (tmp_path / "provenance.json").write_text("{")
     with pytest.raises(InputError, match="is not valid JSON"):
