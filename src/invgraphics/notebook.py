@@ -48,7 +48,7 @@ def style() -> None:
         "axes.prop_cycle": plt.cycler(color=[tone.light for tone in SERIES]),
     }
     if "ipykernel" in sys.modules:  # elsewhere there is no notebook whose pictures could be finer
-        from matplotlib_inline.backend_inline import set_matplotlib_formats
+        from matplotlib_inline.backend_inline import set_matplotlib_formats  # pyright: ignore[reportMissingImports]
 
         set_matplotlib_formats("retina")
 
@@ -100,7 +100,7 @@ def sliders(**positions: Range) -> Callable[[Callable[..., None]], Callable[...,
         ... def draw(count=8, density=5):
         ...     plt.plot(...)
     """
-    from ipywidgets import FloatSlider, IntSlider, SelectionSlider, interact
+    from ipywidgets import FloatSlider, IntSlider, SelectionSlider, interact  # pyright: ignore[reportMissingImports]
 
     def attach(draw: Callable[..., None]) -> Callable[..., None]:
         controls: dict[str, Any] = {}
@@ -138,7 +138,7 @@ def video(path: Path, width: int) -> None:
         path: of an mp4.
         width: on the page, px.
     """
-    from IPython.display import Video, display
+    from IPython.display import Video, display  # pyright: ignore[reportMissingImports]
 
     display(Video(str(path), embed=True, width=width))
 
