@@ -1,4 +1,4 @@
-"""Files that a page shows: maps written small, links kept inside the folder."""
+"""Images and links of a page: colour-mapped PNGs, and files copied so that links stay inside its folder."""
 
 from __future__ import annotations
 
