@@ -38,7 +38,7 @@ def build_report(folder: Path, out: Path | None = None, public: bool = False) ->
 
 
 def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Path:
-    """Write a report of runs from anywhere; what the page shows is copied into ``out`` unless it lies there already.
+    """Write a report of any run folders; files that the page shows are copied into ``out`` unless they lie there already.
 
     Args:
         runs: run folders.

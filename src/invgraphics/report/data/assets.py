@@ -22,7 +22,7 @@ MASKED = 255
 
 @dataclass(frozen=True)
 class Folder:
-    """The folder a report is written to; everything its page shows lies inside.
+    """Output folder of a report; all files that its page shows lie inside.
 
     Attributes:
         root: where ``index.html`` lies.

@@ -38,7 +38,7 @@ SHORTEST = 3
 
 @dataclass(frozen=True)
 class Redactor:
-    """Removes what is private from everything that a report writes.
+    """Removes user names, host names and absolute paths from all outputs of a report.
 
     Attributes:
         words: user and host names, matched as whole words whatever their case.

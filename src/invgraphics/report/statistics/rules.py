@@ -106,7 +106,7 @@ def unused(judged: Sequence[JudgedCell], known: Sequence[KnownDeviation]) -> tup
 
 
 def headline(judged: Sequence[JudgedCell]) -> list[str]:
-    """How many cells are green, what the others are, and why some were skipped."""
+    """Sentences on the numbers of green, red, skipped and missing cells, and the reasons of skipped ones."""
     counts = {key: sum(one.standing == key for one in judged) for key in STANDINGS}
     rest = [f"{counts[key]} {words}" for key, (words, _) in STANDINGS.items() if key != "green" and counts[key]]
     first = f"{counts['green']} of {len(judged)} cells are green" + (f"; {', '.join(rest)}." if rest else ".")
