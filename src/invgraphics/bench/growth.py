@@ -41,7 +41,7 @@ class Growth:
 
 
 def growths(measurements: list[Measurement]) -> list[Growth]:
-    """Power laws of all series of at least three measurements."""
+    """Fit a power law to every series of at least three measurements."""
     found = []
     for along in dict.fromkeys(key for m in measurements for key in m.sizes):
         groups: dict[tuple, list[Measurement]] = defaultdict(list)
@@ -67,7 +67,7 @@ def name_of(key: str) -> str:
 
 
 def size_of(key: str, value: int) -> float:
-    """A size as the quantity that cost grows with."""
+    """Convert a size to the quantity that cost scales with: width to pixels, log2 to entries."""
     if key in PIXEL_KEYS:
         return float(value) ** PIXEL_KEYS[key][1]
     return 2.0**value if key in TABLE_KEYS else float(value)

@@ -91,7 +91,7 @@ def _our_splats() -> dict[str, Run]:
 
 
 def _nerfstudio() -> dict[str, Run]:
-    """nerfstudio's HashEncoding in plain torch (its CUDA one needs a GPU)."""
+    """Hash encoding by nerfstudio's HashEncoding in plain torch (its CUDA one needs a GPU), forward and backward."""
     try:
         from nerfstudio.field_components.encodings import HashEncoding  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -125,7 +125,7 @@ def _use_llvm() -> None:
 
 
 def _drjit() -> dict[str, Run]:
-    """Dr.Jit's HashGridEncoding on its LLVM backend."""
+    """Hash encoding by Dr.Jit's HashGridEncoding on its LLVM backend, forward and backward."""
     _use_llvm()
     import drjit
     from drjit.llvm.ad import Array3f, Float
@@ -157,7 +157,7 @@ def _drjit() -> dict[str, Run]:
 
 
 def _mitsuba() -> dict[str, Run]:
-    """The same Gaussians by Mitsuba's ray tracer of volumetric primitives, one ray per pixel."""
+    """Forward rendering of the same Gaussians by Mitsuba's ray tracer of volumetric primitives, one ray per pixel."""
     _use_llvm()
     try:
         import mitsuba
@@ -169,7 +169,7 @@ def _mitsuba() -> dict[str, Run]:
     scene = mitsuba.load_dict(_mitsuba_scene(mitsuba))
 
     def forward() -> None:
-        # The image is lazy: only reading it makes it.
+        # The image is evaluated lazily; reading it forces evaluation.
         np.asarray(mitsuba.render(scene, spp=1))
 
     return {FORWARD: forward}

@@ -100,7 +100,7 @@ def share_plot(results: Results, folder: Path, style: PlotStyle) -> Plot | None:
 
 
 def gather_plot(results: Results, folder: Path, style: PlotStyle) -> Plot | None:
-    """Random style-ups per second against the table's bytes."""
+    """Plot random look-ups per second against the table's bytes."""
     found = [m for m in results.measurements if m.implementation == MACHINE and m.operation.startswith("gather")]
     if len(found) < 2:
         return None

@@ -1,4 +1,4 @@
-"""Numba kernels that do nothing but reach a limit of the machine; imported only where Numba works."""
+"""Numba microbenchmarks of exp2 throughput and of gather rate; imported only where Numba works."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def exp2_passes(values, passes):
 
 @parallel
 def gather_sum(table, places, jobs, sums):
-    """Per job, the sum of the entries of ``table`` at its share of ``places``."""
+    """Gather and sum the entries of ``table`` at ``places``, which are split evenly among jobs; one sum per job."""
     for job in prange(jobs):
         total = np.int64(0)
         for number in range(job_start(len(places), jobs, job), job_start(len(places), jobs, job + 1)):

@@ -56,7 +56,7 @@ class BenchRequest:
 
 
 def bench(request: BenchRequest) -> Results:
-    """Run the benchmark; the kernel selection is restored afterwards."""
+    """Run the requested parts of the benchmark; the kernel selection is restored afterwards."""
     keep_freed_memory()
     results = Results()
     if not request.kernels:
@@ -140,7 +140,7 @@ def _effort(request: BenchRequest) -> Effort:
 
 
 def thread_counts(most: int) -> list[int]:
-    """1, 2, 4, ... and the most there are."""
+    """Thread counts of a scaling run: powers of two below ``most``, and ``most``."""
     return sorted({min(1 << power, most) for power in range(most.bit_length() + 1)})
 
 
@@ -169,7 +169,7 @@ def _renamed(m: Measurement) -> Measurement:
 
 
 def _gated() -> Iterable[Case]:
-    """One size of each kernel."""
+    """One benchmark case per kernel: the last of its quick sizes."""
     everything = [case for make in _CASES.values() for case in make(True)]
     last = {case.operation: case for case in everything}
     return last.values()

@@ -43,7 +43,7 @@ def splats(quick: bool) -> Iterator[Case]:
 
 
 def ssim(quick: bool) -> Iterator[Case]:
-    """SSIM and its gradient over picture sizes."""
+    """SSIM, forward and backward, over picture sizes."""
     for width in QUICK_SSIM_WIDTHS if quick else SSIM_WIDTHS:
         yield Case("ssim", {"width": width, "channels": 3}, lambda width=width: _ssim(width))
 

@@ -147,7 +147,7 @@ def kernels_of(results: Results) -> list[Measurement]:
 
 
 def sizes(by_key: dict[str, int]) -> str:
-    """Sizes in words."""
+    """Format a problem size in words."""
     return ", ".join(_size(key, value) for key, value in by_key.items())
 
 
@@ -163,17 +163,17 @@ def _size(key: str, value: int) -> str:
 
 
 def milliseconds(timing: Timing) -> str:
-    """Median and quartiles."""
+    """Format median and quartiles in milliseconds."""
     return f"{number(1e3 * timing.median)} ({number(1e3 * timing.low)} to {number(1e3 * timing.high)})"
 
 
 def number(x: float) -> str:
-    """Three significant digits, without an exponent."""
+    """Format a number with three significant digits, without an exponent."""
     return f"{x:.0f}" if x >= 100 else f"{x:.3g}"
 
 
 def quantity(x: float) -> str:
-    """``2.1e9`` as ``2.1 G``; powers of 1000."""
+    """Format a number with a decimal prefix: ``2.1e9`` as ``2.1 G``; powers of 1000."""
     for factor, prefix in _PREFIXES:
         if x >= factor:
             return f"{x / factor:.3g} {prefix}" if prefix != "k" else f"{x / factor:.3g}k"
@@ -181,5 +181,5 @@ def quantity(x: float) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A fraction as a percentage with two significant digits."""
+    """Format a fraction as a percentage with two significant digits."""
     return "" if share is None else f"{100 * share:.2g} %"

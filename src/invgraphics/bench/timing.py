@@ -49,7 +49,7 @@ class Effort:
 
 
 def clock(work: Callable[[], object]) -> float:
-    """Seconds of one call."""
+    """Wall-clock seconds of one call."""
     began = time.perf_counter()
     work()
     return time.perf_counter() - began

@@ -1,4 +1,4 @@
-"""Pure functions of a picture and the truth, each with its unit and direction, and the protocols they are used under."""
+"""Image and geometry metrics as pure functions of prediction and ground truth, and the scoring protocols that apply them."""
 
 from typing import TYPE_CHECKING
 

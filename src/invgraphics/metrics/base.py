@@ -1,4 +1,4 @@
-"""Metrics, and the pair of prediction and truth that they compare."""
+"""Interface of metrics: a pure function of a prediction and its ground truth."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Pair:
         return replace(self, **{name: values[inner] for name, values in maps.items() if values is not None})
 
     def mean_within(self, values: Float[Tensor, "h w"]) -> float:
-        """Mean of a per-pixel map over the pixels that count, in double precision."""
+        """Mean of a per-pixel map over unmasked pixels, in double precision."""
         kept = values if self.mask is None else values[self.mask]
         if kept.numel() == 0:
             raise Skip("the view's mask leaves no pixel to score")
@@ -59,7 +59,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Metric:
-    """A pure function of a `Pair`, with what is needed to read its values.
+    """A metric: a pure function of a `Pair`, with name, unit and direction of its value.
 
     Attributes:
         name: key in scores and tables.

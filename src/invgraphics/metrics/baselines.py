@@ -45,7 +45,7 @@ def camera_distance(a: Camera, b: Camera, extent: float) -> float:
 
 
 def baseline_scores(scene: Scene, protocol: Protocol) -> dict[str, dict[str, Any]]:
-    """Baseline name -> the ``quality`` part of a ``scores.json``, without depth and normals, which baselines do not have."""
+    """Score the baselines: name -> the ``quality`` part of a ``scores.json``, without depth and normals, which they lack."""
     scores = {}
     for name, predict in BASELINES.items():
         views = [score(picture, view, scene, protocol) for picture, view in zip(predict(scene), scene.test, strict=True)]

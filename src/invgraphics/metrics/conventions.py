@@ -1,4 +1,4 @@
-"""Scoring protocols as data: our own, and those of the tools whose numbers a paper compares itself with.
+"""Scoring protocols as data: our own, and the evaluation conventions of other tools.
 
 A number such as "31.2 dB" means little without its conventions. Each `Protocol` states one set of them, another tool's as read
 in the source files that it names; `invgraphics.metrics.protocols` carries them out. Imports nothing heavy.
@@ -101,7 +101,7 @@ class Protocol:
     widest: int | None = None
 
     def record(self) -> dict[str, Any]:
-        """Its settings as plain values for a file; those beyond the common ones only where they say something."""
+        """Settings as plain values for a file; optional ones only where they are set."""
         always = ("name", "summary", "background", "prediction", "truth", "masks")
         return {name: value for name, value in asdict(self).items() if value or name in always}
 

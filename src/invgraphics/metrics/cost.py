@@ -61,7 +61,7 @@ class PeakMemory:
 
     @property
     def peak_bytes(self) -> int:
-        """The highest reading above the first; complete once the block has been left."""
+        """Peak bytes above the level at the start; complete once the block has been left."""
         return self._peak - self._start
 
     def _held(self) -> int:

@@ -16,7 +16,7 @@ JUMP = 0.05
 
 
 def shared_surface(pair: Pair) -> Bool[Tensor, "h w"]:
-    """Where truth and prediction both show a surface (alpha >= 0.5), among the pixels that count."""
+    """Mask of unmasked pixels where truth and prediction both show a surface (alpha >= 0.5)."""
     both = pair.pred_alpha >= OPAQUE
     if pair.true_alpha is not None:
         both = both & (pair.true_alpha >= OPAQUE)
@@ -24,7 +24,7 @@ def shared_surface(pair: Pair) -> Bool[Tensor, "h w"]:
 
 
 def smooth_depth(depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Pixels whose 3 x 3 neighbourhood has no depth discontinuity and no miss (inf)."""
+    """Mask of pixels whose 3 x 3 neighbourhood has no depth discontinuity and no miss (inf)."""
     # Misses become a huge finite depth, so that the pooling below sees a jump and no inf - inf.
     finite = torch.where(depth.isfinite(), depth, torch.finfo(depth.dtype).max / 4)
     farthest = F.max_pool2d(finite[None, None], 3, stride=1, padding=1)[0, 0]

@@ -42,7 +42,7 @@ def psnr(pair: Pair, how: Psnr = _PSNR) -> float:
 
 
 def ssim(pair: Pair, how: Ssim = _SSIM) -> float:
-    """Mean of the SSIM map (Wang et al. 2004, eq. 13) over the pixels that count and over channels, in double precision."""
+    """Mean of the SSIM map (Wang et al. 2004, eq. 13) over unmasked pixels and channels, in double precision."""
     kernel = np.asarray(how.kernel or gaussian_kernel())
     radius, (height, width) = len(kernel) // 2, pair.truth.shape[:2]
     if min(height, width) < len(kernel):
@@ -75,7 +75,7 @@ def _similarity(x: Channel, y: Channel, blur: Callable[[Channel], Channel], cons
 
 
 def gaussian_kernel() -> Float[np.ndarray, " taps"]:
-    """The published window along one axis: 11 taps of a Gaussian with sigma 1.5, sum 1."""
+    """SSIM's published window along one axis: 11 taps of a Gaussian with sigma 1.5, sum 1."""
     weights = np.exp(-0.5 / SSIM_SIGMA**2 * np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) ** 2)
     return weights / weights.sum()
 
@@ -102,7 +102,7 @@ def ms_ssim(pair: Pair) -> float:
 
 
 def refuse_mask(pair: Pair) -> None:
-    """Raise `Skip` for a metric that gives one number for a whole image, if some pixels do not count."""
+    """Raise `Skip` if some pixels are masked, for a metric without a per-pixel map."""
     if pair.mask is not None and not bool(pair.mask.all()):
         raise Skip("the view has a mask, and this metric has no per-pixel map to apply it to")
 

@@ -1,4 +1,4 @@
-"""Perceptual metrics on display colours: FLIP, and LPIPS for those who have its weights."""
+"""Perceptual metrics on display colours: FLIP, and LPIPS where its weights are installed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def flip_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Fl
     """FLIP's error per pixel in [0, 1] (Andersson et al. 2020; LDR, the default 67 pixels per degree of visual angle).
 
     Args:
-        image: what is judged, display sRGB in [0, 1].
+        image: the prediction, display sRGB in [0, 1].
         truth: the reference, likewise.
     """
     import flip_evaluator
@@ -45,7 +45,7 @@ def flip_map(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Fl
 
 
 def flip(pair: Pair) -> float:
-    """Mean of `flip_map` over the pixels that count."""
+    """Mean of `flip_map` over unmasked pixels."""
     errors = flip_map(pair.image, pair.truth)
     return pair.mean_within(errors.to(pair.truth.device))
 
@@ -77,7 +77,7 @@ def lpips(pair: Pair, how: Lpips = _LPIPS) -> float:
     """Learned perceptual similarity v0.1 (Zhang et al. 2018) of a pair without masked pixels.
 
     Raises:
-        Skip: the network is not on this machine, the images are too small, or some pixels do not count.
+        Skip: the network is not on this machine, the images are too small, or some pixels are masked.
     """
     reason = why_no_lpips(how.net)
     if reason:

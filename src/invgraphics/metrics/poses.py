@@ -33,7 +33,7 @@ class Similarity:
 
     @property
     def matrix(self) -> Float[Tensor, "4 4"]:
-        """As one affine matrix, for `invgraphics.core.transforms`."""
+        """Affine 4 x 4 matrix of the similarity, for `invgraphics.core.transforms`."""
         return rigid(self.scale * self.rotation, self.translation)
 
     def inverse(self) -> Similarity:
@@ -62,7 +62,7 @@ class PoseErrors:
         translation_per_cent: distance between estimated and true centre, per cent of ``extent``.
         scale: true length of one unit of the estimate.
         extent: of the true scene, its units.
-        similarity: what was applied to the estimate.
+        similarity: the alignment applied to the estimate.
     """
 
     rotation_degrees: Float[Tensor, " n"]
@@ -166,7 +166,7 @@ def rotation_angle(first: Float[Tensor, "*n 3 3"], second: Float[Tensor, "*n 3 3
 
 
 def _width(centred: Float[Tensor, "n 3"]) -> float:
-    """Second singular value over the first: 0 for points on a line."""
+    """Ratio of the second to the first singular value of centred points: 0 for points on a line."""
     if len(centred) < 2:
         return 0.0
     values = torch.linalg.svdvals(centred)
@@ -174,7 +174,7 @@ def _width(centred: Float[Tensor, "n 3"]) -> float:
 
 
 def _nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """The rotation R with the largest trace of Rᵀ ``matrix``."""
+    """Orthogonal Procrustes: the rotation R that maximises the trace of Rᵀ ``matrix``."""
     u, _, vh = torch.linalg.svd(matrix)
     signs = matrix.new_tensor([1.0, 1.0, float(torch.linalg.det(u @ vh).sign())])
     return u * signs @ vh

@@ -94,7 +94,7 @@ def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) 
 
 
 def _composited(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) -> tuple[Image, Image]:
-    """Prediction and truth over the protocol's background, display sRGB in [0, 1], rounded as it says."""
+    """Prediction and truth over the protocol's background, display sRGB in [0, 1], quantised by its rules."""
     background = scene.background
     if view.alpha is not None and protocol.background != "scene":
         background = torch.tensor(protocol.background)
@@ -105,7 +105,7 @@ def _composited(rendering: Rendering, view: View, scene: Scene, protocol: Protoc
 
 
 def _masked(image: Image, truth: Image, view: View, protocol: Protocol) -> tuple[Image, Image, Bool[Tensor, "h w"] | None]:
-    """Both pictures with the view's mask applied, and the mask where means exclude what it leaves out."""
+    """Both pictures with the view's mask applied, and the mask where means are restricted to it."""
     if view.mask is None or (protocol.masks != "excluded" and bool(view.mask.all())):
         return image, truth, None
     if protocol.masks == "unknown":
@@ -129,7 +129,7 @@ def _over_in_double(view: View, background: Float[Tensor, 3]) -> Image:
 
 
 def rounded(display: Image, rounding: Rounding) -> Image:
-    """Display colours in [0, 1] after an image file of 8 bits, or as they are."""
+    """Display colours in [0, 1] quantised to 8 bits, or unchanged for ``none``."""
     if rounding == "none":
         return display
     levels = quantise(display) if rounding == "nearest" else (display.clamp(0, 1) * 255).to(torch.uint8)
@@ -200,7 +200,7 @@ def _metric(name: str) -> Metric:
 def summarise(
     scores: Sequence[ViewScore], protocol: Protocol = PROTOCOLS["default"]
 ) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Join the views into the ``quality`` and the ``skipped`` part of a ``scores.json``, as the protocol joins them.
+    """Average scores over views by the protocol's rule: the ``quality`` and ``skipped`` parts of a ``scores.json``.
 
     A metric that is missing in any view gets no mean: means over different views cannot be compared. Why it is missing, and
     in which view first, goes to ``skipped``.
@@ -219,7 +219,7 @@ def summarise(
 
 
 def _joined(name: str, values: list[float], protocol: Protocol) -> dict[str, Any]:
-    """Mean over views, unit, direction and the views' values of one metric."""
+    """Average one metric over views by the protocol's rule: mean, unit, direction and per-view values."""
     mean = math.fsum(values) / len(values)
     if protocol.measures is None:
         metric = _metric(name)

@@ -23,7 +23,7 @@ class SurfaceDistance:
 
     @property
     def chamfer(self) -> float:
-        """Mean of both (not squared)."""
+        """Chamfer distance: mean of accuracy and completeness (not squared)."""
         return (self.accuracy + self.completeness) / 2
 
 
@@ -52,7 +52,7 @@ def points_on(
     """Uniform random points on a triangle mesh.
 
     Args:
-        vertices: places.
+        vertices: positions.
         faces: corners; triangles are drawn by area.
         count: points wanted.
         generator: source of randomness.

@@ -1,4 +1,4 @@
-"""Run folders in, tables, figures and pages out. Reads files only."""
+"""Reports from run folders: statistics, tables, figures and pages; reads stored results only."""
 
 from typing import TYPE_CHECKING
 

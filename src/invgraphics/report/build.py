@@ -1,4 +1,4 @@
-"""From a comparison or from single runs to a report: page, Markdown, CSV, LaTeX and figures."""
+"""Report of a comparison or of single runs: HTML, Markdown, CSV, LaTeX and figures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def build_report(folder: Path, out: Path | None = None, public: bool = False) ->
 
 
 def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Path:
-    """Write a report of runs from anywhere; what the page shows is copied into ``out`` unless it lies there already.
+    """Write a report of any run folders; files that the page shows are copied into ``out`` unless they lie there already.
 
     Args:
         runs: run folders.
@@ -75,7 +75,7 @@ def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Pa
 
 
 def _write(comparison: Comparison, out: Path, base: Path, public: bool) -> Path:
-    """Write everything into ``out``; tables name runs by their path from ``base``."""
+    """Write all outputs of a comparison into ``out``; tables name runs by their path from ``base``."""
     redactor = None
     if public:
         check_apart(out, [run.folder for run in comparison.runs])
@@ -98,12 +98,12 @@ def _write(comparison: Comparison, out: Path, base: Path, public: bool) -> Path:
 
 
 def _common(values: Sequence[str]) -> str:
-    """What all agree on; empty where they do not."""
+    """The value that all share; empty where they differ."""
     return values[0] if len(set(values)) == 1 else ""
 
 
 def _tell_apart(runs: Sequence[Run]) -> list[Run]:
-    """Give runs that share method and seed different names: by preset, by budget, else by folder."""
+    """Make (method, seed) unique: append the preset, the budget or else the folder to the method's name."""
     cells = [(run.method, run.seed) for run in runs]
     if len(set(cells)) == len(cells):
         return list(runs)
@@ -116,7 +116,7 @@ def _tell_apart(runs: Sequence[Run]) -> list[Run]:
 
 
 def _folder_name(run: Run, runs: Sequence[Run]) -> str:
-    """The shortest end of a run's path that no other run's path has."""
+    """Shortest suffix of a run's path that is unique among ``runs``."""
     paths = [other.folder.resolve().parts for other in runs]
     own = run.folder.resolve().parts
     length = next(n for n in range(1, len(own) + 1) if sum(path[-n:] == own[-n:] for path in paths) == 1)

@@ -1,4 +1,4 @@
-"""From a study to its report: factor effects, interactions, every scene's tables and pictures, and the matrix of cells."""
+"""Report of a study: factor effects, interactions, tables and figures of every scene, and the matrix of cells."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
 
 
 def study_sentences(folder: Path) -> list[str]:
-    """What a study's factors do to its first metric, a sentence for each pair of levels; or how its cells are judged.
+    """Factor effects on a study's first metric, a sentence per pair of levels; of a study of verdicts, its headline.
 
     Raises:
         InputError: a file is missing or broken.
@@ -99,7 +99,7 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
 
 
 def _quantities(comparisons: Sequence[Comparison]) -> list[Quantity]:
-    """Every column of any scene's table, quality first."""
+    """Union of the columns of all scenes' tables, quality first; empty without a quality metric."""
     columns = [column for comparison in comparisons for column in table_columns(comparison)]
     found = {column.key: column for column in reversed(columns)}
     unique = [found[key] for key in dict.fromkeys(column.key for column in columns)]
@@ -108,7 +108,7 @@ def _quantities(comparisons: Sequence[Comparison]) -> list[Quantity]:
 
 
 def _keys(scenes: Sequence[str]) -> list[str]:
-    """Names that serve in anchors and folders, distinct for distinct scenes."""
+    """Unique names of scenes for HTML anchors and folders."""
     names = [file_name(scene).strip("-") or "scene" for scene in scenes]
     return [name if names.count(name) == 1 else f"{name}-{index}" for index, name in enumerate(names)]
 

@@ -1,4 +1,4 @@
-"""How quantities are called and written: labels, units, directions and digits, the same in every output."""
+"""Labels, units, directions and number formats of quantities, shared by all outputs."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ ABSENT = "–"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of the summary: something measured about a run.
+    """A measured quantity of a run, a column of the summary: label, unit, direction and number format.
 
     Attributes:
         key: its name in ``scores.json``.
-        label: what people call it.
+        label: display name.
         unit: unit in which it is written; empty for a pure number.
-        better: which way is better; ``none`` for what is a fact, not a merit.
-        group: what it judges: ``image``, ``geometry`` or ``cost``; the first two are quality.
+        better: direction of improvement; ``none`` for a quantity that is never ranked.
+        group: what it measures: ``image``, ``geometry`` or ``cost``; the first two are quality.
         scale: the stored value is multiplied by this before it is written.
         decimals: digits after the point; ``None`` means three significant digits.
     """
@@ -62,7 +62,7 @@ class Quantity:
         return "" if self.group == "cost" and float(text.replace(",", "")) == 0 else f"± {text}"
 
     def sort_key(self, value: float) -> float:
-        """Smaller is better."""
+        """Key of an ascending sort, best value first."""
         return -value if self.better == "higher" else value
 
     def _digits(self, value: float) -> int:
@@ -109,12 +109,12 @@ TIMES = ("fit_seconds", "render_seconds_per_view", "render_fps")
 
 
 def metric_label(key: str) -> str:
-    """What people call a metric; an unknown one keeps its name."""
+    """Display name of a metric; an unknown key with spaces for underscores."""
     return _NAMES[key][0] if key in _NAMES else key.replace("_", " ")
 
 
 def quality_quantity(key: str, score: Score) -> Quantity:
-    """The column of a quality metric, whose unit and direction come with its scores."""
+    """Quantity of a quality metric, with unit and direction from its stored score."""
     decimals = _NAMES[key][1] if key in _NAMES else None
     better: Direction = "higher" if score.higher_is_better else "lower"
     group: Group = "geometry" if key.startswith(_GEOMETRY) else "image"
@@ -122,25 +122,25 @@ def quality_quantity(key: str, score: Score) -> Quantity:
 
 
 def significant_decimals(value: float, digits: int = 3) -> int:
-    """Decimals that show ``digits`` significant digits, at most six."""
+    """Number of decimals that show ``digits`` significant digits, at most six."""
     if value == 0:
         return 0
     return min(6, max(0, digits - 1 - math.floor(math.log10(abs(value)))))
 
 
 def times(ratio: float) -> str:
-    """A factor between two costs, to two digits: 1.4, 14, 140."""
+    """Format a ratio of two costs to two significant digits: 1.4, 14, 140."""
     return f"{ratio:.2g}" if ratio < 10 else f"{float(f'{ratio:.2g}'):.0f}"
 
 
 def listing(items: Iterable[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Join items in words: ``a``, ``a and b``, ``a, b and c``."""
     words = list(items)
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
 def budget_words(budget: str) -> str:
-    """``60s`` -> ``60 s``; ``5000steps`` -> ``5,000 steps``."""
+    """Format a budget: ``60s`` -> ``60 s``; ``5000steps`` -> ``5,000 steps``."""
     for unit, words in (("steps", " steps"), ("s", " s")):
         amount = budget.removesuffix(unit)
         if amount != budget and amount.replace(".", "", 1).isdigit():

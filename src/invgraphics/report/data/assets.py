@@ -1,4 +1,4 @@
-"""Files that a page shows: maps written small, links kept inside the folder."""
+"""Images and links of a page: colour-mapped PNGs, and files copied so that links stay inside its folder."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MASKED = 255
 
 @dataclass(frozen=True)
 class Folder:
-    """The folder a report is written to; everything its page shows lies inside.
+    """Output folder of a report; all files that its page shows lie inside.
 
     Attributes:
         root: where ``index.html`` lies.

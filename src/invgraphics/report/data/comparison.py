@@ -1,4 +1,4 @@
-"""What one page compares: runs on the same ground truth, in the order and under the names in which they are shown."""
+"""Comparisons: runs scored against the same ground truth, in display order and under display names."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from invgraphics.runs.scores import DEFAULT, Score
 
 @dataclass(frozen=True)
 class Comparison:
-    """Everything a page shows.
+    """Runs of several methods on one scene, with baselines, protocol and provenance.
 
     Attributes:
         scene: name of the scene.
-        question: what was asked, one sentence.
+        question: what the comparison is to answer, one sentence.
         methods: in the order in which they are shown.
         runs: the cells that succeeded.
         failures: the cells that did not.
@@ -57,7 +57,7 @@ class Comparison:
 
     @property
     def drawn_methods(self) -> tuple[tuple[int, str], ...]:
-        """(series, method) of what gets pictures and curves."""
+        """(series index, method) of the methods with pictures and curves."""
         return tuple((series, method) for series, method in enumerate(self.methods) if not self.shown or method in self.shown)
 
     def runs_of(self, method: str) -> tuple[Run, ...]:
@@ -104,7 +104,7 @@ def read_comparison(folder: Path) -> Comparison:
 
 
 def check_comparable(runs: tuple[Run, ...]) -> None:
-    """Refuse runs that were not scored against the same pixels in the same way.
+    """Check that all runs share ground truth, test views, background and protocol.
 
     Raises:
         InputError: ground truth, test views, background or protocol differ; the sentence names both runs.

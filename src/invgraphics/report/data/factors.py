@@ -19,7 +19,7 @@ ALL_PAIRS = 4
 
 @dataclass(frozen=True)
 class Factor:
-    """Something that a study varies.
+    """An experimental factor and its levels.
 
     Attributes:
         path: dotted path of the key, or ``method``.
@@ -41,7 +41,7 @@ class Factor:
 
 @dataclass(frozen=True)
 class Observation:
-    """A run and where it stands in the study: ``levels`` holds every factor, the method included, as written."""
+    """A run with its scene and its level of every factor, the method included, as written."""
 
     run: Run
     scene: str
@@ -50,7 +50,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class StudyCell:
-    """One cell of a study.
+    """One cell of a study: scene, method, seed and factor levels, with status and run.
 
     Attributes:
         id: name of its run; cells that come to the same settings share one.
@@ -88,7 +88,7 @@ class StudyCell:
 
 
 def level_text(value: Any) -> str:
-    """A level as people write it; equal values give equal text."""
+    """Format a level as text; equal values give equal text."""
     if isinstance(value, str):
         return value
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e6:

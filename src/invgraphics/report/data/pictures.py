@@ -1,4 +1,4 @@
-"""Pictures and arrays of run folders, read with care."""
+"""Checked reading of pictures and arrays from run folders."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Arrays = dict[str, Float[ndarray, "..."]]
 
 
 def read_picture(path: Path) -> UInt8[ndarray, "h w 3"]:
-    """An 8-bit colour picture.
+    """Read an 8-bit colour picture.
 
     Raises:
         InputError: it is missing or broken.
@@ -33,7 +33,7 @@ def read_picture(path: Path) -> UInt8[ndarray, "h w 3"]:
 
 
 def read_arrays(path: Path) -> Arrays:
-    """All arrays of an ``.npz``, as float32; objects are refused.
+    """Read all arrays of an ``.npz`` as float32; pickled objects are refused.
 
     Raises:
         InputError: it is missing or broken.

@@ -1,4 +1,4 @@
-"""What `explain` wrote about one pixel's ray, read and checked."""
+"""Explanation of one pixel's ray: contributions, profiles and depths as arrays, and plotting ranges."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TAIL, FAINT, SMALL = 0.02, 0.02, 0.6
 
 @dataclass(frozen=True, eq=False)
 class Ray:
-    """What `invgraphics.tools.explain` wrote: contributions in the order in which they are composited.
+    """Contributions to one pixel in compositing order, as written by `invgraphics.tools.explain`.
 
     Attributes:
         record: the file's content.
@@ -39,18 +39,18 @@ class Ray:
 
     @property
     def depths(self) -> dict[str, float]:
-        """Those of `DEPTHS` that are known."""
+        """Known depths of the pixel, by key of `DEPTHS`."""
         known = {key: getattr(self.record.pixel, key) for key in DEPTHS}
         return {key: value for key, value in known.items() if value is not None}
 
     def shown(self, colour: Float[ndarray, "*p 3"]) -> Float[ndarray, "*p 3"]:
-        """Colours of the scene's colour space as a screen shows them."""
+        """Convert colours from the scene's colour space to display sRGB in [0, 1]."""
         values = torch.from_numpy(np.asarray(colour, float))
         return (linear_to_srgb(values) if self.record.colour == "linear" else values.clamp(0, 1)).numpy()
 
 
 def read_ray(folder: Path) -> Ray:
-    """Read an explanation.
+    """Read the explanation of a ray into arrays.
 
     Raises:
         InputError: a file is missing or broken.
@@ -62,12 +62,12 @@ def read_ray(folder: Path) -> Ray:
 
 
 def curve_of(table: Contributions | Profile | None) -> dict[str, Float[ndarray, " p"]]:
-    """Columns as arrays, empty where there is no table; what it lacks is left out."""
+    """Columns of a table as float arrays, absent columns left out; empty without a table."""
     return {} if table is None else {key: np.array(values, float) for key, values in plain(table).items()}
 
 
 def whole_ray(ray: Ray) -> tuple[float, float]:
-    """The distances of the whole ray: all that was sampled, or where the Gaussians lie."""
+    """(near, far) distances of the whole ray: the sampled interval, or the extent of its Gaussians."""
     near, far = ray.record.near, ray.record.far
     ends = np.concatenate([ray.columns["begin"], ray.columns["end"], list(ray.depths.values())])
     if ray.record.kind == "samples" and near is not None and far is not None and far > near:
@@ -81,7 +81,7 @@ def whole_ray(ray: Ray) -> tuple[float, float]:
 
 
 def close_up(ray: Ray, whole: tuple[float, float]) -> tuple[float, float] | None:
-    """Where the light comes from, if that is a small part of the ray."""
+    """(near, far) of the interval that contributes most of the weight; ``None`` unless it is a small part of the ray."""
     order = ray.columns["t"].argsort(kind="stable")
     reached = np.cumsum(ray.columns["weight"][order])
     if not len(order) or reached[-1] < FAINT:

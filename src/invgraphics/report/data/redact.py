@@ -1,4 +1,4 @@
-"""Reports for strangers: no absolute paths, no user names, no host names, no picture metadata."""
+"""Redaction of public reports: removes absolute paths, user names, host names and picture metadata."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SHORTEST = 3
 
 @dataclass(frozen=True)
 class Redactor:
-    """Removes what is private from everything that a report writes.
+    """Removes user names, host names and absolute paths from all outputs of a report.
 
     Attributes:
         words: user and host names, matched as whole words whatever their case.
@@ -49,7 +49,7 @@ class Redactor:
     paths: tuple[str, ...] = ()
 
     def text(self, text: str) -> str:
-        """Absolute paths become their last component, private words an ellipsis."""
+        """Redact a text: absolute paths become their last component, private words an ellipsis."""
         text = QUOTED.sub(lambda match: f"{match[1]}{self._last(match[2])}{match[1]}", text)
         for path in self.paths:
             text = re.sub(rf"{re.escape(path)}(?:/{INSIDE}*)*(?!\w)", lambda match: self._last(match[0]), text)
@@ -60,7 +60,7 @@ class Redactor:
         return text
 
     def value(self, value: T) -> T:
-        """The same for strings inside tables, sequences and records; numbers, folders and keys stay."""
+        """Redact strings inside tables, sequences and records; numbers, folders and keys stay."""
         result: Any = value
         if isinstance(value, str):
             result = self.text(value)
@@ -100,7 +100,7 @@ class Redactor:
 
 
 def redactor_for(records: Iterable[Any]) -> Redactor:
-    """A redactor that knows this machine's user and host, and every name that homes or private keys in ``records`` tell."""
+    """Redactor of this machine's user and host, and of names from home folders and private keys in ``records``."""
     found = {socket.gethostname(), socket.gethostname().partition(".")[0], Path.home().name}
     with contextlib.suppress(KeyError, OSError):  # some containers' users have no name
         found.add(getpass.getuser())
@@ -135,7 +135,7 @@ def _gather(value: Any, found: set[str]) -> None:
 
 
 def check_apart(out: Path, runs: Iterable[Path]) -> None:
-    """Refuse a public report whose folder would also hold the runs themselves, which tell paths and names.
+    """Refuse a public report whose folder would contain the runs themselves, which hold paths and names.
 
     Raises:
         InputError: a run lies inside ``out``.

@@ -1,4 +1,4 @@
-"""Study folders: what was varied, which cells ran, and each scene's part as a comparison of its variants."""
+"""Study folders: factors and cells, and each scene as a comparison of its variants."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from invgraphics.runs.study import Approximation, CellRecord, KnownDeviation, St
 
 @dataclass(frozen=True)
 class Study:
-    """Everything a study's page shows.
+    """A study: design (factors, scenes, methods, seeds), cells and provenance.
 
     Attributes:
         name: of the study.
-        question: what was asked, one sentence.
+        question: what the study is to answer, one sentence.
         design: ``factorial``, ``one-at-a-time`` or ``list``.
-        factors: what was varied, the method first where there are several.
+        factors: the varied factors, the method first where there are several.
         base: level of each key that the design varies around.
         scenes: in the order of the study.
         methods: likewise.
@@ -79,7 +79,7 @@ class Study:
         return sum(cell.status == status for cell in self.cells)
 
     def observations(self) -> tuple[Observation, ...]:
-        """The runs that are done, with their levels."""
+        """Finished runs with their factor levels."""
         return tuple(Observation(cell.run, cell.scene, cell.levels) for cell in self.cells if cell.run is not None)
 
 
@@ -126,7 +126,7 @@ def read_study(folder: Path) -> Study:
 
 
 def scene_comparisons(study: Study) -> list[Comparison]:
-    """Each scene as a comparison of its variants; once per ground truth, where a factor changes the truth itself."""
+    """One comparison of variants per scene, and per ground truth where a factor changes the truth itself."""
     comparisons = []
     for scene in study.scenes:
         here = [cell for cell in study.cells if cell.scene == scene]
@@ -142,7 +142,7 @@ def scene_comparisons(study: Study) -> list[Comparison]:
 
 
 def _truth_of(run: Run) -> tuple[Any, ...]:
-    """What two runs must share to be shown side by side."""
+    """Identity of the ground truth that comparable runs share: hash, test views and background."""
     return run.provenance.truth_sha256, run.scores.views, run.provenance.background
 
 
@@ -185,7 +185,7 @@ def _cell(record: CellRecord, base: Mapping[str, str], folder: Path, protocol: s
 
 
 def _listed(stated: Sequence[str], found: Iterable[str]) -> tuple[str, ...]:
-    """Those of ``found`` in the order that the study states, then the rest."""
+    """Order ``found`` as ``stated``, unstated items last."""
     present = list(dict.fromkeys(found))
     return tuple(dict.fromkeys([*(item for item in stated if item in present), *present]))
 

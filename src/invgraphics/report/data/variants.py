@@ -1,4 +1,4 @@
-"""Factors and variants of a study: which levels its cells have, and what a method with its levels is called."""
+"""Factors with the levels observed in a study's cells, and display names of its variants."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from invgraphics.report.data.factors import METHOD, Factor, StudyCell, level_tex
 
 
 def find_factors(declared: Mapping[str, Any], base: Mapping[str, str], cells: Sequence[StudyCell]) -> tuple[Factor, ...]:
-    """The method first, then what the study declares, then what only its cells vary; a single level is no factor."""
+    """Factors with at least two observed levels: the method, declared factors, then others that vary between cells."""
     levels: dict[str, dict[str, None]] = {METHOD: {}}
     for path, values in declared.items():
         listed = values if isinstance(values, list | tuple) else [values]
@@ -29,7 +29,7 @@ def find_factors(declared: Mapping[str, Any], base: Mapping[str, str], cells: Se
 
 
 def variant_name(cell: StudyCell, factors: Sequence[Factor]) -> str:
-    """Method and levels in words, as short as they stay distinct; factors of other methods are left out."""
+    """Display name of a cell's method and levels, factor paths shortened; factors of other methods are left out."""
     names = short_names([factor.path for factor in factors])
     own = [f.path for f in factors if f.path != METHOD and f.path in cell.levels and _concerns(f.path, cell.method)]
     parts = [cell.method] if any(factor.path == METHOD for factor in factors) else []
@@ -37,13 +37,13 @@ def variant_name(cell: StudyCell, factors: Sequence[Factor]) -> str:
 
 
 def _concerns(path: str, method: str) -> bool:
-    """Whether a factor is one of ``method``: ``volumetric/*:batches.rays`` names the methods before its colon."""
+    """Whether a factor applies to ``method``: ``volumetric/*:batches.rays`` names the methods before its colon."""
     pattern, colon, _ = path.rpartition(":")
     return not colon or fnmatch(method, pattern)
 
 
 def short_names(paths: Sequence[str]) -> dict[str, str]:
-    """Path -> the shortest end of it that no other path has."""
+    """Dotted path -> its shortest unique suffix."""
     split = {path: path.split(".") for path in paths}
     names = {}
     for path, parts in split.items():

@@ -1,4 +1,4 @@
-"""Plots and pictures of a report."""
+"""Figures of a report: interval plots, heat maps, curves, Pareto fronts, ray diagrams and image maps."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Curves of a study's analyses (`invgraphics.studies.analyses`), drawn."""
+"""Line plots of a study's analyses (`invgraphics.studies.analyses`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MARKED = 40
 
 @dataclass(frozen=True)
 class AnalysisPart:
-    """An analysis on a page: what it says, and its plot."""
+    """An analysis on a page: title, concluding sentence and line plot."""
 
     title: str
     sentence: str
@@ -25,7 +25,7 @@ class AnalysisPart:
 
 
 def draw_analyses(root: Path, names: Sequence[str], figures: Path) -> list[AnalysisPart]:
-    """Draw the analyses that a study below ``root`` has written so far.
+    """Draw line plots of those analyses that are stored below the study's ``root``.
 
     Raises:
         InputError: a file is broken; the sentence names it.

@@ -42,13 +42,13 @@ def draw_curve_panels(panels: Mapping[str, Sequence[JudgedCell]], methods: Seque
 
 
 def _points(one: JudgedCell) -> list[tuple[float, float]]:
-    """(seconds, dB) of a run; the look before the first step has no place on a log axis."""
+    """(seconds, PSNR in dB) of a run's monitor; the measurement before the first step has no place on a log axis."""
     history = () if one.cell.run is None else one.cell.run.history
     return [(entry.seconds, entry.psnr) for entry in history if entry.psnr is not None and entry.seconds > 0]
 
 
 def _draw_line(axes: Axes, one: JudgedCell, points: Sequence[tuple[float, float]], series: int) -> None:
-    """A curve with its end: filled where the cell is green, hollow where a rule is broken."""
+    """Draw a monitor curve; its end marker is filled where the cell is green, hollow where a rule is broken."""
     look = series_style(series)
     seconds, psnr = zip(*points, strict=True)
     axes.plot(seconds, psnr, color=look.colour, linestyle=look.dash, linewidth=1.8)

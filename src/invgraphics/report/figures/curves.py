@@ -30,7 +30,7 @@ End = tuple[int, str, float]
 
 
 def draw_curves(comparison: Comparison, summary: Summary, folder: Path) -> Figure | None:
-    """One line per method, with the truth's noise ceiling and the better baseline; ``None`` where no run was monitored.
+    """PSNR over time, a line per method, with noise ceiling and better baseline; ``None`` where no run was monitored.
 
     Of several seeds the line is the mean, and a band its t-interval over seeds; each seed's own end is marked.
     """
@@ -105,7 +105,7 @@ def _draw_seeds(axes: Axes, curves: Sequence[Curve], look: SeriesStyle, opacity:
 
 
 def _reference_lines(axes: Axes, comparison: Comparison, summary: Summary, values: Sequence[float]) -> None:
-    """The noise ceiling and the better baseline; a far one is named at the edge instead of squeezing the curves."""
+    """Draw lines at noise ceiling and better baseline; far ones become a label at the edge, which keeps the curves' range."""
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
     span = max(high - low, 1.0)
     bottom, top = low - 0.06 * span, high + 0.08 * span
@@ -145,7 +145,7 @@ def _legend(axes: Axes, ends: Sequence[End]) -> None:
 
 
 def _end_labels(axes: Axes, ends: Sequence[End]) -> None:
-    """Name each line at its end, labels pushed apart."""
+    """Label each line at its end, overlapping labels moved apart."""
     bottom, top = axes.get_ylim()
     places = spread_labels([psnr for *_, psnr in ends], 18 / 330 * (top - bottom), bottom, top)
     for (series, method, psnr), place in zip(ends, places, strict=True):

@@ -1,4 +1,4 @@
-"""How scores spread over the test views."""
+"""Strip plots of scores over test views."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ ON_DARK, ON_LIGHT = "#fdfdfd", "#101214"
 
 
 def draw_intervals(effects: Sequence[Effect], folder: Path) -> Figure | None:
-    """One row per comparison: the mean difference, its interval, and each scene's or method's own mean as small marks."""
+    """Interval plot of effects, one per row: mean difference, interval, and means per scene or method as small marks."""
     shown = [effect for effect in effects if math.isfinite(effect.estimate.mean)]
     if not shown:
         return None
@@ -61,7 +61,7 @@ def _draw_intervals(effects: Sequence[Effect], title: str, stem: Path, width: fl
 
 
 def _limits(effects: Sequence[Effect]) -> tuple[float, float]:
-    """Room for every mean and zero, and for intervals as far as they do not squeeze the rest; two seeds have wide ones."""
+    """Axis limits of an interval plot: all means and zero, and intervals unless far wider than others (two seeds)."""
     scale = effects[0].quantity.scale
     means = [effect.estimate.mean * scale for effect in effects]
     reach = max([abs(mean) for mean in means] + [1e-12])
@@ -109,7 +109,7 @@ class HeatMap:
 
 
 def heat_map(pair: tuple[Factor, Factor], quantity: Quantity, observations: Sequence[Observation]) -> HeatMap | None:
-    """Means over what all combinations have in common; over whatever there is where that is nothing."""
+    """Heat map over the runs that all combinations share, else over all runs; ``None`` unless the factors are crossed."""
     down, across = pair
     cells: dict[tuple[str, str], dict[tuple[Any, ...], float]] = {}
     for observation in observations:

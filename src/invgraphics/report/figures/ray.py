@@ -1,4 +1,4 @@
-"""One pixel's ray, drawn: what it meets, what each thing adds, and how much light is left for the next."""
+"""Ray diagram of one pixel: alpha, compositing weights, transmittance, density and depths along its ray."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CELLS = 900
 
 
 def draw_ray(folder: Path) -> Path:
-    """Draw what `explain` wrote into ``folder``, beside it.
+    """Draw the ray diagram of the explanation in ``folder``, beside its record.
 
     Returns:
         ``ray.png``; ``ray.svg`` lies beside it.
@@ -89,14 +89,14 @@ def _set_span(axes: Axes, low: float, high: float) -> None:
 
 
 def _cells(axes: Axes) -> Float[ndarray, " cells"]:
-    """Middles of a strip's cells, evenly spaced on the axis."""
+    """Distances at the centres of a colour strip's cells, evenly spaced on the axis."""
     low, high = axes.get_xlim()
     share = (np.arange(CELLS) + 0.5) / CELLS
     return low * (high / low) ** share if axes.get_xscale() == "log" else low + (high - low) * share
 
 
 def _nearest_colours(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
-    """The colour of the sample around each place, or of the nearest Gaussian; clear where there is none."""
+    """RGBA of the sample that contains each distance, or of the nearest Gaussian; transparent where there is none."""
     at, t = _cells(axes), ray.columns["t"]
     if not len(t):
         return np.zeros((CELLS, 4))
@@ -111,7 +111,7 @@ def _nearest_colours(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
 
 
 def _so_far(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
-    """What the pixel would show if nothing came from beyond each place: the light from before it, and the background."""
+    """RGBA of the pixel composited up to each distance, over the background."""
     order = ray.columns["t"].argsort(kind="stable")
     weight, t = ray.columns["weight"][order], ray.columns["t"][order]
     light = (weight * ray.columns["counted"][order])[:, None] * ray.rgb[order]
@@ -122,7 +122,7 @@ def _so_far(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
 
 
 def _overview(axes: Axes, ray: Ray, whole: tuple[float, float], close: tuple[float, float]) -> None:
-    """The whole ray, and which part of it is shown below."""
+    """Draw colours and transmittance of the whole ray, with the interval of the close-up shaded."""
     _set_span(axes, *whole)
     begin, end = ray.columns["begin"], ray.columns["end"]
     for start, stop, colour in zip(begin, end, ray.shown(ray.rgb), strict=True):
@@ -134,7 +134,7 @@ def _overview(axes: Axes, ray: Ray, whole: tuple[float, float], close: tuple[flo
 
 
 def _strip(axes: Axes, colours: Float[ndarray, "cells 4"], name: str) -> None:
-    """A band of colours along the ray."""
+    """Draw a strip of colours along the ray."""
     axes.set_ylim(0, 1)
     drawn = axes.imshow(colours[None], aspect="auto", interpolation="nearest", extent=(0, 1, 0, 1), transform=axes.transAxes)
     drawn.set_clip_on(True)
@@ -146,7 +146,7 @@ def _strip(axes: Axes, colours: Float[ndarray, "cells 4"], name: str) -> None:
 
 
 def _shares(axes: Axes, ray: Ray) -> None:
-    """Alpha as hollow bars, the part of it that the light fills, and the light that is left."""
+    """Draw alpha (outlined), weight T·α (filled) and transmittance of all contributions."""
     columns, filled = ray.columns, ray.shown(ray.rgb)
     begin, end, t = columns["begin"], columns["end"], columns["t"]
     edge = {"edgecolor": MUTED.light, "linewidth": 0.5}
@@ -174,7 +174,7 @@ def _shares(axes: Axes, ray: Ray) -> None:
 
 
 def _light(axes: Axes, ray: Ray) -> None:
-    """Transmittance: a curve where the medium is known in between, else stairs."""
+    """Draw transmittance: a curve where the density profile is known, else a step function."""
     profile, marched = curve_of(ray.record.profile), curve_of(ray.record.marched)
     if profile:
         axes.plot(profile["t"], profile["transmittance"], color=LIGHT, linewidth=2.2, label="transmittance T", zorder=4)
@@ -192,7 +192,7 @@ def _light(axes: Axes, ray: Ray) -> None:
 
 
 def _gaps(axes: Axes, ray: Ray) -> None:
-    """Shade where the ray was not sampled."""
+    """Shade intervals of the ray without samples."""
     low, high = axes.get_xlim()
     begin, end = np.append(ray.columns["begin"], high), np.insert(ray.columns["end"], 0, low)
     named = False
@@ -205,7 +205,7 @@ def _gaps(axes: Axes, ray: Ray) -> None:
 
 
 def _densities(axes: Axes, ray: Ray) -> None:
-    """Density along the ray, and where it was looked at."""
+    """Draw density along the ray, and its samples."""
     curve = curve_of(ray.record.profile) or curve_of(ray.record.marched)
     if "density" in curve:
         axes.fill_between(curve["t"], 0, curve["density"], color=DENSITY, alpha=0.25, linewidth=0)
@@ -218,7 +218,7 @@ def _densities(axes: Axes, ray: Ray) -> None:
 
 
 def _depths(panels: tuple[Axes, ...], ray: Ray) -> None:
-    """Vertical lines at the depths, named above the first panel."""
+    """Draw vertical lines at true, expected and median depth, labelled above the first panel."""
     strip, shares = panels[0], panels[1]
     low, high = strip.get_xlim()
     found = sorted((value, *LOOKS[key]) for key, value in ray.depths.items() if low <= value <= high)
@@ -237,7 +237,7 @@ def _depths(panels: tuple[Axes, ...], ray: Ray) -> None:
 
 
 def _pictures(figure: Canvas, places: Any, ray: Ray, folder: Path) -> None:
-    """The picture and the truth, each with the pixel in a cross-hair and its colour below."""
+    """Draw rendering and ground truth, each with the pixel in a cross-hair and its colour below."""
     pixel = ray.record.pixel
     shown = ((PICTURE, pixel.rendered, "rendered"), (TRUTH, pixel.true, "truth"))
     for place, (name, values, title) in zip(places, shown, strict=True):

@@ -1,4 +1,4 @@
-"""The look of every plot: one colour and one marker per method, SVG that reads on white, on black and on paper."""
+"""Plot style: one colour and one marker per method, SVG for light pages, dark pages and print."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ PANEL = (460.0, 330.0)
 
 @dataclass(frozen=True)
 class Figure:
-    """A plot on disk.
+    """A saved plot with title and alternative text.
 
     Attributes:
         path: its SVG.
         narrow: the same plot drawn for a phone; ``None`` where the plot is small anyway.
-        title: what it shows.
-        alt: what a reader who cannot see it should know.
+        title: heading.
+        alt: alternative text, its content in words.
     """
 
     path: Path
@@ -72,7 +72,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class SeriesStyle:
-    """How one method is drawn."""
+    """Line colour, marker and dashes of one method."""
 
     colour: str
     marker: str
@@ -80,7 +80,7 @@ class SeriesStyle:
 
 
 def series_style(index: int) -> SeriesStyle:
-    """The look of method number ``index``."""
+    """Style of the method at ``index``; beyond the last colour, colours repeat with other markers and dashes."""
     turn, position = divmod(index, len(SERIES))
     return SeriesStyle(SERIES[position].light, MARKERS[(position + turn) % len(MARKERS)], DASHES[turn % len(DASHES)])
 

@@ -1,4 +1,4 @@
-"""Quality against cost, with the Pareto front."""
+"""Scatter plots of quality against cost, with the Pareto front."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Point:
 
 
 def draw_tradeoffs(summary: Summary, folder: Path) -> list[Figure]:
-    """The first quality metric against each cost that at least one method has."""
+    """Scatter plots of the first quality metric against each cost that at least one method has."""
     quality = next((column for column in summary.columns if column.group != "cost"), None)
     figures = []
     for key in SUBJECTS:
@@ -90,15 +90,15 @@ def _draw(points: Sequence[Point], quality: Quantity, cost: Quantity, stem: Path
 
 
 def _front(points: Sequence[Point], quality: Quantity, cost: Quantity) -> list[Point]:
-    """The Pareto front of the methods that have all their seeds, and clocks that were not disturbed, by cost."""
+    """Pareto front by cost, over methods that lack no seed and whose clocks were not disturbed (over all if none is such)."""
     ranked = [point for point in points if point.row.ranked_in(cost)] or list(points)
-    # Costs are compared as they are written: a fit that ran a hundredth of a second longer is not dearer.
+    # Costs are compared as written, to three digits: a hundredth of a second more does not change the front.
     keys = [(cost.sort_key(float(f"{point.cost:.3g}")), quality.sort_key(point.quality)) for point in ranked]
     return [ranked[i] for i in pareto_front(keys)]
 
 
 def _quality_limits(points: Sequence[Point]) -> tuple[float, float]:
-    """Room about the points; bars longer than the points' own range are cut rather than squeezing it."""
+    """Limits of the quality axis; error bars much longer than the points' range are cut."""
     values = [point.quality for point in points]
     low, high = min(values), max(values)
     room = max(0.3 * (high - low), min(max(point.spread for point in points), 0.6 * (high - low))) or 0.05 * abs(high) or 1.0
@@ -106,7 +106,7 @@ def _quality_limits(points: Sequence[Point]) -> tuple[float, float]:
 
 
 def _cost_axis(axes: Axes, values: Sequence[float]) -> None:
-    """Logarithmic where costs differ by more than a quarter, else linear about them."""
+    """Scale the cost axis: logarithmic where costs differ by more than a quarter, else linear."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     low, high = min(values), max(values)
@@ -125,7 +125,7 @@ def _cost_axis(axes: Axes, values: Sequence[float]) -> None:
 
 
 def _staircase(axes: Axes, front: Sequence[Point], cost: Quantity, quality: Quantity) -> None:
-    """The boundary of what the front dominates, carried to the edges of the plot."""
+    """Draw the boundary of the region that the Pareto front dominates, extended to the plot's edges."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     xs, ys = [front[0].cost], [bottom if quality.better == "higher" else top]
     ends = [point.cost for point in front[1:]] + [right if cost.better == "lower" else left]
@@ -145,7 +145,7 @@ Box = tuple[float, float, float, float]
 
 
 def _labels(axes: Axes, points: Sequence[Point]) -> None:
-    """Name each point beside, above or below it, wherever the name covers least of what is there already."""
+    """Label each point beside, above or below it, at the offset of least overlap with markers and labels."""
     frame = axes.transAxes.transform([(0, 0), (1, 1)]).ravel().tolist()
     places = [axes.transData.transform((point.cost, point.quality)) for point in points]
     taken = [_box(x, y, MARKER, MARKER) for x, y in places]
@@ -171,7 +171,7 @@ def _box(x: float, y: float, width: float, height: float) -> Box:
 
 
 def _clutter(box: Box, taken: Sequence[Box], frame: Sequence[float]) -> float:
-    """Area of ``box`` that covers something, or lies outside ``frame``, px²."""
+    """Overlap of ``box`` with ``taken`` boxes plus twice its area outside ``frame``, px²."""
     area = (box[2] - box[0]) * (box[3] - box[1])
     return sum(_overlap(box, other) for other in taken) + 2 * (area - _overlap(box, frame))
 

@@ -1,4 +1,4 @@
-"""The test views that a page shows: truth beside each method, with error, depth and normals."""
+"""Test views of a page: ground truth beside each method, with error, depth and normal maps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EVENLY_SPACED = 4
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture, or the reason why there is none.
+    """A picture or map of a test view with caption, or the reason why there is none.
 
     Attributes:
         url: relative link; empty where there is no picture.
@@ -44,7 +44,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Layer:
-    """One way of looking at a view.
+    """Maps of one quantity of a test view, ground truth beside every method.
 
     Attributes:
         key: ``colour``, ``error``, ``depth`` or ``normal``.
@@ -90,7 +90,7 @@ class ViewPage:
 
 @dataclass(frozen=True)
 class _Shown:
-    """A method's run and its arrays on the view at hand."""
+    """A method's run, and its colour and arrays on one test view."""
 
     run: Run
     series: int
@@ -241,7 +241,7 @@ def _error_layer(shown: Sequence[_Shown], truth: UInt8[ndarray, "h w 3"], index:
 
 
 def _solid(arrays: Arrays, key: str) -> Bool[ndarray, "h w"] | None:
-    """Where a picture shows a surface: alpha at least one half and a finite value; ``None`` without that quantity."""
+    """Mask of surface pixels: alpha at least one half and a finite value; ``None`` without that quantity."""
     if key not in arrays:
         return None
     values = arrays[key] if arrays[key].ndim == 2 else np.linalg.norm(arrays[key], axis=-1)
@@ -284,7 +284,7 @@ def _maps(
     place: tuple[Folder, Path],
     save: Callable[[Arrays, Bool[ndarray, "h w"], Path], None],
 ) -> tuple[Picture, list[Picture]]:
-    """The truth's map of a quantity and each method's, or why there is none."""
+    """Write the maps of one quantity, of the truth and of each method; a missing one states the reason."""
     folder, target = place
 
     def one(arrays: Arrays, name: str, missing: str) -> Picture:

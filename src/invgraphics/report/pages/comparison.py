@@ -51,7 +51,7 @@ def write_html(part: Part, contrasts: Contrasts, folder: Folder) -> None:
 
 
 def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
-    """Write ``index.md``: the same answer for a repository's front page."""
+    """Write ``index.md``, the page in Markdown for a repository."""
     comparison, text = part.comparison, escape_markdown
     parts = [f"# {text(comparison.question)}", *(f"- {text(sentence)}" for sentence in part.told)]
     settings = "; ".join(f"{name}: {value}" for name, value in facts.protocol_facts(comparison))
@@ -76,7 +76,7 @@ def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
 
 
 def markdown_part(part: Part) -> list[str]:
-    """A scene's table, and what could not be computed."""
+    """Summary table of a scene in Markdown, with skipped metrics and the reasons."""
     lines = [markdown_table(part.summary), *(f"**{escape_markdown(text)}**\n" for text in part.summary.disturbances)]
     for why, labels in part.summary.skipped.items():
         lines.append(f"Not computed: {escape_markdown(listing(labels))} ({escape_markdown(why)}).")
@@ -84,7 +84,7 @@ def markdown_part(part: Part) -> list[str]:
 
 
 def markdown_crossed(crossed: Crossed | None) -> list[str]:
-    """Fit x render, and what each approximation changes."""
+    """Fit x render table in Markdown, with the picture difference of each approximation; empty without one."""
     if crossed is None:
         return []
     text = escape_markdown
@@ -105,12 +105,12 @@ def markdown_crossed(crossed: Crossed | None) -> list[str]:
 
 
 def markdown_figures(figures: Sequence[Figure], folder: Folder) -> list[str]:
-    """Links to plots below their heading; nothing where there are none."""
+    """Plots as Markdown images below a heading; empty without plots."""
     lines = ["", "## Figures", ""] if figures else []
     return lines + [f"![{escape_markdown(figure.alt)}]({folder.url(figure.path)})" for figure in figures]
 
 
 def markdown_commands(commands: Sequence[str]) -> list[str]:
-    """Commands as code below their heading; nothing where there are none."""
+    """Commands as a Markdown code block below a heading; empty without commands."""
     known = [" ".join(command.split("\n")) for command in commands if command]
     return ["", "## Reproduce", "", *(f"    {command}" for command in known)] if known else []

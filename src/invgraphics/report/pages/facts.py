@@ -1,4 +1,4 @@
-"""Facts beside the numbers: protocol, scene, machine, hashes, and the command that makes a cell again."""
+"""Reproducibility facts of a page: protocol, scene, machine, hashes, and the command of each run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Facts = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True)
 class Cell:
-    """How one run is reproduced.
+    """Reproduction of one run: command, facts that differ from other runs, and files.
 
     Attributes:
         method: its method.
@@ -40,7 +40,7 @@ class Cell:
 
 
 def protocol_facts(comparison: Comparison) -> Facts:
-    """How the scores were made, short enough to stand beside them."""
+    """(name, value) facts of scoring: budget, picture size, views, seeds, presets and protocol settings."""
     facts: dict[str, str] = {}
     if comparison.budget:
         facts["budget per fit"] = f"{budget_words(comparison.budget)} of optimisation"
@@ -57,7 +57,7 @@ def protocol_facts(comparison: Comparison) -> Facts:
 
 
 def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
-    """Presets of the fits, what chose them, and the scenes on which their values were chosen.
+    """Presets of the fits, how each was chosen, and the scenes on which their values were tuned.
 
     Args:
         runs: the fits.
@@ -82,7 +82,7 @@ def _grouped(pairs: Sequence[tuple[str, str]]) -> str:
 
 
 def scene_facts(comparison: Comparison) -> Facts:
-    """What is known about the scene, notes included."""
+    """(name, value) facts of the scene, notes included."""
     facts: dict[str, str] = {}
     for key, value in plain(replace(comparison.scene_info, notes={})).items():
         facts[{"train": "training views", "val": "validation views", "test": "test views"}.get(key, _words(key))] = _text(value)
@@ -94,12 +94,12 @@ def scene_facts(comparison: Comparison) -> Facts:
 
 
 def scene_sentence(comparison: Comparison, key: str) -> str:
-    """What the scene's description says under ``key``."""
+    """The scene's note under ``key``; empty where there is none."""
     return str(comparison.scene_info.notes.get(key) or "")
 
 
 def shared_facts(comparison: Comparison) -> Facts:
-    """Provenance and machine facts on which all runs agree, and what is known of the whole comparison."""
+    """Provenance and machine facts that all runs share, and facts of the whole comparison."""
     tables = [_run_facts(run) for run in comparison.runs]
     shared = {key: value for key, value in tables[0].items() if all(t.get(key) == value for t in tables)} if tables else {}
     for key, value in comparison.environment.facts().items():
@@ -110,7 +110,7 @@ def shared_facts(comparison: Comparison) -> Facts:
 
 
 def reproduction(comparison: Comparison, folder: Folder) -> tuple[Cell, ...]:
-    """Every run with its command and its files, methods in order."""
+    """Reproduction of every run, methods in order; links to the runs' files."""
     shared = dict(shared_facts(comparison))
     cells = []
     for series, method in enumerate(comparison.methods):
@@ -126,12 +126,12 @@ def reproduction(comparison: Comparison, folder: Folder) -> tuple[Cell, ...]:
 
 
 def plain_facts(table: Mapping[str, Any]) -> Facts:
-    """A record as it is, in words; empty values are left out."""
+    """A record as (name, text) facts; empty values are left out."""
     return tuple((_words(str(key)), text) for key, value in table.items() if (text := _text(value)))
 
 
 def _run_facts(run: Run) -> dict[str, str]:
-    """Hashes, versions and machine of one run, under the names that people read."""
+    """Hashes, versions and machine of one run, under display names."""
     known = run.provenance
     facts = {
         "truth SHA-256": known.truth_sha256,
@@ -153,7 +153,7 @@ def _words(key: str) -> str:
 
 
 def _text(value: Any) -> str:
-    """A value as a person writes it; tables inside tables become ``key: value`` lists."""
+    """Format a value for display; nested tables become ``key: value`` lists."""
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Results for analysis: the same rows as CSV and as Parquet, in stored units and full precision."""
+"""Long-format tables of results as CSV and Parquet, in stored units and full precision."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def relative(path: Path, folder: Path) -> str:
 
 
 def _plain(value: Any) -> str:
-    """A value in CSV: whole floats without a point, others so that they are read back exactly."""
+    """Format a value for CSV: whole floats without a point, others with the digits of an exact round trip."""
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""What a page shows of one scene: tables, plots and pictures, for a comparison and for each scene of a study alike."""
+"""Page content of one scene: tables, plots and pictures, of a comparison or of one scene of a study."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TINY = 320
 
 @dataclass(frozen=True)
 class Drawn:
-    """Everything that was drawn for one scene.
+    """Plots and view maps of one scene.
 
     Attributes:
         curves: time to quality.
@@ -58,10 +58,10 @@ class Thumbnail:
 
 @dataclass(frozen=True)
 class Contrasts:
-    """Comparisons of levels on every quality metric.
+    """Effects of factor levels on every quality metric.
 
     Attributes:
-        tables: (metric, its comparisons); the first metric is the one that sentences and plot are about.
+        tables: (metric, its effects); the first metric is the one that sentences and plot are about.
         figure: interval plot of the first metric.
     """
 
@@ -70,23 +70,23 @@ class Contrasts:
 
     @property
     def first(self) -> list[Effect]:
-        """Comparisons on the first metric."""
+        """Effects on the first metric."""
         return self.tables[0][1] if self.tables else []
 
 
 @dataclass(frozen=True)
 class Part:
-    """One scene on a page.
+    """Page content of one scene: summary, verdict, plots and pictures.
 
     Attributes:
         key: prefix of its anchors and folders; empty where the page has a single part.
         comparison: its methods or variants.
         summary: their table.
-        told: what the numbers say.
-        reach: who reaches a quality when.
+        told: sentences of the verdict.
+        reach: time to quality; ``None`` without monitored runs.
         drawn: plots and pictures.
         thumbnails: the truth of every test view.
-        crossed: the same fits through other renderers, where that was asked for.
+        crossed: the same fits through other renderers, where they were rendered.
     """
 
     key: str
@@ -111,11 +111,11 @@ class Part:
 
     @property
     def several_seeds(self) -> bool:
-        """Whether a spread over seeds is shown."""
+        """Whether any method has several seeds, and so a spread."""
         return any(row.seeds > 1 for row in self.summary.methods)
 
     def has_values(self, row: Row, columns: Sequence[int]) -> bool:
-        """Whether a row says anything in some columns."""
+        """Whether a row has a value in any of the columns."""
         return any(row.cells[index].mean is not None for index in columns)
 
     @property
@@ -124,12 +124,12 @@ class Part:
         return bool(self.drawn.views) and self.drawn.views[0].width < TINY
 
     def anchor(self, name: str) -> str:
-        """The page-wide name of something in this part."""
+        """HTML id of ``name`` in this part, unique on the page."""
         return f"{self.key}-{name}" if self.key else name
 
 
 def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[Approximation] = ()) -> Part:
-    """Draw a scene's plots and pictures below ``folder.figures``, and say what its numbers mean.
+    """Summarise a scene, derive its verdict, and draw its plots and pictures below ``folder.figures``.
 
     Args:
         comparison: the scene's runs.
@@ -155,13 +155,13 @@ def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[A
 def draw_contrasts(
     quantities: Sequence[Quantity], factors: Sequence[Factor], runs: Sequence[Observation], folder: Folder
 ) -> Contrasts:
-    """Compare the factors' levels on every metric, and plot the first."""
+    """Estimate effects of the factors' levels on every metric; interval plot of the first."""
     tables = tuple((quantity, found) for quantity in quantities if (found := effects_on(quantity, factors, runs)))
     return Contrasts(tables, draw_intervals(tables[0][1], folder.figures) if tables else None)
 
 
 def method_contrasts(comparison: Comparison, folder: Folder) -> Contrasts:
-    """A comparison's methods against each other; nothing where a single seed leaves no interval to state."""
+    """Effects between a comparison's methods; empty where a single seed gives no interval."""
     methods = tuple(method for method in comparison.methods if comparison.runs_of(method))
     if len(methods) < 2 or len({run.seed for run in comparison.runs}) < 2:
         return Contrasts((), None)

@@ -28,7 +28,7 @@ DESIGNS = {
 
 @dataclass(frozen=True)
 class StudyPage:
-    """Everything that a study's page shows.
+    """Content of a study's page: scenes, effects, heat maps and analyses.
 
     Attributes:
         study: what was read.
@@ -48,14 +48,14 @@ class StudyPage:
 
     @property
     def headline(self) -> list[str]:
-        """What is missing, then a sentence for each pair of levels."""
+        """Unfinished cells, a sentence per pair of levels, and the population of the intervals."""
         effects = self.contrasts.first
         return [*_progress(self.study), *(effect.sentence for effect in effects), *_scope(self)]
 
 
 @dataclass(frozen=True)
 class MatrixCell:
-    """One field of the matrix: ``status``, the score or the word that stands there, and where it leads."""
+    """One field of the matrix of cells: ``status``, score or status word, link and tooltip."""
 
     status: str
     text: str
@@ -94,7 +94,7 @@ def write_study_html(page: StudyPage, folder: Folder) -> None:
 
 
 def study_facts(study: Study) -> facts.Facts:
-    """The design in a line."""
+    """(name, value) facts of the design: scenes, methods, seeds, cells, budget and presets."""
     entries = {
         "scenes": listing(study.scenes),
         "methods": listing(study.methods),
@@ -127,7 +127,7 @@ def _progress(study: Study) -> list[str]:
 
 
 def _scope(page: StudyPage) -> list[str]:
-    """Whom the intervals speak of."""
+    """Sentence on the population that the intervals generalise to."""
     estimates = [effect.estimate for effect in page.contrasts.first if effect.estimate.unit != "none"]
     if not estimates:
         return []
@@ -164,7 +164,7 @@ def _field(cell: StudyCell, index: int, quantity: Quantity | None, folder: Folde
 
 
 def write_study_markdown(page: StudyPage, folder: Folder) -> None:
-    """Write ``index.md``: the same answers for a repository's front page."""
+    """Write ``index.md``, the page in Markdown for a repository."""
     study, text = page.study, escape_markdown
     lines = [f"# {text(study.question or study.name)}", "", *(f"- {text(sentence)}" for sentence in page.headline)]
     lines += ["", "## Design", "", f"{text(DESIGNS.get(study.design, study.design))}.", ""]

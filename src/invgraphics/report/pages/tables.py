@@ -1,4 +1,4 @@
-"""The summary for other programs: Markdown for a repository, LaTeX for a paper."""
+"""Summary and effects as tables: Markdown for a repository, LaTeX for a paper."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from invgraphics.report.wording import Quantity, budget_words
 
 
 def escape_markdown(text: str) -> str:
-    """Text that Markdown and the HTML it turns into show as it is."""
+    """Escape text for Markdown and for the HTML rendered from it."""
     text = " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", text)
 
@@ -67,12 +67,12 @@ _LATEX = {
 
 
 def escape_latex(text: str) -> str:
-    """Text that LaTeX prints as it is."""
+    """Escape text for LaTeX."""
     return "".join(_LATEX.get(letter, letter) for letter in " ".join(text.split()))
 
 
 def write_latex(comparison: Comparison, summary: Summary, path: Path) -> None:
-    """The summary as a ``booktabs`` table, with what a caption must say."""
+    """Write the summary as a ``booktabs`` table with a self-contained caption."""
     budget = f", {budget_words(comparison.budget)} each" if comparison.budget else ""
     views = f"{len(comparison.runs[0].scores.views)} test views" if comparison.runs else "no test views"
     protocol = str(comparison.protocol.get("name", "default"))
@@ -118,7 +118,7 @@ EFFECT_HEADS = ("Factor", "Levels", "Difference", "95% interval", "p (Holm)", "B
 
 
 def effect_cells(effect: Effect) -> list[str]:
-    """A comparison as one line of a table, under ``EFFECT_HEADS``."""
+    """Table cells of an effect, under ``EFFECT_HEADS``."""
     unit = f" {effect.quantity.unit}" if effect.quantity.unit else ""
     corrected = "" if effect.adjusted is None else f"{effect.adjusted:.2g}"
     mean = f"{effect.text(effect.estimate.mean)}{unit}"
@@ -126,7 +126,7 @@ def effect_cells(effect: Effect) -> list[str]:
 
 
 def markdown_effects(effects: list[Effect]) -> str:
-    """Comparisons as a Markdown table; what is called an effect is bold."""
+    """Effects as a Markdown table; significant differences are bold."""
     lines = [_line(list(EFFECT_HEADS)), _line(["---", "---", "---:", "---:", "---:", "---"])]
     for effect in effects:
         cells = [escape_markdown(text) for text in effect_cells(effect)]
@@ -136,7 +136,7 @@ def markdown_effects(effects: list[Effect]) -> str:
 
 
 def effects_caption(effects: list[Effect]) -> str:
-    """What a caption of a table of effects must say."""
+    """Caption of a table of effects: quantity, interval, and family of Holm's correction."""
     quantity, family = effects[0].quantity, effects[0].comparisons
     unit = f" ({quantity.unit})" if quantity.unit else ""
     text = f"Paired differences in {quantity.label}{unit} with 95% intervals."
@@ -144,7 +144,7 @@ def effects_caption(effects: list[Effect]) -> str:
 
 
 def write_latex_effects(effects: list[Effect], caption: str, path: Path) -> None:
-    """Comparisons as a ``booktabs`` table; what is called an effect is bold."""
+    """Write effects as a ``booktabs`` table; significant differences are bold."""
     lines = [
         "% Needs \\usepackage{booktabs}.",
         "\\begin{table}",

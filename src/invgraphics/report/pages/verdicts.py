@@ -1,4 +1,4 @@
-"""The page of a study that judges its cells: headline, matrix, curves, broken rules and every number."""
+"""Page of a study's verdicts: headline, matrix of cells, curves, broken rules and all numbers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ UNITS = ("dB", "", "", "s", "", "", "", "", "MB", "MB", "dB", "")
 
 @dataclass(frozen=True)
 class Field:
-    """A cell as it is shown.
+    """A field of the matrix of cells: verdicts, score, numbers and links.
 
     Attributes:
         judged: the cell and its verdicts.
@@ -61,12 +61,12 @@ class Field:
 
     @property
     def sign(self) -> str:
-        """Its standing without colour."""
+        """Symbol of the cell's standing, legible without colour."""
         return STANDINGS[self.judged.standing][1]
 
     @property
     def hint(self) -> str:
-        """Its standing in words, with what it breaks."""
+        """Tooltip: the cell's standing and broken rules in words."""
         told = [STANDINGS[self.judged.standing][0], *(verdict.sentence for verdict in self.judged.red)]
         told += [self.judged.cell.error] if self.judged.standing == "skipped" else []
         return f"{self.judged.cell.label}: {' '.join(told)}"
@@ -74,7 +74,7 @@ class Field:
 
 @dataclass(frozen=True)
 class RuleCount:
-    """How often a rule was kept and broken."""
+    """Numbers of cells that keep a rule, break it for a known cause, and break it."""
 
     title: str
     ok: int
@@ -84,7 +84,7 @@ class RuleCount:
 
 @dataclass(frozen=True)
 class VerdictPage:
-    """Everything that the page shows.
+    """Content of the page of verdicts: matrix, curves and stale known deviations.
 
     Attributes:
         study: what was read.
@@ -102,7 +102,7 @@ class VerdictPage:
 
     @property
     def headline(self) -> list[str]:
-        """How many cells are green, and what is not."""
+        """Sentences on the numbers of green, red and skipped cells."""
         return headline([field.judged for field in self.fields])
 
     @property
@@ -113,7 +113,7 @@ class VerdictPage:
 
     @property
     def counts(self) -> list[RuleCount]:
-        """Rule by rule."""
+        """Outcomes counted for each rule."""
         verdicts = [verdict for field in self.fields for verdict in field.judged.verdicts]
         found = {key: [verdict.outcome for verdict in verdicts if verdict.rule == key] for key in RULES}
         return [
@@ -146,7 +146,7 @@ def write_verdict_report(study: Study, folder: Folder, source: Path) -> None:
 
 
 def _place(cell: StudyCell) -> str:
-    """Scene and size in words; of a path, what follows its last slash."""
+    """Scene and size in words; a path is shortened to its last component."""
     return f"{_scene(cell)}, {cell.size} px" if cell.size else _scene(cell)
 
 
@@ -193,7 +193,7 @@ def _number(value: float | None, scale: float = 1.0) -> str:
 
 
 def _matrix(study: Study, fields: Sequence[Field]) -> tuple[tuple[str, str, tuple[Field | None, ...]], ...]:
-    """Scenes in the order of the study, then sizes, then budgets; methods across."""
+    """Rows of the matrix, by scene in the study's order, then size, then budget; one field per method."""
     rows: dict[tuple[str, str], dict[str, Field]] = {}
     order: dict[tuple[str, str], tuple[Any, ...]] = {}
     for field in fields:
@@ -215,7 +215,7 @@ def _scene_word(scene: str) -> str:
 
 
 def _write_verdicts(page: VerdictPage, stem: Path) -> None:
-    """One row per cell and rule."""
+    """Write the long table of verdicts, one row per cell and rule."""
     kinds: dict[str, Any] = dict.fromkeys(("cell", "rule", "outcome"), "text")
     kinds |= {"value": "float", "limit": "float", "sentence": "text", "cause": "text", "issue": "text"}
     rows = []

@@ -1,4 +1,4 @@
-"""Intervals, effects, Pareto fronts and verdicts."""
+"""Hierarchical intervals, paired effects with Holm's correction, Pareto fronts and verdicts."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The same fits through several renderers: fit x render tables, and what each approximation alone changes."""
+"""Cross-rendering: each fit through several renderers, and the picture difference that each approximation makes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHOWN_VIEW = 0
 
 @dataclass(frozen=True)
 class CrossRendered:
-    """A fit through several renderers.
+    """A fit rendered by several renderers, with their pairwise picture differences.
 
     Attributes:
         fit: the run, whose own renderer is the first of ``seen``.
@@ -39,7 +39,7 @@ class CrossRendered:
 
 @dataclass(frozen=True)
 class CrossCell:
-    """A fit through a renderer.
+    """Score of one fit under one renderer.
 
     Attributes:
         text: its score against the truth.
@@ -58,7 +58,7 @@ class CrossCell:
 
 @dataclass(frozen=True)
 class CrossRow:
-    """What one method fitted; a cell is ``None`` where it was not rendered so."""
+    """Scores of one method's fits under every renderer; a cell is ``None`` where it was not rendered."""
 
     method: str
     series: int
@@ -67,7 +67,7 @@ class CrossRow:
 
 @dataclass(frozen=True)
 class StepRow:
-    """An approximation, the renderers without and with it, and the difference it makes to each method's fit, dB."""
+    """An approximation: the renderers without and with it, and the PSNR between their pictures for each method, dB."""
 
     name: str
     exact: str
@@ -77,7 +77,7 @@ class StepRow:
 
 @dataclass(frozen=True)
 class Crossed:
-    """Fit x render of one scene.
+    """Fit x render table of one scene.
 
     Attributes:
         quantity: the score against the truth.
@@ -95,7 +95,7 @@ class Crossed:
 
 
 def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendered | None:
-    """The renderings of a fit; ``None`` where there are none.
+    """Read the renderings of a fit by several renderers; ``None`` where there are none.
 
     Args:
         run: the fit.
@@ -116,7 +116,7 @@ def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendere
 
 
 def cross(comparison: Comparison, approximations: Sequence[Approximation], folder: Folder) -> Crossed | None:
-    """The fit x render table of a scene; ``None`` where nothing was rendered twice."""
+    """Fit x render table of a scene; ``None`` without fits rendered by several renderers."""
     clean = folder.redactor.text if folder.redactor is not None else str
     fits = [found for run in comparison.runs if (found := read_renderings(run, clean)) is not None]
     columns = quality_columns(comparison)
@@ -169,7 +169,7 @@ def _mark_best(
 
 
 def _decibels(fits: Sequence[CrossRendered], pair: frozenset[str] | None, name: str = "") -> str:
-    """PSNR between two renderers' pictures, from the mean square over all views and fits; of ``name`` and the fit's own."""
+    """PSNR between two renderers' pictures, MSE pooled over views and fits; without ``pair``, of ``name`` and the fit's own."""
     squares: list[float] = []
     for fit in fits:
         own = next(iter(fit.seen))

@@ -1,4 +1,4 @@
-"""What a factor does: paired differences between its levels, corrected for how many were asked."""
+"""Effects of factor levels: paired differences with intervals, Holm-corrected over all comparisons."""
 
 from __future__ import annotations
 
@@ -51,17 +51,17 @@ class Effect:
 
     @property
     def found(self) -> bool:
-        """Whether it is called an effect: significant after correction."""
+        """Whether the difference is significant after Holm's correction."""
         return self.adjusted is not None and self.adjusted <= ALPHA
 
     @property
     def uncorrected(self) -> bool:
-        """Whether only the uncorrected interval excludes zero."""
+        """Whether the difference is significant before correction only."""
         return not self.found and self.estimate.p is not None and self.estimate.p <= ALPHA
 
     @property
     def label(self) -> str:
-        """The two levels in words."""
+        """The contrast of the two levels in words."""
         return contrast_words(self.factor, self.before, self.after)
 
     def text(self, value: float) -> str:
@@ -73,24 +73,24 @@ class Effect:
 
     @property
     def interval(self) -> str:
-        """The interval as written; empty where there is none."""
+        """The confidence interval as text; empty where there is none."""
         if self.estimate.unit == "none":
             return ""
         return f"[{self.text(self.estimate.low)}, {self.text(self.estimate.high)}]"
 
     @property
     def sentence(self) -> str:
-        """What a reader should take away."""
+        """The effect in a sentence: difference, interval, sample size and significance."""
         return _sentence(self)
 
 
 def contrast_words(factor: str, before: str, after: str) -> str:
-    """``data.train_views 20 instead of 40``."""
+    """Contrast of two levels in words: ``data.train_views 20 instead of 40``."""
     return f"{after} instead of {before}" if factor == METHOD else f"{factor} {after} instead of {before}"
 
 
 def effects_on(quantity: Quantity, factors: Sequence[Factor], observations: Sequence[Observation]) -> list[Effect]:
-    """Every comparison of the factors' levels on one quantity, corrected as one family (Holm 1979).
+    """Paired effects of all compared levels on one quantity, corrected as one family (Holm 1979).
 
     Pairs of levels that no two runs share are left out.
     """
@@ -109,7 +109,7 @@ Pair = tuple[Observation, Observation]
 
 
 def pair_up(path: str, before: str, after: str, observations: Sequence[Observation]) -> list[Pair]:
-    """Runs that differ in one factor only: same scene, same seed, same other levels."""
+    """Pairs of runs that differ in one factor only: same scene, same seed, same other levels."""
     sides: dict[str, dict[tuple[Any, ...], Observation]] = {before: {}, after: {}}
     for observation in observations:
         level = observation.levels.get(path)
@@ -151,7 +151,7 @@ def _known(table: Mapping[str, Estimate | None]) -> dict[str, Estimate]:
 
 
 def _difference(pair: Pair, quantity: Quantity) -> Float[ndarray, " view"] | None:
-    """After minus before on every view that both have, in the order of the first; one value where views were not scored."""
+    """Paired differences, after minus before, on all shared views; one value where single views were not scored."""
     one, other = (observation.run for observation in pair)
     if quantity.group != "cost" and quantity.key in one.scores.quality and quantity.key in other.scores.quality:
         left, right = one.scores.quality[quantity.key].per_view, other.scores.quality[quantity.key].per_view
@@ -171,7 +171,7 @@ def _numbers(values: Sequence[float | None]) -> Float[ndarray, " view"]:
 
 
 def _nest(differences: Sequence[tuple[Pair, Float[ndarray, " view"]]]) -> list[list[ndarray]]:
-    """Scene -> seed -> view; other factors are averaged view by view, since they repeat the seed rather than add one."""
+    """Nest differences as scene -> seed -> view; other factors are averaged per view, since they add no independent seed."""
     cells: dict[str, dict[int, list[ndarray]]] = {}
     for (one, _), values in differences:
         cells.setdefault(one.scene, {}).setdefault(one.run.seed, []).append(values)
@@ -196,7 +196,7 @@ def _verb(quantity: Quantity, difference: float) -> str:
 
 
 def _unit(quantity: Quantity) -> str:
-    """What follows a difference: its unit, or the quantity's name where it has none."""
+    """Unit of a difference in words; the quantity's label where it has no unit."""
     if quantity.unit == "dB":
         return "dB"
     return f"{quantity.unit} of {quantity.label}" if quantity.unit else quantity.label
@@ -217,7 +217,7 @@ def _sentence(effect: Effect) -> str:
         return f"{effect.label}: no difference at all, {size}.{note}"
     if not (effect.found or effect.uncorrected):
         return f"{effect.label}: no effect detectable above {effect.text(value.half_width)} {unit}, {size}.{note}"
-    # Told as a cost or a gain, so the ends follow the sign of what is told.
+    # The verb (gains, costs) carries the sign, so the interval's ends are magnitudes.
     low, high = sorted((abs(value.low), abs(value.high)))
     told = f"{effect.label} {magnitude} [{effect.text(low)}, {effect.text(high)}], {size}"
     if effect.found:

@@ -1,11 +1,11 @@
-"""Intervals and tests for nested scores: views within a seed, seeds within a scene.
+"""Confidence intervals and tests for hierarchical scores: views within a seed, seeds within a scene.
 
 Views of one fit share its weights, so they are never units. The unit is the seed (a fit), or the scene:
 
-- ten scenes or more: the scene; nested resampling scene > seed > view. The interval speaks of scenes like these.
+- ten scenes or more: the scene; hierarchical bootstrap scene > seed > view. The interval generalises to scenes like these.
 - one seed on each of several scenes: the scene; a t-interval over scenes.
-- otherwise: the seed within its scene, scenes counted equally and held fixed. The interval speaks of new fits on these scenes.
-  Below ten seeds a Welch t-interval; from ten seeds on nested resampling seed > view inside each scene.
+- otherwise: the seed within its scene, scenes counted equally and held fixed. It generalises to new fits on these scenes.
+  Below ten seeds a Welch t-interval; from ten seeds on a hierarchical bootstrap seed > view inside each scene.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Unit = Literal["none", "seed", "scene"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean with what is known about it.
+    """A mean with its confidence interval, p-value and sample size.
 
     Attributes:
         mean: over views, then seeds, then scenes, each step with equal weights.
@@ -46,7 +46,7 @@ class Estimate:
         high: its upper end.
         p: two-sided p-value of a true mean of zero, dual to the interval; ``None`` without an interval.
         unit: what the interval counts as independent; ``none`` for a single fit, which has no interval.
-        resampled: whether the interval is a nested bootstrap rather than a t-interval.
+        resampled: whether the interval is a hierarchical bootstrap rather than a t-interval.
         scenes: number of scenes.
         seeds: (fewest, most) seeds per scene.
     """
@@ -67,7 +67,7 @@ class Estimate:
 
     @property
     def size(self) -> str:
-        """What stands behind the interval, for instance ``3 seeds × 2 scenes``."""
+        """Sample size in words, for instance ``3 seeds × 2 scenes``."""
         fewest, most = self.seeds
         count = str(most) if fewest == most else f"{fewest} to {most}"
         scenes = f" × {self.scenes} scenes" if self.scenes > 1 else ""
@@ -76,7 +76,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class _Design:
-    """Finite scores, padded to a block.
+    """Finite scores of a hierarchical design, padded to a dense array.
 
     Attributes:
         values: scores, NaN where a scene has fewer seeds or a seed fewer views.
@@ -92,7 +92,7 @@ class _Design:
 
 
 def estimate(nested: Nested, confidence: float = CONFIDENCE, seed: int = 0) -> Estimate | None:
-    """Mean, interval and p-value of nested scores or of paired differences of them.
+    """Mean, confidence interval and p-value of nested scores or of paired differences of them.
 
     Args:
         nested: scene -> seed -> values per view.
@@ -147,7 +147,7 @@ def band(values: Float[ndarray, "seed time"], confidence: float = CONFIDENCE) ->
 
 
 def _arrange(nested: Nested) -> _Design | None:
-    """Drop what is not finite, and pad the rest to a block."""
+    """Drop non-finite scores and pad the rest to a dense array; ``None`` where no score is finite."""
     kept = [[finite for values in scene if len(finite := values[np.isfinite(values)])] for scene in nested]
     kept = [scene for scene in kept if scene]
     if not kept:
@@ -226,7 +226,7 @@ def _bootstrap(design: _Design, mean: float, statistic: float, confidence: float
 def _resample(
     design: _Design, count: int, generator: np.random.Generator
 ) -> tuple[Float[ndarray, "b scene seed"], Int[ndarray, "b scene"]]:
-    """``count`` resamples: scenes where they are units, then seeds within them, then views within those; one value per fit."""
+    """``count`` hierarchical bootstrap samples (scenes where they are units > seeds > views), averaged over views per fit."""
     scenes, most_seeds, most_views = design.values.shape
     if design.by_scene:
         scene = generator.integers(scenes, size=(count, scenes))

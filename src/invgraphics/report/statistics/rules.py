@@ -1,4 +1,4 @@
-"""Verdicts on the cells of a study: which rule each keeps or breaks, with the numbers and one sentence."""
+"""Verdicts on the cells of a study: outcome, measured value, limit and sentence for every rule."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ STANDINGS: dict[Standing, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """One rule on one cell.
+    """Outcome of one rule on one cell.
 
     Attributes:
         rule: key of ``RULES``.
@@ -75,12 +75,12 @@ class JudgedCell:
 
     @property
     def red(self) -> tuple[Verdict, ...]:
-        """Rules that it breaks, whether the cause is known or not."""
+        """Verdicts of broken rules, with and without a known cause."""
         return tuple(verdict for verdict in self.verdicts if verdict.outcome in ("red", "known"))
 
     @property
     def standing(self) -> Standing:
-        """The worst of its verdicts, or why it has none."""
+        """Worst outcome over all rules; ``skipped`` or ``missing`` for a cell without a run."""
         if self.cell.status == "skipped":
             return "skipped"
         if self.cell.status == "missing":
@@ -90,12 +90,12 @@ class JudgedCell:
 
 
 def judge(cells: Sequence[StudyCell], known: Sequence[KnownDeviation] = ()) -> tuple[JudgedCell, ...]:
-    """The verdict of every rule on every cell that has run."""
+    """Evaluate every rule on every cell that has run."""
     return tuple(JudgedCell(cell, tuple(_excused(cell, one, known) for one in _verdicts(cell, cells))) for cell in cells)
 
 
 def unused(judged: Sequence[JudgedCell], known: Sequence[KnownDeviation]) -> tuple[KnownDeviation, ...]:
-    """Known deviations that no cell shows, although all cells that they name have run."""
+    """Stale known deviations: all cells that they name have run, and none breaks the rule."""
     left = []
     for entry in known:
         named = [one for one in judged if fnmatchcase(one.cell.label, entry.cells)]
@@ -106,7 +106,7 @@ def unused(judged: Sequence[JudgedCell], known: Sequence[KnownDeviation]) -> tup
 
 
 def headline(judged: Sequence[JudgedCell]) -> list[str]:
-    """How many cells are green, what the others are, and why some were skipped."""
+    """Sentences on the numbers of green, red, skipped and missing cells, and the reasons of skipped ones."""
     counts = {key: sum(one.standing == key for one in judged) for key in STANDINGS}
     rest = [f"{counts[key]} {words}" for key, (words, _) in STANDINGS.items() if key != "green" and counts[key]]
     first = f"{counts['green']} of {len(judged)} cells are green" + (f"; {', '.join(rest)}." if rest else ".")
@@ -117,7 +117,7 @@ def headline(judged: Sequence[JudgedCell]) -> list[str]:
 
 
 def psnr_of(cell: StudyCell) -> float | None:
-    """The cell's PSNR over its test views, dB."""
+    """Mean PSNR over the cell's test views, dB; ``None`` without a run."""
     score = None if cell.run is None else cell.run.scores.quality.get("psnr")
     return None if score is None else score.mean
 
@@ -137,7 +137,7 @@ def worst_view(run: Run) -> tuple[str, float, float] | None:
 
 
 def dead_share(run: Run) -> float | None:
-    """Share of primitives that can no longer change at the end of the fit; ``None`` where none were counted."""
+    """Fraction of primitives that no gradient can change at the end of the fit; ``None`` where they were not counted."""
     if (share := run.scores.cost.get("dead")) is not None:
         return share
     return next((entry.dead for entry in reversed(run.history) if entry.dead is not None), None)
@@ -167,7 +167,7 @@ def _verdict(rule: str, broken: bool, sentence: str, value: float, limit: float)
 
 
 def _budget(cell: StudyCell, cells: Sequence[StudyCell]) -> Verdict:
-    """Against the best of all shorter budgets, so that a fall and a later recovery are told apart."""
+    """PSNR against the best of all shorter budgets, so that a fall and a later recovery are told apart."""
     own = psnr_of(cell)
     shorter = [
         (value, other)
@@ -189,7 +189,7 @@ def _without_budget(cell: StudyCell) -> tuple[object, ...]:
 
 
 def _monitor(run: Run) -> Verdict:
-    """The largest fall below the best so far, and where the curve ends."""
+    """Largest drop of the monitored PSNR below its running maximum, and its drop at the end."""
     curve = [(entry, entry.psnr) for entry in run.history if entry.psnr is not None]
     if len(curve) < 2:
         return Verdict("monitor", "none", "The monitor has looked less than twice.")
@@ -233,7 +233,7 @@ def _memory(run: Run) -> Verdict:
 
 
 def _finite(run: Run) -> Verdict:
-    """Metrics that were left out because they are not finite count, as do lines of the history."""
+    """Check scores, costs and history for non-finite values, metrics skipped for that reason included."""
     found = [name for name, score in run.scores.quality.items() if not _all_finite([score.mean, *score.per_view])]
     found += [name for name, why in run.scores.skipped.items() if "finite" in why]
     found += [name for name, value in run.scores.cost.items() if value is not None and not math.isfinite(value)]

@@ -1,4 +1,4 @@
-"""From runs to a table: means over seeds, best values, Pareto fronts, times to quality."""
+"""Summary table of a comparison: means over seeds, best values, Pareto front and time to quality."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from invgraphics.runs.scores import Score
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of the summary.
+    """One cell of the summary: mean, deviation and interval over seeds, as numbers and text.
 
     Attributes:
         mean: over seeds, in stored units; ``None`` where there is none.
@@ -41,7 +41,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """A method or a trivial baseline.
+    """Summary row of a method or of a trivial baseline.
 
     Attributes:
         label: its name.
@@ -65,13 +65,13 @@ class Row:
     disturbed: str = ""
 
     def ranked_in(self, column: Quantity) -> bool:
-        """Whether its number in a column may be called best: a disturbed clock says nothing."""
+        """Whether it is ranked in a column: it lacks no seed, and for times no clock was disturbed."""
         return self.complete and not (self.disturbed and column.key in TIMES)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """The summary table.
+    """Summary table of a comparison: methods and baselines against quantities.
 
     Attributes:
         columns: quality first, then cost.
@@ -111,7 +111,7 @@ class Summary:
 
 
 def summarise(comparison: Comparison) -> Summary:
-    """The summary of a comparison: means over seeds, the best of each column marked."""
+    """Summarise a comparison: means over seeds, the best of each column marked."""
     columns = table_columns(comparison)
     notes: list[str] = []
     rows = []
@@ -128,7 +128,7 @@ def summarise(comparison: Comparison) -> Summary:
 
 
 def quality_columns(comparison: Comparison) -> tuple[Quantity, ...]:
-    """Every quality metric that at least one run or baseline has, in the order of the first that has it."""
+    """Quality metrics that at least one run or baseline has, in order of first appearance."""
     found: dict[str, Score] = {}
     for quality in [run.scores.quality for run in comparison.runs] + list(comparison.baselines.values()):
         for key, score in quality.items():
@@ -155,7 +155,7 @@ def seconds_to_reach(run: Run, level: float) -> float | None:
 
 @dataclass(frozen=True)
 class Reach:
-    """Who reaches a quality when.
+    """Time to quality: median seconds of each method to reach each PSNR level.
 
     Attributes:
         levels: PSNR thresholds in dB, rising.
@@ -206,7 +206,7 @@ def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
         redundant = cost.key == "render_seconds_per_view"
         if redundant or all(run.scores.cost.get(cost.key) is None for run in comparison.runs):
             continue
-        given = cost.key == "fit_seconds" and time_budget  # what every method was given is no merit of any
+        given = cost.key == "fit_seconds" and time_budget  # a fixed time budget ranks no method
         costs.append(replace(cost, better="none") if given else cost)
     return quality_columns(comparison) + tuple(costs)
 
@@ -240,7 +240,7 @@ def _method_cell(column: Quantity, runs: Sequence[Run], notes: list[str]) -> Cel
 
 def _absence(run: Run, column: Quantity) -> str:
     if column.group == "cost":
-        return ""  # NeRFs have no primitives; that needs no apology
+        return ""  # not every method has every cost (primitives, for instance): no footnote
     if column.key in run.scores.quality:
         return "the score is not a number"
     return run.scores.skipped.get(column.key, "the run does not report it")
@@ -256,7 +256,7 @@ def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
 
 
 def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Mark, among methods, every cell that reads the same as the best one; a contest needs two methods."""
+    """Mark, among ranked methods, every cell whose text equals the best one's; needs at least two methods."""
     marked = [list(row.cells) for row in rows]
     for index, column in enumerate(columns):
         values = {i: row.cells[index].mean for i, row in enumerate(rows) if row.kind == "method" and row.ranked_in(column)}
@@ -271,7 +271,7 @@ def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, .
 
 
 def _disturbed(runs: Sequence[Run]) -> str:
-    """Whose clocks were disturbed among a method's fits, and how."""
+    """Seeds of a method whose timings were disturbed, with the cause; empty where none were."""
     seeds = {run.seed: run.scores.disturbed for run in runs if run.scores.disturbed}
     return "; ".join(f"seed {seed} {how}" for seed, how in seeds.items())
 

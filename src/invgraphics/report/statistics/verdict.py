@@ -1,4 +1,4 @@
-"""What the numbers say, in sentences: who wins at what cost, and how sure one may be."""
+"""Verdict on a comparison in sentences: ranking, significance of the lead, costs and warnings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from invgraphics.report.wording import Quantity, budget_words, listing, times
 
 
 def verdict(comparison: Comparison, summary: Summary) -> list[str]:
-    """Sentences in order of importance. Each follows from the summary table alone."""
+    """Sentences on ranking, significance, costs and warnings, in order of importance."""
     sentences = [*_quality(comparison, summary), *_costs(summary), *_warnings(comparison, summary)]
     return [sentence for sentence in sentences if sentence]
 
@@ -63,7 +63,7 @@ def _best_baseline(summary: Summary, column: Quantity) -> tuple[float, Row] | No
 
 
 def _resolution(comparison: Comparison, summary: Summary, column: Quantity, ranking: list[tuple[float, Row]]) -> str:
-    """Whether seeds resolve the lead of the first over the second."""
+    """Sentence on the paired interval of the first method's lead over the second, and its significance over seeds."""
     if len(ranking) < 2:
         return ""
     if max(row.seeds for _, row in ranking) < 2:
