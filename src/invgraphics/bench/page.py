@@ -115,7 +115,7 @@ _KERNELS = (
     "Median time and quartiles of one call. The reference (plain torch), Numba and the limit take turns, call by call, so a "
     "disturbance meets all of them. Splats count the alphas that the rasteriser evaluates (16 for every visit of a footprint "
     "to a block of 4 x 4 pixels; the backward pass visits again) against exponentials per second; hash encoding counts 8 "
-    "style-ups per level and point and pass against random reads in a table of one level's size; what streams through memory "
+    "look-ups per level and point and pass against random reads in a table of one level's size; what streams through memory "
     "is compared with the triad, SSIM's filters with the matrix product."
 )
 _STEPS = (

@@ -105,8 +105,8 @@ def gather_plot(results: Results, folder: Path, style: PlotStyle) -> Plot | None
     if len(found) < 2:
         return None
     line = Line("", 0, tuple(m.sizes["bytes"] / 2**20 for m in found), tuple(m.rate / 1e6 for m in found))
-    labels = ("table, MB", "million style-ups/s")
-    return _log_log([line], "Random style-ups of 8 bytes", labels, folder / "gather", style)
+    labels = ("table, MB", "million look-ups/s")
+    return _log_log([line], "Random look-ups of 8 bytes", labels, folder / "gather", style)
 
 
 def thread_plot(results: Results, folder: Path, style: PlotStyle) -> Plot | None:
