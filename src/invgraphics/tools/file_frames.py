@@ -1,4 +1,4 @@
-"""Between the axes of a file of Gaussians, the data set's world and the scene's local frame."""
+"""Transforms between a Gaussian file's axes, the data set's world and the scene's local frame."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ PathName = Literal["orbit", "spiral", "interpolate"]
 
 @dataclass(frozen=True)
 class Capture:
-    """How the photographs of a scene were taken, and the camera path that stays among them.
+    """Kind of a scene's capture, and the camera path that stays among its photographs.
 
     Attributes:
         path: orbit where cameras surround the subject, spiral where all face one way, otherwise interpolation.
@@ -79,7 +79,7 @@ def _widest_gap(offset: Float[Tensor, "n 3"], up: Float[Tensor, " 3"]) -> float:
 
 
 def spiral(scene: Scene, frames: int) -> list[Camera]:
-    """The closed path of LLFF's films: ellipses within the photographs' window, forward and back, towards their subject.
+    """Closed spiral path of LLFF: ellipses within the cameras' window, moving forward and back, looking at their subject.
 
     The half-axes are the 90th percentiles of the cameras' distances from their mean along its right, down and forward axes.
     """
@@ -99,7 +99,7 @@ def spiral(scene: Scene, frames: int) -> list[Camera]:
 
 
 def orbit(scene: Scene, frames: int) -> list[Camera]:
-    """Once around what the photographs look at, as high above it and as far away as they were taken.
+    """Circular path around the cameras' common focus, at their mean height and distance.
 
     The axis is the photographs' mean upward direction, the lens that of the first test view.
     """
