@@ -1,4 +1,4 @@
-"""Several methods on one scene, each fitted in a process of its own."""
+"""Comparison of several methods on one scene, each fitted in a process of its own."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ class ComparisonResult:
 
     @cached_property
     def record(self) -> Comparison:
-        """Everything that the report knows."""
+        """The comparison's record, from which the report is written."""
         return read_comparison(self.folder)
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names of the methods, as they were given."""
+        """Names of the compared methods, as given."""
         return self.record.methods
 
     @property
     def failures(self) -> tuple[Failure, ...]:
-        """Fits that gave no run, and why."""
+        """Failed fits, with their errors."""
         return self.record.failures
 
     def run(self, method: str, seed: int = 0) -> FolderRun:

@@ -32,7 +32,7 @@ class Method:
 
     Attributes:
         name: ``renderer/recipe`` or the path of a user's own TOML file, with changes after colons (see `split_name`).
-        preset: which preset was laid over the recipe; empty for none.
+        preset: name of the preset merged into the recipe; empty for none.
         recipe: its typed settings.
         table: the same, everything resolved, as plain values; what a run's ``recipe.toml`` holds.
         preset_choice: what chose the preset, in words; empty where it was asked for.

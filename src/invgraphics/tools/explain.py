@@ -95,7 +95,7 @@ def explain(request: ExplainRequest) -> Explanation:
 
 
 def in_world_units(found: Contributions, scale: float) -> Contributions:
-    """Convert contributions to world units: distances times ``scale`` (world length of a local unit), densities divided by it."""
+    """Convert contributions to world units: distances times ``scale``, the world length of a local unit, densities over it."""
 
     def profile(one: Profile | None) -> Profile | None:
         if one is None:
@@ -162,7 +162,7 @@ def _record(fitted: Fitted, request: ExplainRequest, view: View, found: Contribu
 
 
 def _pixel(request: ExplainRequest, view: View, found: Contributions, picture: Rendering, scene: Scene) -> Pixel:
-    """Colours of the pixel: rendered, true, and composited from the contributions."""
+    """Colour, alpha and depth of the pixel: rendered, true, and composited from the contributions."""
     (column, row), background = request.pixel, scene.background
     return Pixel(
         column=column,
@@ -214,7 +214,7 @@ def _row(values: Tensor) -> tuple[float | None, ...]:
 
 
 def _number(value: Tensor | float) -> float | None:
-    """Convert a scalar tensor to a float without spurious digits; ``None`` where it is not finite."""
+    """Round a scalar to `DIGITS` significant digits; ``None`` where it is not finite."""
     number = float(value)
     return _rounded(number) if math.isfinite(number) else None
 

@@ -160,7 +160,7 @@ def _along(fitted: Fitted, cameras: Sequence[Camera], request: FilmRequest) -> I
 
 
 def _picture(fitted: Fitted, camera: Camera) -> np.ndarray:
-    """Convert a rendering to 8-bit display colours over the scene's background."""
+    """Render a camera to 8-bit display colours over the scene's background."""
     rendering = fitted.model.render(camera, normals=False)
     return display(rendering.over(fitted.scene.background), fitted.scene).numpy()
 

@@ -89,7 +89,7 @@ def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
 def _against_truth(surface: Surface, scene: Scene) -> dict[str, str]:
     """Distances between the mesh and the true surface, in world units; empty where that is unknown.
 
-    Completeness is asked of what the training views' true depth shows: nobody can know the inside of things.
+    Completeness is measured on points of the training views' true depth only: the inside of objects is unobservable.
     """
     if scene.mesh is None or not any(view.depth is not None for view in scene.train):
         return {}

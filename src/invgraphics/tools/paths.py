@@ -99,7 +99,7 @@ def spiral(scene: Scene, frames: int) -> list[Camera]:
 
 
 def orbit(scene: Scene, frames: int) -> list[Camera]:
-    """Circular path around the cameras' common focus, at their mean height and distance.
+    """Circular path around the cameras' common focus, at their median height and distance.
 
     The axis is the photographs' mean upward direction, the lens that of the first test view.
     """

@@ -32,7 +32,7 @@ class PictureSet:
         folder: where the predictions came from.
         names: of the views.
         scene: background and colour space; holds no views, which are read one at a time.
-        background: the data set's background; ``None`` where nobody said which.
+        background: the data set's background; ``None`` where it is unknown.
         transparency: ``open``: both sides can be put in front of any background; ``fixed``: one side is already in front of
             ``background``; ``opaque``: photographs, which have none.
         eight_bit: whether unrounded predictions are missing.

@@ -180,7 +180,7 @@ def _facing(picture: Rendering, camera: Camera) -> Float[Tensor, " pixels"]:
 def _ahead(
     points: Float[Tensor, "n 3"], camera: Camera, depth: Float[Tensor, "h w"]
 ) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
-    """Projective signed distance of each point in front of its pixel's depth, -inf outside the picture; and the pixel's index."""
+    """Projective signed distance of each point before its pixel's depth, -inf outside the picture; and that pixel's index."""
     place, z = camera.project(points)
     column, row = place.floor().long().unbind(dim=1)
     inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

@@ -21,7 +21,7 @@ WITH_PARENT = "--while-stdin-is-open"
 """Argument of `invgraphics.experiments.run` as a program that ties its life to that of the process that started it."""
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Whoever may start threads in a fit reads one of these."""
+"""Environment variables from which libraries take their number of threads."""
 
 
 def cores() -> int:

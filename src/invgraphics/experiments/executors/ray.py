@@ -64,7 +64,7 @@ class RayExecutor:
     def _connect(self) -> None:
         address = self._resources.address
         own = {} if address else {"object_store_memory": OBJECT_STORE_BYTES, "include_dashboard": False}
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked to be counted
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # telemetry stays off unless the user enables it
         try:
             self._ray.init(address or "local", log_to_driver=False, logging_level="error", **own)
         except (ConnectionError, ValueError, RuntimeError) as error:

@@ -1,4 +1,4 @@
-"""Coarse to fine: encodings in levels, of which the finer ones can be held back while poses are still wrong (BARF)."""
+"""Coarse-to-fine windows over encoding levels, which mask fine levels while poses are inaccurate (BARF)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Windowed(Encoding):
         self.register_buffer("detail", None)
 
     def add_window(self) -> None:
-        """Make the window part of the encoding, and of its checkpoints; wide open."""
+        """Register the window as a buffer of the encoding, initially fully open."""
         reference = next(self.parameters(), torch.zeros(()))
         self.detail = torch.ones((), device=reference.device)
 
