@@ -76,7 +76,7 @@ class ComparisonResult:
         )
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """The report's summary: headings, and a row of texts for each method and baseline; * marks the best."""
+        """Summary table of the report: headings, and a row of texts for each method and baseline; * marks the best."""
         summary = summarise(self.record)
         rows = [[row.label, *(f"{cell.text}{' *' if cell.best else ''}" for cell in row.cells)] for row in summary.rows]
         return ["", *(column.heading for column in summary.columns)], rows

@@ -129,7 +129,7 @@ def score_model(
 
 
 def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, float | None]:
-    """Costs of a fitted model: size and ``seconds`` per view; warns of primitives that receive no gradient."""
+    """Costs of a fitted model: size and ``seconds`` per view; warns of primitives that can receive no gradient."""
     dead = dead_gaussians(model.field, [view.camera for view in scene.train])
     if dead is not None and dead.share > DEAD_SHARE:
         warn(f"Warning: {dead.sentence()}")

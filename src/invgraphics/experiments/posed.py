@@ -95,7 +95,7 @@ class PosedEvaluation:
         self._world_to_fit = self.errors.similarity.inverse()
 
     def camera(self, view: View) -> Camera:
-        """The test view's camera in the fit's frame, refined to its photograph where the settings say so."""
+        """Camera of a test view in the fit's frame, refined to its photograph if the settings enable it."""
         start = transform_camera(view.camera, self._world_to_fit)
         if not self._config.test_steps:
             return start

@@ -14,7 +14,7 @@ _SETTING = r":(?=[\w.]+=)"
 
 @dataclass(frozen=True)
 class RendererVariant:
-    """A renderer through which a fitted field is shown.
+    """A named renderer, with its settings, for rendering a fitted field.
 
     Attributes:
         name: as it was asked for, ``METHOD`` or ``METHOD:key=value:key=value`` with keys of the recipe's renderer.

@@ -24,18 +24,18 @@ class CapsPrimitives(Protocol):
 
 @dataclass(frozen=True)
 class Recipe:
-    """A method as data: field x renderer, and how to fit it.
+    """A method as data: field, renderer, losses, hooks, optimiser and batches.
 
     Attributes:
         summary: one sentence for ``invgraphics list`` and the report.
         paper: where the method comes from.
         field: parameterisation of the scene.
-        renderer: how it becomes a picture.
+        renderer: how it is rendered.
         losses: their sum is minimised.
-        hooks: what happens between steps.
+        hooks: callbacks between steps, such as density control.
         optimiser: Adam's settings and parameter groups.
         batches: size of a step.
-        training: what else the fit finds out, such as the cameras' poses; ``None`` for nothing.
+        training: what the fit optimises besides the model, such as the cameras' poses; ``None`` for nothing.
         max_primitives: most explicit primitives, of fields and hooks that make some; ``None`` leaves it to their own settings.
     """
 

@@ -1,4 +1,4 @@
-"""The volume-rendering equation over overlapping Gaussians on a ray."""
+"""Quadrature of the volume-rendering equation over overlapping Gaussians on a ray."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MOST_AT_ONCE = 1 << 18
 
 
 def phi(z: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
-    """The standard normal distribution's integral up to ``z``."""
+    """Cumulative distribution function of the standard normal distribution at ``z``."""
     return 0.5 * (1 + torch.erf(z / sqrt(2)))
 
 

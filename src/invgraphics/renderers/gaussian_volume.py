@@ -129,7 +129,7 @@ class GaussianRays(RayRenderer):
     @override
     @torch.no_grad()
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
-        """The Gaussians that the pixel's ray intersects; see `Renderer.contributions`."""
+        """List the Gaussians that the pixel's ray intersects; see `Renderer.contributions`."""
         primitives = precompute(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest, camera.position)
         rays = _clipped(camera.ray(pixel), ctx)
         return self._listed(intersect(primitives, rays), primitives, rays, camera.cam_to_world[:3, 2])

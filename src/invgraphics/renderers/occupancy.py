@@ -168,7 +168,7 @@ class Occupancy(Sampler):
 
     @torch.no_grad()
     def _march_fused(self, rays: Rays, field: Field, ctx: Context) -> March | None:
-        """A march with early termination, where a fused kernel supports the field and these steps; else ``None``."""
+        """March with early termination by a fused kernel, where it supports the field and these steps; else ``None``."""
         parts, steps = field.fused(ctx.bounds), self.steps(ctx)
         even = ctx.bounds.space == "box" or steps.contracted
         if parts is None or not even or steps.cone > 0 or not kernels.compiled("ngp_march", parts.table):

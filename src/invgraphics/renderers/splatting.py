@@ -123,7 +123,7 @@ class Splatting(Renderer):
     @override
     @torch.no_grad()
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
-        """The splats whose footprints cover the pixel, by the depth of their centres; see `Renderer.contributions`."""
+        """List the splats whose footprints cover the pixel, by the depth of their centres; see `Renderer.contributions`."""
         gaussians: Gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
         footprints, rgb = self.project(gaussians, camera)
         point = camera.focal.new_tensor([pixel]) + 0.5

@@ -102,7 +102,7 @@ class SamplerPass:
 
 @dataclass(frozen=True, kw_only=True)
 class DeadPrimitives:
-    """Primitives of the whole model that receive no gradient: their share, and number and causes in a sentence."""
+    """Primitives of the whole model that can receive no gradient: their share, and number and causes in a sentence."""
 
     share: float | None
     sentence: str

@@ -60,7 +60,7 @@ def check_run(folder: Path) -> None:
 
 
 class RunFolder:
-    """A run on disk. Every file but the history is replaced whole, so that an interruption leaves valid files."""
+    """A run's folder. All files but the history are replaced atomically, so that an interruption leaves valid files."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

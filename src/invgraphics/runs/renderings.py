@@ -13,7 +13,7 @@ OWN = "."
 
 @dataclass(frozen=True, kw_only=True)
 class Rendering:
-    """A renderer as it was named, and the folder of the run that shows the fit with it, relative (`OWN`: the fit itself)."""
+    """A renderer's name, as given, and the relative folder of the run rendered with it (`OWN`: the fit itself)."""
 
     renderer: str
     run: str

@@ -42,7 +42,7 @@ class Run:
 
     @property
     def files(self) -> RunFolder:
-        """The run's folder, for paths of its files."""
+        """The run's `RunFolder`, for paths of its files."""
         return RunFolder(self.folder)
 
 

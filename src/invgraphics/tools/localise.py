@@ -184,7 +184,7 @@ def _written(request: LocateRequest, fitted: Fitted, result: tuple[View, list[St
 
 
 def _test_view_like(found: View, scene: Scene) -> View | None:
-    """The test view that shows the same pixels, if there is one."""
+    """Find the test view with the same pixels as the photograph; ``None`` without one."""
     shown = display(found.over(scene.background), scene).float()
     for view in scene.test:
         if view.image.shape[:2] == found.image.shape[:2]:

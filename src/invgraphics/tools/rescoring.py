@@ -68,7 +68,7 @@ def write_scores(rescored: Rescored, out: Path | None) -> list[Path]:
 
 
 def scores_of(pictures: PictureSet, protocol: str) -> Scores | None:
-    """The run's scores under a protocol; ``None`` where there are none.
+    """Read the run's scores under a protocol; ``None`` without any.
 
     Raises:
         InputError: they cannot be read.

@@ -17,8 +17,8 @@ class Windowed(Encoding):
 
     Attributes:
         levels: number of levels.
-        always: levels that are never held back.
-        detail: how far the window is open, from 0 (only what is never held back) to 1 (everything); ``None`` without a window.
+        always: levels that are never masked.
+        detail: how far the window is open, from 0 (only those never masked) to 1 (all levels); ``None`` without a window.
     """
 
     levels: int
