@@ -28,7 +28,7 @@ class Slot:
 
 
 def fill(schema: type[T], table: Mapping[str, Any], path: str = "") -> T:
-    """Make a ``schema`` from ``table``.
+    """Fill the dataclass ``schema`` from ``table``.
 
     Args:
         schema: a frozen dataclass.
@@ -56,7 +56,7 @@ def fill(schema: type[T], table: Mapping[str, Any], path: str = "") -> T:
 
 
 def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
-    """Make the registered config that ``table['type']`` names, from the rest of the table."""
+    """Fill the registered config that ``table['type']`` names from the rest of the table."""
     if not isinstance(table, Mapping) or "type" not in table:
         raise InputError(f"'{path}' needs a 'type' key.", f"Known {registry}: {', '.join(sorted(plugins.names(registry)))}.")
     rest = {key: value for key, value in table.items() if key != "type"}
@@ -64,7 +64,7 @@ def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
 
 
 def to_table(config: Any) -> dict[str, Any]:
-    """The complete table of a filled config, defaults included; ``fill`` of it gives an equal config. None is left out."""
+    """Convert a config to its complete table (inverse of `fill`), with defaults, without ``None``."""
     hints = get_type_hints(type(config), include_extras=True)
     table = {}
     for field in dataclasses.fields(config):
@@ -99,7 +99,7 @@ def set_path(table: dict[str, Any], path: str, value: Any) -> None:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``over`` laid on top, tables merged key by key. A table whose ``type`` changes is replaced whole."""
+    """Merge ``over`` into ``base``, tables key by key. A table whose ``type`` changes is replaced whole."""
     result = dict(base)
     for key, value in over.items():
         old = result.get(key)

@@ -1,4 +1,4 @@
-"""What a person is told when their input cannot be used."""
+"""Exceptions with user-facing sentences: bad input, incompatible components, numerical failures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ LONGEST = 1000
 
 
 class InputError(Exception):
-    """Bad input, said in one clear sentence and, where there is one, the remedy.
+    """Bad input, described in one clear sentence, with the remedy where there is one.
 
     The command line prints at most four lines of it and exits with status 2; library users catch it as an exception.
 
@@ -27,20 +27,20 @@ class InputError(Exception):
 
 
 def _shortened(text: str) -> str:
-    """A text without its middle where it quotes a value of thousands of characters."""
+    """Shorten a text that quotes a value of thousands of characters, by its middle."""
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 200]} ... {text[-200:]}"
 
 
 class NotComposableError(InputError):
-    """A field and a renderer that cannot work together; the sentence names the missing quantity."""
+    """Incompatible field and renderer; the sentence names the missing quantity."""
 
 
 class NumericalError(Exception):
-    """A fit produced a number that is not finite; the sentence names the step and the tensor."""
+    """Non-finite value in a fit; the sentence names the step and the tensor."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The closest known name to a misspelt one, as a question with a leading space; empty where none is close.
+    """Suggest the closest known name to a misspelt one, as a question with a leading space; empty where none is close.
 
     Names with folders (``renderer/recipe``) are also known by their last part.
     """

@@ -1,4 +1,4 @@
-"""Submodules that are imported when they are first named: ``ig.core.transforms`` after ``import invgraphics as ig`` alone."""
+"""Lazy imports of submodules on first access: ``ig.core.transforms`` after ``import invgraphics as ig`` alone."""
 
 from __future__ import annotations
 

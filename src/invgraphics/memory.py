@@ -19,7 +19,7 @@ def total_bytes() -> int:
 
 
 def available_bytes() -> int:
-    """What new allocations can have without swapping: the kernel's estimate, within the container's limit."""
+    """Memory available without swapping: the kernel's estimate, within the container's limit."""
     free = [total_bytes()]
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
@@ -33,7 +33,7 @@ def available_bytes() -> int:
 
 
 def check_fits(needed: float, what: str, remedy: str) -> None:
-    """Refuse a request that needs more memory than there is, before any of it is allocated.
+    """Check a memory demand against the available memory, before anything is allocated.
 
     Args:
         needed: bytes at the peak.
@@ -49,14 +49,14 @@ def check_fits(needed: float, what: str, remedy: str) -> None:
 
 
 def spelt(size: float) -> str:
-    """A number of bytes in GB or MB, two digits."""
+    """Format bytes as GB or MB, two digits."""
     if size >= 1e11:
         return f"{size / 1e9:,.0f} GB"
     return f"{size / 1e9:.2g} GB" if size >= 1e9 else f"{size / 1e6:.2g} MB"
 
 
 def _number(path: Path) -> int | None:
-    """A limit of the container; ``None`` where there is none."""
+    """Read a limit of the container; ``None`` where there is none."""
     try:
         return int(path.read_text(encoding="ascii"))
     except (OSError, ValueError):  # no container, or "max"

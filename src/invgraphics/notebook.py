@@ -1,4 +1,4 @@
-"""What the teaching notebooks share: the look of their plots, rows of pictures, sliders, films, and the score of one picture.
+"""Helpers of the teaching notebooks: plot style, rows of pictures, sliders, films, and the PSNR of one picture.
 
 >>> from invgraphics import notebook
 >>> notebook.style()                                                    # doctest: +SKIP
@@ -90,7 +90,7 @@ def show(images: Sequence[Picture], titles: Sequence[str] = (), **options: Any) 
 
 
 def sliders(**positions: Range) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorate a function that draws a figure: it is drawn again at each position of a slider for each argument.
+    """Decorate a function that draws a figure with one slider per argument, which redraws it.
 
     Args:
         positions: of each argument's slider; it begins at the argument's default.
@@ -124,7 +124,7 @@ def sliders(**positions: Range) -> Callable[[Callable[..., None]], Callable[...,
 
 
 def scratch() -> Path:
-    """Make a folder for what a notebook writes, and work in it; it is removed when the kernel ends."""
+    """Create a temporary working folder for a notebook's files and change to it; it is removed when the kernel ends."""
     folder = tempfile.TemporaryDirectory(prefix="invgraphics-notebook-")
     atexit.register(folder.cleanup)
     os.chdir(folder.name)
@@ -132,7 +132,7 @@ def scratch() -> Path:
 
 
 def video(path: Path, width: int) -> None:
-    """Show a film, which becomes part of the page.
+    """Embed a film in the notebook's page.
 
     Args:
         path: of an mp4.

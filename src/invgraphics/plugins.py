@@ -41,7 +41,7 @@ def _own(registry: str) -> dict[str, str]:
 
 @cache
 def _entry_points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Our entry points found on ``path``; looking through every installed package takes long enough to be done once."""
+    """Entry points of this package's groups found on ``path``, cached because scanning installed packages is slow."""
     found = entry_points()
     return tuple(point for registry in REGISTRIES for point in found.select(group=f"invgraphics.{registry}"))
 
@@ -52,13 +52,13 @@ def _foreign(registry: str) -> dict[str, EntryPoint]:
 
 
 def names(registry: str) -> dict[str, str]:
-    """Name -> where it comes from (``"module:object"``), own entries first; imports no implementation."""
+    """List a registry's entries, name -> ``"module:object"``, built-in ones first; imports no implementation."""
     foreign = {name: point.value for name, point in _foreign(registry).items()}
     return _own(registry) | {name: value for name, value in foreign.items() if name not in _own(registry)}
 
 
 def origin(registry: str, name: str) -> str:
-    """``"built in"`` or the name of the distribution that brought ``name``."""
+    """Distribution that provides ``name``, or ``"built in"``."""
     if name in _own(registry):
         return "built in"
     point = _foreign(registry).get(name)
@@ -66,7 +66,7 @@ def origin(registry: str, name: str) -> str:
 
 
 def brought(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
-    """Name -> distribution and version of the plug-ins among a recipe's ``type`` entries, and of the recipe itself.
+    """Map the plug-ins among a recipe's ``type`` entries, and the recipe itself, to distribution and version.
 
     Args:
         table: a resolved recipe.
@@ -90,7 +90,7 @@ def brought(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
 
 
 def installed(package: str) -> bool:
-    """Whether the distribution that `brought` calls ``name version`` is here, in whatever version."""
+    """Whether the distribution that `brought` names as ``name version`` is installed, in any version."""
     try:
         distribution(package.partition(" ")[0])
     except PackageNotFoundError:
@@ -119,7 +119,7 @@ def load(registry: str, name: str) -> Any:
 
 
 def name_of(registry: str, kind: type) -> str:
-    """The name under which the class ``kind`` is registered (inverse of `load`)."""
+    """Registered name of the class ``kind`` (inverse of `load`)."""
     wanted = f"{kind.__module__}:{kind.__qualname__}"
     for name, target in names(registry).items():
         if target == wanted:

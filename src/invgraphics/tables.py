@@ -1,4 +1,4 @@
-"""Files of strangers as plain values: JSON, TOML and NumPy arrays, read within limits on size, depth and digits.
+"""Safe reading of untrusted files: JSON, TOML and NumPy arrays within limits on size, depth and digits.
 
 What a file may cost is known before it is read: sizes are compared with `LIMITS` and with the memory there is, and what a
 header claims is compared with the bytes behind it. Typed records are made of the plain values (`invgraphics.config.fill`).
@@ -27,7 +27,7 @@ from invgraphics.memory import check_fits, spelt
 
 @dataclass(frozen=True)
 class Limits:
-    """The most that is read.
+    """Limits on the size, depth and digits of files.
 
     Attributes:
         json_bytes: length of a JSON file; a thousand posed photographs take about 1 MB.
@@ -71,7 +71,7 @@ _LONGEST_HEADER = 10_000
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file (UTF-8).
+    """Read a JSON file (UTF-8).
 
     Raises:
         InputError: it is missing, unreadable, no JSON (line and column are given), or beyond `LIMITS`.
@@ -90,7 +90,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file (UTF-8).
+    """Read a TOML file (UTF-8).
 
     Raises:
         InputError: it is missing, unreadable, no TOML, or beyond `LIMITS`.
@@ -99,7 +99,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
-    """TOML as plain values; ``where`` names its origin in messages.
+    """Parse TOML to plain values; ``where`` names its origin in messages.
 
     Raises:
         InputError: it is no TOML, or beyond `LIMITS`.
@@ -119,7 +119,7 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
 
 
 def read_text(path: Path, most: int) -> str:
-    """A UTF-8 file of at most ``most`` bytes.
+    """Read a UTF-8 text file of at most ``most`` bytes.
 
     Raises:
         InputError: it is missing, unreadable, no text, or longer.
@@ -140,7 +140,7 @@ def read_text(path: Path, most: int) -> str:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an ``.npz`` archive, checksums verified.
+    """Read all arrays of an ``.npz`` archive, with checksums verified.
 
     Raises:
         InputError: it is missing or damaged, a member is no array of numbers or text, or it does not fit into memory.
@@ -166,7 +166,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """The array of an ``.npy`` file.
+    """Read the array of an ``.npy`` file.
 
     Raises:
         InputError: it is missing or damaged, holds no numbers or text, or does not fit into memory.
@@ -188,7 +188,7 @@ def _unreadable(path: Path, error: BaseException) -> InputError:
 
 
 def _array(file: IO[bytes], size: int) -> np.ndarray:
-    """An array in NumPy's format (versions 1 and 2) whose header and data are exactly ``size`` bytes."""
+    """Parse an array in NumPy's format (versions 1 and 2) whose header and data are exactly ``size`` bytes."""
     magic = file.read(8)
     if len(magic) < 8 or magic[:6] != b"\x93NUMPY" or magic[6] not in _HEADERS:
         raise ValueError("it is no NumPy array")
@@ -218,7 +218,7 @@ _TOO_DEEP = f"tables and lists lie within each other more than {LIMITS.depth} de
 
 
 def _whole(digits: str) -> int:
-    """A whole number of JSON."""
+    """Parse a JSON integer, within the limit on digits."""
     if len(digits) > LIMITS.digits:
         raise ValueError(f"a whole number has {len(digits)} digits")
     return int(digits)

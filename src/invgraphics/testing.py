@@ -1,4 +1,4 @@
-"""For tests, ours and strangers': a small scene with known truth, and conformance suites for fields and renderers.
+"""Test utilities, also for plug-ins: a small scene with known truth, and conformance suites for fields and renderers.
 
 A plug-in's test needs three lines::
 
@@ -74,7 +74,7 @@ class TwoBalls(Field):
 
 
 def toy_cameras(count: int, size: int, turn: float = 0.0, zoom: float = 1.0) -> list[Camera]:
-    """Cameras on a spiral around the origin at distance 3, seeing all of the box [-1, 1]³ unless ``zoom`` exceeds 1."""
+    """Place cameras on a spiral around the origin at distance 3; all of [-1, 1]³ is in view unless ``zoom`` exceeds 1."""
     cameras = []
     for i in range(count):
         azimuth = 2 * math.pi * (i * 0.618034 + turn)
@@ -88,7 +88,7 @@ def toy_cameras(count: int, size: int, turn: float = 0.0, zoom: float = 1.0) -> 
 def toy_scene(
     views: int = 12, size: int = 24, space: Literal["box", "contracted"] = "box", checks: float = 0.0, zoom: float = 1.0
 ) -> Scene:
-    """Two balls of fog seen from all around, with alpha, points and a white background; fits in well under a second.
+    """Make a scene of two balls of fog with alpha, points and a white background; fits in well under a second.
 
     Args:
         views: training views.
@@ -120,7 +120,7 @@ def toy_scene(
 
 
 def check_field(field: Field, scene: Scene) -> None:
-    """Assert what the contract promises of a field: shapes, finiteness, nothing unasked, gradients, a state that reloads."""
+    """Assert the contract of a field: shapes, finiteness, only requested quantities, gradients, a state that reloads."""
     pointwise = [quantity for quantity in _POINTWISE if quantity in field.provides]
     position = scene.bounds.from_unit(torch.rand(37, 3)).requires_grad_(True)
     direction = torch.nn.functional.normalize(torch.randn(37, 3), dim=1)
@@ -141,7 +141,7 @@ def check_field(field: Field, scene: Scene) -> None:
 
 
 def check_renderer(renderer: Renderer, field: Field, scene: Scene) -> None:
-    """Assert what the contract promises of a renderer: shapes, ranges, repeatability, gradients to the field and the pose."""
+    """Assert the contract of a renderer: shapes, ranges, repeatability, gradients to the field and the pose."""
     check(field, renderer)
     camera = scene.test[0].camera.resized(12, 9)
     ctx = Context(scene.bounds, geometry=True)

@@ -1,4 +1,4 @@
-"""Texts that several packages need: names of folders and files, lengths of time, hashes of plain values."""
+"""Text helpers: names of folders and files, durations, hashes of plain values."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any
 
 
 def slug(method: str) -> str:
-    """A method's name, ``renderer/recipe`` or the path of a recipe, as one folder name."""
+    """Convert a method's name, ``renderer/recipe`` or the path of a recipe, to one folder name."""
     return method.removesuffix(".toml").strip("/").replace("/", "-").replace(":", "-")
 
 
 def file_name(key: str) -> str:
-    """A key, a scene's or a metric's name as part of a file's name: letters and digits stay, all else becomes a hyphen."""
+    """Convert a name to a part of a file name: letters and digits stay, all else becomes a hyphen."""
     return "".join(letter if letter.isalnum() else "-" for letter in key)
 
 
 def duration(seconds: float) -> str:
-    """A length of time: ``12 s``, ``6 min 52 s``, ``10 min``, ``2 h 1 min``."""
+    """Format a duration: ``12 s``, ``6 min 52 s``, ``10 min``, ``2 h 1 min``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)

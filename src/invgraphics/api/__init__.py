@@ -1,4 +1,4 @@
-"""The functions of ``import invgraphics as ig``: scenes, methods, fits, scores, comparisons, studies."""
+"""Functions of ``import invgraphics as ig``: load scenes and methods, fit, evaluate, compare, run studies."""
 
 from invgraphics.api.comparing import compare as compare
 from invgraphics.api.fitting import evaluate as evaluate

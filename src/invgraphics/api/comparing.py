@@ -1,4 +1,4 @@
-"""Several methods on one scene, each fitted in a process of its own."""
+"""Comparison of several methods on one scene, each fitted in a process of its own."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ class ComparisonResult:
 
     @cached_property
     def record(self) -> Comparison:
-        """Everything that the report knows."""
+        """The comparison's record, from which the report is written."""
         return read_comparison(self.folder)
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names of the methods, as they were given."""
+        """Names of the compared methods, as given."""
         return self.record.methods
 
     @property
     def failures(self) -> tuple[Failure, ...]:
-        """Fits that gave no run, and why."""
+        """Failed fits, with their errors."""
         return self.record.failures
 
     def run(self, method: str, seed: int = 0) -> FolderRun:
@@ -76,7 +76,7 @@ class ComparisonResult:
         )
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """The report's summary: headings, and a row of texts for each method and baseline; * marks the best."""
+        """Summary table of the report: headings, and a row of texts for each method and baseline; * marks the best."""
         summary = summarise(self.record)
         rows = [[row.label, *(f"{cell.text}{' *' if cell.best else ''}" for cell in row.cells)] for row in summary.rows]
         return ["", *(column.heading for column in summary.columns)], rows

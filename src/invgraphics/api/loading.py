@@ -1,4 +1,4 @@
-"""Scenes, methods and runs, from names and paths; and names of what has none yet, for other processes."""
+"""Loading of scenes, methods and runs by name or path, and their names or files for other processes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def load_scene(
     test_views: int | None = 16,
     spp: int | None = None,
 ) -> Scene:
-    """Open a scene: views with known cameras to fit, and others to score.
+    """Open a scene: posed training views to fit, and held-out views to score.
 
     Args:
         spec: a built-in scene (``bricks``; it is rendered at first use and cached), the path of a data set in a known format,
@@ -130,7 +130,7 @@ def load_run(folder: str | os.PathLike[str], scene: str | None = None) -> Folder
 
 
 def opened(scene: Scene | str | os.PathLike[str]) -> Scene:
-    """A scene that may be opened already, checked.
+    """Open a scene by name, or check one that is already open.
 
     Raises:
         InputError: it cannot be opened, or not be used.
@@ -139,7 +139,7 @@ def opened(scene: Scene | str | os.PathLike[str]) -> Scene:
 
 
 def name_of(method: MethodLike, file: Path | None, budget: str) -> tuple[str, Method | None]:
-    """A name under which other processes find a method, and the method where it has no such name.
+    """Name by which other processes load a method, and the method itself where it has no such name.
 
     Args:
         method: of any kind.
@@ -163,7 +163,7 @@ def name_of(method: MethodLike, file: Path | None, budget: str) -> tuple[str, Me
 
 
 def place_of(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:
-    """A scene as other processes open it, and how a request names it: as it was opened, or as a copy in ``folder``.
+    """Scene and name by which other processes open it: as it was opened, or as a copy written to ``folder``.
 
     Raises:
         InputError: the scene was made in Python and cannot be kept, or the folder holds another one.
@@ -182,7 +182,7 @@ def place_of(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:
 
 
 def _same(one: Scene, other: Scene) -> bool:
-    """Whether two scenes show the same; poses that are read from a file are polished, and differ by rounding."""
+    """Whether two scenes are equal; poses read from a file are re-orthonormalised, and may differ by rounding."""
     if any(one.digest(split) != other.digest(split) for split in ("train", "test")):
         return False
     pairs = zip((*one.train, *one.test), (*other.train, *other.test), strict=True)

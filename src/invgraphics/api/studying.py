@@ -1,4 +1,4 @@
-"""Studies: factors and levels as a TOML file, every cell fitted in a process of its own, effects with intervals."""
+"""Studies: factors and levels from a TOML file, each cell fitted in its own process, effects with confidence intervals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from invgraphics.studies.study import Study as Design
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing of a report; in a notebook, a picture.
+    """Figure of a report as SVG, which a notebook displays.
 
     Attributes:
         path: of the SVG file.
@@ -35,7 +35,7 @@ class Figure:
 
 
 class StudyResult:
-    """What a study has found so far; in a notebook, its sentences.
+    """Results of a study so far; a notebook displays its sentences.
 
     Args:
         folder: that `ablate` wrote.
@@ -49,7 +49,7 @@ class StudyResult:
         self.folder, self.page = folder, build_study_report(folder)
 
     def figure(self, name: str) -> Figure:
-        """One of the report's drawings, ``effects-psnr`` for instance; in a notebook, a picture.
+        """Select one of the report's figures by name, for instance ``effects-psnr``.
 
         Raises:
             InputError: the report has no such drawing; it names those that there are.
@@ -62,11 +62,11 @@ class StudyResult:
 
     @cached_property
     def record(self) -> Study:
-        """Everything that the report knows: design, cells and scores."""
+        """The study's data, from which the report is written: design, cells and scores."""
         return read_study(self.folder)
 
     def sentences(self) -> list[str]:
-        """What the factors do, with intervals."""
+        """Effects of the factors in sentences, with confidence intervals."""
         return study_sentences(self.folder)
 
     def _repr_markdown_(self) -> str:

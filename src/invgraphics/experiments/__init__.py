@@ -1,4 +1,4 @@
-"""From a request to a run folder, and from many runs to a comparison."""
+"""Fitting, evaluating and comparing methods: requests become run folders, and runs a comparison."""
 
 from typing import TYPE_CHECKING
 

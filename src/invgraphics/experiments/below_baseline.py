@@ -1,4 +1,4 @@
-"""A sentence for a method that scores below the mean training image: the likely cause, and a remedy."""
+"""Diagnosis of a method that scores below the mean training image: the likely cause, and a remedy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def coverage_and_depth(picture: Rendering, camera: Camera, scene: Scene) -> dict
 def below_baseline(
     method: str, quality: Mapping[str, Any], statistics: Sequence[Mapping[str, float]], scene: Scene, protocol: Protocol
 ) -> str:
-    """A sentence where the mean PSNR is below that of the mean training image; else empty.
+    """Diagnose a mean PSNR below that of the mean training image in a sentence; empty otherwise.
 
     Args:
         method: ``renderer/recipe``.
@@ -52,7 +52,7 @@ def below_baseline(
 
 
 def _diagnose(method: str, means: Mapping[str, float], opaque: bool) -> tuple[str, str]:
-    """Cause and remedy, by the family of the method and the statistics of its renderings."""
+    """Select cause and remedy by the family of the method and the statistics of its renderings."""
     if method.startswith("splatting/"):
         return "its Gaussians do not cover the views yet, or overfit few photographs", "a longer --budget or more photographs"
     remedy = "a longer --budget, a smaller --size, more photographs, or splatting/gaussians, which starts from known points"

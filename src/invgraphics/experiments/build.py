@@ -1,4 +1,4 @@
-"""From a method and a scene to the objects of a fit."""
+"""Build a fit's model, optimiser plan and kernels from a method and a scene."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from invgraphics.training.poses import coarse_to_fine_encodings, make_poses
 
 
 def device_of(name: str | None) -> torch.device:
-    """The device a run uses: the one that was asked for, else the CPU.
+    """Resolve the torch device of a run: the requested one, else the CPU.
 
     Raises:
         InputError: no such device here.
@@ -33,7 +33,7 @@ def device_of(name: str | None) -> torch.device:
 
 
 def open_with_progress(spec: str, options: SceneOptions) -> Scene:
-    """Open a scene; how far its rendering is, where it has to be rendered, is shown.
+    """Open a scene, with a progress bar where it has to be rendered first.
 
     Raises:
         InputError: the scene cannot be opened.
@@ -55,7 +55,7 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -
 
 
 def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: torch.device) -> Plan:
-    """Everything a fit is made of."""
+    """Build the plan of a fit: model, scene, losses, hooks, optimiser and batch settings, budget and poses."""
     recipe = method.recipe
     model = build_model(method, scene, seed, device)
     poses = make_poses(recipe.training, scene)
@@ -82,12 +82,12 @@ def _view_share(recipe: Recipe, renderer: Renderer, scene: Scene) -> float:
 
 
 def use_kernels(name: str | None) -> None:
-    """Choose kernels by name, and compile what needs compiling before any clock runs."""
+    """Select the kernel backend by name, and compile its kernels before any timing starts."""
     kernels.use(name)
     kernels.warm_up()
 
 
 def repeatable(device: torch.device) -> None:
-    """Ask torch for sums in a fixed order; on a CPU that makes the same seed and threads give the same bits."""
+    """Use torch's deterministic algorithms on a CPU, where the same seed and thread count then give the same bits."""
     torch.use_deterministic_algorithms(device.type == "cpu", warn_only=True)
     torch.utils.deterministic.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]  # a debugging aid, slow

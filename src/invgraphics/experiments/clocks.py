@@ -1,4 +1,4 @@
-"""What a fit cost in time, and whether its clock can be believed."""
+"""Time costs of a fit, and detection of timings disturbed by other processes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LEAST_SHARE = 0.85
 
 
 def load_average() -> float | None:
-    """Processes that ran or were ready to, mean over the last minute; ``None`` where the system does not say."""
+    """System load: mean number of running or runnable processes over the last minute; ``None`` where unavailable."""
     try:
         return round(os.getloadavg()[0], 2)
     except (AttributeError, OSError):
@@ -20,7 +20,7 @@ def load_average() -> float | None:
 
 
 def fit_record(steps: int, clocks: Mapping[str, float | None]) -> FitRecord:
-    """How far a fit is, from its steps and what `training.fit.Fit.clocks` says."""
+    """Make the record of a fit's step count and clock readings (`training.fit.Fit.clocks`)."""
     return FitRecord(
         steps=steps,
         seconds=clocks["seconds"],
@@ -42,7 +42,7 @@ def fit_costs(fit: FitRecord) -> dict[str, float | None]:
 
 
 def processor_share(fit: FitRecord) -> float | None:
-    """Share of the time in which a fit was ready to run that it ran; ``None`` where nothing is known.
+    """CPU share of a fit: running time over runnable time, in [0, 1]; ``None`` where unknown.
 
     From the scheduler's own times (see `training.clock`), else from the load average at the end: cores per process that wants
     one, which counts other programs' processes that wait for a disk as well.
@@ -54,7 +54,7 @@ def processor_share(fit: FitRecord) -> float | None:
 
 
 def disturbance(share: float | None) -> str:
-    """What is wrong with a fit's clock, the subject left out; empty where nothing is.
+    """Describe how a fit's timings were disturbed, as a sentence without its subject; empty where they were not.
 
     Args:
         share: as `processor_share` has it.

@@ -1,4 +1,4 @@
-"""The main job: several methods on one scene under one budget, each fit in its own process, one report."""
+"""Comparison of several methods on one scene under one budget: each fit in its own process, one report."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
 
 
 def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
-    """A job of each method, with the first seed, and the scene as that one sees it.
+    """Resolve one job per method with the first seed, and open the scene with that seed's data degradation.
 
     Raises:
         InputError: anything that could be wrong, before any time is spent.
@@ -81,7 +81,7 @@ def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
 
 
 def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> ComparisonRecord:
-    """Everything that is known before the fits."""
+    """Make the comparison's record, without its runs: scene, methods, protocol, baselines and environment."""
     protocol, budget = jobs[0].protocol, jobs[0].budget
     camera = scene.test[0].camera
     names = ", ".join(request.methods)
@@ -125,5 +125,5 @@ def _scene_facts(scene: Scene) -> SceneFacts:
 
 
 def _common(texts: Sequence[str]) -> str:
-    """What all agree on; empty where they differ."""
+    """Common value of all texts; empty where they differ."""
     return texts[0] if len(set(texts)) == 1 else ""

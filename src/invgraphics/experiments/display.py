@@ -1,4 +1,4 @@
-"""Fits and scores as notebooks show them: a curve as SVG, a table as HTML."""
+"""Notebook display of fits and scores: a curve as SVG, a table as HTML."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LEFT, RIGHT, TOP, BOTTOM = 44, 12, 22, 30
 
 
 def curve_svg(points: Sequence[tuple[float, float]], title: str, axes: tuple[str, str]) -> str:
-    """Draw a curve through points; values that are not finite are left out.
+    """Draw a curve through points as SVG; values that are not finite are left out.
 
     Args:
         points: (x, y), x rising.
@@ -47,7 +47,7 @@ def _range(values: Sequence[float]) -> tuple[float, float]:
 
 
 def table_html(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table under a title."""
+    """Format a table under a title as HTML."""
     head = "".join(f"<th>{html.escape(column)}</th>" for column in columns)
     body = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
     return f"<table><caption>{html.escape(title)}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

@@ -1,4 +1,4 @@
-"""What a run's numbers depend on: the machine, the versions, the code."""
+"""Record of the machine, package versions and source code that a run's numbers depend on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CUDA_PACKAGES = ("triton", "gsplat")
 
 @cache
 def code_version() -> str:
-    """Version and a hash of every source file of the package, so that an edited working copy is told from a release."""
+    """Package version with a hash of all source files, which tells an edited working copy from a release."""
     root = Path(__file__).resolve().parents[1]
     sha = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
@@ -33,7 +33,7 @@ def code_version() -> str:
 
 
 def cpu_name() -> str:
-    """The processor's name as the system tells it."""
+    """Name of the CPU as reported by the operating system."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -43,7 +43,7 @@ def cpu_name() -> str:
 
 
 def environment(device: torch.device) -> Environment:
-    """This machine and its software, for a device."""
+    """Record the machine, its software versions and the compute device."""
     cuda = device.type == "cuda"
     packages: dict[str, str | None] = {name: version(name) for name in PACKAGES}
     if cuda:

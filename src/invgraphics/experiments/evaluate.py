@@ -37,7 +37,7 @@ TIMED = 6
 
 
 def expected_seconds(model: Model, scene: Scene) -> float:
-    """Seconds for all test views, extrapolated from one small picture with the unfitted model."""
+    """Estimate the seconds to render all test views, extrapolated from one small picture of the unfitted model."""
     camera = scene.test[0].camera
     small = camera.resized(max(8, camera.width // 8), max(8, camera.height // 8))
     began = time.perf_counter()
@@ -55,7 +55,7 @@ def evaluate(
     method: Method,
     poses: Poses | None = None,
 ) -> Scores:
-    """Render, keep and score all test views of ``scene``; writes the pictures and the scores, returns the scores.
+    """Render and score all test views of ``scene``; writes predictions and scores to the run folder, returns the scores.
 
     Where the fit has refined its training poses, test poses are aligned and refined first (see `experiments.posed`).
     """
@@ -89,7 +89,7 @@ def score_model(
     poses: Poses | None = None,
     keep: Callable[[int, Rendering], None] = lambda index, picture: None,
 ) -> Scores:
-    """Render and score all test views of ``scene``; the part of the scores that needs no run folder.
+    """Render and score all test views of ``scene`` without a run folder; returns their quality and the model's cost.
 
     Args:
         model: what is scored.
@@ -129,7 +129,7 @@ def score_model(
 
 
 def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, float | None]:
-    """What a fitted model costs, and warns of primitives that no gradient could change; ``seconds`` are those of one view."""
+    """Costs of a fitted model: size and ``seconds`` per view; warns of primitives that can receive no gradient."""
     dead = dead_gaussians(model.field, [view.camera for view in scene.train])
     if dead is not None and dead.share > DEAD_SHARE:
         warn(f"Warning: {dead.sentence()}")
@@ -144,7 +144,7 @@ def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, float 
 
 
 def _picture(model: Model, camera: Camera, *, normals: bool, timed: bool) -> tuple[Rendering, list[float]]:
-    """A picture for scoring, and the seconds that one takes as a viewer would ask for it: colour, alpha and depth."""
+    """Render one view for scoring; also time it as a viewer renders it (colour, alpha, depth), in seconds."""
     if normals and not timed:
         return model.render(camera), []
     began = time.perf_counter()
@@ -177,7 +177,7 @@ def _evaluate_fitted(fitted: Fitted, protocol: str) -> Scores:
 
 
 def _save_view(folder: RunFolder, index: int, picture: Rendering, scene: Scene) -> None:
-    """Keep a prediction: float16 premultiplied with geometry, and an 8-bit picture over the declared background."""
+    """Write a prediction: float16 premultiplied with geometry, and an 8-bit picture over the declared background."""
     arrays: dict[str, Any] = {
         "rgb": picture.rgb.numpy().astype(np.float16),
         "alpha": picture.alpha.numpy().astype(np.float16),
@@ -190,12 +190,12 @@ def _save_view(folder: RunFolder, index: int, picture: Rendering, scene: Scene) 
 
 
 def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
-    """8-bit display colours of a composited picture."""
+    """Convert a composited picture to 8-bit display colours."""
     return quantise(linear_to_srgb(colour) if scene.colour == "linear" else colour)
 
 
 def save_truth(scene: Scene, root: Path) -> Path:
-    """Keep the test views' truth once per content, in ``root/<sha>``: pictures and, for what they cannot hold, arrays."""
+    """Write the test views' truth to ``root/<sha of content>``: pictures, and arrays of what those cannot hold."""
     folder = root / scene.digest("test")[:16]
     folder.mkdir(parents=True, exist_ok=True)
     for index, view in enumerate(scene.test):
@@ -208,7 +208,7 @@ def save_truth(scene: Scene, root: Path) -> Path:
 
 
 def _truth_arrays(view: View, scene: Scene) -> dict[str, Any]:
-    """What an 8-bit picture over one background does not hold: geometry, mask, straight colour under transparency."""
+    """Collect truth that an 8-bit composited picture cannot hold: geometry, mask, straight colour under transparency."""
     arrays: dict[str, Any] = {}
     if view.depth is not None:
         arrays["depth"] = view.depth.numpy() * np.float32(scene.scale)

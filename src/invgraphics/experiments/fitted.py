@@ -1,4 +1,4 @@
-"""A finished run, opened again: its scene and its model."""
+"""Loading of a finished run: its scene and its fitted model."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from invgraphics.training.poses import Poses
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What a run holds.
+    """A loaded run: recipe, scene, fitted model and refined poses.
 
     Attributes:
         folder: of the run.
@@ -45,7 +45,7 @@ class Fitted:
     poses: Poses | None = None
 
     def load(self, state: Mapping[str, Mapping[str, Any]]) -> None:
-        """Take over a checkpoint's tensors; of a rendering, whose renderer was not fitted, only the field's.
+        """Load a checkpoint's tensors into a model; for a rendering, whose renderer was not fitted, only the field's.
 
         Raises:
             RuntimeError: they do not fit the model.
@@ -56,7 +56,7 @@ class Fitted:
             self.model.field.load_state_dict(state.get("field", {}))
 
     def in_its_frame(self) -> Fitted:
-        """The same with the scene where the fit has it: a fit that refines poses may drift from those that it was given."""
+        """The same run with its scene transformed to the fit's frame, which drifts where poses are refined."""
         return self if self.poses is None else replace(self, scene=scene_in_fit_frame(self.poses, self.scene))
 
 
@@ -74,7 +74,7 @@ def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
 
 
 def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
-    """The model of a run from its checkpoint; a rendering's is that of the run it shows (see `experiments.renderings`).
+    """Load a run's model from its checkpoint; a rendering uses the one of the run it shows (see `experiments.renderings`).
 
     Raises:
         InputError: the checkpoint is missing or does not fit the recipe.
@@ -101,7 +101,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
 
 
 def _method(folder: RunFolder, provenance: Provenance) -> Method:
-    """The run's recipe.
+    """Read the run's recipe.
 
     Raises:
         InputError: it cannot be resolved here; where packages are missing that the run was made with, the sentence names them.

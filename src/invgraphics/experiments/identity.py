@@ -1,4 +1,4 @@
-"""When two runs are the same run: SHA-256 of everything that decides a result."""
+"""Identity of runs: SHA-256 of everything that determines a result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from invgraphics.text import sha256_of
 
 @dataclass(frozen=True)
 class TruthDigest:
-    """Fingerprints of a scene as it was loaded, which stand for its pixels where only they are needed.
+    """Hashes of a scene as loaded, which identify it without keeping its pixels in memory.
 
     Attributes:
         pixels: of the training, validation and test views.
@@ -27,12 +27,12 @@ class TruthDigest:
 
     @staticmethod
     def of(scene: Scene) -> TruthDigest:
-        """The fingerprints of ``scene``."""
+        """Hash the pixels and cameras of ``scene``."""
         return TruthDigest((scene.digest("train"), scene.digest("val"), scene.digest("test")), scene.camera_digest())
 
 
 def identify(job: Job, truth: TruthDigest, threads: int) -> str:
-    """The identity of a run: equal for equal bits, on one machine.
+    """Hash everything that determines a run's result; equal identities mean equal bits on one machine.
 
     Args:
         job: of the run; its degradations of training data follow from the truth as loaded, the settings and the seed, so that
@@ -59,7 +59,7 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
 
 
 def define(job: Job) -> str:
-    """The identity of a cell of a study: what it is asked for, whatever machine and code answer."""
+    """Hash the settings of a study's cell, independent of machine and code version."""
     request = job.request
     scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}
     scene |= {} if request.spp is None else {"spp": request.spp}  # so that studies without keep their folders' names
@@ -68,6 +68,6 @@ def define(job: Job) -> str:
 
 
 def _asked(job: Job) -> dict[str, Any]:
-    """Settings that decide a result; a budget counts, not its spelling."""
+    """Collect the request's settings that determine a result; budgets are normalised, whatever their spelling."""
     settings = {key: getattr(job.request, key) for key in ("seed", "device", "kernels", "protocol")}
     return settings | {"budget": str(job.budget)}

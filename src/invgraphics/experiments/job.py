@@ -1,4 +1,4 @@
-"""A run with all of its text read: the one place where requests are parsed."""
+"""Resolved run requests: the one place where a request's text is parsed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from invgraphics.training.budget import Budget, Cadence
 
 @dataclass(frozen=True)
 class Job:
-    """A `FitRequest` with everything that is text in it resolved and checked; what makes a run takes this.
+    """A `FitRequest` resolved and checked: method, budget, cadence, data and device as typed values.
 
     Attributes:
         request: as it was asked for; its values that need no reading (seed, scene, folders) stand there.
@@ -73,12 +73,12 @@ class Job:
 
     @property
     def folder(self) -> RunFolder:
-        """Of the run."""
+        """The run's folder."""
         return RunFolder(Path(self.request.out))
 
     @property
     def protocols(self) -> tuple[str, ...]:
-        """Names of the protocols that score the run, the default one last: a run that has its scores is finished."""
+        """Names of the protocols that score the run; the default one is last, and its scores mark the run as finished."""
         return tuple(dict.fromkeys([self.protocol.name, "default"]))
 
 

@@ -21,7 +21,7 @@ from invgraphics.training.poses import Poses, PosesConfig
 
 
 def protocol_note(method: Method) -> str:
-    """How test poses are aligned and refined, for a table of the protocol; empty where poses are taken as given."""
+    """Describe the alignment and refinement of test poses for the protocol's table; empty for fixed poses."""
     config = refined_poses(method)
     if config is None:
         return ""
@@ -30,7 +30,7 @@ def protocol_note(method: Method) -> str:
 
 
 def refined_poses(method: Method) -> PosesConfig | None:
-    """The settings of a method's pose refinement; ``None`` where it takes poses as given."""
+    """Settings of a method's pose refinement; ``None`` for fixed poses."""
     training = method.recipe.training
     return training.poses if training is not None and training.poses is not None and training.poses.optimise else None
 
@@ -47,13 +47,13 @@ def world_to_fit(poses: Poses, scene: Scene) -> Similarity:
 
 
 def transform_camera(camera: Camera, similarity: Similarity) -> Camera:
-    """The camera after a similarity of the world."""
+    """Transform a camera by a similarity of the world."""
     return camera.moved(similarity.poses(camera.cam_to_world).to(camera.cam_to_world))
 
 
 @torch.no_grad()
 def scene_in_fit_frame(poses: Poses, scene: Scene) -> Scene:
-    """The scene in the frame that the fit has drifted to: training cameras as refined, all else transformed by `world_to_fit`.
+    """Transform the scene to the fit's drifted frame: refined training cameras, all else transformed by `world_to_fit`.
 
     Its ``world_from_local`` leads to the same world as before."""
     errors = training_errors(poses, scene)
@@ -95,7 +95,7 @@ class PosedEvaluation:
         self._world_to_fit = self.errors.similarity.inverse()
 
     def camera(self, view: View) -> Camera:
-        """The test view's camera in the fit's frame, refined to its photograph where the settings say so."""
+        """Camera of a test view in the fit's frame, refined to its photograph if the settings enable it."""
         start = transform_camera(view.camera, self._world_to_fit)
         if not self._config.test_steps:
             return start
@@ -103,7 +103,7 @@ class PosedEvaluation:
         return refine_pose(self._model, replace(view, camera=start), self._scene, descent)
 
     def to_scene_frame(self, picture: Rendering, used: Camera, view: View) -> Rendering:
-        """The rendering with depth in the scene's units and normals in the scene's frame."""
+        """Convert a rendering's depth to the scene's units and its normals to the scene's frame."""
         turn = view.camera.cam_to_world[:3, :3] @ used.cam_to_world[:3, :3].T
         normal: Tensor | None = None if picture.normal is None else picture.normal @ turn.T
         return replace(picture, depth=picture.depth * self.errors.scale, normal=normal)

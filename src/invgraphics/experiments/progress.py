@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 
 class Reporter:
-    """Shows how far a piece of work is; writes to stderr so that stdout stays for results.
+    """Progress display on stderr, which leaves stdout to results.
 
     Args:
         title: what is being done.
@@ -39,7 +39,7 @@ class Reporter:
             self._bar.stop()
 
     def show(self, fraction: float, note: str) -> None:
-        """Say that ``fraction`` of the work is done."""
+        """Update the display: ``fraction`` of the work is done."""
         now = time.monotonic()
         if self._bar is not None:
             self._bar.update(self._task, completed=fraction, note=note)
@@ -49,5 +49,5 @@ class Reporter:
 
 
 def warn(sentence: str) -> None:
-    """Say on stderr what must not be missed, in red on a terminal."""
+    """Print a warning to stderr, in red on a terminal."""
     Console(stderr=True, highlight=False, markup=False).print(sentence, style="bold red", soft_wrap=True)

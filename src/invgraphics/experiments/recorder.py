@@ -1,4 +1,4 @@
-"""Watches a fit: history, checkpoints, monitor views, progress and interruptions. Its own time is not the fit's."""
+"""Training loop around a fit: history, checkpoints, monitor PSNR, progress and interruptions, outside the fit's clock."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Monitor:
 
     @torch.no_grad()
     def psnr(self, fit: Fit) -> float:
-        """PSNR in dB over all watched pixels, over the declared background."""
+        """PSNR in dB over all monitored pixels, over the declared background."""
         ctx = Context(self._bounds, progress=fit.progress)
         background = self._scene.background.to(self._device)
         errors = []
@@ -164,7 +164,7 @@ class Recorder:
         self._saved_at = (self._fit.steps, time.monotonic())
 
     def _keep_snapshot(self, progress: float) -> None:
-        """Keep the model, if the fit has come to a moment that is wanted and is not there."""
+        """Write a snapshot of the model if one is due and not yet written."""
         if self._folder is None or not self._snapshots:
             return
         path = self._folder.snapshot(math.floor(progress * self._snapshots))

@@ -1,4 +1,4 @@
-"""The same fitted field through other renderers: what of a picture is the representation, and what is the renderer.
+"""Cross-rendering of a fitted field by other renderers, which separates effects of representation and renderer.
 
 A rendering is a run folder without a fit, ``RUN/rendered/NAME``; it knows the run whose checkpoint it shows. The run holds what
 the pictures of one fit differ in (`invgraphics.runs.renderings`).
@@ -33,7 +33,7 @@ FOLDER = "rendered"
 
 
 def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method], scene: Scene) -> None:
-    """Refuse renderers that cannot show what the methods fit, before anything is fitted.
+    """Check before fitting that each renderer can render the methods' fields.
 
     Raises:
         InputError: a renderer is named twice, has learnt state for which no constants stand in, or needs what a field does
@@ -53,7 +53,7 @@ def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method
 
 
 def rendered(job: Job) -> bool:
-    """Whether every rendering that a job asks for is there, of the fit that is there."""
+    """Whether every rendering requested by a job exists and belongs to the current fit."""
     if not job.variants:
         return True
     try:
@@ -64,7 +64,7 @@ def rendered(job: Job) -> bool:
 
 
 def render_missing(job: Job, scene: Scene) -> None:
-    """Show a finished fit through every renderer that its job names; renderings that are there are kept.
+    """Render and score a finished fit by every requested renderer; existing renderings are kept.
 
     Args:
         job: of the fit.
@@ -95,7 +95,7 @@ def render_missing(job: Job, scene: Scene) -> None:
 def _render(
     folder: RunFolder, fit: RunFolder, model: tuple[Method, RendererVariant], scene: Scene, protocols: Sequence[str]
 ) -> None:
-    """Make one rendering, unless it is there."""
+    """Render and score the fit by one renderer, unless that was done before."""
     method, variant = model
     seen = with_renderer(method, variant)
     identity = sha256_of([fit.identity, variant.digest])
@@ -124,7 +124,7 @@ def _render(
 
 
 def _with_own(variants: Sequence[RendererVariant], method: Method) -> list[RendererVariant]:
-    """The renderer of the fit, under the name that was asked for if it was, and all others."""
+    """List the fit's own renderer, under its requested name if it has one, and all others."""
     own = method.table["renderer"]
     named = [variant for variant in variants if variant.table == own]
     others = [variant for variant in variants if variant.table != own]
@@ -137,7 +137,7 @@ def _identity(folder: RunFolder, variants: Sequence[RendererVariant], method: Me
 
 
 def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:
-    """Kept predictions over the scene's background, in its colour space and before rounding to 8 bits."""
+    """Composite saved predictions over the scene's background, in its colour space, without rounding to 8 bits."""
     background = scene.background.numpy()
     pictures = []
     for index in range(len(scene.test)):
@@ -150,7 +150,7 @@ def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:
 def _difference(
     renderers: tuple[str, str], one: Sequence[Float[ndarray, "h w 3"]], other: Sequence[Float[ndarray, "h w 3"]]
 ) -> Difference:
-    """Per view, between pictures of one fit by two renderers."""
+    """Colour difference per view between pictures of one fit by two renderers."""
     gaps = [a - b for a, b in zip(one, other, strict=True)]
     rmse, largest = [float(np.sqrt((gap**2).mean())) for gap in gaps], [float(np.abs(gap).max()) for gap in gaps]
     return Difference(renderers=renderers, rmse=tuple(rmse), largest=tuple(largest))

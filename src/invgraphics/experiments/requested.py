@@ -1,4 +1,4 @@
-"""Whether what a recipe asks for can fit into memory, from its settings alone: before anything is built."""
+"""Lower bound of a recipe's memory demand from its settings alone, checked before anything is built."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TRAINED_COPIES = 4
 
 
 def check_request(method: Method, scene: Scene) -> None:
-    """Refuse a method whose field or whose batches alone need more memory than is free. An estimate from below.
+    """Check that a method's field and batches fit into free memory; the estimate is a lower bound.
 
     Raises:
         InputError: it does not fit; the remedy names the value to change.
@@ -42,7 +42,7 @@ def check_request(method: Method, scene: Scene) -> None:
 
 
 def _parameter_bytes(method: Method, scene: Scene) -> int:
-    """Bytes of a field's parameters, from shapes without storage."""
+    """Bytes of a field's parameters, from tensor shapes on torch's meta device."""
     try:
         with torch.device("meta"):
             field = method.recipe.field.build(scene)

@@ -1,4 +1,4 @@
-"""One run: open the scene, build the method, fit, keep, evaluate."""
+"""One run: open the scene, build the model, fit, write the run folder, evaluate."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from invgraphics.training.fit import Fit
 
 
 def fit_run(request: FitRequest) -> Path:
-    """Make the run that ``request`` describes; returns its folder.
+    """Fit and evaluate the run that ``request`` describes; returns its folder.
 
     Raises:
         InputError, KeyboardInterrupt, NumericalError: as `make_run`.
@@ -59,7 +59,7 @@ def fit_run(request: FitRequest) -> Path:
 
 
 def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None] | None = None) -> None:
-    """Make a run in its folder; one that is there already is kept, continued or replaced, as the request says.
+    """Fit and evaluate a run in its folder; an existing run is kept, resumed or replaced, as requested.
 
     Args:
         job: of the run.
@@ -115,7 +115,7 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
 
 
 def prepare(job: Job, shown: Scene) -> Fit:
-    """The fit of a job before its first step, on the scene as the fit sees it.
+    """Build a job's fit, before its first step, on the degraded training data.
 
     Raises:
         InputError: method and scene do not go together, or what the method starts from cannot be used.
@@ -134,7 +134,7 @@ def _check_existing(folder: RunFolder, request: FitRequest) -> None:
 
 
 def _warm_up(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
-    """Take a step and a look of the monitor that count for nothing; the memory that they needed tells what the fit will need.
+    """Run a discarded warm-up step and monitor pass, and forecast the fit's memory from their peak.
 
     Raises:
         InputError: the primitives would need more memory than the machine has.
@@ -148,7 +148,7 @@ def _warm_up(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
 
 
 def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
-    """What the person is in for, said before the work starts."""
+    """Forecast the fit's budget, memory and evaluation time in one sentence, before the fit starts."""
     views = len(fit.plan.scene.test)
     seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
@@ -157,21 +157,21 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
 
 
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
-    """Write how busy the machine was beside the run's provenance, and warn where others had the fit's cores."""
+    """Write the system load to the run's provenance, and warn where other processes disturbed the timings."""
     folder.write(replace(folder.read(Provenance), threads=torch.get_num_threads(), load_average=spent.load_average))
     if disturbed := disturbance(processor_share(spent)):
         warn(f"The fit {disturbed}. Its times are not to be compared.")
 
 
 def _evaluate(job: Job, scene: Scene, fit: Fit, spent: FitRecord) -> None:
-    """Score the fit on the scene as loaded. The default protocol's scores come last: a run that has them is finished."""
+    """Score the fit on the scene as loaded. The default protocol's scores are last: they mark the run as finished."""
     job.folder.write(spent)
     for protocol in job.protocols:
         evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
 
 
 def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance:
-    """Write recipe, machine and truth, and return what can be known before the fit of where the run comes from.
+    """Write the run's recipe, environment and truth; return its provenance as known before the fit.
 
     Args:
         job: of the run.
@@ -216,7 +216,7 @@ def _relative(target: Path, start: Path) -> tuple[str, ...]:
 
 
 def work(job: Path) -> int:
-    """Make the run of a JSON job file in this process; the exit status says how it went (see `executors.local`)."""
+    """Run the fit of a JSON job file in this process; returns its exit status (see `executors.local`)."""
     try:
         fit_run(FitRequest.from_json(json.loads(job.read_text())))
     except KeyboardInterrupt:
@@ -230,7 +230,7 @@ def work(job: Path) -> int:
 
 
 def end_with_parent() -> None:
-    """Ask this process to end when its standard input is closed, which happens however the parent dies."""
+    """Terminate this process when its standard input closes, as it does however the parent dies."""
 
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 1):  # not sys.stdin.read, whose lock would outlive the interpreter

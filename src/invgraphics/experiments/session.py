@@ -1,4 +1,4 @@
-"""Fits as objects: one that is made in this process, or one that a run folder keeps."""
+"""Fits as objects of the public interface: in memory, or loaded from a run folder."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class FittedRun(ABC):
     @property
     @abstractmethod
     def history(self) -> tuple[Moment, ...]:
-        """The fit's course: moments with ``step``, ``seconds``, ``progress``, and ``psnr`` on views that are not trained on."""
+        """Training history: ``step``, ``seconds``, ``progress``, and ``psnr`` on held-out views."""
 
     @property
     @abstractmethod
@@ -121,7 +121,7 @@ class FittedRun(ABC):
     @property
     @abstractmethod
     def scores(self) -> ScoreTable:
-        """Scores under the default protocol; of a fit without a folder, computed when they are first asked for."""
+        """Scores under the default protocol; without a run folder, computed on first access."""
 
     def evaluate(self, protocol: str = "default") -> ScoreTable:
         """Render and score the test views by the rules of the command line.
@@ -135,7 +135,7 @@ class FittedRun(ABC):
         return ScoreTable(score_model(self.model, self.scene, protocol, self.method.name, self.poses))
 
     def through(self, renderer: str) -> Model:
-        """The fitted field seen through the renderer of another method.
+        """Model of the fitted field with the renderer of another method.
 
         Args:
             renderer: a method's name; settings of its renderer may follow, ``gaussian-volume/exact:steps=8``.
@@ -161,7 +161,7 @@ class FittedRun(ABC):
 
 @final
 class MemoryRun(FittedRun):
-    """A fit in this process that no folder keeps; an interrupted one can go on.
+    """A fit in this process, without a run folder; an interrupted one can be resumed.
 
     Args:
         job: what to fit, and how.
@@ -198,7 +198,7 @@ class MemoryRun(FittedRun):
             self._scores = None
 
     def resume(self, budget: str | None = None) -> None:
-        """Go on where the fit stands, in this object; one that was interrupted ends with the same bits as one that was not.
+        """Continue the fit from its current step, in place; an interrupted fit ends with the same bits as an uninterrupted one.
 
         Args:
             budget: of the whole fit from its beginning, ``60s`` or ``5000steps``; ``None`` for the one that it had. A larger
@@ -233,7 +233,7 @@ class MemoryRun(FittedRun):
 
     @property
     def scores(self) -> ScoreTable:
-        """Scores under the default protocol, computed when they are first asked for."""
+        """Scores under the default protocol, computed on first access."""
         if self._scores is None:
             scores = self.evaluate()
             costs = fit_costs(fit_record(self.fit.steps, self.fit.clocks()))
@@ -243,7 +243,7 @@ class MemoryRun(FittedRun):
 
 @final
 class FolderRun(FittedRun):
-    """A run that a folder keeps, opened again.
+    """A fit loaded from its run folder.
 
     Args:
         fitted: the run's scene and model.
@@ -278,5 +278,5 @@ class FolderRun(FittedRun):
 
     @property
     def scores(self) -> ScoreTable:
-        """The scores that the folder keeps; those of the last checkpoint where the run was interrupted."""
+        """Scores from the run folder; those of the last checkpoint where the run was interrupted."""
         return ScoreTable(self._fitted.folder.read_scores()) if self.finished else self.evaluate()

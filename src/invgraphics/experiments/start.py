@@ -1,4 +1,4 @@
-"""What a fit of explicit primitives starts from, and what it may grow to."""
+"""Initialisation of explicit primitives from another run, and the forecast of a fit's peak memory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ the forecast, or exceeded it by 12."""
 
 
 def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
-    """The plan, beginning with the converted field of the run that the recipe's ``field.source`` names, if it names one.
+    """Initialise the plan's field by conversion from the run that the recipe's ``field.source`` names, if any.
 
     Raises:
         InputError: there is no such run, it shows another scene, or its field cannot be converted.
@@ -55,7 +55,7 @@ def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
 
 @dataclass(frozen=True)
 class MemoryForecast:
-    """What a fit will hold at most, above what its process held before it.
+    """Forecast peak memory of a fit, above what its process held before.
 
     Attributes:
         bytes: on the device that computes.
@@ -71,7 +71,7 @@ class MemoryForecast:
 
 
 def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
-    """What a fit will need: what it holds after a step and a look of the monitor, and what is still to come.
+    """Forecast peak memory: what a step and a monitor pass needed, plus what is still to be allocated.
 
     To come are primitives with their gradients, moments and footprints, pictures at full size where the fit begins with smaller
     ones, more rays where empty space leaves fewer samples on each, and a checkpoint's copy of the parameters and their moments.

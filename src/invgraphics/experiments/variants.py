@@ -1,4 +1,4 @@
-"""Renderers by name, for looking at a field that was fitted through another one."""
+"""Named renderer variants, for rendering a field that was fitted through another renderer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SETTING = r":(?=[\w.]+=)"
 
 @dataclass(frozen=True)
 class RendererVariant:
-    """A renderer through which a fitted field is shown.
+    """A named renderer, with its settings, for rendering a fitted field.
 
     Attributes:
         name: as it was asked for, ``METHOD`` or ``METHOD:key=value:key=value`` with keys of the recipe's renderer.
@@ -31,13 +31,13 @@ class RendererVariant:
 
     @property
     def folder(self) -> str:
-        """The name as one folder name."""
+        """The variant's name as one folder name."""
         method, *settings = re.split(_SETTING, self.name)
         return re.sub(r"[^\w.=+-]+", "-", "-".join([slug(method), *settings]))
 
 
 def variant_named(name: str) -> RendererVariant:
-    """Read what ``--render-with`` names.
+    """Parse an entry of ``--render-with``.
 
     Raises:
         InputError: unknown method or setting, or a renderer of several parts whose recipe does not say which.
@@ -48,6 +48,6 @@ def variant_named(name: str) -> RendererVariant:
 
 
 def with_renderer(method: Method, variant: RendererVariant) -> Method:
-    """A method with another renderer."""
+    """Replace a method's renderer."""
     name = f"{method.name} rendered with {variant.name}"
     return resolve(name, method.preset, method.table | {"renderer": variant.table})

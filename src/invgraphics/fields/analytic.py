@@ -1,4 +1,4 @@
-"""Fields whose line integrals are known in closed form: oracles for samplers, renderers and tests."""
+"""Analytic fields with closed-form line integrals: ground truth for samplers, renderers and tests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Colour = Sequence[float] | Float[Tensor, " 3"] | Float[Tensor, "k 3"]
 
 
 class AnalyticField(Field):
-    """A density in closed form, of one colour per direction.
+    """Base of fields with a closed-form density and line integral, and a colour that depends on direction only.
 
     Args:
         colour: radiance everywhere; see `Colour`.
@@ -38,7 +38,7 @@ class AnalyticField(Field):
 
     @abstractmethod
     def density_at(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-        """Density at points."""
+        """Density at points, per local unit of length."""
 
     @abstractmethod
     def optical_depth(self, rays: Rays) -> Float[Tensor, " n"]:
@@ -70,12 +70,12 @@ class Slab(AnalyticField):
         self.register_buffer("axis", normalize(_vector(axis), dim=0))
 
     def density_at(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-        """The constant inside, zero outside."""
+        """Density: the constant inside, zero outside."""
         height = position @ self.axis
         return self.density * ((height >= self.lo) & (height <= self.hi))
 
     def optical_depth(self, rays: Rays) -> Float[Tensor, " n"]:
-        """Density times the length between the planes."""
+        """Optical depth: density times the ray's length between the planes."""
         height, slope = rays.origins @ self.axis, rays.directions @ self.axis
         # A ray along the planes is inside all the way or never: the infinities of the division say which.
         slope = torch.where(slope == 0, torch.full_like(slope, 1e-30), slope)
@@ -96,15 +96,15 @@ class Sphere(AnalyticField):
         self.register_buffer("centre", _vector(centre))
 
     def density_at(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-        """The constant inside, zero outside."""
+        """Density: the constant inside, zero outside."""
         return self.density * (self.sdf_at(position) <= 0)
 
     def sdf_at(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-        """Distance to the sphere, negative inside."""
+        """Signed distance to the sphere, negative inside."""
         return (position - self.centre).norm(dim=1) - self.radius
 
     def optical_depth(self, rays: Rays) -> Float[Tensor, " n"]:
-        """Density times the length of the chord."""
+        """Optical depth: density times the length of the chord."""
         offset = self.centre - rays.origins
         middle = (offset * rays.directions).sum(dim=1)
         squared = self.radius**2 - (offset - middle[:, None] * rays.directions).square().sum(dim=1)
@@ -146,12 +146,12 @@ class GaussianBlob(AnalyticField):
         self.centre = nn.Parameter(_vector(centre))
 
     def density_at(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-        """The Gaussian."""
+        """Density of the Gaussian at points."""
         offset = position - self.centre
         return self.peak * torch.exp(-self._product(offset, offset) / 2)
 
     def optical_depth(self, rays: Rays) -> Float[Tensor, " n"]:
-        """A Gaussian restricted to a line is a Gaussian, whose integral is an error function.
+        """Optical depth by the error function: a Gaussian restricted to a line is a Gaussian.
 
         With the exponent ``-(a t^2 + 2 b t + c) / 2`` along the ray, completed to ``-(a (t + b/a)^2 + c - b^2/a) / 2``.
         """

@@ -1,4 +1,4 @@
-"""From a density field to points where it shows something, from which Gaussians can start."""
+"""Conversion of a density field to visible surface points, from which Gaussians are initialised."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EFFORT = 64
 
 @torch.no_grad()
 def visible_points(field: Field, scene: Scene, count: int) -> Points:
-    """Points drawn where the training views see the field: each on a random ray, at a depth drawn by the weights along it.
+    """Sample points visible from the training views: each on a random ray, at a depth drawn from the rendering weights.
 
     A pixel of opacity alpha gives a point with probability alpha, so points are as dense as what is seen; what is hidden inside
     a solid gets none. Randomness comes from torch's global generator.
@@ -60,7 +60,7 @@ def visible_points(field: Field, scene: Scene, count: int) -> Points:
 
 
 def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
-    """Batches of random pixels' rays, each of one random training view."""
+    """Generate batches of rays through random pixels, each batch of one random training view."""
     for _ in range(-(-most // RAYS)):
         camera = scene.train[int(torch.randint(len(scene.train), ()))].camera
         flat = torch.randint(camera.width * camera.height, (RAYS,))
@@ -68,7 +68,7 @@ def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
 
 
 def _drawn(field: Field, rays: Rays, bounds: Bounds) -> Points:
-    """At most one point on each ray."""
+    """Sample at most one point per ray by its rendering weights; rays pass through with probability 1 - alpha."""
     rays = bounds.clip(rays)
     edges = _edges(rays, bounds)
     index = torch.arange(len(rays), device=edges.device).repeat_interleave(SAMPLES)
@@ -88,7 +88,7 @@ def _drawn(field: Field, rays: Rays, bounds: Bounds) -> Points:
 
 
 def _edges(rays: Rays, bounds: Bounds) -> Float[Tensor, "n samples_plus_1"]:
-    """Interval ends: even steps through a box, even ratios of distance where space is unbounded."""
+    """Interval edges along rays: linear in distance in a box, logarithmic in a contracted space."""
     s = torch.linspace(0, 1, SAMPLES + 1, device=rays.near.device)
     near, far = rays.near[:, None], rays.far[:, None]
     return near * (far / near) ** s if bounds.space == "contracted" else near + (far - near) * s

@@ -24,7 +24,7 @@ PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "
 
 @dataclass(frozen=True)
 class GaussianFieldConfig:
-    """How a set of Gaussians starts.
+    """Settings of a set of Gaussians and its initialisation.
 
     Attributes:
         sh_degree: degree of the colour's spherical harmonics, 0 to 3.
@@ -67,12 +67,12 @@ class GaussianFieldConfig:
             raise ValueError("init = 'field' needs the folder of a run as 'source', and nothing else does.")
 
     def capped(self, most: int) -> GaussianFieldConfig:
-        """The same, starting with at most ``most`` Gaussians; the backdrop gives way first."""
+        """Limit the initial number of Gaussians to ``most``; backdrop points are dropped first."""
         count, max_init = min(self.count, most), min(self.max_init, most)
         return replace(self, count=count, max_init=max_init, backdrop=min(self.backdrop, most - max(count, max_init)))
 
     def build(self, scene: Scene) -> GaussianField:
-        """The Gaussians that a fit of ``scene`` starts from; randomness comes from torch's global generator.
+        """Initialise the Gaussians for ``scene``; randomness comes from torch's global generator.
 
         With ``init = "field"`` they are random until `converted` is given the field.
 
@@ -88,7 +88,7 @@ class GaussianFieldConfig:
         return self.from_points(points, scene)
 
     def converted(self, source: Field, scene: Scene) -> GaussianField:
-        """Gaussians where the training views see the density field ``source``.
+        """Initialise Gaussians by conversion of the density field ``source``, where the training views see it.
 
         Raises:
             InputError: it has no density and radiance, or is empty.
@@ -96,7 +96,7 @@ class GaussianFieldConfig:
         return self.from_points(visible_points(source, scene, self.max_init), scene)
 
     def from_points(self, points: Points, scene: Scene) -> GaussianField:
-        """One Gaussian per point, whose colour is in the scene's colour space; as wide as its neighbours are far."""
+        """Initialise one Gaussian per point, coloured in the scene's colour space, scaled by its neighbours' distances."""
         n, rgb = len(points), points.rgb
         scales = starting_scales(points.position, scene.bounds) * self.scale_factor
         logit = torch.logit(torch.tensor(self.opacity))
@@ -157,7 +157,7 @@ class GaussianField(Field):
         self.sh_active.fill_(degree)
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
-        """Gaussians have no pointwise reading here."""
+        """Refuse pointwise queries: this field has primitives only."""
         raise NotComposableError(f"GaussianField has no {want.words()} at points.", "It provides gaussians.")
 
     def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
@@ -172,7 +172,7 @@ class GaussianField(Field):
 
     @torch.no_grad()
     def replace(self, tensors: Mapping[str, Tensor]) -> None:
-        """Swap all parameters for new ones, of any common number of rows, without smoothing. An optimiser must be told.
+        """Replace all parameters by new ones, of any common number of rows, without smoothing. An optimiser must be told.
 
         Raises:
             ValueError: a name is missing or unknown, the numbers of rows differ, or a row has another shape than before.
@@ -200,7 +200,7 @@ class GaussianField(Field):
         )
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
-        """Convolved with the filter: wider, and fainter such that each keeps its integral (Mip-Splatting, §4.1)."""
+        """Apply the 3D smoothing filter: wider, and fainter such that each keeps its integral (Mip-Splatting, §4.1)."""
         if not bool(self.smoothing.any()):
             return gaussians
         scales = (gaussians.scales.square() + self.smoothing[:, None].square()).sqrt()
@@ -211,7 +211,7 @@ class GaussianField(Field):
         for name in PARAMETERS:
             stored, parameter = state_dict.get(prefix + name), getattr(self, name)
             if isinstance(stored, Tensor) and stored.shape[1:] == parameter.shape[1:] and len(stored) != len(parameter):
-                # Resized in place, so that whoever holds the parameter still holds it after loading.
+                # Resized in place, so that references to the parameter (an optimiser's, for instance) stay valid.
                 parameter.data = parameter.new_empty(stored.shape)
                 parameter.grad = None
         # Kept by runs that have it; others are not smoothed.

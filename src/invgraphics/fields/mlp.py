@@ -1,4 +1,4 @@
-"""Fully connected networks, their activations, and the initialisation that makes one a sphere's distance function."""
+"""Fully connected networks, their activations, and the geometric initialisation as a sphere's signed distance."""
 
 from __future__ import annotations
 

@@ -101,14 +101,20 @@ class NeuralFieldConfig:
         return widths[self.direction]
 
     def build(self, scene: Scene) -> NeuralField:
-        """The field of ``scene``'s region and colour space, its weights drawn from torch's global generator."""
+        """Build the field for ``scene``'s bounds and colour space, its weights drawn from torch's global generator."""
         return NeuralField(self, scene.bounds, scene.colour)
 
 
 @dataclass(frozen=True, eq=False)
 class _Answers:
-    """What the networks say about one chunk: the geometry network's output, the colour, the output's slope in the encoding,
-    and what the geometry network hands to the colour network."""
+    """Outputs of both networks on one chunk.
+
+    Attributes:
+        raw: density before its activation, or signed distance.
+        radiance: colour; ``None`` where it is not wanted.
+        slope: gradient of ``raw`` in the encoding's features; ``None`` without normals.
+        handed: features that the geometry network hands to the colour network; ``None`` where they are not wanted.
+    """
 
     raw: Float[Tensor, " m"]
     radiance: Float[Tensor, "m 3"] | None
@@ -220,7 +226,7 @@ class NeuralField(Field):
 
     @property
     def _contracted_density(self) -> float:
-        """Half-extents per local length unit where densities are per half-extent after contraction, else 0."""
+        """Half-extents per local unit, which scale densities given per contracted half-extent; 0 for other densities."""
         contracted = self._space == "contracted" and self.config.density_per == "contracted"
         return 1 / float(self.bounds.half.mean()) if contracted else 0.0
 
@@ -241,7 +247,7 @@ class NeuralField(Field):
         return zip(features.split(size), direction.split(size), strict=True)
 
     def _answer(self, features: Tensor, direction: Tensor, want: Quantity, training: bool) -> _Answers:
-        """Both networks on one chunk. Its graph is dropped at once unless ``training``."""
+        """Evaluate both networks on one chunk; detached unless ``training``."""
         with_colour = Quantity.RADIANCE in want
         if Quantity.NORMAL in want and not training:
             # Starting the chunk's graph here keeps it from growing over all chunks.
@@ -277,7 +283,7 @@ class NeuralField(Field):
 def unit_covariance(
     bounds: Bounds, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]
 ) -> Float[Tensor, "m 3 3"]:
-    """Covariances carried to the unit cube by the linearised map J Σ J^T (mip-NeRF 360, equation 9)."""
+    """Transform covariances to the unit cube by the linearised map J Σ J^T (mip-NeRF 360, equation 9)."""
     differentiable = torch.is_grad_enabled()
     with torch.enable_grad():
         if not (differentiable and position.requires_grad):

@@ -1,4 +1,4 @@
-"""Where Gaussians start: points of the scene, of its depth maps or at random, and sizes from their neighbours."""
+"""Initial points of Gaussians, from the scene, its depth maps or at random, and scales from nearest neighbours."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SCALE_RANGE = (1e-5, 0.5)
 
 
 def starting_scales(positions: Float[Tensor, "n 3"], bounds: Bounds) -> Float[Tensor, " n"]:
-    """Mean distance to the nearest neighbours, kept within `SCALE_RANGE`."""
+    """Initial scales: mean distance to the nearest neighbours, clamped to `SCALE_RANGE`."""
     from scipy.spatial import KDTree
 
     reach = (positions - bounds.centre).norm(dim=1).clamp_min(bounds.radius)
@@ -38,7 +38,7 @@ def starting_scales(positions: Float[Tensor, "n 3"], bounds: Bounds) -> Float[Te
 
 
 def random_points(bounds: Bounds, count: int) -> Points:
-    """Uniform points of random colour in the box; in a contracted space some of them on shells far around it."""
+    """Draw uniform points of random colour in the box, in a contracted space some of them on distant shells."""
     x = torch.rand(count, 3) * 2 - 1
     if bounds.space == "contracted":
         far = round(FAR_SHARE * count)
@@ -48,7 +48,7 @@ def random_points(bounds: Bounds, count: int) -> Points:
 
 
 def scene_points(scene: Scene, most: int) -> Points:
-    """Up to ``most`` of the scene's points, at random, with colours in the scene's colour space.
+    """Draw up to ``most`` of the scene's points, with colours in the scene's colour space.
 
     Raises:
         InputError: the point cloud is empty or not finite.
@@ -59,7 +59,7 @@ def scene_points(scene: Scene, most: int) -> Points:
 
 
 def backdrop_points(scene: Scene, count: int) -> Points:
-    """``count`` points behind the subject, along the rays of random pixels of the training views and of their colours.
+    """Draw ``count`` background points behind the subject, on rays of random training pixels, with their colours.
 
     Structure from motion knows the subject and little of what is behind it. Without Gaussians there, photographs are explained
     by floaters in front of it instead, which other views do not share. There are none in a box, which holds all there is, nor
@@ -87,7 +87,7 @@ def backdrop_points(scene: Scene, count: int) -> Points:
 
 
 def depth_points(scene: Scene, most: int) -> Points:
-    """Up to ``most`` surface points that the training views' depth maps show, evenly over the views, pixels at random.
+    """Draw up to ``most`` surface points from the training views' depth maps, evenly over views, pixels at random.
 
     Raises:
         InputError: no training view has a depth map, or they show nothing.
@@ -102,7 +102,7 @@ def depth_points(scene: Scene, most: int) -> Points:
 
 
 def _seen_points(view: View, most: int) -> Points:
-    """Points on a view's depth map; where it is transparent, nothing is hit."""
+    """Unproject a view's depth map to points; transparent pixels are left out."""
     assert view.depth is not None
     depth = view.depth.reshape(-1)
     hit = torch.isfinite(depth)

@@ -1,4 +1,4 @@
-"""Which preset of a recipe a fit takes: the one that is named, or the one whose budgets hold the fit's own."""
+"""Selection of a recipe's preset: by name, or by the fit's budget."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CHOSEN_ON = "chosen_on"
 
 @dataclass(frozen=True)
 class Preset:
-    """A preset of a recipe, and why it is this one.
+    """A selected preset of a recipe, and the reason for its selection.
 
     Attributes:
         name: as in the recipe; empty for none.
@@ -35,7 +35,7 @@ class Preset:
 
 
 def preset_for(budget: Budget | None, known: Collection[str]) -> str:
-    """Name of the preset for a budget: its own step of `LADDER`, else the nearest smaller one of the recipe's; empty for none.
+    """Select the preset for a budget: its step of `LADDER`, else the recipe's nearest smaller one; empty for none.
 
     A budget in steps says nothing about seconds; it takes the first, as does no budget.
 
@@ -49,7 +49,7 @@ def preset_for(budget: Budget | None, known: Collection[str]) -> str:
 
 
 def select_preset(method: str, asked: str | None, budget: Budget | None, known: Mapping[str, Any]) -> Preset:
-    """The preset that a person names, or the one for the budget.
+    """Select the preset by name, or else by the budget.
 
     Args:
         method: name of the recipe, for the sentence of an error.
@@ -74,7 +74,7 @@ def select_preset(method: str, asked: str | None, budget: Budget | None, known: 
 
 
 def described(known: Mapping[str, Any]) -> str:
-    """The presets of a recipe in a line, by length of budget, each with the scenes on which it was chosen.
+    """List a recipe's presets in a line, by length of budget, each with the scenes that it was tuned on.
 
     Args:
         known: the recipe's presets and their tables.
@@ -86,7 +86,7 @@ def described(known: Mapping[str, Any]) -> str:
 
 
 def announcements(choices: Iterable[tuple[str, str, str]]) -> list[str]:
-    """A sentence for each preset that nobody named.
+    """Report automatically selected presets, one sentence for each.
 
     Args:
         choices: (method, preset, what chose it) of every fit.
@@ -108,7 +108,7 @@ def _choice(budget: Budget) -> str:
 
 
 def _span(seconds: float) -> str:
-    """An exact length of time in the largest unit that leaves no long fraction."""
+    """Format seconds exactly, in the largest unit that leaves no long fraction."""
     if seconds >= 3600 and seconds % 900 == 0:
         return f"{seconds / 3600:g} h"
     return f"{seconds / 60:g} min" if seconds >= 120 and seconds % 15 == 0 else f"{seconds:g} s"

@@ -28,11 +28,11 @@ PRESET = "preset="
 
 @dataclass(frozen=True)
 class Method:
-    """A recipe ready to be built.
+    """A resolved recipe, ready to build: name, table, preset and digest.
 
     Attributes:
         name: ``renderer/recipe`` or the path of a user's own TOML file, with changes after colons (see `split_name`).
-        preset: which preset was laid over the recipe; empty for none.
+        preset: name of the preset merged into the recipe; empty for none.
         recipe: its typed settings.
         table: the same, everything resolved, as plain values; what a run's ``recipe.toml`` holds.
         preset_choice: what chose the preset, in words; empty where it was asked for.
@@ -48,17 +48,17 @@ class Method:
 
     @property
     def choice(self) -> tuple[str, str, str]:
-        """Name, preset and what chose the preset, for `recipes.presets.announcements`."""
+        """Name, preset and reason of the preset's selection, for `recipes.presets.announcements`."""
         return self.name, self.preset, self.preset_choice
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the resolved table, the same whatever its keys are called by now."""
+        """SHA-256 of the resolved table, invariant under renamed keys."""
         return sha256_of(with_first_names(self.table))
 
 
 def methods() -> dict[str, str]:
-    """Name -> summary of every known method, our own first; imports no implementation."""
+    """List all known methods, name -> summary, built-in ones first; imports no implementation."""
     root = find("renderers")
     found = {}
     for path in sorted(root.glob("*/*.toml")):
@@ -74,7 +74,7 @@ def presets(name: str) -> list[str]:
 
 
 def load_method(name: str, preset: str | None = None, overrides: Sequence[str] = (), budget: Budget | None = None) -> Method:
-    """Read a method's recipe, lay a preset and then overrides over it, and check every key.
+    """Read a method's recipe, merge a preset and then overrides into it, and check every key.
 
     Args:
         name: ``renderer/recipe`` of a built-in or plugged-in method, or the path of a TOML file; either may have changes after
@@ -93,7 +93,7 @@ def load_method(name: str, preset: str | None = None, overrides: Sequence[str] =
 def method_from(
     table: Mapping[str, Any], name: str, preset: str | None = None, overrides: Sequence[str] = (), budget: Budget | None = None
 ) -> Method:
-    """A method from a recipe's table as a file holds it, presets included; otherwise as `load_method`.
+    """Resolve a method from a recipe's table with its presets; otherwise as `load_method`.
 
     Raises:
         InputError: unknown preset or key, or a value of the wrong type.
@@ -107,7 +107,7 @@ def method_from(
 
 
 def split_name(name: str) -> tuple[str, str | None, tuple[str, ...]]:
-    """A method's name without the changes that follow it: recipe, preset (``None`` where none is named), and overrides.
+    """Split a method's name into recipe, preset (``None`` where none is named) and overrides.
 
     ``volumetric/hash:field.width=64:batches.rays=2048`` is the recipe with two values changed, ``volumetric/nerf:preset=paper``
     one of its presets. A comparison can so hold several variants of one recipe, each under a name that makes it again.
@@ -131,7 +131,7 @@ def assign(table: dict[str, Any], items: Sequence[str]) -> None:
 
 
 def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
-    """A method from a complete table, for instance from a run's ``recipe.toml``; keys may have names of earlier versions.
+    """Resolve a method from a complete table, such as a run's ``recipe.toml``; keys of earlier versions are renamed.
 
     Raises:
         InputError: unknown key, a value of the wrong type, or a hook that the field cannot serve.
@@ -144,7 +144,7 @@ def resolve(name: str, preset: str, table: dict[str, Any]) -> Method:
 
 
 def source(name: str) -> dict[str, Any]:
-    """The recipe's table as written, presets included; changes that the name itself makes are left out."""
+    """Read a recipe's table as written, presets included, without the overrides in the method's name."""
     name = split_name(name)[0]
     if name.endswith(".toml"):
         path = Path(name)

@@ -1,4 +1,4 @@
-"""Keys of recipes that have been renamed. Recipes and runs from before still open."""
+"""Renamed recipe keys, with which recipes and runs of earlier versions still load."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ A part is its dotted path, followed by its ``type`` where it has one: ``hooks.de
 
 
 def with_current_names(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A recipe's table with today's keys."""
+    """Rename a recipe table's old keys to their current names."""
     return _renamed(table, RENAMED_KEYS)
 
 
 def with_first_names(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A recipe's table with the keys' first names, for hashes that a renaming must not change."""
+    """Rename a recipe table's keys to their original names, for hashes that are invariant under renaming."""
     return _renamed(table, {part: {new: old for old, new in keys.items()} for part, keys in RENAMED_KEYS.items()})
 
 

@@ -15,27 +15,27 @@ from invgraphics.training.poses import TrainingConfig
 
 @runtime_checkable
 class CapsPrimitives(Protocol):
-    """A part of a recipe whose number of explicit primitives can be capped."""
+    """Protocol of recipe parts whose number of explicit primitives can be capped."""
 
     def capped(self, most: int) -> Self:
-        """The same part, making at most ``most`` primitives."""
+        """Limit this part to at most ``most`` primitives."""
         ...
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A method as data: field x renderer, and how to fit it.
+    """A method as data: field, renderer, losses, hooks, optimiser and batches.
 
     Attributes:
         summary: one sentence for ``invgraphics list`` and the report.
         paper: where the method comes from.
         field: parameterisation of the scene.
-        renderer: how it becomes a picture.
+        renderer: how it is rendered.
         losses: their sum is minimised.
-        hooks: what happens between steps.
+        hooks: callbacks between steps, such as density control.
         optimiser: Adam's settings and parameter groups.
         batches: size of a step.
-        training: what else the fit finds out, such as the cameras' poses; ``None`` for nothing.
+        training: what the fit optimises besides the model, such as the cameras' poses; ``None`` for nothing.
         max_primitives: most explicit primitives, of fields and hooks that make some; ``None`` leaves it to their own settings.
     """
 
@@ -55,7 +55,7 @@ class Recipe:
             raise ValueError(f"max_primitives must be at least 1, not {self.max_primitives}.")
 
     def capped(self) -> Recipe:
-        """The recipe with ``max_primitives`` applied to the field and the hooks that make primitives (`CapsPrimitives`)."""
+        """Apply ``max_primitives`` to the field and the hooks that create primitives (`CapsPrimitives`)."""
         most = self.max_primitives
         if most is None:
             return self
@@ -63,7 +63,7 @@ class Recipe:
         return replace(self, field=field, hooks=tuple(hooks))
 
     def check_hooks(self) -> None:
-        """Refuse a hook that needs what the field does not have, before anything is built.
+        """Check before building that the field provides what each hook needs.
 
         Classes are those with which ``build`` of the configs is annotated; where there is no annotation, the fit checks.
 
@@ -77,7 +77,7 @@ class Recipe:
 
 
 def _built(config: Any) -> type | None:
-    """The class that a config's ``build`` says it returns; ``None`` where it does not say."""
+    """Return annotation of a config's ``build``; ``None`` without one."""
     try:
         result = get_type_hints(type(config).build).get("return")
     except (AttributeError, NameError, TypeError):  # a name that is imported for type checkers only

@@ -1,4 +1,4 @@
-"""The project's idea as a table: field parameterisation x renderer, from the recipes themselves."""
+"""Matrix of methods, field parameterisation x renderer, generated from the recipes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from invgraphics.recipes.recipe import methods, source
 
 
 def matrix() -> tuple[list[str], list[str], dict[tuple[str, str], list[str]]]:
-    """Rows (fields), columns (renderers), and the methods in each cell, in the order of `methods`."""
+    """Build the matrix of methods: fields as rows, renderers as columns, methods in each cell in the order of `methods`."""
     cells: dict[tuple[str, str], list[str]] = {}
     for name in methods():
         table = source(name)
@@ -20,7 +20,7 @@ def matrix() -> tuple[list[str], list[str], dict[tuple[str, str], list[str]]]:
 
 
 def markdown() -> str:
-    """The table as Markdown, for the README."""
+    """Format the matrix as Markdown, for the README."""
     rows, columns, cells = matrix()
     lines = ["| field | " + " | ".join(columns) + " |", "|---|" + "---|" * len(columns)]
     for row in rows:
@@ -35,6 +35,6 @@ def _field_title(field: dict[str, Any]) -> str:
 
 
 def _title(registry: str, part: dict[str, Any]) -> str:
-    """The title that a component's config declares; else its type."""
+    """Display title of a component: declared by its config, else its type."""
     kind = str(part["type"])
     return str(getattr(plugins.load(registry, kind), "title", kind))

@@ -1,4 +1,4 @@
-"""Ways to make a picture (see `invgraphics.core.Renderer`); each entry is a frozen config with ``build(scene)``."""
+"""Renderers (see `invgraphics.core.Renderer`); each entry is a frozen config with ``build(scene)``."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""From a pixel's weighted sums to colour, alpha, depth and normal."""
+"""Normalisation of a pixel's weighted sums to colour, alpha, depth and normal."""
 
 from __future__ import annotations
 

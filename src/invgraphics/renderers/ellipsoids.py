@@ -1,4 +1,4 @@
-"""Gaussians as solid ellipsoids, to see what a fit is made of; not a way to fit."""
+"""Rendering of Gaussians as opaque ellipsoids, for inspection of a fit; not differentiable."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _nearest(
 
 
 def _squares(mean: Float[Tensor, "n 3"], axes: Float[Tensor, "n 3 3"], camera: Camera) -> Footprints:
-    """Where the ellipsoids lie on the screen, as `over_tiles` needs it."""
+    """Screen-space bounding squares of the ellipsoids, for `over_tiles`."""
     n = len(mean)
     means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]
     image = homogeneous(torch.cat([axes, mean[:, :, None]], dim=2), camera)

@@ -19,7 +19,7 @@ REACH = 4.0
 def density_profile(
     t: Float[Tensor, " k"], sigma: Float[Tensor, " k"], depth: Float[Tensor, " k"], rays: Rays
 ) -> Profile | None:
-    """Profile of Gaussians as overlapping densities; ``None`` without any, or where one is flat.
+    """Density and transmittance profile of Gaussians as overlapping densities; ``None`` without any, or where one is flat.
 
     Args:
         t: distance of each one's largest response.

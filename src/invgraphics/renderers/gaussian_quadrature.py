@@ -1,4 +1,4 @@
-"""The volume-rendering equation over overlapping Gaussians on a ray."""
+"""Quadrature of the volume-rendering equation over overlapping Gaussians on a ray."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MOST_AT_ONCE = 1 << 18
 
 
 def phi(z: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
-    """The standard normal distribution's integral up to ``z``."""
+    """Cumulative distribution function of the standard normal distribution at ``z``."""
     return 0.5 * (1 + torch.erf(z / sqrt(2)))
 
 
@@ -63,7 +63,7 @@ def integrate_overlapping(intersections: Intersections, rays: Rays, steps: int, 
 
 
 def _in_blocks(intersections: Intersections, rays: int, nodes: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Rays with about as many Gaussians side by side: rays (n,), places of their intersections (n, k), which of these exist."""
+    """Batch rays of similar intersection counts: ray indices (n,), their intersections' indices (n, k), and a valid mask."""
     counts = torch.bincount(intersections.ray, minlength=rays)
     firsts = counts.cumsum(0) - counts
     order = counts.argsort(descending=True)
@@ -79,7 +79,7 @@ def _in_blocks(intersections: Intersections, rays: int, nodes: int) -> Iterator[
 def _interval(
     t: Float[Tensor, "n k"], sigma: Float[Tensor, "n k"], there: Bool[Tensor, "n k"], near: Tensor, far: Tensor
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """The part of each ray on which its Gaussians lie: finite, so that gradients are."""
+    """Integration interval of each ray, which covers its Gaussians; finite, so that gradients are."""
     low = torch.where(there, t - SURE * sigma, torch.inf).amin(dim=1).maximum(near)
     return low, torch.where(there, t + SURE * sigma, -torch.inf).amax(dim=1).minimum(far).maximum(low)
 
@@ -116,7 +116,7 @@ def place_nodes(
     interval: tuple[Float[Tensor, " n"], Float[Tensor, " n"]],
     steps: int,
 ) -> Float[Tensor, "n steps_plus_1"]:
-    """Ends of intervals that share alpha, and optical depth up to `DARK`, about equally.
+    """Edges of quadrature intervals with about equal shares of alpha, and of optical depth up to `DARK`.
 
     Splitting an interval's light in proportion is wrong by about its light times its optical depth times how much the mixture
     changes in it, so both are kept small. Only the places are approximate; what happens between them is not.

@@ -41,7 +41,7 @@ MOST_TESTED = 1 << 18
 
 @dataclass(frozen=True, eq=False)
 class Primitives:
-    """m Gaussians with everything about them that does not depend on the ray.
+    """m Gaussians with their precomputed, ray-independent quantities.
 
     Attributes:
         means: centres.
@@ -175,7 +175,7 @@ def _colour(sh: Float[Tensor, "p c 3"], offset: Float[Tensor, "p 3"]) -> Float[T
 def _along(
     whitening: Float[Tensor, "*p 3 3"], offset: Float[Tensor, "*p 3"], direction: Float[Tensor, "*p 3"]
 ) -> tuple[Float[Tensor, "*p"], Float[Tensor, "*p"], Float[Tensor, "*p"]]:
-    """Distance of the largest response, standard deviation along the ray, squared Mahalanobis distance from the centre."""
+    """Restrict Gaussians to rays: distance of the peak, standard deviation, squared Mahalanobis distance from the centre."""
     x = (whitening * offset[..., None, :]).sum(dim=-1)
     d = (whitening * direction[..., None, :]).sum(dim=-1)
     rate = d.square().sum(dim=-1)
@@ -185,7 +185,7 @@ def _along(
 
 @torch.no_grad()
 def _search(primitives: Primitives, rays: Rays) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
-    """Rays and Gaussians that meet within the Gaussian's reach, by ray, then by Gaussian."""
+    """Find pairs of rays and Gaussians within the Gaussians' reach, sorted by ray, then by Gaussian."""
     some = _in_cone(primitives, rays)
     centres, exact = primitives.means[some], 1 - ROUNDING
     # A ray meets a Gaussian's sphere where |c - o|² - ((c - o).d)² <= r²; terms of one of the two are computed once.
@@ -207,7 +207,7 @@ def _search(primitives: Primitives, rays: Rays) -> tuple[Int[Tensor, " p"], Int[
 
 
 def _in_cone(primitives: Primitives, rays: Rays) -> Int[Tensor, " s"]:
-    """Gaussians that can be seen at all and whose sphere of reach meets the cone around rays with one origin."""
+    """Cull Gaussians: visible ones whose bounding sphere meets the cone around rays with one origin."""
     seen = primitives.reach > 0
     if len(rays) and bool((rays.origins == rays.origins[0]).all()):
         axis = normalize(rays.directions.mean(dim=0), dim=0)

@@ -1,4 +1,4 @@
-"""Gaussians ray-traced instead of splatted: composited one after the other, or integrated where they overlap."""
+"""Ray tracing of Gaussians: composited in order, or integrated as overlapping densities."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class GaussianRays(RayRenderer):
     @override
     @torch.no_grad()
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
-        """The Gaussians that the pixel's ray intersects; see `Renderer.contributions`."""
+        """List the Gaussians that the pixel's ray intersects; see `Renderer.contributions`."""
         primitives = precompute(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest, camera.position)
         rays = _clipped(camera.ray(pixel), ctx)
         return self._listed(intersect(primitives, rays), primitives, rays, camera.cam_to_world[:3, 2])
@@ -138,7 +138,7 @@ class GaussianRays(RayRenderer):
     def _listed(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
-        """Contributions of one ray's intersections, in the order in which they are composited."""
+        """Contributions of one ray's intersections, in compositing order."""
 
     def _render(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, ctx: Context) -> Rendering:
         rays = _clipped(rays, ctx)
@@ -166,13 +166,13 @@ class GaussianExact(GaussianRays):
         self.config = config
 
     def weigh(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool) -> Weights:
-        """See `integrate_overlapping`; there is no order."""
+        """Integrate overlapping densities to weights (see `integrate_overlapping`), independent of order."""
         return integrate_overlapping(intersections, rays, self.config.steps, with_distances)
 
     def _listed(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
-        """Nearest first, with the transmittance of the whole mixture."""
+        """Contributions by distance, with the transmittance of the whole mixture."""
         weight, _ = self.weigh(intersections, rays, axis, False)
         order = intersections.t.argsort(stable=True)
         order = order[intersections.depth[order] > 0]
@@ -199,7 +199,7 @@ class GaussianSorted(GaussianRays):
         self.config = config
 
     def weigh(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool) -> Weights:
-        """Front to back: alpha_i = 1 - exp(-tau_i), seen through all that come before."""
+        """Composite front to back: w_i = alpha_i times the product of (1 - alpha_j) before it, alpha_i = 1 - exp(-tau_i)."""
         near, far = rays.near[intersections.ray], rays.far[intersections.ray]
         t, sigma, depth = intersections.t, intersections.sigma, intersections.depth
         if self.config.opacity != "splat":
@@ -215,7 +215,7 @@ class GaussianSorted(GaussianRays):
     def _listed(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
-        """In the order of compositing; beside them, the same Gaussians as overlapping densities."""
+        """Contributions in compositing order, with the profile of the same Gaussians as overlapping densities."""
         weight, _ = self.weigh(intersections, rays, axis, False)
         order = self.order(intersections, rays, axis)
         order = order[intersections.depth[order] > 0]  # those below the splats' limit are on the ray all the same
@@ -236,7 +236,7 @@ class GaussianSorted(GaussianRays):
 
     @torch.no_grad()
     def order(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None) -> Int[Tensor, " p"]:
-        """Intersections by ray, then front to back."""
+        """Sort intersections by ray, then front to back."""
         key = intersections.t
         if self.config.order == "centre":
             axes = rays.directions[intersections.ray] if axis is None else axis
@@ -246,7 +246,7 @@ class GaussianSorted(GaussianRays):
 
 
 def _clipped(rays: Rays, ctx: Context) -> Rays:
-    """Rays that begin no nearer than the bounds allow."""
+    """Clip rays to the near distance of the bounds."""
     return rays.within(rays.near.clamp_min(ctx.bounds.near), rays.far)
 
 
@@ -256,6 +256,6 @@ def _check_smallest(smallest: float) -> None:
 
 
 def _by_tiles(camera: Camera) -> list[Tensor]:
-    """Pixel numbers, tile after tile."""
+    """Flat pixel indices of each screen tile."""
     pixels = torch.arange(camera.width * camera.height, device=camera.focal.device).view(camera.height, camera.width)
     return [tile.reshape(-1) for row in pixels.split(TILE, dim=0) for tile in row.split(TILE, dim=1)]

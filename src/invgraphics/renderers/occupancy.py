@@ -1,4 +1,4 @@
-"""A sampler that remembers where the scene is empty (Instant-NGP, appendix E) and stops behind opaque surfaces."""
+"""Occupancy-grid sampler with empty-space skipping (Instant-NGP, appendix E) and early ray termination."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LATE = 0.5
 
 @dataclass(frozen=True)
 class OccupancyConfig:
-    """Marching through an occupancy grid; the defaults are Instant-NGP's where nothing else is said.
+    """Settings of occupancy-grid ray marching; the defaults are Instant-NGP's unless noted.
 
     Attributes:
         resolution: cells along each edge of the unit cube.
@@ -93,33 +93,33 @@ class OccupancyConfig:
             raise ValueError("threshold, warmup, grace and cone must not be negative")
 
     def decay_at(self, progress: float) -> float:
-        """The decay at a point of the fit."""
+        """Decay of the occupancy EMA at a progress of the fit in [0, 1]."""
         if self.early_decay is None:
             return self.decay
         share = min(1.0, 2 * progress)
         return 1 - (1 - self.early_decay) ** (1 - share) * (1 - self.decay) ** share
 
     def steps_at(self, progress: float) -> float:
-        """Training steps across the diagonal at a point of the fit."""
+        """Number of march steps across the bounds' diagonal in training, at a progress of the fit in [0, 1]."""
         usual = self.steps_per_diagonal
         early, late = self.early_steps or usual, self.late_steps or usual
         return early * (usual / early) ** min(1.0, 4 * progress) * (late / usual) ** max(0.0, (progress - LATE) / (1 - LATE))
 
     def build(self, scene: Scene) -> Occupancy:
-        """The sampler; every cell is occupied, in endless space only those that a training view shows."""
+        """Build the sampler with every cell occupied, in unbounded space only cells visible in a training view."""
         endless = scene.bounds.space == "contracted" and len(scene.train) > 0
         cameras = [view.camera for view in scene.train]
         return Occupancy(self, scene.bounds, visible_cells(scene.bounds, self.resolution, cameras) if endless else None)
 
 
 class Occupancy(Sampler):
-    """Marches in fixed steps and keeps those in occupied cells.
+    """Ray marcher in fixed steps, which keeps samples in occupied cells.
 
     Attributes:
         ema: fading maximum of the optical depth that one step has in each cell.
         occupied: cells worth a sample.
         visible: cells that may be; ``None`` for all. Not part of the state: it follows from the scene.
-        step: number of updates asked for so far.
+        step: number of calls of `update` so far.
     """
 
     ema: Float[Tensor, "r r r"]
@@ -141,7 +141,7 @@ class Occupancy(Sampler):
 
     @override
     def untrained(self) -> Occupancy:
-        """The same march with every visible cell occupied, as before a fit."""
+        """Copy of the sampler with every visible cell occupied, as before training."""
         fresh = copy.deepcopy(self)
         fresh.ema.zero_()
         fresh.step.zero_()
@@ -151,7 +151,7 @@ class Occupancy(Sampler):
         return fresh
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
-        """Samples in occupied cells, in front of what is opaque; with their densities, where the field was queried."""
+        """Sample occupied cells in front of opaque surfaces; returns densities too, where the field was queried."""
         if self.config.stop == "never" or (self.config.stop == "evaluation" and ctx.training):
             march = self._march(rays, ctx)
             return Samples.on(rays, march.ray, march.t0, march.t1), ()
@@ -168,7 +168,7 @@ class Occupancy(Sampler):
 
     @torch.no_grad()
     def _march_fused(self, rays: Rays, field: Field, ctx: Context) -> March | None:
-        """A march with early termination, where a fused kernel supports the field and these steps; else ``None``."""
+        """March with early termination by a fused kernel, where it supports the field and these steps; else ``None``."""
         parts, steps = field.fused(ctx.bounds), self.steps(ctx)
         even = ctx.bounds.space == "box" or steps.contracted
         if parts is None or not even or steps.cone > 0 or not kernels.compiled("ngp_march", parts.table):
@@ -177,20 +177,20 @@ class Occupancy(Sampler):
         return kernels.ngp_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
 
     def steps(self, ctx: Context) -> MarchSteps:
-        """How long steps are now."""
+        """Current step lengths of the march."""
         usual = self.config.steps_per_diagonal
         now = self.config.steps_at(ctx.progress) if ctx.training else self.config.evaluation_steps or usual
         return MarchSteps(self.length * usual / now, self.cone * usual / now, contracted=self.contracted)
 
     def _start(self, rays: Rays, steps: MarchSteps, ctx: Context) -> Float[Tensor, " n"]:
-        """Where rays begin: in training their whole lattice of steps is shifted, so that every distance gets its turn."""
+        """Start distances of rays; in training each ray's lattice of steps is jittered as a whole."""
         if not ctx.training:
             return rays.near
         return rays.near + uniform((len(rays),), ctx, like=rays.near) * step_lengths(rays, rays.near, ctx.bounds, steps)
 
     @torch.no_grad()
     def _march(self, rays: Rays, ctx: Context) -> March:
-        """March all rays to their ends."""
+        """March all rays to their ends; returns the intervals in occupied cells."""
         steps = self.steps(ctx)
         march = kernels.ray_march(rays, self.occupied, ctx.bounds, steps, self._start(rays, steps, ctx))
         parts = [march]
@@ -204,7 +204,7 @@ class Occupancy(Sampler):
 
     @torch.no_grad()
     def update(self, field: Field, ctx: Context) -> None:
-        """Count a training step; every so often, look at cells again."""
+        """Count a training step, and refresh the occupancy grid every `OccupancyConfig.every` steps after ``grace``."""
         step = int(self.step)
         self.step += 1
         if step >= self.config.grace and step % self.config.every == 0:
@@ -215,7 +215,7 @@ class Occupancy(Sampler):
         return torch.arange(self.ema.numel(), device=self.ema.device)
 
     def _some_cells(self, ctx: Context) -> Int[Tensor, " k"]:
-        """Flat cell indices: half uniform, half from the occupied cells; a cell can be drawn twice."""
+        """Draw flat cell indices with replacement: half uniform, half from occupied cells."""
         occupied = torch.nonzero(self.occupied.flatten())[:, 0]
         half = self.config.cells // 2
         anywhere = self._draw(self.ema.numel(), self.config.cells - half, ctx)
@@ -226,7 +226,7 @@ class Occupancy(Sampler):
         return torch.randint(below, (count,), generator=ctx.generator, device=device).to(self.ema.device)
 
     def _refresh(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> None:
-        """Look at one random point in each of ``cells`` and decide anew which cells are occupied."""
+        """Update the EMA at one random point in each of ``cells``, and threshold it to the occupancy grid."""
         fresh = torch.full_like(self.ema, -1.0).flatten()
         for part in cells.split(ctx.chunk):
             thickness = self._thickness(part, field, ctx).to(fresh.dtype)
@@ -257,7 +257,7 @@ class Occupancy(Sampler):
 
 
 def _joined(parts: list[March]) -> March:
-    """Parts of a march, each sorted by ray and farther than those before it, as one; a stable sort keeps distances in order."""
+    """Concatenate consecutive parts of a march, sorted by ray; the sort is stable, which keeps distances in order."""
     ray = torch.cat([part.ray for part in parts])
     order = torch.argsort(ray, stable=True)
     t0, t1 = (torch.cat([getattr(part, name) for part in parts])[order] for name in ("t0", "t1"))

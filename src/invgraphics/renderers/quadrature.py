@@ -1,4 +1,4 @@
-"""The volume rendering sum, written once for all renderers that sample rays."""
+"""Volume-rendering quadrature, shared by all renderers that sample rays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Samplers without memory: strata along each ray, and strata refined where a coarse pass found something."""
+"""Stateless samplers: stratified along each ray, and hierarchical by importance sampling of a coarse pass."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PADDING = 1e-5
 
 @dataclass(frozen=True)
 class StratifiedConfig:
-    """Equal strata along each ray.
+    """Settings of stratified sampling: equal strata along each ray.
 
     Attributes:
         count: samples per ray.
@@ -40,14 +40,14 @@ class StratifiedConfig:
 
 
 class Stratified(Sampler):
-    """Intervals that tile each ray from near to far; their inner edges are jittered in training."""
+    """Stratified sampler: intervals tile each ray from near to far, inner edges jittered in training."""
 
     def __init__(self, config: StratifiedConfig) -> None:
         super().__init__()
         self.config = config
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
-        """Samples on every ray that meets the bounds; the field is not queried."""
+        """Sample every ray that intersects the bounds, without querying the field."""
         hit = hitting(rays)
         knee = far_side(rays[hit], ctx.bounds)
         edges = from_spacing(strata(rays[hit], self.config.count, ctx, knee), ctx.bounds, knee)
@@ -56,7 +56,7 @@ class Stratified(Sampler):
 
 @dataclass(frozen=True)
 class HierarchicalConfig:
-    """Coarse strata, and fine samples drawn from the coarse pass's weights (NeRF, §5.2).
+    """Settings of hierarchical sampling: coarse strata, fine samples drawn from the coarse weights (NeRF, §5.2).
 
     Attributes:
         coarse: strata of the first pass.
@@ -79,7 +79,7 @@ class HierarchicalConfig:
 
 
 class Hierarchical(Sampler):
-    """Two passes; the second one's intervals tile the ray with the edges of both."""
+    """Hierarchical sampler: two passes, whose merged edges bound the second pass's intervals."""
 
     def __init__(self, config: HierarchicalConfig, proposal: Field | None = None) -> None:
         super().__init__()
@@ -90,11 +90,11 @@ class Hierarchical(Sampler):
 
     @override
     def untrained(self) -> Hierarchical:
-        """The rendered field's own density in place of a trained proposal, as NeRF samples."""
+        """Copy of the sampler with the rendered field's density in place of a trained proposal, as in NeRF."""
         return self if self.proposal is None else Hierarchical(replace(self.config, proposal=None))
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
-        """Samples of the second pass; and the first pass's trace, in training only if it has a field of its own to train."""
+        """Sample by two passes; returns the first pass's trace too, in training only if its proposal field is trained."""
         hit = hitting(rays)
         spacing, trace = self._coarse_pass(rays, field, ctx)
         assert trace.weights is not None
@@ -123,12 +123,12 @@ class Hierarchical(Sampler):
 
 
 def hitting(rays: Rays) -> Int[Tensor, " k"]:
-    """Indices of the rays that have an interval to sample."""
+    """Indices of the rays that hit the bounds: far > near."""
     return torch.nonzero(rays.far > rays.near)[:, 0]
 
 
 def far_side(rays: Rays, bounds: Bounds) -> Float[Tensor, "k 1"]:
-    """Distance at which rays have the bounds' unit ball behind them, wherever they began."""
+    """Distance beyond which a ray has left the bounds' unit ball, from any origin."""
     return (rays.origins - bounds.centre).norm(dim=1, keepdim=True) + bounds.half.max()
 
 
@@ -144,13 +144,13 @@ def strata(rays: Rays, count: int, ctx: Context, knee: Float[Tensor, "k 1"] | No
 
 
 def quantiles(rays: int, count: int, ctx: Context, like: Tensor) -> Float[Tensor, "k count"]:
-    """One point in each of ``count`` equal parts of [0, 1]: the middle, or anywhere in training."""
+    """Stratified quantiles: one in each of ``count`` equal parts of [0, 1], the middle, or random in training."""
     within = uniform((rays, count), ctx, like) if ctx.training else like.new_full((rays, count), 0.5)
     return (torch.arange(count, dtype=like.dtype, device=like.device) + within) / count
 
 
 def uniform(shape: tuple[int, ...], ctx: Context, like: Tensor) -> Tensor:
-    """Random numbers in [0, 1) from the context's generator, drawn on its device: a GPU gets the same ones as a CPU."""
+    """Uniform random numbers in [0, 1), drawn on the generator's device, so that CPU and GPU get the same."""
     device = like.device if ctx.generator is None else ctx.generator.device
     return torch.rand(shape, generator=ctx.generator, dtype=like.dtype, device=device).to(like.device)
 
@@ -158,7 +158,7 @@ def uniform(shape: tuple[int, ...], ctx: Context, like: Tensor) -> Tensor:
 def invert(
     edges: Float[Tensor, "k bins_plus_1"], mass: Float[Tensor, "k bins"], u: Float[Tensor, "k c"]
 ) -> Float[Tensor, "k c"]:
-    """Where the cumulative distribution of a piecewise constant density reaches ``u``.
+    """Inverse-CDF sampling of a piecewise constant density at quantiles ``u``.
 
     Args:
         edges: bin edges, increasing.
@@ -173,6 +173,6 @@ def invert(
 
 
 def pack(rays: Rays, hit: Int[Tensor, " k"], edges: Float[Tensor, "k edges"]) -> Samples:
-    """Samples whose intervals tile the rays ``hit`` between ``edges``."""
+    """Pack the intervals between ``edges`` of the rays ``hit`` to samples."""
     ray = hit.repeat_interleave(edges.shape[1] - 1)
     return Samples.on(rays, ray, edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1))

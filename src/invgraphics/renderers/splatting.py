@@ -86,7 +86,7 @@ class Splatting(Renderer):
         self.depth_kind = "median" if config.depth == "median" else "mean"
 
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
-        """Render every pixel. Depth is left at infinity in training, unless ``ctx.geometry`` asks for it."""
+        """Render every pixel. Depth is left at infinity in training, unless ``ctx.geometry`` is set."""
         gaussians: Gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
         footprints, rgb = self.project(gaussians, camera)
         features = [rgb]
@@ -117,13 +117,13 @@ class Splatting(Renderer):
 
     @override
     def for_depth_fusion(self) -> Splatting:
-        """The same splats with median depth and the depth map's normals, which are sharper at edges than means."""
+        """Copy of the renderer with median depth and depth-map normals, which are sharper at edges than means."""
         return Splatting(replace(self.config, depth="median", normals="depth"))
 
     @override
     @torch.no_grad()
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
-        """The splats whose footprints cover the pixel, by the depth of their centres; see `Renderer.contributions`."""
+        """List the splats whose footprints cover the pixel, by the depth of their centres; see `Renderer.contributions`."""
         gaussians: Gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
         footprints, rgb = self.project(gaussians, camera)
         point = camera.focal.new_tensor([pixel]) + 0.5
@@ -154,7 +154,7 @@ class Splatting(Renderer):
     def _rendering(
         self, sums: Float[Tensor, "h w c"], alpha: Float[Tensor, "h w"], camera: Camera, footprints: Footprints
     ) -> Rendering:
-        """Take the pixel sums apart: colour, then three distance coefficients, then the normal, as far as they are there."""
+        """Convert pixel sums to a rendering; channels: colour, three distance coefficients and the normal, if present."""
         far = torch.full_like(alpha, torch.inf)
         if sums.shape[2] == 3:
             return Rendering(sums, alpha, far)
@@ -172,19 +172,19 @@ class Splatting(Renderer):
 
 
 def _deviations(gaussians: Gaussians, order: Int[Tensor, " k"], rays: Rays) -> Float[Tensor, " k"]:
-    """Standard deviation of some Gaussians along one ray, 1 / |diag(1/s) Rᵀ d|."""
+    """Standard deviation along one ray of the Gaussians ``order``, 1 / |diag(1/s) Rᵀ d|."""
     axes = quaternion_to_matrix(gaussians.quaternions[order])
     return ((rays.directions[0] @ axes) / gaussians.scales[order]).norm(dim=1).reciprocal()
 
 
 def _distance_coefficients(footprints: Footprints) -> Float[Tensor, "n 3"]:
-    """`Footprints.depth_planes` rewritten as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
+    """Rewrite `Footprints.depth_planes` as t = k_x x + k_y y + k_1, whose coefficients can be summed over splats."""
     at_mean, slopes = footprints.depth_planes[:, :1], footprints.depth_planes[:, 1:]
     return torch.cat([slopes, at_mean - (slopes * footprints.means2d).sum(dim=1, keepdim=True)], dim=1)
 
 
 def _normals(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
-    """The shortest axis of each Gaussian, turned towards the camera."""
+    """Normal of each Gaussian: its shortest axis, turned towards the camera."""
     shortest = gaussians.scales.argmin(dim=1)
     axes = quaternion_to_matrix(gaussians.quaternions)
     normal = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
@@ -193,7 +193,7 @@ def _normals(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
 
 
 def _slope(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Normals of the surface through neighbouring pixels' points; sided, where a neighbour sees nothing.
+    """Normals of a depth map by central differences of its points, one-sided where a neighbour is empty.
 
     A pixel without a neighbour in one direction gets its own viewing direction, reversed.
     """
@@ -205,7 +205,7 @@ def _slope(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, 
 
 
 def _difference(points: Float[Tensor, "h w 3"], seen: Tensor, axis: int) -> Float[Tensor, "h w 3"]:
-    """The step to the next point plus that from the one before, leaving out what is not seen."""
+    """Difference to the next point plus that from the previous one, without unseen neighbours."""
     last = points.shape[axis] - 1
     step = points.narrow(axis, 1, last) - points.narrow(axis, 0, last)
     both = seen.narrow(axis, 1, last) & seen.narrow(axis, 0, last)

@@ -1,4 +1,4 @@
-"""Which cells of the unit cube a photograph shows: only there can anything be learnt (Instant-NGP's untrained cells)."""
+"""Visibility of unit-cube cells in the training views; no other cell can be trained (Instant-NGP's untrained cells)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOM = 0.1
 
 @torch.no_grad()
 def visible_cells(bounds: Bounds, resolution: int, cameras: Sequence[Camera]) -> Bool[Tensor, "r r r"]:
-    """Cells with a corner or their centre, beyond the near plane, in the picture of at least one camera."""
+    """Mask of cells with a corner or their centre, beyond the near plane, in the picture of at least one camera."""
     seen = _corners(bounds, resolution, 0.0, cameras)
     padded = seen[:-1] | seen[1:]
     padded = padded[:, :-1] | padded[:, 1:]
@@ -24,7 +24,7 @@ def visible_cells(bounds: Bounds, resolution: int, cameras: Sequence[Camera]) ->
 
 
 def _corners(bounds: Bounds, resolution: int, offset: float, cameras: Sequence[Camera]) -> Bool[Tensor, "k k k"]:
-    """Whether the lattice's points are in a picture: the cells' corners for ``offset`` 0, their centres for 0.5."""
+    """Mask of lattice points in any picture: cell corners for ``offset`` 0, centres for 0.5."""
     count = resolution if offset else resolution + 1
     axis = (torch.arange(count, dtype=bounds.lo.dtype, device=bounds.lo.device) + offset) / resolution
     position = bounds.from_unit(torch.cartesian_prod(axis, axis, axis))

@@ -1,4 +1,4 @@
-"""Volume rendering by quadrature along rays (NeRF and all that follow it)."""
+"""Volume rendering by quadrature along rays (NeRF and its successors)."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class VolumetricConfig:
 
 
 class Volumetric(RayRenderer):
-    """Integrates a density and a radiance along rays clipped to the scene's bounds."""
+    """Volume renderer: integrates density and radiance along rays clipped to the scene's bounds."""
 
     requires: ClassVar[Quantity] = Quantity.DENSITY | Quantity.RADIANCE
 
@@ -73,7 +73,7 @@ class Volumetric(RayRenderer):
         self.gradient_reach = gradient_reach
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
-        """Render n rays; normals are added when ``ctx.geometry`` asks for them and the field has some."""
+        """Render n rays; with normals if ``ctx.geometry`` is set and the field provides them."""
         samples, levels = self.sampler.sample(ctx.bounds.clip(rays), field, ctx)
         want = self.requires | (field.provides & Quantity.NORMAL if ctx.geometry else Quantity.NONE)
         if Quantity.NORMAL in want and samples.density is None and not torch.is_grad_enabled():
@@ -96,7 +96,7 @@ class Volumetric(RayRenderer):
         return None if rendering is None else (rendering, Trace())
 
     def _render_fused(self, field: Field, camera: Camera, ctx: Context) -> Rendering | None:
-        """A picture without gradients and normals by one kernel, where one supports field and sampler; else ``None``."""
+        """Render without gradients and normals by one fused kernel, where it supports field and sampler; else ``None``."""
         sampler, normals = self.sampler, ctx.geometry and Quantity.NORMAL in field.provides
         if torch.is_grad_enabled() or ctx.training or normals or not isinstance(sampler, Occupancy):
             return None
@@ -115,12 +115,12 @@ class Volumetric(RayRenderer):
 
     @override
     def untrained(self) -> Volumetric:
-        """The same with the sampler's constants in place of what it has learnt."""
+        """Copy of the renderer with the sampler's constants in place of its learnt state."""
         return Volumetric(self.sampler.untrained(), self.gradient_reach)
 
 
 def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldValues:
-    """Density and radiance as they are, with gradients multiplied by ``scale``."""
+    """Scale the gradients of density and radiance by ``scale``; values are unchanged."""
     assert values.density is not None
     assert values.radiance is not None
     density = torch.lerp(values.density.detach(), values.density, scale)
@@ -128,7 +128,7 @@ def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldVa
 
 
 def _seen(field: Field, samples: Samples, rays: int, want: Quantity, chunk: int) -> FieldValues:
-    """Values of samples whose density is known: what contributes next to nothing is not asked for its colour and stays zero."""
+    """Query samples of known density; radiance of samples with negligible weight is skipped and stays zero."""
     assert samples.density is not None
     weights, _, _ = kernels.composite(samples.density * samples.delta, samples.density[:, None], samples.ray, rays)
     seen = contributing_samples(weights, samples.ray, rays, UNSEEN)
@@ -143,7 +143,7 @@ def _seen(field: Field, samples: Samples, rays: int, want: Quantity, chunk: int)
 
 
 def query(field: Field, samples: Samples, want: Quantity, chunk: int) -> FieldValues:
-    """Ask a field about at most ``chunk`` samples at a time, so that its activations stay small."""
+    """Query a field in chunks of at most ``chunk`` samples, which bounds the memory of its activations."""
     if len(samples) <= chunk:
         return field.query(samples, want)
     parts = [field.query(samples[start : start + chunk], want) for start in range(0, len(samples), chunk)]

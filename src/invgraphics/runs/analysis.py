@@ -1,4 +1,4 @@
-"""``analyses/NAME.json``: a small computation beside a study's fits, as curves."""
+"""``analyses/NAME.json``: an analysis beside a study's fits, as curves."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Analysis(Record):
-    """What was computed, in words and as curves.
+    """Result of an analysis: title, sentence, and curves.
 
     Attributes:
         title: a few words.

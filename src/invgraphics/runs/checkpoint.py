@@ -1,4 +1,4 @@
-"""One file that holds a whole fit: safetensors, written to the side and renamed, never a pickle, no clock readings."""
+"""Checkpoints: the whole state of a fit as one safetensors file, written atomically, without clock readings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from invgraphics.errors import InputError
 
 
 def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
-    """Write ``parts`` (section -> name -> tensor) so that an interruption leaves either the old file or the new one."""
+    """Write ``parts`` (section -> name -> tensor) atomically: an interruption leaves either the old file or the new one."""
     flat = {
         f"{section}|{name}": value.detach().cpu().contiguous().clone()
         for section, part in parts.items()
@@ -33,7 +33,7 @@ def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
 
 
 def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, Tensor]]:
-    """Inverse of `save`.
+    """Read a checkpoint as section -> name -> tensor (inverse of `save`).
 
     Raises:
         InputError: the file is missing or is not a whole checkpoint.

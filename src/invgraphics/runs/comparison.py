@@ -12,7 +12,7 @@ from invgraphics.runs.scores import Score
 
 @dataclass(frozen=True, kw_only=True)
 class Failure:
-    """A cell that gave no run, and why."""
+    """A failed cell of a comparison, with the error."""
 
     method: str
     seed: int
@@ -21,7 +21,7 @@ class Failure:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFacts:
-    """What is known about a scene.
+    """Facts about a scene: numbers of views, colour space, background and bounds.
 
     Attributes:
         train: number of training views.
@@ -44,7 +44,7 @@ class SceneFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonRecord(Record):
-    """A comparison: what was asked, under which conditions, and where the runs lie.
+    """Record of a comparison: its question, conditions, and the folders of its runs.
 
     Attributes:
         scene: its name.

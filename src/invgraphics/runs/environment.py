@@ -1,4 +1,4 @@
-"""``environment.json``: the machine and the versions that a run, a comparison or a study depends on."""
+"""``environment.json``: machine and package versions that a run, a comparison or a study depends on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from invgraphics.runs.schema import Record, plain, stored_fields
 
 @dataclass(frozen=True, kw_only=True)
 class Environment(Record):
-    """A machine and its software. Schema 1 had the packages beside the other keys.
+    """Record of a machine and its software. Schema 1 had the packages beside the other keys.
 
     Attributes:
         invgraphics: version, and hash of the sources.
@@ -53,13 +53,13 @@ class Environment(Record):
 
     @classmethod
     def migrate(cls, table: dict[str, Any], schema: int) -> dict[str, Any]:
-        """Schema 1 had every package's version under a key of its own."""
+        """Convert schema 1, which had every package's version under a key of its own."""
         own = {key: value for key, value in table.items() if key in stored_fields(cls) or key == "schema"}
         rest = {key: value for key, value in table.items() if key not in own and isinstance(value, str | None)}
         return own | {"packages": rest}
 
     def facts(self) -> dict[str, Any]:
-        """Everything that is known, name -> value, packages among them."""
+        """All recorded facts, name -> value, packages among them."""
         known = plain(self)
         del known["schema"]
         packages = known.pop("packages", {})

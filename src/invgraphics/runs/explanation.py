@@ -1,4 +1,4 @@
-"""``ray.json``: one pixel's ray, what it meets and what each thing adds; all lengths in `ExplanationRecord.length_unit`."""
+"""``ray.json``: contributions along one pixel's ray, all lengths in `ExplanationRecord.length_unit`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FIGURE, CSV, PICTURE, TRUTH = "ray", "ray.csv", "picture.png", "truth.png"
 
 @dataclass(frozen=True, kw_only=True)
 class Pixel:
-    """A pixel. Colours are over the scene's background, in its colour space.
+    """Colours, alpha and depths of a pixel; colours over the scene's background, in its colour space.
 
     Attributes:
         column: from 0, from the left.
@@ -78,7 +78,7 @@ class Contributions:
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
-    """The light of a ray at increasing distances.
+    """Density and transmittance along a ray at increasing distances.
 
     Attributes:
         t: distance.
@@ -93,7 +93,7 @@ class Profile:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerPass:
-    """The weights of an earlier pass of the sampler in its intervals [t0, t1]."""
+    """Weights of an earlier sampler pass in its intervals [t0, t1]."""
 
     t0: Column
     t1: Column
@@ -102,7 +102,7 @@ class SamplerPass:
 
 @dataclass(frozen=True, kw_only=True)
 class DeadPrimitives:
-    """Primitives of the whole model that no gradient can change: their share, and number and causes in a sentence."""
+    """Primitives of the whole model that can receive no gradient: their share, and number and causes in a sentence."""
 
     share: float | None
     sentence: str
@@ -110,7 +110,7 @@ class DeadPrimitives:
 
 @dataclass(frozen=True, kw_only=True)
 class ExplanationRecord(Record):
-    """A pixel's ray.
+    """Record of a pixel's ray: near and far, contributions, profile and sampler passes.
 
     Attributes:
         method: ``renderer/recipe``.

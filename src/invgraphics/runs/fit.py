@@ -1,4 +1,4 @@
-"""``fit.json``: how far a fit is, and what its clocks say; written with every checkpoint."""
+"""``fit.json``: step count and clock readings of a fit, written with every checkpoint."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from invgraphics.runs.schema import Record
 
 @dataclass(frozen=True, kw_only=True)
 class FitRecord(Record):
-    """What a resumed fit and its scores need besides the checkpoint.
+    """Steps, times and peak memory of a fit, which resuming and scoring need besides the checkpoint.
 
     Attributes:
         steps: optimisation steps taken; ``None`` for a model that was fitted elsewhere.

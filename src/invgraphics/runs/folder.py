@@ -1,4 +1,4 @@
-"""The files of a run folder: where they are, and how they are written and read."""
+"""Run folders: paths of their files, reading and atomic writing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PUBLISHED = (RECIPE, scores_file(), history.FILE, Provenance.FILE, Environment.F
 
 
 def make_parent(out: Path) -> None:
-    """Create the folder that the file ``out`` goes into, before anything is computed for it.
+    """Create the parent folder of the output file ``out``, before its computation starts.
 
     Raises:
         InputError: it cannot be made, or ``out`` is a folder.
@@ -60,13 +60,13 @@ def check_run(folder: Path) -> None:
 
 
 class RunFolder:
-    """A run on disk. Every file but the history is replaced whole, so that an interruption leaves valid files."""
+    """A run's folder. All files but the history are replaced atomically, so that an interruption leaves valid files."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def create(self) -> None:
-        """Make the folder and see that it can be written.
+        """Create the folder, and check that it is writable.
 
         Raises:
             InputError: it cannot.
@@ -81,7 +81,7 @@ class RunFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Be the only process that writes this run; whoever comes second says so and waits. Freed when a process dies."""
+        """Lock the run for writing by this process; a second process reports it and waits. A dying process frees the lock."""
         with (self.root / ".lock").open("w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -91,7 +91,7 @@ class RunFolder:
             yield
 
     def has(self, kind: type[Record]) -> bool:
-        """Whether the file of a record is there."""
+        """Whether the file of a record exists."""
         return (self.root / kind.FILE).is_file()
 
     def read(self, kind: type[R]) -> R:
@@ -107,44 +107,44 @@ class RunFolder:
         record.write(self.root / record.file)
 
     def remove(self, kind: type[Record]) -> None:
-        """Remove the file of a record, if it is there."""
+        """Remove the file of a record, if it exists."""
         (self.root / kind.FILE).unlink(missing_ok=True)
 
     @property
     def identity(self) -> str:
-        """Identity of the run that is here, finished or not; empty where there is none."""
+        """Identity of the folder's run, finished or not; empty without a run."""
         return self.read(Provenance).cell_sha256 if self.has(Provenance) else ""
 
     @property
     def checkpoint(self) -> Path:
-        """Everything a resumed fit needs."""
+        """Path of the fit's checkpoint."""
         return self.root / CHECKPOINT
 
     def snapshot(self, index: int) -> Path:
-        """The model at one moment of the fit, for time-lapses."""
+        """Path of a snapshot of the model during the fit, for time-lapses."""
         return self.root / "snapshots" / f"{index:04d}.safetensors"
 
     @property
     def snapshots(self) -> list[Path]:
-        """The kept states of the model, first to last."""
+        """Paths of all snapshots of the model, first to last."""
         return sorted((self.root / "snapshots").glob("*.safetensors"))
 
     def picture(self, index: int) -> Path:
-        """The model's picture of a test view, 8 bits, over the scene's background."""
+        """Path of the prediction of a test view, 8 bits, over the scene's background."""
         return self.root / "test" / f"{index:04d}.png"
 
     def arrays(self, index: int) -> Path:
-        """The model's picture of a test view, not rounded: colour, alpha, depth and normals."""
+        """Path of the unrounded prediction of a test view: colour, alpha, depth and normals."""
         return self.root / "test" / f"{index:04d}.npz"
 
     @property
     def predictions(self) -> list[Path]:
-        """The arrays of all test views that there are."""
+        """Paths of all unrounded predictions that exist."""
         return sorted((self.root / "test").glob("*.npz"))
 
     @property
     def history(self) -> Path:
-        """One JSON line for each recorded moment of the fit."""
+        """Path of the history, one JSON line for each recorded moment of the fit."""
         return self.root / history.FILE
 
     @property
@@ -154,15 +154,15 @@ class RunFolder:
 
     @property
     def resumable(self) -> bool:
-        """Whether a fit can go on: from a checkpoint, and the seconds that it had taken."""
+        """Whether the fit can be resumed: its checkpoint and its elapsed seconds exist."""
         return self.checkpoint.is_file() and self.has(FitRecord)
 
     def scores_path(self, protocol: str = DEFAULT) -> Path:
-        """The file of a protocol's scores."""
+        """Path of a protocol's scores."""
         return self.root / scores_file(protocol)
 
     def read_scores(self, protocol: str = DEFAULT) -> Scores:
-        """The scores under a protocol.
+        """Read the scores under a protocol.
 
         Raises:
             InputError: they are missing or broken.
@@ -170,7 +170,7 @@ class RunFolder:
         return read_scores(self.root, protocol)
 
     def clear(self) -> None:
-        """Remove the files of an earlier run, and nothing else."""
+        """Remove the files of an earlier run, and no others."""
         kinds = (FitRecord, Environment, Provenance, Renderings)
         names = [RECIPE, history.FILE, CHECKPOINT, *(kind.FILE for kind in kinds)]
         patterns = (Scores.FILES, "test/*", "snapshots/*")
@@ -195,9 +195,9 @@ class RunFolder:
         return read_toml(self.root / RECIPE)
 
     def append_history(self, moment: Moment) -> None:
-        """Add one moment to the history."""
+        """Append one moment to the history."""
         history.append_history(self.history, moment)
 
     def cut_history(self, step: int) -> None:
-        """Drop what came after ``step``: a resumed fit will live it again."""
+        """Truncate the history after ``step``, from which a resumed fit continues."""
         history.cut_history(self.history, step)

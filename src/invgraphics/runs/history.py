@@ -1,4 +1,4 @@
-"""``history.jsonl``: how a fit went, one JSON table a line, appended while it runs."""
+"""``history.jsonl``: the training history of a fit, one JSON table a line, appended while it runs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Moment:
 
 
 def read_history(path: Path) -> tuple[Moment, ...]:
-    """All lines, oldest first. A last line that an interruption cut off is dropped, as the fit itself does on resuming.
+    """Read all moments, oldest first; a last line truncated by an interruption is dropped, as on resuming.
 
     Raises:
         InputError: the file is missing, or another line is broken; the sentence names it.
@@ -55,13 +55,13 @@ def read_history(path: Path) -> tuple[Moment, ...]:
 
 
 def append_history(path: Path, moment: Moment) -> None:
-    """Add one line."""
+    """Append one moment as a line."""
     with path.open("a") as file:
         file.write(json.dumps(plain(moment)) + "\n")
 
 
 def cut_history(path: Path, step: int) -> None:
-    """Drop what came after ``step``: a resumed fit will live it again."""
+    """Truncate the history after ``step``, from which a resumed fit continues."""
     if path.is_file():
         kept = [table for table in _tables(path) if table["step"] <= step]
         path.write_text("".join(json.dumps(table) + "\n" for table in kept))

@@ -1,4 +1,4 @@
-"""``PHOTO-located.json``: where a photograph of a fitted scene was taken."""
+"""``PHOTO-located.json``: the estimated camera pose of a photograph in a fitted scene."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ AXES = "OpenCV: +x right, +y down, +z forward; the data set's world"
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """A pose from which the search began.
+    """An initial pose of the search, with its loss after each round.
 
     Attributes:
         start: index among all starts.
@@ -29,7 +29,7 @@ class Start:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseError:
-    """Difference from a known pose: degrees, and per cent of the scene's extent."""
+    """Pose error against a known pose: degrees, and per cent of the scene's extent."""
 
     rotation_deg: float
     translation_percent: float
@@ -37,7 +37,7 @@ class PoseError:
 
 @dataclass(frozen=True, kw_only=True)
 class Location(Record):
-    """The pose of a photograph. Schema 1 had a start's rounds beside its other keys.
+    """Estimated pose of a photograph. Schema 1 had a start's rounds beside its other keys.
 
     Attributes:
         photo: its file, as given.
@@ -71,7 +71,7 @@ class Location(Record):
 
     @classmethod
     def migrate(cls, table: dict[str, Any], schema: int) -> dict[str, Any]:
-        """Schema 1 had ``loss_at_scale_S`` where schema 2 has the entry ``S`` of ``rounds``."""
+        """Convert schema 1, which had ``loss_at_scale_S`` in place of the entry ``S`` of ``rounds``."""
         starts = table.get("starts")
         if not isinstance(starts, list):
             return table

@@ -1,4 +1,4 @@
-"""``provenance.json``: what a run was asked for, and hashes of everything that decides its numbers."""
+"""``provenance.json``: a run's request, and hashes of everything that determines its result."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from invgraphics.runs.schema import Record
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """How the scene was opened.
+    """Options with which the scene was opened.
 
     Attributes:
         size: longest side in pixels, or (width, height); ``None`` for the scene's own.
@@ -25,7 +25,7 @@ class Options:
 
 @dataclass(frozen=True, kw_only=True)
 class LoadAverage:
-    """Processes that ran or were ready to, mean over the minute before the fit began and before it ended."""
+    """System load: mean number of running or runnable processes over the minute before the fit's start and its end."""
 
     start: float | None = None
     end: float | None = None
@@ -33,7 +33,7 @@ class LoadAverage:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportedFile:
-    """A model that was fitted elsewhere.
+    """Origin of an imported model: its file, hash, format and axes.
 
     Attributes:
         file: its path, as given.
@@ -62,7 +62,7 @@ class ImportedFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance(Record):
-    """Where a run comes from.
+    """Provenance of a run: request, identity, and hashes of recipe, code and data.
 
     Attributes:
         cell_sha256: identity of the run: equal for equal bits, on one machine.

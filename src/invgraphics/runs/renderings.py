@@ -1,4 +1,4 @@
-"""``renderings.json``: one fitted field through several renderers, and what their pictures differ in."""
+"""``renderings.json``: one fitted field by several renderers, and the colour differences of their pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OWN = "."
 
 @dataclass(frozen=True, kw_only=True)
 class Rendering:
-    """A renderer as it was named, and the folder of the run that shows the fit with it, relative (`OWN`: the fit itself)."""
+    """A renderer's name, as given, and the relative folder of the run rendered with it (`OWN`: the fit itself)."""
 
     renderer: str
     run: str
@@ -21,7 +21,7 @@ class Rendering:
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Pictures of one fit by two renderers, over the scene's background and before rounding; colours in [0, 1].
+    """Colour difference between unrounded pictures of one fit by two renderers, over the scene's background, in [0, 1].
 
     Attributes:
         renderers: as they were named.

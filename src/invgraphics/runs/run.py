@@ -1,4 +1,4 @@
-"""A whole run, read: its scores, where they come from, the machine and the history."""
+"""Reading of a whole run: scores, provenance, environment and history."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from invgraphics.runs.scores import DEFAULT, Scores
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run, as its folder tells it.
+    """A finished run, read from its folder.
 
     Attributes:
         folder: where it lies.
@@ -42,17 +42,17 @@ class Run:
 
     @property
     def files(self) -> RunFolder:
-        """The folder's files."""
+        """The run's `RunFolder`, for paths of its files."""
         return RunFolder(self.folder)
 
 
 def truth_picture(truth: Path, index: int) -> Path:
-    """The true picture of a test view, 8 bits, over the scene's background."""
+    """Path of a test view's true picture, 8 bits, over the scene's background."""
     return truth / f"{index:04d}.png"
 
 
 def truth_arrays(truth: Path, index: int) -> Path:
-    """What a true picture cannot hold, where there is such: depth, normals, alpha, straight colour, mask."""
+    """Path of a test view's true arrays, where they exist: depth, normals, alpha, straight colour, mask."""
     return truth / f"{index:04d}.npz"
 
 

@@ -1,4 +1,4 @@
-"""Records: frozen dataclasses that are JSON files of a public format, read with care and written whole.
+"""Records: frozen dataclasses stored as JSON files of a public format, validated on reading, written atomically.
 
 A field without a default is a key that every file has. For another, absence and null stand for the default, and a default that
 says nothing (null, empty, false) is left out. Keys that a reader does not know are ignored, so that keys can be added; what
@@ -44,12 +44,12 @@ class Record:
 
     @classmethod
     def migrate(cls, table: dict[str, Any], schema: int) -> dict[str, Any]:
-        """A table of an older ``schema`` as ``schema + 1`` would have it."""
+        """Convert a table of an older ``schema`` to ``schema + 1``."""
         return table
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a file.
+        """Read a record from its file, validated and migrated.
 
         Raises:
             InputError: it is missing, is no JSON table, lacks a key, has a value of the wrong type or a newer schema; the
@@ -58,22 +58,22 @@ class Record:
         return from_table(cls, read_table(path), path)
 
     def to_table(self) -> dict[str, Any]:
-        """The content of the file as plain values."""
+        """Convert the record to plain JSON values, as in its file."""
         return plain(self)
 
     def write(self, path: Path) -> None:
-        """Write the file whole: beside its place first, then renamed, so that an interruption leaves the old or the new."""
+        """Write the record atomically: an interruption leaves either the old file or the new one."""
         write_json(path, self.to_table())
 
 
 def stored_fields(kind: type) -> dict[str, bool]:
-    """Keys of a record or of a table in it -> whether every file has them, in the order in which they are written."""
+    """Map the keys of a record or of a table in it, in their order in the file, to whether they are required."""
     fields = (field for field in dataclasses.fields(kind) if field.metadata.get("stored", True))
     return {field.name: not _has_default(field) for field in fields}
 
 
 def plain(value: Any) -> Any:
-    """Plain values as JSON has them: records as tables, without defaults that say nothing; tuples as lists."""
+    """Convert a value to plain JSON values: records become tables without empty defaults, tuples become lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         table = {"schema": value.SCHEMA} if isinstance(value, Record) else {}
         for field in dataclasses.fields(value):
@@ -117,7 +117,7 @@ def from_table(kind: type[T], table: Any, source: Path, key: str = "") -> T:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """A JSON file that holds a table, read within the limits of `invgraphics.tables`.
+    """Read a JSON file that holds a table, within the limits of `invgraphics.tables`.
 
     Raises:
         InputError: it is missing, unreadable or holds no table.
@@ -131,7 +131,7 @@ def read_table(path: Path) -> dict[str, Any]:
 
 
 def guarded(path: Path, read: Callable[[], T]) -> T:
-    """What ``read`` reads from ``path``.
+    """Call ``read`` on ``path``, with system errors turned into `InputError`.
 
     Raises:
         InputError: the file is missing or cannot be read.
@@ -145,7 +145,7 @@ def guarded(path: Path, read: Callable[[], T]) -> T:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON beside ``path`` and rename it."""
+    """Write JSON atomically: to a temporary file beside ``path``, then renamed."""
     temporary = path.with_name(path.name + ".tmp")
     try:
         temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -155,7 +155,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def _current(kind: type[Record], table: Mapping[str, Any], source: Path, key: str) -> Mapping[str, Any]:
-    """The table brought up to the schema of this version."""
+    """Migrate a table to the schema of this version."""
     schema = table.get("schema", 1)
     if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
         raise _wrong(source, _join(key, "schema"), schema, "a whole number, 1 or more")
@@ -171,7 +171,7 @@ def _current(kind: type[Record], table: Mapping[str, Any], source: Path, key: st
 
 
 def _converted(hint: Any, value: Any, source: Path, key: str) -> Any:
-    """``value`` as the type that ``hint`` names."""
+    """Convert ``value`` to the type that ``hint`` names."""
     origin, args = get_origin(hint), get_args(hint)
     if hint is Any:
         return value
@@ -199,7 +199,7 @@ def _converted(hint: Any, value: Any, source: Path, key: str) -> Any:
 
 
 def _one_of(options: tuple[Any, ...], value: Any, source: Path, key: str) -> Any:
-    """``value`` as the first type that takes it; NaN counts as missing where a number may be."""
+    """Convert ``value`` to the first member of a union that accepts it; NaN counts as missing for optional numbers."""
     missing = value is None or (float in options and isinstance(value, float) and math.isnan(value))
     if missing and type(None) in options:
         return None

@@ -1,4 +1,4 @@
-"""``scores.json``: what a model reaches on the test views, and what it cost."""
+"""``scores.json``: quality of a model on the test views, and its costs."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Score:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredTruth:
-    """The true pictures of a rescoring.
+    """Ground truth of a rescoring: its hash, size, background and transparency.
 
     Attributes:
         sha256: of their pixels.
@@ -121,7 +121,7 @@ class Scores(Record):
 
 
 def quality_of(joined: Mapping[str, Mapping[str, Any]]) -> dict[str, Score]:
-    """Metric -> score, from the tables that `invgraphics.metrics.protocols.summarise` joins over the views."""
+    """Convert the summaries of `invgraphics.metrics.protocols.summarise` to scores by metric."""
     return {name: Score(**{**table, "per_view": tuple(table.get("per_view", ()))}) for name, table in joined.items()}
 
 
@@ -131,7 +131,7 @@ def scores_file(protocol: str = DEFAULT) -> str:
 
 
 def read_scores(run: Path, protocol: str = DEFAULT) -> Scores:
-    """The scores in a folder.
+    """Read a protocol's scores from a folder.
 
     Raises:
         InputError: the file is missing or broken.

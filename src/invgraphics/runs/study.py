@@ -1,4 +1,4 @@
-"""``study.json``: what a study is, and how far each of its cells is."""
+"""``study.json``: a study's design, and the state of each of its cells."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Status = Literal["done", "failed", "missing", "skipped"]
 
 @dataclass(frozen=True)
 class Approximation:
-    """Two renderers that differ in one approximation only, to be compared on every fit.
+    """A pair of renderers that differ in one approximation only, compared on every fit.
 
     Attributes:
         name: of the approximation.
@@ -28,7 +28,7 @@ class Approximation:
 
 @dataclass(frozen=True)
 class KnownDeviation:
-    """A verdict that is expected to be red, with its cause; the page still shows it.
+    """An expected failing verdict with its cause; the report still shows it.
 
     Attributes:
         cells: pattern of the cells' labels, for instance ``splatting/* fence@800 *``.
@@ -45,7 +45,7 @@ class KnownDeviation:
 
 @dataclass(frozen=True, kw_only=True)
 class CellRecord:
-    """A cell of a study.
+    """Record of a study's cell: its levels, run folder, state and times.
 
     Attributes:
         id: name of its run's folder; cells that come to the same settings share one.
@@ -84,7 +84,7 @@ class CellRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class StudyRecord(Record):
-    """A study: its design, the conditions, and the state of every cell.
+    """Record of a study: design, conditions, and the state of every cell.
 
     Attributes:
         name: of the study.

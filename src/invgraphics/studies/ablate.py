@@ -1,4 +1,4 @@
-"""A study, from its description to its runs: validate everything, forecast, run what is missing, record."""
+"""Execution of a study: validate every cell, forecast the cost, fit missing cells, write the record."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Size = int | tuple[int, int] | None
 
 @dataclass
 class _Progress:
-    """How far the runs are, and how long they took compared with the forecast."""
+    """Progress of a study's runs, weighted by their forecast seconds."""
 
     expected: dict[str, float]
     began: float
@@ -50,7 +50,7 @@ class _Progress:
     failed: int = 0
 
     def count(self, outcome: Outcome) -> tuple[float, str]:
-        """Take a run into account; returns the finished share and what to say."""
+        """Count a finished run; returns the finished share and the progress message."""
         self.done += 1
         self.failed += outcome.status != 0
         self.spent += self.expected[outcome.request.out]
@@ -62,7 +62,7 @@ class _Progress:
 
 
 def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple[Path, list[CellRecord]]:
-    """Make every run of a study that is missing; the study's record is true at any moment.
+    """Run every missing cell of a study; its record is kept up to date throughout.
 
     Args:
         request: the study, and where and how to run it.
@@ -110,7 +110,7 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
 
 
 def _state(planned: Planned, keep: bool, chosen: bool) -> CellState:
-    """How far a cell is, as far as that can be told without its scene.
+    """Determine a cell's state without opening its scene: done, skipped, missing or left for later.
 
     Args:
         planned: the cell and its run.
@@ -133,24 +133,24 @@ def _is_kept(planned: Planned) -> bool:
 
 
 def _place(planned: Planned) -> tuple[str, Size]:
-    """What a cell's truth depends on."""
+    """Key of a cell's ground truth: scene and size."""
     return planned.cell.scene, planned.fit.size
 
 
 def _kind(planned: Planned) -> tuple[str, str, Size]:
-    """What a cell's cost depends on, as far as it is measured."""
+    """Key of a cell's measured cost: method, preset and size."""
     return planned.cell.method, planned.method.preset, planned.fit.size
 
 
 def _expense(planned: Planned, study: Study, costs: dict[tuple[str, str, Size], Cost]) -> tuple[int, float, int]:
-    """Cheap cells come first; of several seeds, the first with all its cells."""
+    """Sort key of the execution order: seed, then forecast seconds, then size."""
     size = planned.fit.size
     seconds = costs[_kind(planned)].fit_seconds(planned.job.budget)
     return study.seeds.index(planned.cell.seed), seconds, max(size) if isinstance(size, tuple) else size or 0
 
 
 def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple[str, Size], TruthDigest]]:
-    """Open every scene once per size, rendering what has to be; one scene of each size is kept, of the others fingerprints.
+    """Open every scene once per size, rendered if necessary; keeps one scene per size, and the hashes of all.
 
     Raises:
         InputError: a scene cannot be used, or not with every level of the data's factors.
@@ -177,7 +177,7 @@ def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
 
 
 def _try_methods(missing: Sequence[Planned], samples: dict[Size, Scene]) -> dict[tuple[str, str, Size], Cost]:
-    """What a run of each method costs with each preset at each size, measured on one scene of that size."""
+    """Measure the cost of a run of each method with each preset at each size, on one scene of that size."""
     costs: dict[tuple[str, str, Size], Cost] = {}
     for planned in missing:
         if _kind(planned) not in costs:
@@ -192,7 +192,7 @@ def _check_disk(forecast: Forecast, folder: Path) -> None:
 
 
 def _run(executor: Executor, missing: list[Planned], expected: dict[str, float], files: tuple[StudyRecorder, Path]) -> None:
-    """Run what is missing; ``files`` are the record, and the folder for jobs and their logs."""
+    """Run the missing cells; ``files`` are the record, and the folder for jobs and their logs."""
     record, jobs = files
     progress = _Progress({p.fit.out: expected[p.id] for p in missing}, time.monotonic())
     fits = [planned.fit for planned in missing]

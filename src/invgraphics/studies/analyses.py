@@ -1,4 +1,4 @@
-"""Small computations that a study sets beside its fits: a known case, where a single effect can be seen alone.
+"""Analyses of a study beside its fits: computations on known cases that isolate a single effect.
 
 An analysis is a function that returns an `invgraphics.runs.analysis.Analysis`; ``study.toml`` names it, and its curves are kept
 for the report.
@@ -24,7 +24,7 @@ ANALYSES = {
 
 
 def check_analyses(names: Sequence[str], where: str) -> None:
-    """Refuse names that are no analyses.
+    """Check that all names are registered analyses.
 
     Raises:
         InputError: one is unknown; the known ones are listed.
@@ -35,7 +35,7 @@ def check_analyses(names: Sequence[str], where: str) -> None:
 
 
 def write_analyses(names: Sequence[str], root: Path) -> None:
-    """Compute what is missing below ``root``, or was computed by other code."""
+    """Compute and write the analyses that are missing below ``root`` or were computed by a different code version."""
     from invgraphics.experiments.environment import code_version
     from invgraphics.runs.folder import RunFolder
 

@@ -1,4 +1,4 @@
-"""What splatting approximates, one approximation at a time, on Gaussians that are known exactly."""
+"""Errors of splatting's approximations, measured one at a time on known Gaussians."""
 
 from __future__ import annotations
 
@@ -41,22 +41,22 @@ RESPONSES = 512
 
 
 def splat() -> Splatting:
-    """EWA splatting without the low-pass filter, which is no approximation of the Gaussians but of pixels."""
+    """Splat by EWA without the low-pass filter, which approximates pixels and not the Gaussians."""
     return Splatting(SplattingConfig(dilation=0.0))
 
 
 def along_rays(order: Literal["centre", "ray"] = "centre", opacity: Opacity = "splat") -> GaussianSorted:
-    """The same opacities in the same order, but with responses measured on each pixel's own ray."""
+    """Render with the same opacities in the same order, but responses evaluated on each pixel's own ray."""
     return GaussianSorted(GaussianSortedConfig(opacity, order))
 
 
 def integrated(opacity: Literal["peak", "physical"] = "peak", steps: int = 64) -> GaussianExact:
-    """Densities that overlap, integrated along each ray; nothing of the splatter's is left."""
+    """Render overlapping densities by exact integration along each ray, without any of splatting's approximations."""
     return GaussianExact(GaussianExactConfig(opacity, steps))
 
 
 def affine_projection() -> Analysis:
-    """One round Gaussian, farther and farther from the optical axis: largest error of alpha due to the affine projection."""
+    """Analyse the affine projection: largest alpha error of one isotropic Gaussian over its angle from the optical axis."""
     curves, told = [], {}
     for size in SIZES:
         errors = [affine_error(math.radians(angle), math.radians(size)) for angle in ANGLES]
@@ -74,7 +74,7 @@ def affine_projection() -> Analysis:
 
 
 def affine_error(angle: float, size: float, opacity: float = 0.9) -> float:
-    """Largest difference of alpha between a splat and the response along rays.
+    """Largest difference in alpha between a splat and the response along rays.
 
     Args:
         angle: of the Gaussian's centre from the optical axis, radians.
@@ -93,7 +93,7 @@ def affine_error(angle: float, size: float, opacity: float = 0.9) -> float:
 
 
 def field_of_view() -> Analysis:
-    """A cloud that fills the picture, from closer and closer with a wider and wider lens."""
+    """Analyse the affine projection: RMS colour error over the field of view, for a cloud that fills the picture."""
     curves = []
     for scale in SCALES:
         errors = [cloud_error(math.radians(angle), scale) for angle in FIELDS_OF_VIEW]
@@ -131,7 +131,7 @@ def cloud_error(view: float, scale: float) -> float:
 
 
 def sorting_by_centre() -> Analysis:
-    """Two long Gaussians that cross, seen while the camera turns around them."""
+    """Analyse sorting by centre: colour of two crossing elongated Gaussians over the camera's turn, for three orders."""
     renderers = {
         "sorted by centre": along_rays(),
         "sorted along the ray": along_rays("ray"),
@@ -153,7 +153,7 @@ def sorting_by_centre() -> Analysis:
 
 
 def crossing(renderer: Renderer, turns: int = TURNS) -> tuple[list[float], list[float]]:
-    """Turns of the camera in degrees, and the share of red in the light of a red and a blue Gaussian that cross."""
+    """Camera turns in degrees, and the red share of the light of a red and a blue crossing Gaussian."""
     pair = crossing_pair(torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     model, size = model_of(pair, renderer), PATCH // 2
     angles = torch.linspace(-TURN, TURN, turns, dtype=torch.float64)
@@ -169,7 +169,7 @@ def crossing(renderer: Renderer, turns: int = TURNS) -> tuple[list[float], list[
 
 
 def crossing_pair(rgb: Float[Tensor, "2 3"]) -> Gaussians:
-    """Two long Gaussians of these colours that cross at the origin, turned by 0.4 rad about z to either side of x."""
+    """Make two elongated Gaussians of these colours that cross at the origin, turned by ±0.4 rad about z from x."""
     means = torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
     pair = round_ones(means, torch.tensor([0.1, 0.1]), torch.tensor([0.8, 0.8]), rgb)
     scales = torch.tensor([[0.5, 0.1, 0.1], [0.5, 0.1, 0.1]]).double()
@@ -178,7 +178,7 @@ def crossing_pair(rgb: Float[Tensor, "2 3"]) -> Gaussians:
 
 
 def opacity_convention() -> Analysis:
-    """One Gaussian by itself: what alpha a G and alpha 1 - (1 - a)^G differ by."""
+    """Analyse opacity conventions: largest difference of alpha = a G and alpha = 1 - (1 - a)^G for one Gaussian."""
     gaps = [opacity_gap(opacity) for opacity in OPACITIES]
     between = tuple(opacity / 100 for opacity in range(1, 100))
     exact = tuple(opacity_gap_formula(opacity) for opacity in between)
@@ -215,7 +215,7 @@ def round_ones(
     opacities: Float[Tensor, " n"],
     rgb: Float[Tensor, "n 3"] | None = None,
 ) -> Gaussians:
-    """Round Gaussians, float64; white without colours."""
+    """Make isotropic Gaussians, float64; white without colours."""
     n = len(means)
     colour = torch.ones(n, 3) if rgb is None else rgb
     quaternions = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(n, 1)
@@ -224,7 +224,7 @@ def round_ones(
 
 
 def field_of(gaussians: Gaussians) -> GaussianField:
-    """A field that holds given Gaussians."""
+    """Make a field of given Gaussians."""
     return GaussianField(
         {
             "means": gaussians.means,
@@ -238,12 +238,12 @@ def field_of(gaussians: Gaussians) -> GaussianField:
 
 
 def model_of(gaussians: Gaussians, renderer: Renderer) -> Model:
-    """Given Gaussians seen through a renderer, nothing of them cut off near the camera."""
+    """Make a model of given Gaussians and a renderer, without near-plane clipping."""
     ball = torch.full((3,), 1.5, dtype=torch.float64)
     return Model(field_of(gaussians), renderer, Bounds(-ball, ball, near=1e-3))
 
 
 def _largest_gap(gaussians: Gaussians, camera: Camera, one: Renderer, two: Renderer) -> float:
-    """Largest difference of alpha where both see something: that splatters skip alphas below 1/255 is another matter."""
+    """Largest difference in alpha where both are non-zero, which excludes splatting's cut-off of alphas below 1/255."""
     first, second = (model_of(gaussians, renderer).render(camera, normals=False).alpha for renderer in (one, two))
     return float(torch.where((first > 0) & (second > 0), first - second, 0.0).abs().max())

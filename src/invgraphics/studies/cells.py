@@ -1,4 +1,4 @@
-"""The cells of a study as runs: settings resolved and checked, folders named."""
+"""Planning of a study's cells as runs: settings resolved and checked, folders named."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LONGEST_NAME = 100
 
 @dataclass(frozen=True)
 class Planned:
-    """A cell and the run that answers it; several cells may share a run.
+    """A cell and its run, which several cells may share.
 
     Attributes:
         cell: of the study.
@@ -36,7 +36,7 @@ class Planned:
 
     @property
     def fit(self) -> FitRequest:
-        """The run as it is asked for."""
+        """The run's request."""
         return self.job.request
 
     @property
@@ -51,14 +51,14 @@ class Planned:
 
     @property
     def label(self) -> str:
-        """Method, scene@size, other levels, budget and seed: what ``--cells`` and known deviations are matched with."""
+        """Label ``--cells`` and known deviations match against: method, scene@size, other levels, budget and seed."""
         size = self.fit.size if not isinstance(self.fit.size, tuple) else "x".join(map(str, self.fit.size))
         where = self.cell.scene_name if size is None else f"{self.cell.scene_name}@{size}"
         return " ".join([self.cell.method, where, *_levels(self.cell), self.fit.budget, f"seed={self.cell.seed}"])
 
 
 def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
-    """Every cell with its run, all settings checked.
+    """Resolve every cell to its run, and check all settings.
 
     Raises:
         InputError: unknown method, key, protocol or device, or a level that does not fit; the sentence names the cell.
@@ -82,7 +82,7 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
 
 
 def select(plan: list[Planned], request: AblateRequest) -> list[Planned]:
-    """The part of a plan that ``--cells`` and ``--most-seconds`` leave; budgets in steps have no seconds to compare.
+    """Filter a plan by ``--cells`` and ``--most-seconds``; budgets in steps have no seconds to compare.
 
     Raises:
         InputError: nothing is left.
@@ -101,7 +101,7 @@ def select(plan: list[Planned], request: AblateRequest) -> list[Planned]:
 
 
 def _in_cell(cell: Cell, error: InputError) -> InputError:
-    """An error with the cell that it came from."""
+    """Prefix an error with the cell that caused it."""
     levels = {name: level for name, level in cell.levels.items() if in_scope(name, cell.method)}
     where = f"{cell.method} with {', '.join(f'{name} = {level}' for name, level in levels.items())}" if levels else cell.method
     remedy = error.remedy
@@ -111,12 +111,12 @@ def _in_cell(cell: Cell, error: InputError) -> InputError:
 
 
 def _levels(cell: Cell, without: tuple[str, ...] = (BUDGET, SIZE)) -> list[str]:
-    """Each level that concerns the cell's method, but those in ``without``, as ``key=level`` with the key's last part."""
+    """Format the levels in scope of the cell's method, except ``without``, as ``key=level`` with the key's last part."""
     scoped = {path_of(name): level for name, level in cell.levels.items() if in_scope(name, cell.method)}
     return [f"{path.rpartition('.')[2]}={level}" for path, level in scoped.items() if path not in without]
 
 
 def _readable(cell: Cell) -> str:
-    """What a person sees of a run's folder name."""
+    """Human-readable part of a run's folder name."""
     words = [cell.scene_name, slug(cell.method), *_levels(cell, ()), f"seed={cell.seed}"]
     return re.sub(r"[^\w.=+-]+", "-", "-".join(words))[:LONGEST_NAME]

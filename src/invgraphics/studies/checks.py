@@ -1,4 +1,4 @@
-"""Studies as they are written, completed and checked, before anything heavy is imported."""
+"""Completion and validation of study tables, without heavy imports."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_CELLS = 10_000
 
 
 def completed(study: Study, where: str) -> Study:
-    """The study with flat names, the factors of a list, and a base level for every factor."""
+    """Complete a study: flat factor names, the factors of listed cells, and a base level for every factor."""
     base = _flat(study.base)
     cells = tuple(_flat(cell) for cell in study.cells)
     factors = _flat(study.factors)
@@ -41,7 +41,7 @@ def completed(study: Study, where: str) -> Study:
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one with dotted names."""
+    """Flatten nested tables to one with dotted names."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
@@ -49,7 +49,7 @@ def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def checked(study: Study, where: str) -> Study:
-    """Refuse what cannot be expanded, or would run in vain."""
+    """Validate a study: it can be expanded, and no run would be in vain."""
     for what in NARROWING:
         _check_list(getattr(study, what), f"{where}: '{what}'")
     _check_narrowing(study, where)
@@ -84,7 +84,7 @@ def checked(study: Study, where: str) -> Study:
 
 
 def _check_count(study: Study, where: str) -> None:
-    """Refuse a study that is too large to be expanded, whatever its runs would take."""
+    """Refuse a study whose number of cells is too large to be expanded."""
     levels = [len(levels) for levels in study.factors.values()]
     points = {"factorial": math.prod(levels), "one-at-a-time": 1 + sum(levels), "list": len(study.cells)}[study.design]
     count = points * len(study.scenes) * len(study.methods) * len(study.seeds)
@@ -96,7 +96,7 @@ def _check_count(study: Study, where: str) -> None:
 
 
 def _check_narrowing(study: Study, where: str) -> None:
-    """Listed cells may name some of the study's scenes, methods and seeds, and no others."""
+    """Check that listed cells name only scenes, methods and seeds of the study."""
     for number, cell in enumerate(study.cells, 1):
         for what in NARROWING:
             own, all_of_them = cell.get(what, []), getattr(study, what)
@@ -108,7 +108,7 @@ def _check_narrowing(study: Study, where: str) -> None:
 
 
 def _check_setting(name: str, level: Any, where: str) -> None:
-    """Refuse a budget, a size or a preset that cannot be one."""
+    """Check that the level of a budget, size or preset is valid."""
     if name == BUDGET:
         Budget.parse(str(level))
     sides = level if isinstance(level, list) and len(level) == 2 else [level]

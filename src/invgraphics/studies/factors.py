@@ -1,4 +1,4 @@
-"""Factors of a study: their names, which methods have them, and which of them are settings of the request itself."""
+"""Factors of a study: their names, the methods in their scope, and those that are settings of the request."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ NARROWING = ("scenes", "methods", "seeds")
 
 
 def in_scope(factor: str, method: str) -> bool:
-    """Whether a method has a factor (or a key of the base)."""
+    """Whether a method is in the scope of a factor (or of a key of the base)."""
     scope, colon, _ = factor.rpartition(":")
     return not colon or fnmatch(method, scope)
 
 
 def path_of(factor: str) -> str:
-    """What a factor sets, without its scope."""
+    """Dotted path of the setting that a factor changes, without its scope."""
     return factor.rpartition(":")[2]
 
 
 def levels_of(cell: Mapping[str, Any]) -> Levels:
-    """The levels of a listed cell, without what narrows it."""
+    """Levels of a listed cell, without the keys that restrict its scenes, methods and seeds."""
     return {name: level for name, level in cell.items() if name not in NARROWING}
 
 
 def covers(cell: Mapping[str, Any], scene: str, method: str, seed: int) -> bool:
-    """Whether a listed cell holds for a scene, a method and a seed."""
+    """Whether a listed cell applies to a scene, a method and a seed."""
     return all(value in cell.get(key, (value,)) for key, value in zip(NARROWING, (scene, method, seed), strict=True))
 
 
 def override(path: str, level: Any) -> str:
-    """A level as ``--set`` takes it: ``path=value`` in TOML, which for plain values is JSON."""
+    """Format a level for ``--set``: ``path=value`` in TOML, which for plain values is JSON."""
     return f"{path}={json.dumps(level, ensure_ascii=False)}"

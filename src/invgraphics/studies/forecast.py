@@ -1,4 +1,4 @@
-"""What a study will cost, from trying each of its methods for two steps and a small picture."""
+"""Cost forecast of a study, measured by two training steps and a small picture of each method."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PIXEL_BYTES = 20
 
 @dataclass(frozen=True)
 class Cost:
-    """What one run of a method needs.
+    """Measured cost of one run of a method.
 
     Attributes:
         step: seconds of a training step.
@@ -53,7 +53,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What is left of a study.
+    """Forecast cost of a study's missing runs.
 
     Attributes:
         runs: of the whole study.
@@ -81,7 +81,7 @@ class Forecast:
 
 
 def try_method(job: Job, scene: Scene) -> Cost:
-    """Measure one method on one scene.
+    """Measure the cost of one method on one scene.
 
     Raises:
         InputError: field, renderer or scene do not go together.
@@ -108,6 +108,6 @@ def try_method(job: Job, scene: Scene) -> Cost:
 
 
 def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int, later: int = 0) -> Forecast:
-    """The forecast for missing runs with these costs, ``jobs`` at a time; a study has ``runs``, ``later`` of them left out."""
+    """Sum the costs of missing runs, ``jobs`` at a time; a study has ``runs``, ``later`` of them left out."""
     seconds = sum(cost.seconds(budget) for cost, budget in costs) / jobs
     return Forecast(runs, len(costs), seconds, sum(cost.size for cost, _ in costs), later)

@@ -1,4 +1,4 @@
-"""Studies found by name, read from their files, and changed by the command line."""
+"""Locating and reading study files, and applying the command line's settings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FILE = "study.toml"
 
 
 def locate(name: str) -> Path:
-    """The file of a built-in study, or of one's own: the path of a TOML file or of its folder.
+    """Find a study's file: the path of a TOML file or of its folder, else a built-in study's name.
 
     Raises:
         InputError: there is none; the built-in studies are listed.
@@ -34,12 +34,12 @@ def locate(name: str) -> Path:
 
 
 def name_of(path: Path) -> str:
-    """A study's name: that of its folder, or of its file where that has a name of its own."""
+    """Name of a study: that of its folder, or of its file unless that has the default name."""
     return path.resolve().parent.name if path.name == FILE else path.stem
 
 
 def read_study(path: Path) -> Study:
-    """Read a study and check all that can be checked without its methods and scenes.
+    """Read a study, and validate it as far as possible without its methods and scenes.
 
     Raises:
         InputError: not TOML; a key is unknown, missing or of the wrong type; a factor is empty or repeats a level; a design
@@ -54,7 +54,7 @@ def read_study(path: Path) -> Study:
 
 
 def with_request(study: Study, request: AblateRequest) -> Study:
-    """The study with what the command line says instead.
+    """Override a study's settings with those of the command line.
 
     Raises:
         InputError: it names a budget, a size or seeds, and the study itself varies them; or a seed twice.

@@ -1,4 +1,4 @@
-"""Keeps a study's record true at any moment: what the study is, and how far each of its cells is."""
+"""Updates of a study's record while it runs: its design, and the state of each cell."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from invgraphics.studies.study import Study
 
 @dataclass(frozen=True)
 class CellState:
-    """How far a cell is when a study starts.
+    """State of a cell when a study starts.
 
     Attributes:
         status: ``missing`` will be run; ``done`` is there; ``skipped`` lacks its data; ``later`` is not part of this command,
@@ -35,7 +35,7 @@ class CellState:
 
 
 class StudyRecorder:
-    """Writes `StudyRecord` whenever a cell's state changes.
+    """Writer of `StudyRecord`, on every change of a cell's state.
 
     Args:
         folder: of the study.
@@ -55,12 +55,12 @@ class StudyRecorder:
         self._cells = [_cell_record(planned, before.get(planned.id)) for planned in plan]
 
     def start(self, states: Mapping[str, CellState]) -> None:
-        """Take over how far each run is, and write."""
+        """Set the initial state of each cell, and write the record."""
         self._cells = [_started(cell, states[cell.id]) for cell in self._cells]
         self._write()
 
     def note(self, outcome: Outcome) -> None:
-        """Write how a run ended into all cells that share it."""
+        """Record a run's outcome in all cells that share it."""
         status: Status = "failed" if outcome.status else "done"
         ended = {"status": status, "error": outcome.error or None, "seconds": round(outcome.seconds, 3)}
         name = Path(outcome.request.out).name
@@ -76,7 +76,7 @@ class StudyRecorder:
 
 
 def _started(cell: CellRecord, state: CellState) -> CellRecord:
-    """A cell's record when the study starts."""
+    """Initial record of a cell when the study starts."""
     if state.status == "missing":
         return replace(cell, status="missing", error=None, seconds=None, forecast_seconds=state.forecast)
     if state.status == "done":
@@ -85,7 +85,7 @@ def _started(cell: CellRecord, state: CellState) -> CellRecord:
 
 
 def _cell_record(planned: Planned, before: CellRecord | None) -> CellRecord:
-    """A cell's record, with what an earlier command knew of its run."""
+    """Make a cell's record, with its run's facts from an earlier command's record."""
     cell, budget = planned.cell, planned.job.budget
     ended = before is not None and (before.status == "failed" or (before.status == "done" and planned.job.folder.finished))
     return CellRecord(
@@ -108,7 +108,7 @@ def _cell_record(planned: Planned, before: CellRecord | None) -> CellRecord:
 
 
 def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resources], job: Job) -> StudyRecord:
-    """A study's record, without its cells; ``job`` is one of theirs."""
+    """Make a study's record, without its cells; ``job`` is one of theirs."""
     request, resources = asked
     machine = environment(job.device)
     return StudyRecord(

@@ -1,4 +1,4 @@
-"""Studies: a question, factors and their levels as data, and the cells that they expand to. Imports nothing heavy.
+"""Study definitions: question, factors and levels as data, and their expansion to cells, without heavy imports.
 
 A factor's name is the dotted path of what it sets: a key of the recipes (``field.encoding.log2_size``), a key of the training
 data (``data.train_views``, see `invgraphics.scenes.degrade.TrainingData`), or ``budget``, ``size`` or ``preset``. A factor that
@@ -33,7 +33,7 @@ from invgraphics.studies.factors import (
 
 @dataclass(frozen=True)
 class Study:
-    """What a ``study.toml`` says.
+    """Definition of a study, as read from ``study.toml``.
 
     Attributes:
         question: what the study is to answer, one sentence.
@@ -82,7 +82,7 @@ class Study:
     known: tuple[KnownDeviation, ...] = ()
 
     def points(self) -> list[Levels]:
-        """Every combination of levels that the design asks for, in the order of the factors; at least the base."""
+        """List the design's combinations of levels, in the order of the factors; at least the base."""
         base = {name: self.base[name] for name in self.factors}
         if self.design == "factorial":
             return [dict(zip(self.factors, levels, strict=True)) for levels in itertools.product(*self.factors.values())]
@@ -92,7 +92,7 @@ class Study:
         return [base | levels_of(cell) for cell in self.cells]
 
     def expand(self) -> list[Cell]:
-        """Every run that the study needs, each once: seeds outermost, so that an unfinished study is balanced."""
+        """Expand the study to its unique runs, seeds outermost, so that an unfinished study is balanced."""
         cells: dict[str, Cell] = {}
         points = list(zip(self.points(), self.cells, strict=True)) if self.cells else [(point, {}) for point in self.points()]
         for seed, scene, (point, listed), method in itertools.product(self.seeds, self.scenes, points, self.methods):
@@ -103,7 +103,7 @@ class Study:
         return list(cells.values())
 
     def fit_request(self, cell: Cell, request: AblateRequest) -> FitRequest:
-        """The run of one cell; its folder is still to be named."""
+        """Make the fit request of one cell, its output folder still unset."""
         values = self.base | cell.levels
         settings = {path_of(name): value for name, value in values.items() if in_scope(name, cell.method)}
         given = {name: settings.pop(name, getattr(self, name)) for name in SETTINGS}

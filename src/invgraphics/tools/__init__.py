@@ -1,4 +1,4 @@
-"""What is done with a finished run: films, exports, poses, explanations, scores under other protocols."""
+"""Tools for finished runs: films, exports, camera localisation, pixel explanations, scores under other protocols."""
 
 from typing import TYPE_CHECKING
 

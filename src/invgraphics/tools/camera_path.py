@@ -29,7 +29,7 @@ MOST_SECONDS = 3600.0
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """One camera of a path.
+    """Keyframe of a camera path: pose and field of view.
 
     Attributes:
         pose: camera-to-world in the data set's world frame; +x right, +y down, +z forward.
@@ -41,7 +41,7 @@ class Keyframe:
 
     @staticmethod
     def from_local(pose: Float[Tensor, "4 4"], fov: float, scene: Scene) -> Keyframe:
-        """A keyframe from a pose in the scene's local frame."""
+        """Make a keyframe from a pose in the scene's local frame."""
         return Keyframe(apply_similarity(scene.world_from_local.double(), pose.double()), fov)
 
     def local_pose(self, scene: Scene) -> Float[Tensor, "4 4"]:
@@ -185,12 +185,12 @@ def _invalid(file: Path, what: str) -> InputError:
 
 
 def without(path: CameraPath, index: int) -> CameraPath:
-    """The path without one keyframe."""
+    """Remove one keyframe from a path."""
     return replace(path, keyframes=path.keyframes[:index] + path.keyframes[index + 1 :])
 
 
 def with_keyframe(path: CameraPath, keyframe: Keyframe, after: int | None = None) -> CameraPath:
-    """The path with a keyframe inserted after an index, or at its end."""
+    """Insert a keyframe after an index of a path, or at its end."""
     place = len(path.keyframes) if after is None else after + 1
     keyframes: Sequence[Keyframe] = (*path.keyframes[:place], keyframe, *path.keyframes[place:])
     return replace(path, keyframes=tuple(keyframes))

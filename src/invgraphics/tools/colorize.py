@@ -71,7 +71,7 @@ def to_display(rendering: Rendering, scene: Scene) -> Picture:
 
 
 def true_image(view: View, scene: Scene, size: tuple[int, int] | None = None) -> Picture:
-    """A view's ground truth over the scene's background in 8-bit display colours, resized to (width, height)."""
+    """Convert a view's ground truth over the scene's background to 8-bit display colours, resized to (width, height)."""
     return resize_image(display(view.over(scene.background), scene).numpy(), size)
 
 
@@ -113,7 +113,7 @@ def depth_range(renderings: Sequence[Rendering], scenes: Sequence[Scene]) -> tup
 def _surface_depths(
     renderings: Sequence[Rendering], scenes: Sequence[Scene]
 ) -> list[tuple[Float[ndarray, "h w"], Bool[ndarray, "h w"]]]:
-    """Depth in world units, and where it shows a surface."""
+    """Depth in world units, and the mask of pixels that show a surface."""
     depths = [rendering.depth.numpy() * scene.scale for rendering, scene in zip(renderings, scenes, strict=True)]
     return [
         (depth, (rendering.alpha.numpy() >= OPAQUE) & np.isfinite(depth))
@@ -122,7 +122,7 @@ def _surface_depths(
 
 
 def _depths(renderings: Sequence[Rendering], scenes: Sequence[Scene], span: tuple[float, float] | None) -> ColorizedImages:
-    """Depth images in one range."""
+    """Map depths to 8-bit images over one shared depth range."""
     found = span or depth_range(renderings, scenes)
     low, high = found or (0.0, 1.0)
     pictures = []

@@ -1,4 +1,4 @@
-"""One pixel of a run, explained: everything along its ray written to a folder, for a figure and a table."""
+"""Explanation of one pixel of a run: all contributions along its ray, written to a folder as figure and table."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ class ExplainRequest:
 
     @property
     def folder(self) -> Path:
-        """Where the explanation goes."""
+        """Output folder."""
         column, row = self.pixel
         return self.out or self.run / "explained" / f"{self.split}-{self.view:04d}-{column}-{row}"
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A pixel and what it is made of.
+    """A pixel's colour and the contributions along its ray.
 
     Attributes:
         folder: holds the record, the contributions as a table, the picture and the photograph.
@@ -74,7 +74,7 @@ class Explanation:
 
 
 def explain(request: ExplainRequest) -> Explanation:
-    """Open a run, take a pixel apart, and write what was found.
+    """List all contributions along the ray of a run's pixel, and write them to a folder.
 
     Raises:
         InputError: the run cannot be opened, has no such view or pixel, or its renderer has nothing to show along rays.
@@ -95,7 +95,7 @@ def explain(request: ExplainRequest) -> Explanation:
 
 
 def in_world_units(found: Contributions, scale: float) -> Contributions:
-    """Contributions with distances times ``scale``, the world length of one local unit, and densities divided by it."""
+    """Convert contributions to world units: distances times ``scale``, the world length of a local unit, densities over it."""
 
     def profile(one: Profile | None) -> Profile | None:
         if one is None:
@@ -115,7 +115,7 @@ def in_world_units(found: Contributions, scale: float) -> Contributions:
 
 
 def _view(scene: Scene, request: ExplainRequest) -> View:
-    """The view that is asked for.
+    """Select the requested view, with the pixel checked.
 
     Raises:
         InputError: there is no such view, or it has no such pixel.
@@ -135,7 +135,7 @@ def _view(scene: Scene, request: ExplainRequest) -> View:
 
 
 def _record(fitted: Fitted, request: ExplainRequest, view: View, found: Contributions, picture: Rendering) -> ExplanationRecord:
-    """Everything that the figure says."""
+    """Make the record of the explanation, all lengths in world units."""
     scene, (column, row) = fitted.scene, request.pixel
     ray = scene.bounds.clip(view.camera.rays(view.camera.focal.new_tensor([[column + 0.5, row + 0.5]])))
     red, green, blue = scene.background.double().tolist()
@@ -162,7 +162,7 @@ def _record(fitted: Fitted, request: ExplainRequest, view: View, found: Contribu
 
 
 def _pixel(request: ExplainRequest, view: View, found: Contributions, picture: Rendering, scene: Scene) -> Pixel:
-    """The pixel in the picture, in the photograph, and as the contributions have it."""
+    """Colour, alpha and depth of the pixel: rendered, true, and composited from the contributions."""
     (column, row), background = request.pixel, scene.background
     return Pixel(
         column=column,
@@ -214,7 +214,7 @@ def _row(values: Tensor) -> tuple[float | None, ...]:
 
 
 def _number(value: Tensor | float) -> float | None:
-    """A number of as many digits as it has, ``None`` where it is not finite."""
+    """Round a scalar to `DIGITS` significant digits; ``None`` where it is not finite."""
     number = float(value)
     return _rounded(number) if math.isfinite(number) else None
 
@@ -224,7 +224,7 @@ def _rounded(number: float) -> float:
 
 
 def _write(explanation: Explanation, view: View, picture: Rendering, scene: Scene) -> None:
-    """Write the folder.
+    """Write the explanation's folder: record, table, picture and photograph.
 
     Raises:
         InputError: it cannot be made.

@@ -1,4 +1,4 @@
-"""Writing a run's model as a file that other programs read, and saying what the file lost."""
+"""Export of a run's model to files of other programs, with a report of what the file format loses."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ class ExportRequest:
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written: a file, and facts about it, name -> value in words."""
+    """Result of an export: the file, and facts about it, name -> value in words."""
 
     path: Path
     facts: dict[str, str]
 
 
 class FixedGaussians(Field):
-    """Gaussians as they are, to be rendered and not fitted."""
+    """Field of constant Gaussians, for rendering without fitting."""
 
     provides = Quantity.GAUSSIANS
 
@@ -75,7 +75,7 @@ class FixedGaussians(Field):
         self._gaussians = gaussians
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
-        """Gaussians have no pointwise reading here."""
+        """Refuse pointwise queries: this field has primitives only."""
         raise NotComposableError(f"FixedGaussians has no {want.words()} at points.", "It provides gaussians.")
 
     def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
@@ -83,12 +83,12 @@ class FixedGaussians(Field):
         return self._gaussians if want == Quantity.GAUSSIANS else super().primitives(want, ctx)
 
     def primitive_count(self) -> int:
-        """Their number."""
+        """Number of Gaussians."""
         return len(self._gaussians)
 
 
 def export_run(request: ExportRequest) -> Exported:
-    """Write the file.
+    """Export a run's model as the request says; returns the file and facts about it.
 
     Raises:
         InputError: the run cannot be opened, its model cannot be written in this way, or the file cannot be written.
@@ -99,7 +99,7 @@ def export_run(request: ExportRequest) -> Exported:
 
 
 def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
-    """Write the Gaussians as the renderer reads them, in world coordinates, and render the file once more.
+    """Write a run's Gaussians in world coordinates, and compare renderings of the file with the run's.
 
     Raises:
         InputError: the model has no Gaussians, or they do not fit into the format.
@@ -138,7 +138,7 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
 
 
 def with_degree(gaussians: Gaussians, degree: int | None) -> Gaussians:
-    """The Gaussians with spherical harmonics of ``degree``: further bands are zero, or cut off; ``None`` changes nothing."""
+    """Pad with zeros or truncate the Gaussians' spherical harmonics to ``degree``; ``None`` changes nothing."""
     if degree is None:
         return gaussians
     wanted, (count, have, _) = harmonics.count(degree), gaussians.sh.shape
@@ -165,7 +165,7 @@ def shown(gaussians: Gaussians, fitted: Fitted, camera: Camera) -> Tensor:
 
 
 def decibels(values: list[float]) -> str:
-    """Mean and worst of several PSNRs in words."""
+    """Format the mean and the lowest of several PSNRs (dB) in words."""
     if math.isinf(min(values)):
         return "equal"
     mean = sum(values) / len(values)
@@ -173,11 +173,11 @@ def decibels(values: list[float]) -> str:
 
 
 def on_device(gaussians: Gaussians, device: torch.device) -> Gaussians:
-    """Move all tensors, outside the graph."""
+    """Detach all tensors and move them to a device."""
     names = ("means", "quaternions", "scales", "opacities", "sh")
     return replace(gaussians, **{name: getattr(gaussians, name).detach().to(device) for name in names})
 
 
 def on_cpu(gaussians: Gaussians) -> Gaussians:
-    """Move all tensors to the CPU, outside the graph."""
+    """Detach all tensors and move them to the CPU."""
     return on_device(gaussians, torch.device("cpu"))

@@ -1,4 +1,4 @@
-"""Between the axes of a file of Gaussians, the data set's world and the scene's local frame."""
+"""Transforms between a Gaussian file's axes, the data set's world and the scene's local frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from invgraphics.core import Scene
 from invgraphics.core.transforms import axes_to_opencv, opencv_to_axes
 
 WORLD = "opencv"
-"""How the world's axes are understood where nobody says: as converters between files understand those of a PLY."""
+"""Default axes of the world where none are given: those that file converters assume for a PLY."""
 
 Pose = Float[Tensor, "4 4"]
 

@@ -101,7 +101,7 @@ def film(request: FilmRequest) -> Path:
 
 
 def explanation(path: str, capture: Capture) -> str:
-    """Why this path, or what is wrong with it, in one line."""
+    """Explain in one line why the path was chosen, or why it does not suit the capture."""
     if path == capture.path:
         return f"Path: {path}, as the photographs {capture.words}."
     if path == "orbit":
@@ -117,7 +117,7 @@ def _reported(pictures: Iterator[np.ndarray], total: int, reporter: Reporter) ->
 
 
 def _timelapse(fitted: Fitted, request: FilmRequest) -> tuple[int, Iterator[np.ndarray]]:
-    """Number of snapshots, and their pictures; beside each its ellipsoids, where the field is made of Gaussians."""
+    """Render all snapshots; returns their number and pictures, side by side with ellipsoids for Gaussian fields."""
     snapshots = RunFolder(request.run).snapshots
     if not snapshots:
         raise InputError(f"{request.run} has no snapshots to make a time-lapse from.", "Fit with --snapshots 60, for instance.")
@@ -142,7 +142,7 @@ def _timelapse(fitted: Fitted, request: FilmRequest) -> tuple[int, Iterator[np.n
 
 
 def _along(fitted: Fitted, cameras: Sequence[Camera], request: FilmRequest) -> Iterator[np.ndarray]:
-    """The pictures of a path; depth in one range for all, which is printed."""
+    """Render the pictures of a path, depth in one shared range, which is printed."""
     geometry, span = request.show == "normal", None
 
     def render(camera: Camera) -> Rendering:
@@ -160,7 +160,7 @@ def _along(fitted: Fitted, cameras: Sequence[Camera], request: FilmRequest) -> I
 
 
 def _picture(fitted: Fitted, camera: Camera) -> np.ndarray:
-    """8-bit display colours over the scene's background."""
+    """Render a camera to 8-bit display colours over the scene's background."""
     rendering = fitted.model.render(camera, normals=False)
     return display(rendering.over(fitted.scene.background), fitted.scene).numpy()
 
@@ -172,7 +172,7 @@ def _ellipsoids(fitted: Fitted, camera: Camera) -> np.ndarray:
 
 
 def _sized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
-    """The camera at another size; one number is the longest side."""
+    """Resize a camera; one number is the longest side in pixels."""
     if size is None:
         return camera
     if isinstance(size, tuple):

@@ -1,4 +1,4 @@
-"""A model that was trained elsewhere as a run like any other: scored by the same rules, shown in the same reports."""
+"""Import of a Gaussian model trained elsewhere as a run, scored and reported like every other run."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ImportRequest:
     world: str = WORLD
 
     def shell(self) -> str:
-        """The command that makes this run."""
+        """Shell command that reproduces this import."""
         placed = ["--frame", self.frame] if self.frame else []
         placed += ["--world", self.world] if self.world != WORLD else []
         given = self.run.flags()
@@ -61,7 +61,7 @@ class ImportRequest:
 
 
 def import_run(request: ImportRequest) -> Path:
-    """Make the run that ``request`` describes, evaluation included; returns its folder.
+    """Import a Gaussian file as a run and evaluate it; returns the run's folder.
 
     Raises:
         InputError: anything about the request, the file or the scene that cannot be used; nothing has been written then.
@@ -101,7 +101,7 @@ def import_run(request: ImportRequest) -> Path:
 
 
 def without_zero_bands(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians without upper bands of spherical harmonics that are zero throughout, with which files are padded."""
+    """Truncate upper spherical-harmonics bands that are zero for all Gaussians, with which files are padded."""
     sh = gaussians.sh
     while (degree := harmonics.degree_of(sh.shape[1])) and not bool(sh[:, harmonics.count(degree - 1) :].any()):
         sh = sh[:, : harmonics.count(degree - 1)]
@@ -109,7 +109,7 @@ def without_zero_bands(gaussians: Gaussians) -> Gaussians:
 
 
 def method_for(method: Method, file: str, gaussians: Gaussians) -> Method:
-    """The method whose renderer shows the Gaussians of a file, its field made for their SH degree.
+    """Resolve the method that renders a file's Gaussians, with its field's SH degree set to theirs.
 
     Raises:
         InputError: the method is none of Gaussians.
@@ -122,7 +122,7 @@ def method_for(method: Method, file: str, gaussians: Gaussians) -> Method:
 
 
 def fill(field: GaussianField, gaussians: Gaussians) -> None:
-    """Make a field hold these Gaussians, local frame."""
+    """Replace a field's Gaussians by the given ones, local frame."""
     tensors = {
         "means": gaussians.means,
         "quaternions": gaussians.quaternions,

@@ -1,4 +1,4 @@
-"""Where a photograph was taken: its pose by gradient descent in a fitted scene, from several starts, coarse to fine."""
+"""Camera localisation: a photograph's pose by gradient descent in a fitted scene, from several starts, coarse to fine."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class LocateRequest:
 
 
 def locate(request: LocateRequest) -> Location:
-    """Find the pose; writes it and the pictures, returns what was written.
+    """Estimate a photograph's camera pose in a fitted scene; writes and returns the location, with comparison pictures.
 
     Raises:
         InputError: the run or the photograph cannot be used, there is no such view, or the files cannot be written.
@@ -91,7 +91,7 @@ def locate(request: LocateRequest) -> Location:
 
 
 def _photo(pixels: UInt8[np.ndarray, "h w c"], request: LocateRequest, scene: Scene) -> View:
-    """The photograph as a view of the scene's size, with a lens but no pose.
+    """Read the photograph as a view of the scene's size, with intrinsics but no pose.
 
     With the scene's own lens it is cropped to the shape of the scene's pictures; with a field of view it keeps its shape.
     """
@@ -113,7 +113,7 @@ def _photo(pixels: UInt8[np.ndarray, "h w c"], request: LocateRequest, scene: Sc
 
 
 def _starts(request: LocateRequest, scene: Scene) -> list[torch.Tensor]:
-    """Poses to begin with, in the scene's frame."""
+    """Initial poses of the search, in the scene's frame."""
     poses = [view.camera.cam_to_world for view in scene.train]
     if request.near is not None:
         names = [view.name for view in scene.train]
@@ -134,7 +134,7 @@ def _starts(request: LocateRequest, scene: Scene) -> list[torch.Tensor]:
 
 
 def _search(fitted: Fitted, starts: list[View], request: LocateRequest, reporter: Reporter) -> tuple[View, list[Start]]:
-    """The best view after every round; each round keeps half of those it got. Also what became of the starts."""
+    """Optimise poses in coarse-to-fine rounds, each keeping the better half; returns the best view, and all starts' results."""
     model, scene = fitted.model, fitted.scene
     coarse = min(1.0, COARSEST / max(starts[0].camera.width, starts[0].camera.height))
     losses = [photometric_error(model, view, scene, coarse) for view in starts]
@@ -184,7 +184,7 @@ def _written(request: LocateRequest, fitted: Fitted, result: tuple[View, list[St
 
 
 def _test_view_like(found: View, scene: Scene) -> View | None:
-    """The test view that shows the same pixels, if there is one."""
+    """Find the test view with the same pixels as the photograph; ``None`` without one."""
     shown = display(found.over(scene.background), scene).float()
     for view in scene.test:
         if view.image.shape[:2] == found.image.shape[:2]:
@@ -195,7 +195,7 @@ def _test_view_like(found: View, scene: Scene) -> View | None:
 
 
 def _draw(path: Path, fitted: Fitted, found: View) -> None:
-    """Photograph, what the pose shows, and four times their difference, side by side."""
+    """Draw the photograph, the rendering at the estimated pose, and four times their difference, side by side."""
     from PIL import Image
 
     scene = fitted.scene

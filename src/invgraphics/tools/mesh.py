@@ -1,4 +1,4 @@
-"""Writing a run's model as a triangle mesh, and measuring it where the truth is known."""
+"""Export of a run's model as a triangle mesh, with its errors where the true surface is known."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ POINTS = 200_000
 
 
 def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
-    """Write the surface of the model, with a colour at each vertex, in world coordinates.
+    """Write the model's surface as a triangle mesh with vertex colours, in world coordinates.
 
     A field of densities is cut at a level by marching cubes; of anything else, depth pictures are fused.
 
@@ -55,7 +55,7 @@ def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
 
 
 def _cut(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
-    """Marching cubes, and how the surface was found."""
+    """Extract the surface by marching cubes; also names the method in words."""
     bounds = fitted.model.bounds
     surface = field_surface(fitted.model.field, bounds, request.resolution, request.level)
     if Quantity.SDF in fitted.model.field.provides:
@@ -65,7 +65,7 @@ def _cut(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
 
 
 def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
-    """Fusion of the training views' depth: the median one, where the renderer has it."""
+    """Extract the surface by fusion of the training views' depth maps (median depth, where the renderer has it)."""
     if request.level is not None:
         remedy = "Leave --level out: its depth pictures are fused."
         raise InputError(f"The model of '{request.run}' ({fitted.method.name}) has no density with a level.", remedy)
@@ -87,9 +87,9 @@ def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
 
 
 def _against_truth(surface: Surface, scene: Scene) -> dict[str, str]:
-    """Distances to the true surface, in world units; nothing where it is not known.
+    """Distances between the mesh and the true surface, in world units; empty where that is unknown.
 
-    Completeness is asked of what the training views' true depth shows: nobody can know the inside of things.
+    Completeness is measured on points of the training views' true depth only: the inside of objects is unobservable.
     """
     if scene.mesh is None or not any(view.depth is not None for view in scene.train):
         return {}

@@ -34,7 +34,7 @@ PathName = Literal["orbit", "spiral", "interpolate"]
 
 @dataclass(frozen=True)
 class Capture:
-    """How the photographs of a scene were taken, and the camera path that stays among them.
+    """Kind of a scene's capture, and the camera path that stays among its photographs.
 
     Attributes:
         path: orbit where cameras surround the subject, spiral where all face one way, otherwise interpolation.
@@ -46,7 +46,7 @@ class Capture:
 
 
 def classify_capture(scene: Scene) -> Capture:
-    """The kind of capture, by the azimuths of the training cameras around their subject and by their viewing directions."""
+    """Classify a capture by the azimuths of the training cameras around their subject, and by their viewing directions."""
     cameras = [view.camera for view in scene.train]
     forward, position, up = _axis(cameras, 2), torch.stack([camera.position for camera in cameras]), _mean_up(cameras)
     mean = torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
@@ -79,7 +79,7 @@ def _widest_gap(offset: Float[Tensor, "n 3"], up: Float[Tensor, " 3"]) -> float:
 
 
 def spiral(scene: Scene, frames: int) -> list[Camera]:
-    """The closed path of LLFF's films: ellipses within the photographs' window, forward and back, towards their subject.
+    """Closed spiral path of LLFF: ellipses within the cameras' window, moving forward and back, looking at their subject.
 
     The half-axes are the 90th percentiles of the cameras' distances from their mean along its right, down and forward axes.
     """
@@ -99,7 +99,7 @@ def spiral(scene: Scene, frames: int) -> list[Camera]:
 
 
 def orbit(scene: Scene, frames: int) -> list[Camera]:
-    """Once around what the photographs look at, as high above it and as far away as they were taken.
+    """Circular path around the cameras' common focus, at their median height and distance.
 
     The axis is the photographs' mean upward direction, the lens that of the first test view.
     """
@@ -121,7 +121,7 @@ def orbit(scene: Scene, frames: int) -> list[Camera]:
 
 
 def _focus(cameras: Sequence[Camera], otherwise: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
-    """The point nearest to all optical axes (least squares), unless those are parallel or it lies behind some camera."""
+    """Least-squares point nearest to all optical axes; a fallback where those are parallel or it lies behind a camera."""
     forward = torch.stack([camera.cam_to_world[:3, 2] for camera in cameras]).double()
     position = torch.stack([camera.position for camera in cameras]).double()
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
@@ -134,7 +134,7 @@ def _focus(cameras: Sequence[Camera], otherwise: Float[Tensor, " 3"]) -> Float[T
 
 
 def interpolate(scene: Scene, frames: int) -> list[Camera]:
-    """A closed path by some of the photographs' cameras: positions on a spline, rotations by the shortest turns between."""
+    """Interpolate a closed path through some of the training cameras: splines of positions and rotations."""
     stops = _tour([view.camera for view in scene.train])
     if len(stops) == 1:
         return stops * frames
@@ -170,7 +170,7 @@ PATHS: dict[PathName, Callable[[Scene, int], list[Camera]]] = {"orbit": orbit, "
 
 
 def _tour(cameras: Sequence[Camera]) -> list[Camera]:
-    """Cameras far apart from one another, each followed by the nearest that is left."""
+    """Select cameras far apart from one another, ordered by nearest neighbour."""
     position = torch.stack([camera.position for camera in cameras])
     chosen = [0]
     while len(chosen) < min(STOPS, len(cameras)):

@@ -1,4 +1,4 @@
-"""Photographs become a scene, and where their true poses are known the recovered ones are scored against them."""
+"""Import of photographs as a scene by structure from motion, scored against true poses where those are known."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LEAST = 3  # cameras: with two, a similarity explains everything
 
 
 def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress: Progress | None = None) -> dict[str, Any]:
-    """Reconstruct, and compare with known poses.
+    """Reconstruct cameras and points from photographs, and compare the cameras with known poses.
 
     Args:
         job: which photographs, and how.
@@ -83,7 +83,7 @@ def compare(folder: Path, quality: dict[str, Any], truth: Path) -> dict[str, Any
 
 
 def true_poses(scene: Scene) -> dict[str, Float[Tensor, "4 4"] | None]:
-    """World poses of a scene's views by name without suffix, alone and after the split; ``None`` where two share one."""
+    """Map view names, without suffix, alone and after the split, to world poses; ``None`` where two views share a name."""
     world = scene.world_from_local.double()
     known: dict[str, Float[Tensor, "4 4"] | None] = {}
     for split in ("train", "val", "test"):
@@ -102,7 +102,7 @@ def _lookup(known: dict[str, Float[Tensor, "4 4"] | None], folder: Path, source:
 
 
 def _found_truth(folder: Path, quality: dict[str, Any]) -> dict[str, Any]:
-    """A comparison with a data set that the photographs lie in, if they do."""
+    """Compare the cameras with the data set that contains the photographs, if any."""
     for place in (folder, folder.resolve().parent):
         try:
             return {"truth": compare(folder, quality, place)}

@@ -1,4 +1,4 @@
-"""Predictions on disk with their truth: a run's, or a folder of pictures that any tool wrote."""
+"""Predictions on disk with their ground truth: those of a run, or a folder of another tool's pictures."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ LAYOUTS = (("renders", "gt"), ("color", "gt-color"))
 
 @dataclass(frozen=True, eq=False)
 class PictureSet:
-    """Predicted pictures, their truth, and what is known about their backgrounds.
+    """Predicted pictures with their ground truth, backgrounds and transparency.
 
     Attributes:
         folder: where the predictions came from.
         names: of the views.
         scene: background and colour space; holds no views, which are read one at a time.
-        background: the data set's background; ``None`` where nobody said which.
+        background: the data set's background; ``None`` where it is unknown.
         transparency: ``open``: both sides can be put in front of any background; ``fixed``: one side is already in front of
             ``background``; ``opaque``: photographs, which have none.
         eight_bit: whether unrounded predictions are missing.
@@ -146,7 +146,7 @@ def _open_folder(folder: Path, truth: Path | None, background: Colour | None) ->
 
 
 def _sides(folder: Path, truth: Path | None) -> tuple[Path, Path]:
-    """Folders of predictions and truth."""
+    """Find the folders of predictions and of ground truth."""
     models = sorted(path for path in folder.glob("test/ours_*") if path.is_dir())
     if len(models) > 1:
         raise InputError(f"'{folder}' holds the pictures of {len(models)} models.", f"Give one, for instance '{models[-1]}'.")
@@ -168,7 +168,7 @@ def _pictures_in(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """Order r_2 before r_10."""
+    """Sort key in natural order: r_2 before r_10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.stem) if part]
 
 
@@ -199,7 +199,7 @@ def _any_alpha(matched: Sequence[tuple[Path, Path]]) -> bool:
 
 
 def _survey(true_view: Callable[[int], View], count: int) -> tuple[str, bool, tuple[int, int]]:
-    """Digest of all true pixels, whether any is transparent, and the first view's size."""
+    """Hash all true pixels; also returns whether any is transparent, and the first view's size."""
     sha, transparent, size = hashlib.sha256(), False, (0, 0)
     for index in range(count):
         view = true_view(index)

@@ -1,4 +1,4 @@
-"""Score saved pictures again under named protocols: a run's, or another tool's."""
+"""Rescoring of saved pictures, a run's or another tool's, under named protocols."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHARED = ("psnr", "ssim", "lpips")
 
 
 def protocols_named(names: str) -> list[Protocol]:
-    """Protocols from a comma-separated list, or from ``all``.
+    """Parse a comma-separated list of protocols, or ``all``.
 
     Raises:
         InputError: a name is unknown, or there is none.
@@ -36,7 +36,7 @@ def protocols_named(names: str) -> list[Protocol]:
 
 
 def check_same_truth(sets: Sequence[PictureSet]) -> None:
-    """Refuse sets of pictures whose scores must not stand side by side.
+    """Refuse sets of pictures with different ground truth, whose scores are not comparable.
 
     Raises:
         InputError: views, size, background or true pixels differ; the sentence names both sets and what differs.
@@ -59,7 +59,7 @@ def check_same_truth(sets: Sequence[PictureSet]) -> None:
 
 
 def why_unsuited(pictures: PictureSet, protocol: Protocol, allow_8bit: bool = False) -> str:
-    """Why these pictures cannot be scored under a protocol, because they lack something; empty if they can.
+    """Reason why pictures cannot be scored under a protocol, for lack of data that it needs; empty if they can.
 
     Args:
         pictures: what is to be scored.
@@ -107,7 +107,7 @@ def rescore(sets: Sequence[PictureSet], protocols: Sequence[Protocol], allow_8bi
 
 
 def _predictions(pictures: PictureSet, index: int) -> Callable[[bool], Rendering]:
-    """A view's prediction, read once from half-precision floats and once from its picture."""
+    """Read a view's prediction twice: from half-precision floats, and from its 8-bit picture."""
     return cache(lambda exact: _checked(pictures, index, exact))
 
 
@@ -119,7 +119,7 @@ def _metrics(pictures: PictureSet, protocol: Protocol) -> tuple[str, ...] | None
 
 
 def _wants_bytes(pictures: PictureSet, truth: View, protocol: Protocol) -> bool:
-    """Whether a protocol scores the very picture that is saved: rounded, over the scene's background."""
+    """Whether a protocol scores exactly the saved picture: rounded to 8 bits, over the scene's background."""
     same = truth.alpha is None or protocol.background in ("scene", pictures.background)
     return protocol.prediction == "nearest" and same
 
@@ -136,7 +136,7 @@ def _checked(pictures: PictureSet, index: int, exact: bool) -> Rendering:
 
 
 def _scores(pictures: PictureSet, protocol: Protocol, views: Sequence[ViewScore] | None, lacking: str) -> Scores:
-    """Scores of a set of pictures, from those of its views."""
+    """Aggregate the scores of a set of pictures from those of its views."""
     if views is None:
         quality, skipped = {}, dict.fromkeys(SHARED if protocol.measures is None else protocol.measures, lacking)
     else:

@@ -18,7 +18,7 @@ COLUMNS = {"psnr": ("PSNR (dB)", 3), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4),
 
 @dataclass(frozen=True, eq=False)
 class Rescored:
-    """One set of pictures under several protocols.
+    """Scores of one set of pictures under several protocols.
 
     Attributes:
         pictures: what was scored.
@@ -32,13 +32,13 @@ class Rescored:
 
 
 def background_name(colour: Colour | None) -> str:
-    """A background for a person."""
+    """Human-readable name of a background colour."""
     named = {(1.0, 1.0, 1.0): "white", (0.0, 0.0, 0.0): "black", None: "not stated"}
     return named.get(colour) or "({:.3g}, {:.3g}, {:.3g})".format(*colour or ())
 
 
 def labels(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths that tell them apart; numbered where whole paths are equal."""
+    """Shortest distinguishing suffix of each path; numbered where whole paths are equal."""
     parts = [folder.resolve().parts[1:] or ("root",) for folder in folders]
     for length in range(1, max(map(len, parts)) + 1):
         ends = ["/".join(part[-length:]) for part in parts]
@@ -68,7 +68,7 @@ def write_scores(rescored: Rescored, out: Path | None) -> list[Path]:
 
 
 def scores_of(pictures: PictureSet, protocol: str) -> Scores | None:
-    """The run's scores under a protocol; ``None`` where there are none.
+    """Read the run's scores under a protocol; ``None`` without any.
 
     Raises:
         InputError: they cannot be read.
@@ -84,7 +84,7 @@ def evaluated(pictures: PictureSet, protocol: str) -> bool:
 
 
 def rows_of(rescored: Rescored) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows of the table of one set of pictures; the last row is the spread that conventions alone cause."""
+    """Table of one set of pictures: headings and rows per protocol, the last row the spread over protocols."""
     shown = {key: column for key, column in COLUMNS.items() if _values(rescored, key)}
     rows = []
     for name, scores in rescored.scores.items():
@@ -103,14 +103,14 @@ def spread_of(rescored: Rescored, metric: str) -> float:
 
 
 def stated(protocol: Protocol) -> tuple[str, str, str]:
-    """Background, and the rounding of prediction and truth, in words."""
+    """Describe a protocol's background and its rounding of prediction and truth."""
     words = {"none": "float", "nearest": "8-bit, rounded", "down": "8-bit, truncated"}
     background = protocol.background if isinstance(protocol.background, str) else background_name(protocol.background)
     return background, words[protocol.prediction], words[protocol.truth]
 
 
 def winners(results: Sequence[Rescored], metric: str) -> str:
-    """Who is best under each protocol, in a sentence; empty where a single set was scored, or the metric is missing."""
+    """Name the best set under each protocol in a sentence; empty for a single set, or without the metric."""
     best: dict[str, list[str]] = {}
     for protocol in results[0].scores:
         found = {one.label: one.scores[protocol].quality.get(metric) for one in results}
@@ -127,7 +127,7 @@ def winners(results: Sequence[Rescored], metric: str) -> str:
 
 
 def reasons(rescored: Rescored) -> list[str]:
-    """What was skipped and why, one line for each reason; then what was assumed, one line for each assumption."""
+    """List the skipped protocols with their reasons, then the assumptions, one line each."""
     skipped: dict[str, dict[str, list[str]]] = {}
     noted: dict[str, list[str]] = {}
     for protocol, scores in rescored.scores.items():

@@ -1,4 +1,4 @@
-"""Reading one picture at a time: a run's saved predictions and truth, and the files of other tools."""
+"""Reading of single pictures: a run's saved predictions and ground truth, and the files of other tools."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from invgraphics.scenes.images import read_pixels
 
 
 def read_truth(path: Path, scene: Scene) -> View:
-    """A true view from its picture, and from the arrays that `save_truth` keeps beside it; depth in world units."""
+    """Read a true view from its picture and the arrays that `save_truth` wrote beside it; depth in world units."""
     pixels = read_pixels(path)
     arrays = _arrays(path.with_suffix(".npz")) if path.with_suffix(".npz").is_file() else {}
     image, alpha = torch.from_numpy(pixels[..., :3].copy()), None
@@ -37,7 +37,7 @@ def read_truth(path: Path, scene: Scene) -> View:
 
 
 def is_baked(truth: Path) -> bool:
-    """Whether a saved truth had transparent pixels and keeps only its picture over the scene's background."""
+    """Whether a saved truth's transparency is lost: it is stored only as composited over the scene's background."""
     path = truth.with_suffix(".npz")
     arrays = _arrays(path) if path.is_file() else {}
     return "alpha" in arrays and "rgb" not in arrays and bool((arrays["alpha"] < 1).any())
@@ -54,14 +54,14 @@ def _any_camera(image: torch.Tensor) -> Camera:
 
 
 def read_picture(path: Path) -> Rendering:
-    """A prediction from a picture file of any tool, in display sRGB; straight alpha if it has a channel for it."""
+    """Read a prediction from any tool's picture file, in display sRGB; straight alpha if it has an alpha channel."""
     values = torch.from_numpy(read_pixels(path)).float() / 255
     alpha = values[..., 3] if values.shape[2] == 4 else torch.ones(values.shape[:2])
     return Rendering(values[..., :3] * alpha[..., None], alpha, torch.full_like(alpha, torch.inf))
 
 
 def read_saved(path: Path, scene: Scene, exact: bool) -> Rendering:
-    """A prediction that `evaluate` saved, in the scene's colour space and world units.
+    """Read a prediction that `evaluate` saved, in the scene's colour space and world units.
 
     Args:
         path: the ``.npz``, half-precision colours.

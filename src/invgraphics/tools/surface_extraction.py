@@ -1,4 +1,4 @@
-"""Surfaces of fields: marching cubes through a density or a signed distance, and fusion of depth pictures."""
+"""Surface extraction: marching cubes on a density or signed distance, and TSDF fusion of depth maps."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Surface:
 
     @property
     def open_edges(self) -> int:
-        """Edges that have only one triangle; a closed surface has none."""
+        """Number of boundary edges, which belong to one triangle only; 0 for a closed surface."""
         edges = torch.cat([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]).sort(dim=1).values
         _, counts = edges.unique(dim=0, return_counts=True)
         return int((counts == 1).sum())
@@ -67,7 +67,7 @@ class Lattice:
 
     @staticmethod
     def across(bounds: Bounds, resolution: int) -> Lattice:
-        """Voxels that fill the bounds' box, ``resolution`` of them along its longest edge."""
+        """Make the lattice of voxels that fills the bounds' box, ``resolution`` along its longest edge."""
         edges = bounds.hi - bounds.lo
         step = float(edges.max()) / resolution
         counts = tuple(max(1, math.ceil(edge / step - 1e-4)) for edge in edges.tolist())
@@ -77,20 +77,20 @@ class Lattice:
         return math.prod(self.shape)
 
     def centres(self, first: int, last: int) -> Float[Tensor, "n 3"]:
-        """Centres number ``first`` up to ``last``, z fastest."""
+        """Positions of the voxel centres ``first`` to ``last`` (exclusive), z fastest."""
         flat = torch.arange(first, min(last, len(self)), device=self.origin.device)
         index = torch.stack(torch.unravel_index(flat, self.shape), dim=1)
         return self.origin + self.step * index
 
 
 def default_level(bounds: Bounds) -> float:
-    """Density, per local unit, of which a share `HALF_OPAQUE` of the bounds' diagonal has alpha 1/2."""
+    """Default isosurface density per local unit: a share `HALF_OPAQUE` of the bounds' diagonal at it has alpha 1/2."""
     return math.log(2) / (HALF_OPAQUE * 2 * bounds.radius)
 
 
 @torch.no_grad()
 def field_surface(field: Field, bounds: Bounds, resolution: int, level: float | None = None, chunk: int = 1 << 16) -> Surface:
-    """Where a field's density has a level, or its signed distance, if it has one; closed at the box.
+    """Extract an isosurface of a field's signed distance, or else of its density, closed at the box.
 
     Args:
         field: provides density and radiance; in a contracted space the box of its bounds is taken.
@@ -126,7 +126,7 @@ def field_surface(field: Field, bounds: Bounds, resolution: int, level: float | 
 
 @torch.no_grad()
 def fused_surface(cameras: Sequence[Camera], render: Callable[[int], Rendering], bounds: Bounds, resolution: int) -> Surface:
-    """The surface that depth pictures agree on (truncated signed distances; Curless and Levoy 1996).
+    """Fuse depth maps to a surface by truncated signed distances (TSDF; Curless and Levoy 1996).
 
     Each picture says of every voxel in front of its surface, and up to `BAND` voxels behind it, how far the surface is along
     the ray; the mean over pictures is zero on the surface. Where pictures have normals, those that face the surface count more
@@ -180,7 +180,7 @@ def _facing(picture: Rendering, camera: Camera) -> Float[Tensor, " pixels"]:
 def _ahead(
     points: Float[Tensor, "n 3"], camera: Camera, depth: Float[Tensor, "h w"]
 ) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
-    """How far before the surface of its pixel each point lies, -inf where the camera does not see it; and which pixel."""
+    """Projective signed distance of each point before its pixel's depth, -inf outside the picture; and that pixel's index."""
     place, z = camera.project(points)
     column, row = place.floor().long().unbind(dim=1)
     inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
@@ -190,7 +190,7 @@ def _ahead(
 
 
 def _march(volume: Float[Tensor, "x y z"], level: float, what: str) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
-    """Vertices in voxels and faces of the surface around what is above the level.
+    """Marching cubes: vertices, in voxels, and outward faces of the isosurface around values above the level.
 
     Raises:
         InputError: there is none.
@@ -216,7 +216,7 @@ def outwards(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float
 
 
 def _inside_known(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], seen: Bool[Tensor, "x y z"]) -> Bool[Tensor, " f"]:
-    """Faces of cubes all of whose corners were seen: each face lies in one cube."""
+    """Mask of faces inside voxel cubes all of whose corners were observed."""
     corners = [seen[i : seen.shape[0] - 1 + i, j : seen.shape[1] - 1 + j, k : seen.shape[2] - 1 + k]
                for i in (0, 1) for j in (0, 1) for k in (0, 1)]  # fmt: skip
     known = torch.stack(corners).all(dim=0)
@@ -226,7 +226,7 @@ def _inside_known(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], see
 
 
 def without_specks(surface: Surface) -> Surface:
-    """The same surface without its smallest pieces."""
+    """Remove the smallest connected components of a surface."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -1,4 +1,4 @@
-"""What runs many fits: on this machine, or on a cluster."""
+"""Executors: run many fits in parallel, on this machine or on a cluster."""
 
 EXECUTORS = {
     "local": "invgraphics.experiments.executors.local:LocalExecutor",

@@ -1,4 +1,4 @@
-"""What every executor is given, and what it gives back."""
+"""The executor interface: resources given, outcomes returned."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INTERRUPTED = 130
 
 @dataclass(frozen=True, kw_only=True)
 class Resources:
-    """What each fit may use, and where.
+    """Compute resources: parallel jobs, threads and GPUs of each fit, the cluster's address.
 
     Attributes:
         jobs: fits that share this machine at the same time.
@@ -34,7 +34,7 @@ class Resources:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a fit ended.
+    """Result of one fit: finished, failed or interrupted.
 
     Attributes:
         request: what it was asked to do.

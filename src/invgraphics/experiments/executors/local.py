@@ -1,4 +1,4 @@
-"""Fits on this machine, each in its own spawned process, so that its time and memory are its own."""
+"""Local executor: each fit in its own spawned process, so that time and memory are measured per fit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WITH_PARENT = "--while-stdin-is-open"
 """Argument of `invgraphics.experiments.run` as a program that ties its life to that of the process that started it."""
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Whoever may start threads in a fit reads one of these."""
+"""Environment variables from which libraries take their number of threads."""
 
 
 def cores() -> int:
@@ -30,7 +30,7 @@ def cores() -> int:
 
 
 class FitProcess:
-    """A fit in a process of its own, which ends when this one does.
+    """Child process of one fit; it ends when the parent does.
 
     Args:
         request: what to fit.
@@ -57,7 +57,7 @@ class FitProcess:
         )
 
     def wait(self) -> Outcome:
-        """Wait for the end."""
+        """Wait until the fit's process ends."""
         status = self._process.wait()
         if self._process.stdin is not None:
             self._process.stdin.close()
@@ -67,7 +67,7 @@ class FitProcess:
         return Outcome(self._request, status, error, time.monotonic() - self._began)
 
     def stop(self) -> None:
-        """Ask it to write a checkpoint and end; after Ctrl-C it is doing so already, and a second signal changes nothing."""
+        """Signal the fit to write a checkpoint and end; after Ctrl-C it does so already, a second signal changes nothing."""
         self._process.terminate()
 
     def _error(self, status: int) -> str:
@@ -78,7 +78,7 @@ class FitProcess:
 
 
 def _name(request: FitRequest) -> str:
-    """A name for a run's job: its folder below ``runs``."""
+    """Name of a run's job: its folder's path below ``runs``."""
     *_, parent, name = Path(request.out).resolve().parts
     return name if parent == "runs" else f"{parent}-{name}"
 

@@ -1,4 +1,4 @@
-"""Fits on a Ray cluster: one that is there, or one that is started on this machine for as long as it is needed.
+"""Ray executor: fits on an existing cluster, or on one started on this machine for the duration.
 
 Each fit is a Ray task that starts the same process as the local executor does. The folders of data and runs must be on a file
 system that all nodes share, under the same path; invgraphics must be installed on all of them.
@@ -24,11 +24,11 @@ OBJECT_STORE_BYTES = 100 * 2**20
 
 
 class StoppedError(Exception):
-    """A fit was asked to stop, as a node that shuts down asks its processes; another node may go on with it."""
+    """A fit received a termination signal, as when its node shuts down; another node may resume it."""
 
 
 class RayExecutor:
-    """Hands fits to a cluster, which runs as many at a time as its cores allow."""
+    """Runs fits as Ray tasks, as many at a time as the cluster's cores allow."""
 
     def __init__(self, resources: Resources) -> None:
         try:
@@ -64,7 +64,7 @@ class RayExecutor:
     def _connect(self) -> None:
         address = self._resources.address
         own = {} if address else {"object_store_memory": OBJECT_STORE_BYTES, "include_dashboard": False}
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked to be counted
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # telemetry stays off unless the user enables it
         try:
             self._ray.init(address or "local", log_to_driver=False, logging_level="error", **own)
         except (ConnectionError, ValueError, RuntimeError) as error:
@@ -90,7 +90,7 @@ class RayExecutor:
 
 
 def _fit(request: FitRequest, jobs: str, resources: Resources, folder: str) -> tuple[int, str, float]:
-    """What a worker does. Paths in requests are relative to the driver's ``folder``."""
+    """Run one fit on a worker. Paths in requests are relative to the driver's ``folder``."""
     for path in (jobs, folder):
         if not Path(path).is_dir():
             return 1, f"A worker does not see {path}, which must be on a file system that all nodes share.", 0.0

@@ -38,7 +38,7 @@ class FrequencyConfig:
 
 
 class FrequencyEncoding(Windowed):
-    """Frequencies of the unit cube's coordinates, mapped to [-1, 1] first.
+    """Positional encoding of unit-cube coordinates, mapped to [-1, 1] first.
 
     Attributes:
         width: ``3 * (2 * octaves + include_input)``.

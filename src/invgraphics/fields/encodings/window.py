@@ -1,4 +1,4 @@
-"""Coarse to fine: encodings in levels, of which the finer ones can be held back while poses are still wrong (BARF)."""
+"""Coarse-to-fine windows over encoding levels, which mask fine levels while poses are inaccurate (BARF)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Windowed(Encoding):
 
     Attributes:
         levels: number of levels.
-        always: levels that are never held back.
-        detail: how far the window is open, from 0 (only what is never held back) to 1 (everything); ``None`` without a window.
+        always: levels that are never masked.
+        detail: how far the window is open, from 0 (only those never masked) to 1 (all levels); ``None`` without a window.
     """
 
     levels: int
@@ -31,7 +31,7 @@ class Windowed(Encoding):
         self.register_buffer("detail", None)
 
     def add_window(self) -> None:
-        """Make the window part of the encoding, and of its checkpoints; wide open."""
+        """Register the window as a buffer of the encoding, initially fully open."""
         reference = next(self.parameters(), torch.zeros(()))
         self.detail = torch.ones((), device=reference.device)
 
