@@ -19,6 +19,8 @@ NONE = "none yet"
 """Entry of the list without keyframes."""
 PLAY_RATE = 20
 """Cameras per second that are sent to a browser while a path plays."""
+ECHO = 0.5
+"""Seconds after a change of the list within which selections are the browser's echoes of it."""
 SAMPLES = 24
 """Segments of the drawn path between two keyframes."""
 LINE = (0, 158, 115)
@@ -58,7 +60,7 @@ class PathPanel:
         self.path = CameraPath(())
         self._playing: asyncio.Task[None] | None = None
         self._exporting = False
-        self._listed = NONE
+        self._listed, self._listed_at = NONE, 0.0
         self._line: Any = None
         with gui.add_folder("Camera path", expand_by_default=False):
             add = gui.add_button("Add keyframe", hint="The current view, after the keyframe that is selected below.")
@@ -115,11 +117,13 @@ class PathPanel:
         names = [f"{index + 1} of {len(self.path.keyframes)}" for index in range(len(self.path.keyframes))]
         self.selected.options = tuple(names) or (NONE,)
         self._listed = self.selected.value = names[selected] if names else NONE
+        self._listed_at = time.monotonic()
         self._changed()
 
     async def _go(self) -> None:
-        if self.selected.value == self._listed:
-            return  # the browser's echo of a selection that the program made
+        # A browser echoes what the program lists: the first of the new options, none at all, and the selection.
+        if self.selected.value in (self._listed, NONE) or time.monotonic() - self._listed_at < ECHO:
+            return
         self._listed = self.selected.value
         if (index := self._index) is not None:
             self._callbacks.move(self.path.keyframes[index])
