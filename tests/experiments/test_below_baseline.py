@@ -6,6 +6,7 @@ import torch
 from invgraphics.core import Bounds, Camera, Rendering, Scene, View
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.metrics.protocols import protocol_named, score, summarise
+from invgraphics.runs.scores import Score
 
 
 def scene() -> Scene:
@@ -51,4 +52,9 @@ def test_says_nothing_where_there_is_nothing_to_compare_with() -> None:
     shown = scene()
     assert below_baseline("volumetric/hash", {}, [], shown, protocol_named("default")) == ""
     alone = shown.with_views(train=())
-    assert below_baseline("volumetric/hash", {"psnr": {"mean": 1.0}}, [], alone, protocol_named("default")) == ""
+    assert (
+        below_baseline(
+            "volumetric/hash", {"psnr": Score(mean=1.0, higher_is_better=True)}, [], alone, protocol_named("default")
+        )
+        == ""
+    )

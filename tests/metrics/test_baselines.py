@@ -69,8 +69,8 @@ def test_scores_of_both_baselines() -> None:
     train = (view_at(0.0, 0.2), view_at(2.0, 0.6))
     scene = scene_of(train, (view_at(0.1, 0.2), view_at(1.9, 0.6)))
     scores = baselines.baseline_scores(scene, PROTOCOLS["default"])
-    assert scores["nearest view"]["psnr"]["per_view"] == [100.0, 100.0]
-    assert scores["mean image"]["psnr"]["mean"] == pytest.approx(20 * math.log10(1 / 0.2), abs=1e-4)
+    assert scores["nearest view"]["psnr"].per_view == (100.0, 100.0)
+    assert scores["mean image"]["psnr"].mean == pytest.approx(20 * math.log10(1 / 0.2), abs=1e-4)
     assert set(scores["mean image"]) == {"psnr", "ssim", "flip"}  # nothing about geometry
 
 

@@ -72,7 +72,7 @@ def measure(how: Measure, image: torch.Tensor, truth: torch.Tensor) -> float:
 def scored(name: str) -> dict[str, float]:
     scores = [score(*view_of(index), scene(), PROTOCOLS[name]) for index in range(VIEWS)]
     quality, _ = summarise(scores, PROTOCOLS[name])
-    return {metric: entry["mean"] for metric, entry in quality.items()}
+    return {metric: entry.mean for metric, entry in quality.items()}
 
 
 def composited(background: tuple, dtype: type = np.float64) -> list[tuple[np.ndarray, np.ndarray]]:

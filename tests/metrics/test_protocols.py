@@ -14,6 +14,7 @@ from invgraphics.metrics import protocols
 from invgraphics.metrics.base import Metric, Pair
 from invgraphics.metrics.conventions import BLACK, PROTOCOLS, WHITE, Psnr, Ssim
 from invgraphics.metrics.protocols import ViewScore, prepare, score, summarise
+from invgraphics.runs.scores import Score
 
 HEIGHT, WIDTH = 16, 20
 PLAIN = PROTOCOLS["float"]
@@ -135,18 +136,18 @@ def test_a_prediction_of_another_size_is_refused() -> None:
         score(rendering_of(), view, scene_of(view), PLAIN)
 
 
-def test_summary_has_the_layout_of_scores_json() -> None:
+def test_summary_is_a_score_for_each_metric() -> None:
     scores = [ViewScore(f"000{i}", {"psnr": value}, {"lpips": "no weights"}) for i, value in enumerate([20.0, 30.0])]
     quality, skipped = summarise(scores)
-    assert quality == {"psnr": {"mean": 25.0, "unit": "dB", "higher_is_better": True, "per_view": [20.0, 30.0]}}
+    assert quality == {"psnr": Score(mean=25.0, unit="dB", higher_is_better=True, per_view=(20.0, 30.0))}
     assert skipped == {"lpips": "no weights"}
 
 
 def test_mean_error_aggregation_joins_errors_rather_than_decibels() -> None:
     scores = [ViewScore(str(i), {"psnr": value, "ssim": value}, {}) for i, value in enumerate([20.0, 30.0])]
     quality, _ = summarise(scores, replace(PLAIN, measures={"psnr": Psnr(views="mean error"), "ssim": Ssim()}))
-    assert quality["psnr"]["mean"] == pytest.approx(-10 * math.log10((0.01 + 0.001) / 2))
-    assert quality["ssim"]["mean"] == 25.0
+    assert quality["psnr"].mean == pytest.approx(-10 * math.log10((0.01 + 0.001) / 2))
+    assert quality["ssim"].mean == 25.0
 
 
 def test_names_are_checked() -> None:
@@ -200,4 +201,4 @@ def test_a_strangers_metric_is_scored_and_cannot_spoil_the_others(monkeypatch) -
     assert result.skipped["nothing"] == "the value is not finite (nan)"
     assert "not an invgraphics Metric" in result.skipped["odd"]
     assert result.values["psnr"] == pytest.approx(20 * math.log10(4), abs=1e-4)
-    assert summarise([result])[0]["bias"]["mean"] == pytest.approx(0.25)
+    assert summarise([result])[0]["bias"].mean == pytest.approx(0.25)

@@ -6,7 +6,8 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, Literal, Self, final
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from invgraphics.core.camera import Camera
 from invgraphics.core.contributions import Contributions, sampled_contributions
@@ -42,6 +43,23 @@ class Sampler(_Learning, ABC):
 
     def update(self, field: Field, ctx: Context) -> None:
         """Refresh what is learnt without gradients (an occupancy grid); called once after each training step."""
+
+    def composite_fused(
+        self, rays: Rays, width: int, field: Field, ctx: Context, max_error: float
+    ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]] | None:
+        """Sampling, query and compositing of a whole picture in one kernel, without gradients, where one supports the field.
+
+        Args:
+            rays: of all n pixels, row by row, whose near and far are set.
+            width: of the picture, in pixels.
+            field: what is rendered.
+            ctx: of an evaluation.
+            max_error: upper bound, per ray, of the summed weights of samples whose radiance is not evaluated, in [0, 1].
+
+        Returns:
+            Sums of weight * (radiance, distance), and of the weights, per ray; ``None`` where there is no such kernel.
+        """
+        return None
 
 
 class Renderer(_Learning, ABC):

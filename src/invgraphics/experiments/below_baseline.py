@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 
 from invgraphics.core import Camera, Rendering, Scene
 from invgraphics.metrics.baselines import mean_image
 from invgraphics.metrics.protocols import Protocol, score
+from invgraphics.runs.scores import Score
 
 FLOATER_DEPTH = 0.6
 """Median depth, over the camera's distance to the scene's centre, below which floaters stand in front of the cameras."""
@@ -26,28 +26,29 @@ def coverage_and_depth(picture: Rendering, camera: Camera, scene: Scene) -> dict
 
 
 def below_baseline(
-    method: str, quality: Mapping[str, Any], statistics: Sequence[Mapping[str, float]], scene: Scene, protocol: Protocol
+    method: str, quality: Mapping[str, Score], statistics: Sequence[Mapping[str, float]], scene: Scene, protocol: Protocol
 ) -> str:
     """Diagnose a mean PSNR below that of the mean training image in a sentence; empty otherwise.
 
     Args:
         method: ``renderer/recipe``.
-        quality: the ``quality`` part of its scores.
+        quality: its scores by metric, see `summarise`.
         statistics: `coverage_and_depth` of each test view.
         scene: with its training views.
         protocol: of the scores.
     """
-    if "psnr" not in quality or not scene.train:
+    psnr = quality["psnr"].mean if "psnr" in quality else None
+    if psnr is None or not scene.train:
         return ""
     with torch.no_grad():
         pairs = zip(mean_image(scene), scene.test, strict=True)
         values = [score(picture, view, scene, protocol, only=("psnr",)).values.get("psnr") for picture, view in pairs]
     known = [value for value in values if value is not None]
-    if not known or quality["psnr"]["mean"] >= (baseline := sum(known) / len(known)):
+    if not known or psnr >= (baseline := sum(known) / len(known)):
         return ""
     means = {key: sum(view[key] for view in statistics) / len(statistics) for key in ("alpha", "relative_depth")}
     cause, remedy = _diagnose(method, means, opaque=not scene.has_alpha)
-    lost = f"{method} reaches {quality['psnr']['mean']:.1f} dB, below the mean training image ({baseline:.1f} dB)"
+    lost = f"{method} reaches {psnr:.1f} dB, below the mean training image ({baseline:.1f} dB)"
     return f"{lost}: {cause}. Try {remedy}."
 
 

@@ -21,7 +21,6 @@ from invgraphics.experiments.request import CompareRequest
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.runs.comparison import ComparisonRecord, Failure, SceneFacts
 from invgraphics.runs.folder import RunFolder
-from invgraphics.runs.scores import quality_of
 from invgraphics.scenes.degrade import degrade
 
 
@@ -102,7 +101,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
         preset_chosen_on={method.name: method.chosen_on for method in methods if method.chosen_on},
         render_with=request.render_with,
         command=request.shell(),
-        baselines={name: quality_of(quality) for name, quality in baselines.items()},
+        baselines=baselines,
         noise_ceiling=scene.noise_ceiling,
         protocol=protocol.record() | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
         scene_info=_scene_facts(scene),

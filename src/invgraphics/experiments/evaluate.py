@@ -28,7 +28,7 @@ from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.run import truth_arrays, truth_picture
-from invgraphics.runs.scores import Scores, quality_of
+from invgraphics.runs.scores import Scores
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
 
@@ -115,14 +115,13 @@ def score_model(
             statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
-    joined = quality_of(quality)
     return Scores(
         method=title,
         scene=scene.name,
         protocol=protocol,
         views=tuple(view.name for view in scene.test),
         cost=_model_costs(model, scene, statistics.median(seconds)),
-        quality=joined if posed is None else joined | posed.quality(),
+        quality=quality if posed is None else quality | posed.quality(),
         skipped=skipped,
         shortfall=below_baseline(title, quality, statistics_of_views, scene, rules),
     )

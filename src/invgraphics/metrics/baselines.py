@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -13,6 +12,7 @@ from torch import Tensor
 from invgraphics.core import Camera, Rendering, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.metrics.protocols import Protocol, score, summarise
+from invgraphics.runs.scores import Score
 
 
 def mean_image(scene: Scene) -> Iterator[Rendering]:
@@ -44,8 +44,8 @@ def camera_distance(a: Camera, b: Camera, extent: float) -> float:
     return float((a.position - b.position).norm()) / extent + float(angle)
 
 
-def baseline_scores(scene: Scene, protocol: Protocol) -> dict[str, dict[str, Any]]:
-    """Score the baselines: name -> the ``quality`` part of a ``scores.json``, without depth and normals, which they lack."""
+def baseline_scores(scene: Scene, protocol: Protocol) -> dict[str, dict[str, Score]]:
+    """Score the baselines: name -> metric -> score, without depth and normals, which they lack."""
     scores = {}
     for name, predict in BASELINES.items():
         views = [score(picture, view, scene, protocol) for picture, view in zip(predict(scene), scene.test, strict=True)]

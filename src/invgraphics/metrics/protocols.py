@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,6 +18,7 @@ from invgraphics.metrics.base import Metric, Pair, Skip
 from invgraphics.metrics.conventions import PROTOCOLS, Lpips, Measure, Protocol, Psnr, Rounding, Ssim
 from invgraphics.metrics.image import psnr, ssim
 from invgraphics.metrics.perceptual import lpips
+from invgraphics.runs.scores import Score
 
 Image = Float[Tensor, "h w 3"]
 
@@ -199,14 +199,14 @@ def _metric(name: str) -> Metric:
 
 def summarise(
     scores: Sequence[ViewScore], protocol: Protocol = PROTOCOLS["default"]
-) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+) -> tuple[dict[str, Score], dict[str, str]]:
     """Average scores over views by the protocol's rule: the ``quality`` and ``skipped`` parts of a ``scores.json``.
 
     A metric that is missing in any view gets no mean: means over different views cannot be compared. Why it is missing, and
     in which view first, goes to ``skipped``.
     """
     names = list(dict.fromkeys(name for one in scores for name in (*one.values, *one.skipped)))
-    quality: dict[str, dict[str, Any]] = {}
+    quality: dict[str, Score] = {}
     skipped: dict[str, str] = {}
     for name in names:
         missing = [one for one in scores if name not in one.values]
@@ -218,7 +218,7 @@ def summarise(
     return quality, skipped
 
 
-def _joined(name: str, values: list[float], protocol: Protocol) -> dict[str, Any]:
+def _joined(name: str, values: list[float], protocol: Protocol) -> Score:
     """Average one metric over views by the protocol's rule: mean, unit, direction and per-view values."""
     mean = math.fsum(values) / len(values)
     if protocol.measures is None:
@@ -229,4 +229,4 @@ def _joined(name: str, values: list[float], protocol: Protocol) -> dict[str, Any
         if isinstance(how, Psnr) and how.views == "mean error":
             mean = -10 * math.log10(math.fsum(10 ** (-value / 10) for value in values) / len(values))
         unit, higher_is_better = ("dB" if isinstance(how, Psnr) else ""), not isinstance(how, Lpips)
-    return {"mean": mean, "unit": unit, "higher_is_better": higher_is_better, "per_view": values}
+    return Score(mean=mean, unit=unit, higher_is_better=higher_is_better, per_view=tuple(values))

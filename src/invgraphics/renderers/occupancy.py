@@ -176,6 +176,18 @@ class Occupancy(Sampler):
         start = self._start(rays, steps, ctx)
         return kernels.ngp_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
 
+    @override
+    @torch.no_grad()
+    def composite_fused(
+        self, rays: Rays, width: int, field: Field, ctx: Context, max_error: float
+    ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]] | None:
+        """See `Sampler.composite_fused`; fields that hand out the parameters of a hash grid have a kernel."""
+        parts = field.fused(ctx.bounds)
+        if parts is None or self.config.stop == "never" or not kernels.compiled("ngp_render", parts.table):
+            return None
+        limits = self.config.transmittance, max_error
+        return kernels.ngp_render(rays, self.occupied, ctx.bounds, self.steps(ctx), parts, *limits, width)
+
     def steps(self, ctx: Context) -> MarchSteps:
         """Current step lengths of the march."""
         usual = self.config.steps_per_diagonal

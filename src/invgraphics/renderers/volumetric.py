@@ -27,7 +27,6 @@ from invgraphics.core import (
     Trace,
 )
 from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.occupancy import Occupancy
 from invgraphics.renderers.quadrature import integrate
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.termination import contributing_samples
@@ -97,15 +96,14 @@ class Volumetric(RayRenderer):
 
     def _render_fused(self, field: Field, camera: Camera, ctx: Context) -> Rendering | None:
         """Render without gradients and normals by one fused kernel, where it supports field and sampler; else ``None``."""
-        sampler, normals = self.sampler, ctx.geometry and Quantity.NORMAL in field.provides
-        if torch.is_grad_enabled() or ctx.training or normals or not isinstance(sampler, Occupancy):
+        normals = ctx.geometry and Quantity.NORMAL in field.provides
+        if torch.is_grad_enabled() or ctx.training or normals:
             return None
-        parts = field.fused(ctx.bounds)
-        if parts is None or sampler.config.stop == "never" or not kernels.compiled("ngp_render", parts.table):
+        rays = camera.rays()
+        composited = self.sampler.composite_fused(ctx.bounds.clip(rays), camera.width, field, ctx, UNSEEN)
+        if composited is None:
             return None
-        rays, given = camera.rays(), (sampler.occupied, ctx.bounds, sampler.steps(ctx), parts)
-        limits = sampler.config.transmittance, UNSEEN
-        sums, alpha = kernels.ngp_render(ctx.bounds.clip(rays), *given, *limits, camera.width)
+        sums, alpha = composited
         flat = to_rendering(sums[:, :3], alpha, sums[:, 3], None, rays.far)
         return flat.reshape(camera.height, camera.width)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -118,11 +117,6 @@ class Scores(Record):
     def file(self) -> str:
         """Name of the file that holds this record."""
         return scores_file(self.protocol)
-
-
-def quality_of(joined: Mapping[str, Mapping[str, Any]]) -> dict[str, Score]:
-    """Convert the summaries of `invgraphics.metrics.protocols.summarise` to scores by metric."""
-    return {name: Score(**{**table, "per_view": tuple(table.get("per_view", ()))}) for name, table in joined.items()}
 
 
 def scores_file(protocol: str = DEFAULT) -> str:

@@ -11,7 +11,7 @@ from invgraphics.errors import InputError, did_you_mean
 from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.conventions import PROTOCOLS, Protocol
 from invgraphics.metrics.protocols import ViewScore, score, summarise
-from invgraphics.runs.scores import DEFAULT, ScoredTruth, Scores, quality_of
+from invgraphics.runs.scores import DEFAULT, ScoredTruth, Scores
 from invgraphics.tools.predictions import PictureSet
 from invgraphics.tools.rescoring import Rescored, background_name, evaluated, labels, scores_of
 
@@ -155,7 +155,7 @@ def _scores(pictures: PictureSet, protocol: Protocol, views: Sequence[ViewScore]
         protocol=protocol.name,
         views=pictures.names,
         cost={} if own is None else own.cost,
-        quality=quality_of(quality),
+        quality=quality,
         skipped=skipped,
         rescored=True,
         conventions=protocol.record(),
