@@ -152,7 +152,7 @@ def test_a_strangers_renderer_with_state_takes_part(environment: dict[str, str],
     assert json.loads((shown / "scores.json").read_text())["method"] == "volumetric/fog rendered with exposed/fog"
     with np.load(ours / "test" / "0000.npz") as own, np.load(shown / "test" / "0000.npz") as other:
         np.testing.assert_allclose(own["rgb"], other["rgb"], atol=1e-3)
-    several = "import sys; from invgraphics.cli.main import run as start; [start(['explain', run, *sys.argv[3:]]) for run in sys.argv[1:3]]"
+    several = "import sys; from invgraphics.cli.main import run; [run(['explain', a, *sys.argv[3:]]) for a in sys.argv[1:3]]"
     command = [sys.executable, "-c", several, str(theirs), str(shown), "--view", "0", "--pixel", "12,12"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.count("8 samples") == 2

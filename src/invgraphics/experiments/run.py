@@ -37,6 +37,7 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
+from invgraphics.recipes.recipe import Method
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import TRUTH, RunFolder
@@ -99,7 +100,8 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
             else:
                 folder.clear()
             folder.write(describe(job, (scene, shown), identity))
-            forecast = _warm_up(job, fit, memory)
+            forecast = warm_up(fit, method, memory)
+            folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
             if "suspicion" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
             for sentence in (*announcements([method.choice]), _prediction(job, fit, forecast)):
@@ -133,7 +135,7 @@ def _check_existing(folder: RunFolder, request: FitRequest) -> None:
     folder.create()
 
 
-def _warm_up(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
+def warm_up(fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
     """Run a discarded warm-up step and monitor pass, and forecast the fit's memory from their peak.
 
     Raises:
@@ -141,10 +143,7 @@ def _warm_up(job: Job, fit: Fit, memory: PeakMemory) -> MemoryForecast:
     """
     fit.warmup_step()
     Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
-    folder = job.folder
-    forecast = memory_forecast(fit.plan, job.method, memory.peak_bytes)
-    folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
-    return forecast
+    return memory_forecast(fit.plan, method, memory.peak_bytes)
 
 
 def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:

@@ -17,10 +17,9 @@ from invgraphics.experiments.display import curve_svg, table_html
 from invgraphics.experiments.evaluate import score_model
 from invgraphics.experiments.fitted import Fitted
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.recorder import Monitor, Recorder
+from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.renderings import check_variants
-from invgraphics.experiments.run import prepare
-from invgraphics.experiments.start import memory_forecast
+from invgraphics.experiments.run import prepare, warm_up
 from invgraphics.experiments.variants import variant_named, with_renderer
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
@@ -182,9 +181,7 @@ class MemoryRun(FittedRun):
         use_kernels(job.request.kernels)
         with PeakMemory(job.device) as memory:
             self.fit = prepare(job, degrade(scene, job.data, job.request.seed))
-            self.fit.warmup_step()
-            Monitor(self.fit.plan.scene, job.device).psnr(self.fit)
-            memory_forecast(self.fit.plan, job.method, memory.peak_bytes)
+            warm_up(self.fit, job.method, memory)
         self._run()
 
     def _run(self) -> None:
