@@ -22,6 +22,7 @@ from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.run import prepare
 from invgraphics.experiments.start import memory_forecast
 from invgraphics.experiments.variants import variant_named, with_renderer
+from invgraphics.interruption import Terminated
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.history import Moment, read_history
@@ -191,6 +192,8 @@ class MemoryRun(FittedRun):
         recorder = Recorder(self.fit, None, self._job.cadence, self.method.name, on_step=self._on_step)
         try:
             recorder.run()
+        except Terminated:
+            raise
         except KeyboardInterrupt:
             print(f"Interrupted after {self.fit.steps} steps; resume() goes on.", file=sys.stderr)
         finally:
