@@ -15,7 +15,15 @@ from pathlib import Path
 PRELOADED = [
     *("invgraphics.experiments.compare", "invgraphics.studies.ablate", "invgraphics.report.study", "invgraphics.tools.photos"),
     *("invgraphics.recipes.recipe", "invgraphics.training.fit", "invgraphics.scenes.colmap_library", "torch._dynamo", "numba"),
-    *("matplotlib.pyplot", "pyarrow.parquet", "statsmodels.api", "flip_evaluator", "pytorch_msssim", "scipy.ndimage", "tomlkit"),
+    *(
+        "matplotlib.pyplot",
+        "pyarrow.parquet",
+        "statsmodels.api",
+        "flip_evaluator",
+        "pytorch_msssim",
+        "scipy.ndimage",
+        "tomlkit",
+    ),
 ]
 
 _context = multiprocessing.get_context("forkserver")

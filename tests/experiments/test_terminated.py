@@ -200,7 +200,9 @@ def test_sigterm_ends_the_rendering_of_the_truth(tmp_path: Path) -> None:
 def test_a_renderer_does_not_outlive_a_killed_command(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(SCENE)
     cache = tmp_path / "cache"
-    process = Running(["make-scene", str(tmp_path / "scene.toml")], tmp_path / "log", environment={"INVGRAPHICS_CACHE": str(cache)})
+    process = Running(
+        ["make-scene", str(tmp_path / "scene.toml")], tmp_path / "log", environment={"INVGRAPHICS_CACHE": str(cache)}
+    )
     end = time.monotonic() + 60
     while not list(cache.glob("scenes/*.partial")) and time.monotonic() < end:
         time.sleep(0.05)
