@@ -135,7 +135,7 @@ def test_a_fit_does_not_outlive_its_parent(request_for, tmp_path: Path) -> None:
     parent.kill()
     parent.wait()
     wait_for(run / CHECKPOINT, seconds=60)
-    with RunFolder(run).held():  # comes only once the child is gone
+    with RunFolder(run).held(wait=True):  # comes only once the child is gone
         assert not (run / "scores.json").exists()
 
 

@@ -15,6 +15,7 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import make_run
 from invgraphics.experiments.session import FolderRun, MemoryRun, OnStep, ScoreTable
+from invgraphics.interruption import Terminated
 from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.open import source_of
 
@@ -98,8 +99,8 @@ def fit(
     request = FitRequest(method=name, out=str(out), existing=existing, **settings, **place)
     try:
         make_run(Job.of(request), scene, on_step)
-    except KeyboardInterrupt:
-        if not folder.resumable:
+    except KeyboardInterrupt as error:
+        if isinstance(error, Terminated) or not folder.resumable:
             raise
         print(f"Interrupted; the same call goes on from {folder.root}.", file=sys.stderr)
     return FolderRun(load_fitted(folder, scene))

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from invgraphics.cli.arguments import Shared, parse_list, parse_seeds
 from invgraphics.cli.report import write_report
 from invgraphics.experiments.request import CompareRequest
+from invgraphics.interruption import Terminated
 from invgraphics.recipes.recipe import presets
 from invgraphics.runs.folder import RUNS, RunFolder
 
@@ -41,6 +42,8 @@ class Compare(Shared):
 
         try:
             folder, failures = compare(request)
+        except Terminated:
+            raise
         except KeyboardInterrupt:
             _report_what_is_finished(Path(request.out))
             raise

@@ -1,6 +1,6 @@
 """The console script: finds the command, reads its arguments, and turns what goes wrong into a sentence and an exit status.
 
-Exit status: 0 done, 1 some cells failed, 2 bad input, 130 interrupted.
+Exit status: 0 done, 1 some cells failed, 2 bad input, 130 interrupted or terminated.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import errno
 import importlib
 import os
-import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from typing import Any
 
 from invgraphics.cli.arguments import parse
 from invgraphics.errors import InputError, NumericalError, did_you_mean
+from invgraphics.interruption import INTERRUPTED, end_on_sigterm
 
 COMMANDS = {
     "list": (
@@ -45,7 +45,7 @@ COMMANDS = {
 }
 """Name -> (``module:class`` of its arguments, summary). A class is imported when its command is given."""
 
-DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, BAD_INPUT = 0, 1, 2
 MOST_LINES = 4
 
 USER_ERRNOS = {
@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     Args:
         argv: arguments without the program's name; ``None`` for those of the process.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # being asked to end is an interruption like Ctrl-C
+    end_on_sigterm()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     sys.exit(run([word for word in arguments if word != "--debug"], debug))

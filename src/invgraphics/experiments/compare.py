@@ -12,15 +12,16 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.environment import environment
-from invgraphics.experiments.executors.base import INTERRUPTED
 from invgraphics.experiments.executors.local import LocalExecutor
+from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.request import CompareRequest
+from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.runs.comparison import ComparisonRecord, Failure, SceneFacts
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import RunFolder, output_folder
 from invgraphics.scenes.degrade import degrade
 
 
@@ -36,13 +37,17 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
         InputError: anything that cannot be used; found before the first fit.
         KeyboardInterrupt: interrupted; the record covers what is finished.
     """
+    with output_folder(Path(request.out)):
+        return _compare(request)
+
+
+def _compare(request: CompareRequest) -> tuple[Path, int]:
     began = time.monotonic()
     jobs, scene = _resolve(request)
     folder = RunFolder(Path(request.out))
-    folder.create()
     failures: list[Failure] = []
     summary = _summary(request, jobs, scene)
-    interrupted = False
+    interrupted: KeyboardInterrupt | None = None
     try:
         with closing(LocalExecutor().run(request.fits(), folder.root / "jobs")) as outcomes:
             for outcome in outcomes:
@@ -51,14 +56,14 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
                 if outcome.status != 0:
                     fit = outcome.request
                     failures.append(Failure(method=fit.method, seed=fit.seed, error=outcome.error))
-    except KeyboardInterrupt:
-        interrupted = True
+    except KeyboardInterrupt as error:
+        interrupted = error
     done = [fit for fit in request.fits() if RunFolder(Path(fit.out)).finished]
     runs = tuple(Path(fit.out).relative_to(request.out).as_posix() for fit in done)
     seconds = round(time.monotonic() - began, 1)
     folder.write(replace(summary, runs=runs, failures=tuple(failures), wall_seconds=seconds))
-    if interrupted:
-        raise KeyboardInterrupt
+    if interrupted is not None:
+        raise interrupted
     return folder.root, len(failures)
 
 
@@ -72,8 +77,10 @@ def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
         raise InputError("--methods is empty.", "Example: --methods volumetric/hash,splatting/gaussians.")
     if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
         raise InputError("A method or a seed is named twice.")
-    jobs = [Job.of(fit) for fit in request.fits() if fit.seed == request.seeds[0]]
-    RunFolder(Path(request.out)).create()
+    every = [Job.of(fit) for fit in request.fits()]
+    for job in every:
+        check_replaceable(job)
+    jobs = [job for job in every if job.request.seed == request.seeds[0]]
     scene = open_with_progress(request.scene, jobs[0].options)
     check_variants(jobs[0].variants, [job.method for job in jobs], scene)
     return jobs, degrade(scene, jobs[0].data, request.seeds[0])

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from invgraphics import locks
 from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
@@ -28,6 +29,7 @@ from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.run import truth_arrays, truth_picture
+from invgraphics.runs.schema import replacing
 from invgraphics.runs.scores import Scores
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
@@ -158,7 +160,9 @@ def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "defa
     Raises:
         InputError: the folder holds no run, or its checkpoint does not fit its recipe.
     """
-    return _evaluate_fitted(open_fitted(run, scene_spec), protocol)
+    fitted = open_fitted(run, scene_spec)
+    with fitted.folder.held():
+        return _evaluate_fitted(fitted, protocol)
 
 
 def evaluate_saved(folder: RunFolder, scene: Scene, protocol: str) -> Scores:
@@ -184,8 +188,18 @@ def _save_view(folder: RunFolder, index: int, picture: Rendering, scene: Scene) 
     }
     if picture.normal is not None:
         arrays["normal"] = picture.normal.numpy().astype(np.float16)
-    np.savez_compressed(folder.arrays(index), **arrays)
-    Image.fromarray(display(picture.over(scene.background), scene).numpy()).save(folder.picture(index))
+    _save_arrays(folder.arrays(index), arrays)
+    _save_picture(folder.picture(index), display(picture.over(scene.background), scene))
+
+
+def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def _save_picture(path: Path, colours: torch.Tensor) -> None:
+    with replacing(path) as temporary:
+        Image.fromarray(colours.numpy()).save(temporary, "PNG")
 
 
 def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
@@ -197,12 +211,13 @@ def save_truth(scene: Scene, root: Path) -> Path:
     """Write the test views' truth to ``root/<sha of content>``: pictures, and arrays of what those cannot hold."""
     folder = root / scene.digest("test")[:16]
     folder.mkdir(parents=True, exist_ok=True)
-    for index, view in enumerate(scene.test):
-        if not truth_picture(folder, index).is_file():
-            Image.fromarray(display(view.over(scene.background), scene).numpy()).save(truth_picture(folder, index))
-        arrays = _truth_arrays(view, scene)
-        if arrays and not truth_arrays(folder, index).is_file():
-            np.savez_compressed(truth_arrays(folder, index), **arrays)
+    with locks.locked(folder, folder / locks.INSIDE, waiting=lambda holder: None):  # runs of a study share it
+        for index, view in enumerate(scene.test):
+            if not truth_picture(folder, index).is_file():
+                _save_picture(truth_picture(folder, index), display(view.over(scene.background), scene))
+            arrays = _truth_arrays(view, scene)
+            if arrays and not truth_arrays(folder, index).is_file():
+                _save_arrays(truth_arrays(folder, index), arrays)
     return folder
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.core import Scene
+from invgraphics.errors import InputError
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.job import Job
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
 from invgraphics.text import sha256_of
 
 
@@ -56,6 +58,32 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
             "threads": threads,
         }
     )
+
+
+def check_replaceable(job: Job) -> None:
+    """Check that a job's folder holds no run on another request; only what other code or other pixels made is replaced.
+
+    Raises:
+        InputError: it does; the sentence names the first setting that differs.
+    """
+    folder = job.folder
+    if not folder.has(Provenance):
+        return
+    found, request = folder.read(Provenance), job.request
+    settings = {
+        "scene": (found.scene, request.scene),
+        "seed": (found.seed, request.seed),
+        "budget": (found.budget, request.budget),
+        "size": (found.options.size, request.size),
+        "number of test views": (found.options.test_views, request.test_views),
+        "samples per pixel": (found.options.spp, request.spp),
+        "training data": (found.data, job.data.changes()),
+        "recipe": (found.recipe_sha256[:12], job.method.digest[:12]),
+    }
+    for name, (theirs, ours) in settings.items():
+        if theirs != ours:
+            sentence = f"{folder.root} holds another run: its {name} is {theirs}, not {ours}."
+            raise InputError(sentence, "Choose another --out, or delete that folder.")
 
 
 def define(job: Job) -> str:

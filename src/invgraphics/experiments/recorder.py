@@ -16,6 +16,7 @@ from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
 from invgraphics.experiments.clocks import fit_record
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
+from invgraphics.interruption import Terminated
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import Moment
@@ -102,7 +103,7 @@ class Recorder:
         self._saved_at = (fit.steps, time.monotonic())
         self._marks = [mark for mark in MARKS if mark > fit.progress]
         self._snapshots = snapshots
-        self._asked_to_stop = False
+        self._stopped_by = 0
         self._loss = math.nan
 
     def run(self) -> None:
@@ -111,7 +112,7 @@ class Recorder:
         Raises:
             KeyboardInterrupt: Ctrl-C or SIGTERM came; the run folder holds a checkpoint of the last whole step.
         """
-        self._asked_to_stop = False
+        self._stopped_by = 0
         # Only a program's main thread hears signals.
         numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
         before = {number: signal.signal(number, self._stop) for number in numbers}
@@ -126,15 +127,15 @@ class Recorder:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-        if self._asked_to_stop:
-            raise KeyboardInterrupt
+        if self._stopped_by:
+            raise Terminated if self._stopped_by == signal.SIGTERM else KeyboardInterrupt
 
     def _call(self) -> None:
         if self._on_step is not None:
             self._on_step(self._fit)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        self._asked_to_stop = True
+        self._stopped_by = number
 
     def _after_step(self, loss: float, reporter: Reporter) -> bool:
         fit = self._fit
@@ -149,7 +150,7 @@ class Recorder:
         if self._due():
             self._save()
         self._call()
-        return self._asked_to_stop
+        return bool(self._stopped_by)
 
     def _due(self) -> bool:
         step, moment = self._saved_at

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
-import threading
 import traceback
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -26,8 +24,8 @@ from invgraphics.experiments.build import (
 from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average, processor_share
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
-from invgraphics.experiments.executors.local import WITH_PARENT, cores
-from invgraphics.experiments.identity import TruthDigest, identify
+from invgraphics.experiments.executors.local import cores
+from invgraphics.experiments.identity import TruthDigest, check_replaceable, identify
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import protocol_note
 from invgraphics.experiments.progress import warn
@@ -35,6 +33,7 @@ from invgraphics.experiments.recorder import Monitor, Recorder
 from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
+from invgraphics.interruption import INTERRUPTED, end_on_sigterm, end_with_parent
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
 from invgraphics.recipes.recipe import Method
@@ -73,9 +72,12 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
     folder, method, request = job.folder, job.method, job.request
-    _check_existing(folder, request)
+    if request.existing == "resume":
+        _check_existing(job)  # before the folder is made
+    folder.create()
     repeatable(job.device)
-    with folder.held():
+    with folder.held(wait=request.existing == "reuse"):  # by a child of a killed comparison or study, which is about to end
+        _check_existing(job)
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
         shown = degrade(scene, job.data, request.seed)
@@ -126,13 +128,15 @@ def prepare(job: Job, shown: Scene) -> Fit:
     return Fit(started(plan, job.method, job.request.scene))
 
 
-def _check_existing(folder: RunFolder, request: FitRequest) -> None:
+def _check_existing(job: Job) -> None:
+    folder, request = job.folder, job.request
     present = folder.has(Provenance)
     if request.existing == "refuse" and present:
         raise InputError(f"{folder.root} already holds a run.", "Add --resume to go on with it, or choose another --out.")
     if request.existing == "resume" and not present:
         raise InputError(f"{folder.root} holds no run to resume.", "Leave --resume away to start one.")
-    folder.create()
+    if request.existing == "reuse":
+        check_replaceable(job)
 
 
 def warm_up(fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
@@ -219,7 +223,7 @@ def work(job: Path) -> int:
     try:
         fit_run(FitRequest.from_json(json.loads(job.read_text())))
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
     except Exception as error:  # a cell that fails is a result: its sentence goes into the report
         write_json(job.with_suffix(".error.json"), {"kind": type(error).__name__, "error": str(error)})
         if not isinstance(error, InputError):
@@ -228,19 +232,7 @@ def work(job: Path) -> int:
     return 0
 
 
-def end_with_parent() -> None:
-    """Terminate this process when its standard input closes, as it does however the parent dies."""
-
-    def watch() -> None:
-        while os.read(sys.stdin.fileno(), 1):  # not sys.stdin.read, whose lock would outlive the interpreter
-            pass
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if WITH_PARENT in sys.argv[2:]:
-        end_with_parent()
+    end_on_sigterm()
+    end_with_parent()
     sys.exit(work(Path(sys.argv[1])))

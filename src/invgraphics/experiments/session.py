@@ -21,6 +21,7 @@ from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.run import prepare, warm_up
 from invgraphics.experiments.variants import variant_named, with_renderer
+from invgraphics.interruption import Terminated
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.history import Moment, read_history
@@ -188,6 +189,8 @@ class MemoryRun(FittedRun):
         recorder = Recorder(self.fit, None, self._job.cadence, self.method.name, on_step=self._on_step)
         try:
             recorder.run()
+        except Terminated:
+            raise
         except KeyboardInterrupt:
             print(f"Interrupted after {self.fit.steps} steps; resume() goes on.", file=sys.stderr)
         finally:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.errors import InputError
-from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.assets import Folder, writing
 from invgraphics.report.data.comparison import Comparison, check_comparable, read_comparison
 from invgraphics.report.data.pictures import read_picture
 from invgraphics.report.data.redact import check_apart, redactor_for
@@ -82,8 +82,7 @@ def _write(comparison: Comparison, out: Path, base: Path, public: bool) -> Path:
         redactor = redactor_for([comparison])
         comparison = redactor.value(comparison)
     folder = Folder(out, redactor=redactor)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing(out):
         part = draw_part(comparison, folder)
         contrasts = method_contrasts(comparison, folder)
         write_comparison_table(comparison, out / "results", base)
@@ -92,8 +91,6 @@ def _write(comparison: Comparison, out: Path, base: Path, public: bool) -> Path:
             write_latex_effects(contrasts.first, effects_caption(contrasts.first), out / "effects.tex")
         write_markdown(part, contrasts, folder)
         write_html(part, contrasts, folder)
-    except OSError as error:
-        raise InputError(f"The report cannot be written to '{out}': {error}.", "Choose another --out.") from error
     return out / "index.html"
 
 

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from invgraphics.errors import InputError
-from invgraphics.report.data.assets import Folder
+from invgraphics.report.data.assets import Folder, writing
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.redact import check_apart, redactor_for
 from invgraphics.report.data.studies import Study, read_study, scene_comparisons
@@ -51,8 +50,7 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
         redactor = redactor_for([study])
         study = redactor.value(study)
     place = Folder(target, redactor=redactor)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
+    with writing(target):
         if study.report == "verdicts":
             write_study_table(study, target / "results", folder)
             write_verdict_report(study, place, folder)
@@ -65,8 +63,6 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
             write_latex_effects(page.contrasts.first, effects_caption(page.contrasts.first), target / "effects.tex")
         write_study_markdown(page, place)
         write_study_html(page, place)
-    except OSError as error:
-        raise InputError(f"The report cannot be written to '{target}': {error}.", "Choose another --out.") from error
     return target / "index.html"
 
 

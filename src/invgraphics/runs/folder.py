@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from invgraphics import locks
 from invgraphics.errors import InputError
 from invgraphics.runs import history
 from invgraphics.runs.environment import Environment
@@ -16,7 +16,7 @@ from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.history import Moment
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.renderings import Renderings
-from invgraphics.runs.schema import Record
+from invgraphics.runs.schema import Record, write_text
 from invgraphics.runs.scores import DEFAULT, Scores, read_scores, scores_file
 from invgraphics.tables import read_toml
 
@@ -34,11 +34,12 @@ PUBLISHED = (RECIPE, scores_file(), history.FILE, Provenance.FILE, Environment.F
 """Files of a run that a report links."""
 
 
-def make_parent(out: Path) -> None:
-    """Create the parent folder of the output file ``out``, before its computation starts.
+@contextmanager
+def output_file(out: Path) -> Iterator[None]:
+    """Lock the output file ``out`` before its computation starts; its folder is created.
 
     Raises:
-        InputError: it cannot be made, or ``out`` is a folder.
+        InputError: its folder cannot be made, ``out`` is a folder, or another process is writing it.
     """
     if out.is_dir():
         raise InputError(f"--out cannot be '{out}', which is a folder.", "Give the name of a file.")
@@ -46,6 +47,21 @@ def make_parent(out: Path) -> None:
         out.absolute().parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"The folder of '{out}' cannot be made: {error.strerror}.", "Choose another --out.") from error
+    with locks.locked(out):
+        yield
+
+
+@contextmanager
+def output_folder(out: Path) -> Iterator[None]:
+    """Create the folder ``out``, and lock it for writing.
+
+    Raises:
+        InputError: it cannot be made, or another process is writing it.
+    """
+    folder = RunFolder(out)
+    folder.create()
+    with folder.held():
+        yield
 
 
 def check_run(folder: Path) -> None:
@@ -80,14 +96,20 @@ class RunFolder:
             raise InputError(f"The folder {self.root} cannot be written: {error.strerror}.", "Choose another --out.") from error
 
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """Lock the run for writing by this process; a second process reports it and waits. A dying process frees the lock."""
-        with (self.root / ".lock").open("w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                print(f"Waiting for another process that writes {self.root}.", file=sys.stderr, flush=True)
-                fcntl.flock(file, fcntl.LOCK_EX)
+    def held(self, wait: bool = False) -> Iterator[None]:
+        """Lock the folder for writing by this process; a dying process frees the lock.
+
+        Args:
+            wait: for a process that holds it, which is named on the terminal.
+
+        Raises:
+            InputError: another process holds it, and is not waited for; the sentence names it.
+        """
+
+        def waiting(holder: locks.Holder) -> None:
+            print(f"Waiting for {holder}, which writes {self.root}.", file=sys.stderr, flush=True)
+
+        with locks.locked(self.root, self.root / locks.INSIDE, waiting if wait else None):
             yield
 
     def has(self, kind: type[Record]) -> bool:
@@ -170,19 +192,29 @@ class RunFolder:
         return read_scores(self.root, protocol)
 
     def clear(self) -> None:
-        """Remove the files of an earlier run, and no others."""
-        kinds = (FitRecord, Environment, Provenance, Renderings)
-        names = [RECIPE, history.FILE, CHECKPOINT, *(kind.FILE for kind in kinds)]
+        """Remove the files of an unfinished or replaced run, and no others.
+
+        Its scores go first, as without them it is not finished; its provenance, which tells whose files these are, goes last.
+
+        Raises:
+            InputError: there are files in their places, and no provenance of a run that wrote them.
+        """
+        kinds = (FitRecord, Renderings, Environment, Provenance)
         patterns = (Scores.FILES, "test/*", "snapshots/*")
         found = [path for pattern in patterns for path in self.root.glob(pattern)]
-        for path in [*(self.root / name for name in names), *found]:
+        names = [CHECKPOINT, history.FILE, RECIPE, *(kind.FILE for kind in kinds)]
+        foreign = [path for path in (*found, self.checkpoint) if path.exists()]
+        if foreign and not self.has(Provenance):
+            sentence = f"{self.root} holds {foreign[0].relative_to(self.root)}, which no run here has written."
+            raise InputError(sentence, "Choose another --out.")
+        for path in [*found, *(self.root / name for name in names)]:
             path.unlink(missing_ok=True)
 
     def write_recipe(self, table: dict[str, Any]) -> None:
-        """Write the resolved recipe."""
+        """Write the resolved recipe, atomically."""
         import tomlkit
 
-        (self.root / RECIPE).write_text(tomlkit.dumps(table))
+        write_text(self.root / RECIPE, tomlkit.dumps(table))
 
     def read_recipe(self) -> dict[str, Any]:
         """Read the resolved recipe.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.runs.schema import NOT_STORED, from_table, guarded, plain
+from invgraphics.runs.schema import NOT_STORED, from_table, guarded, plain, write_text
 
 FILE = "history.jsonl"
 
@@ -64,7 +64,7 @@ def cut_history(path: Path, step: int) -> None:
     """Truncate the history after ``step``, from which a resumed fit continues."""
     if path.is_file():
         kept = [table for table in _tables(path) if table["step"] <= step]
-        path.write_text("".join(json.dumps(table) + "\n" for table in kept))
+        write_text(path, "".join(json.dumps(table) + "\n" for table in kept))
 
 
 def _tables(path: Path) -> Iterator[dict[str, Any]]:

@@ -12,9 +12,11 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from subprocess import PIPE
 from typing import IO
 
 from invgraphics.errors import InputError
+from invgraphics.interruption import WITH_PARENT
 
 Progress = Callable[[int, int, str], None]
 
@@ -30,9 +32,15 @@ def write_error(error: InputError) -> None:
 
 
 def run_worker(
-    module: str, folder: Path, progress: Progress, subject: str, remedy: str, environment: Mapping[str, str] | None = None
+    module: str,
+    folder: Path,
+    progress: Progress,
+    subject: str,
+    remedy: str,
+    environment: Mapping[str, str] | None = None,
+    lock: int | None = None,
 ) -> None:
-    """Run ``python -m module folder`` to its end; an interruption here ends it too.
+    """Run ``python -m module folder`` to its end; it ends with this process, and an interruption here ends it too.
 
     Args:
         module: what to run.
@@ -41,20 +49,26 @@ def run_worker(
         subject: beginning of the sentence about a failure: "The scene 'x' could not be rendered".
         remedy: what to do where the process was killed.
         environment: of the process; this one's if not given.
+        lock: descriptor of the lock of ``folder``, which the process keeps until it ends.
 
     Raises:
         InputError: the worker gave up, failed or was killed.
     """
-    command = [sys.executable, "-P", "-m", module, str(folder)]
+    command = [sys.executable, "-P", "-m", module, str(folder), WITH_PARENT]
+    kept = () if lock is None else (lock,)
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=complaints, text=True, env=environment)
+        process = subprocess.Popen(
+            command, stdin=PIPE, stdout=PIPE, stderr=complaints, text=True, env=environment, pass_fds=kept
+        )
         try:
             failure = _follow(process, progress)
             status = process.wait()
         finally:
-            if process.poll() is None:
-                process.terminate()
-                process.wait()
+            process.kill()  # what it has written is whole, and another one goes on with it
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None
+                pipe.close()
         if status:
             raise failure or _explain(subject, remedy, status, complaints)
 

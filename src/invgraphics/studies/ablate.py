@@ -16,12 +16,13 @@ from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
-from invgraphics.experiments.executors.base import INTERRUPTED, Executor, Outcome, Resources
+from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.renderings import check_variants, rendered
 from invgraphics.experiments.request import AblateRequest
+from invgraphics.interruption import INTERRUPTED
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance

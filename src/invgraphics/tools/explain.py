@@ -18,6 +18,7 @@ from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.runs.explanation import CSV, PICTURE, TRUTH, DeadPrimitives, ExplanationRecord, Pixel, SamplerPass
 from invgraphics.runs.explanation import Contributions as Columns
 from invgraphics.runs.explanation import Profile as ProfileRecord
+from invgraphics.runs.folder import output_folder
 from invgraphics.runs.schema import plain
 from invgraphics.training.limits import dead_gaussians
 
@@ -90,7 +91,8 @@ def explain(request: ExplainRequest) -> Explanation:
     composited = found.colour + (1 - found.opacity) * background
     record = _record(fitted, request, view, found, picture)
     explanation = Explanation(request.folder, found, rendered, composited, record)
-    _write(explanation, view, picture, fitted.scene)
+    with output_folder(request.folder):
+        _write(explanation, view, picture, fitted.scene)
     return explanation
 
 
@@ -224,16 +226,8 @@ def _rounded(number: float) -> float:
 
 
 def _write(explanation: Explanation, view: View, picture: Rendering, scene: Scene) -> None:
-    """Write the explanation's folder: record, table, picture and photograph.
-
-    Raises:
-        InputError: it cannot be made.
-    """
+    """Write the explanation's folder: record, table, picture and photograph."""
     folder = explanation.folder
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {folder} cannot be written: {error.strerror}.", "Choose another --out.") from error
     for name, colour in ((PICTURE, picture.over(scene.background)), (TRUTH, view.over(scene.background))):
         Image.fromarray(display(colour, scene).numpy()).save(folder / name)
     columns = {name: values for name, values in plain(explanation.record.contributions).items() if values is not None}

@@ -17,7 +17,7 @@ from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
-from invgraphics.runs.folder import make_parent
+from invgraphics.runs.folder import output_file
 from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_file
 
 RESOLUTION, RESOLUTIONS = 192, (8, 512)
@@ -94,8 +94,8 @@ def export_run(request: ExportRequest) -> Exported:
         InputError: the run cannot be opened, its model cannot be written in this way, or the file cannot be written.
     """
     fitted = open_fitted(request.run, request.scene).in_its_frame()
-    make_parent(request.out)
-    return plugins.load("exporters", request.to)(fitted, request)
+    with output_file(request.out):
+        return plugins.load("exporters", request.to)(fitted, request)
 
 
 def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:

@@ -18,8 +18,8 @@ from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
 from invgraphics.renderers.ellipsoids import draw_ellipsoids
 from invgraphics.runs import checkpoint
-from invgraphics.runs.folder import RunFolder, make_parent
-from invgraphics.tools.camera_path import read_camera_path
+from invgraphics.runs.folder import RunFolder, output_file
+from invgraphics.tools.camera_path import CameraPath, read_camera_path
 from invgraphics.tools.colorize import colorize, depth_range
 from invgraphics.tools.paths import PATHS, Capture, PathName, classify_capture
 
@@ -79,7 +79,11 @@ def film(request: FilmRequest) -> Path:
     """
     saved = read_camera_path(request.path) if isinstance(request.path, Path) else None
     fitted = open_fitted(request.run, request.scene).in_its_frame()
-    make_parent(request.out)
+    with output_file(request.out):
+        return _film(fitted, request, saved)
+
+
+def _film(fitted: Fitted, request: FilmRequest, saved: CameraPath | None) -> Path:
     if request.path == "timelapse":
         total, pictures = _timelapse(fitted, request)
     elif saved is not None:
@@ -182,7 +186,7 @@ def _sized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
 
 
 class FilmWriter:
-    """Writer of an H.264 film; a context manager that removes the file if it is left by an exception.
+    """Writer of an H.264 film; a context manager whose file appears at its end, and not if it is left by an exception.
 
     Pictures need even sides: an odd one is continued by its last row or column.
 
@@ -193,6 +197,7 @@ class FilmWriter:
 
     def __init__(self, out: Path, rate: int) -> None:
         self._out, self._rate = out, rate
+        self._partial = out.with_name(f".{out.stem}.partial{out.suffix}")
         self._writer: Any = None
 
     def add(self, picture: np.ndarray) -> None:
@@ -203,7 +208,7 @@ class FilmWriter:
         even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if self._writer is None:
             size = (even.shape[1], even.shape[0])
-            self._writer = imageio_ffmpeg.write_frames(str(self._out), size, fps=self._rate, quality=8, macro_block_size=2)
+            self._writer = imageio_ffmpeg.write_frames(str(self._partial), size, fps=self._rate, quality=8, macro_block_size=2)
             self._writer.send(None)
         self._writer.send(np.ascontiguousarray(even))
 
@@ -213,5 +218,6 @@ class FilmWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._writer is not None:
             self._writer.close()
-        if kind is not None:
-            self._out.unlink(missing_ok=True)
+            if kind is None:
+                self._partial.replace(self._out)
+        self._partial.unlink(missing_ok=True)

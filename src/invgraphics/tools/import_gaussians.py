@@ -23,6 +23,7 @@ from invgraphics.formats.ply import OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import Moment
 from invgraphics.runs.provenance import ImportedFile, Provenance
 from invgraphics.text import sha256_of
@@ -72,8 +73,7 @@ def import_run(request: ImportRequest) -> Path:
     job = replace(job, method=method_for(job.method, request.file, splats.gaussians))
     axes = request.frame or splats.axes
     folder = job.folder
-    if folder.has(Provenance):
-        raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
+    _check_empty(folder)  # before the work, and again when nobody else can write there
     scene = open_with_progress(job.request.scene, job.options)
     gaussians = transform_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()
@@ -85,6 +85,7 @@ def import_run(request: ImportRequest) -> Path:
             "The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true shows it so.", file=sys.stderr
         )
     with folder.held():
+        _check_empty(folder)
         folder.clear()
         provenance = describe(job, (scene, scene), _identity(job.method, scene, origin))
         folder.write(replace(provenance, budget=IMPORTED, command=request.shell(), imported=origin))
@@ -98,6 +99,11 @@ def import_run(request: ImportRequest) -> Path:
         for protocol in job.protocols:
             evaluate(folder, scene, model, protocol, costs, job.method)
     return folder.root
+
+
+def _check_empty(folder: RunFolder) -> None:
+    if folder.has(Provenance):
+        raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
 
 
 def without_zero_bands(gaussians: Gaussians) -> Gaussians:

@@ -19,7 +19,7 @@ from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.metrics.poses import Similarity, rotation_angle
-from invgraphics.runs.folder import make_parent
+from invgraphics.runs.folder import output_file
 from invgraphics.runs.location import Location, PoseError, Start
 from invgraphics.scenes.images import make_view, read_pixels
 from invgraphics.training.localise import PoseDescent, photometric_error, refine_pose
@@ -77,7 +77,11 @@ def locate(request: LocateRequest) -> Location:
     """
     pixels = read_pixels(request.photo)
     fitted = open_fitted(request.run, request.scene)
-    make_parent(request.out)
+    with output_file(request.out):
+        return _locate(request, pixels, fitted)
+
+
+def _locate(request: LocateRequest, pixels: UInt8[np.ndarray, "h w c"], fitted: Fitted) -> Location:
     drift = Similarity(1.0, torch.eye(3).double(), torch.zeros(3).double())
     if fitted.poses is not None:
         drift = world_to_fit(fitted.poses, fitted.scene)

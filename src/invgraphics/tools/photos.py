@@ -17,6 +17,7 @@ from invgraphics.metrics.poses import pose_errors
 from invgraphics.scenes.open import SceneOptions, find_loader
 from invgraphics.scenes.photos import PhotoJob, reconstruct
 from invgraphics.scenes.photos.job import QUALITY
+from invgraphics.scenes.photos.maker import writing
 from invgraphics.scenes.process import Progress
 
 _LEAST = 3  # cameras: with two, a similarity explains everything
@@ -40,15 +41,16 @@ def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress:
     """
     if truth is not None:
         find_loader(truth)  # refuses before the work what it would refuse after it
-    quality = reconstruct(job, out, progress)
-    quality.pop("truth", None)
-    if truth is not None:
-        quality["truth"] = compare(job.path, quality, truth)
-    else:
-        quality |= _found_truth(job.path, quality)
-    partial = out / f"{QUALITY}.partial"
-    partial.write_text(json.dumps(quality, indent=1), encoding="utf-8")
-    partial.replace(out / QUALITY)
+    with writing(out):
+        quality = reconstruct(job, out, progress)
+        quality.pop("truth", None)
+        if truth is not None:
+            quality["truth"] = compare(job.path, quality, truth)
+        else:
+            quality |= _found_truth(job.path, quality)
+        partial = out / f"{QUALITY}.partial"
+        partial.write_text(json.dumps(quality, indent=1), encoding="utf-8")
+        partial.replace(out / QUALITY)
     return quality
 
 

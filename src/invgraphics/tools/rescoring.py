@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from invgraphics.metrics.conventions import PROTOCOLS, Colour, Protocol
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import RunFolder, output_folder
 from invgraphics.runs.scores import Score, Scores
 from invgraphics.tools.predictions import PictureSet
 
@@ -57,13 +57,13 @@ def write_scores(rescored: Rescored, out: Path | None) -> list[Path]:
     if out is None and not pictures.provenance:
         return []
     folder = pictures.folder if out is None else out
-    folder.mkdir(parents=True, exist_ok=True)
     written = []
-    for protocol, scores in rescored.scores.items():
-        if not scores.quality or (out is None and evaluated(pictures, protocol)):
-            continue
-        written.append(folder / scores.file)
-        scores.write(written[-1])
+    with output_folder(folder):
+        for protocol, scores in rescored.scores.items():
+            if not scores.quality or (out is None and evaluated(pictures, protocol)):
+                continue
+            written.append(folder / scores.file)
+            scores.write(written[-1])
     return written
 
 
@@ -145,7 +145,6 @@ def reasons(rescored: Rescored) -> list[str]:
 
 def write_tables(results: Sequence[Rescored], out: Path) -> list[Path]:
     """Write ``rescore.md`` (the tables) and ``rescore.csv`` (one line for each number) into ``out``."""
-    out.mkdir(parents=True, exist_ok=True)
     lines = ["# The same pictures under several protocols", ""]
     for one in results:
         columns, rows = rows_of(one)
@@ -160,8 +159,9 @@ def write_tables(results: Sequence[Rescored], out: Path) -> list[Path]:
         if name in results[0].scores
     ]
     page = out / "rescore.md"
-    page.write_text("\n".join(line for line in lines).strip() + "\n", encoding="utf-8")
-    return [page, _write_csv(results, out / "rescore.csv")]
+    with output_folder(out):
+        page.write_text("\n".join(line for line in lines).strip() + "\n", encoding="utf-8")
+        return [page, _write_csv(results, out / "rescore.csv")]
 
 
 def _write_csv(results: Sequence[Rescored], path: Path) -> Path:

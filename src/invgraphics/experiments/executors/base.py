@@ -9,9 +9,6 @@ from typing import Protocol
 
 from invgraphics.experiments.request import FitRequest
 
-INTERRUPTED = 130
-"""Exit status of a fit that was asked to stop and left a checkpoint."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Resources:

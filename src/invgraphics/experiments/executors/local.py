@@ -13,12 +13,10 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.executors.base import INTERRUPTED, Outcome, Resources
+from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.request import FitRequest
+from invgraphics.interruption import INTERRUPTED, WITH_PARENT
 from invgraphics.runs.schema import write_json
-
-WITH_PARENT = "--while-stdin-is-open"
-"""Argument of `invgraphics.experiments.run` as a program that ties its life to that of the process that started it."""
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables from which libraries take their number of threads."""

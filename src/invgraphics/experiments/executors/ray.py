@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.executors.base import INTERRUPTED, Outcome, Resources
+from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.executors.local import FitProcess
 from invgraphics.experiments.request import FitRequest
+from invgraphics.interruption import INTERRUPTED
 
 RETRIES = 3
 """How often a fit whose worker or node is lost starts again, from its last checkpoint."""

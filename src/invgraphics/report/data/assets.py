@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from invgraphics import locks
 from invgraphics.errors import InputError
 from invgraphics.report.data.redact import Redactor
 
+LOCK = ".report.lock"
+"""Lock file of a report's folder; a study's folder has another one, as its report may be written while it runs."""
 MASKED = 255
 """Palette entry of transparent pixels."""
 
@@ -61,6 +66,21 @@ class Folder:
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, copy)
         return self.url(copy)
+
+
+@contextmanager
+def writing(out: Path) -> Iterator[None]:
+    """Create a report's folder and lock it for writing.
+
+    Raises:
+        InputError: it cannot be written, or another process is writing it.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with locks.locked(out, out / LOCK):
+            yield
+    except OSError as error:
+        raise InputError(f"The report cannot be written to '{out}': {error}.", "Choose another --out.") from error
 
 
 def save_scalar(path: Path, unit: Float[ndarray, "h w"], mask: Bool[ndarray, "h w"], colours: str) -> None:

@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
+from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.images import area_resize
 from invgraphics.scenes.mitsuba import cache, render, stage
 from invgraphics.scenes.mitsuba import folder as folders
@@ -84,6 +85,7 @@ def _declare(folder: Path, source: Source) -> None:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     try:
         main(Path(sys.argv[1]))
     except InputError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -10,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from invgraphics import locks
 from invgraphics.errors import InputError
 from invgraphics.tables import read_json
 
@@ -54,19 +54,15 @@ def read_truth(folder: Path) -> dict[str, Any] | None:
 
 
 @contextmanager
-def locked(folder: Path, waiting: Callable[[], None]) -> Iterator[None]:
-    """Hold an exclusive lock on ``folder``; a second process waits. The system releases it when a process dies."""
+def locked(folder: Path, waiting: Callable[[], None]) -> Iterator[int]:
+    """Hold an exclusive lock on ``folder``, and yield its descriptor; a second process waits."""
+    file = folder.with_name(f"{folder.name}.lock")
     try:
-        file = folder.with_name(f"{folder.name}.lock").open("w")
+        file.touch()
     except OSError as error:
         raise unwritable(folder.parent, error) from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            waiting()
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+    with locks.locked(folder, file, lambda holder: waiting()) as descriptor:
+        yield descriptor
 
 
 def copy(source: Path, target: Path) -> Path:
@@ -75,6 +71,15 @@ def copy(source: Path, target: Path) -> Path:
     Raises:
         InputError: the target holds something else, or cannot be written.
     """
+    try:
+        target.absolute().parent.mkdir(parents=True, exist_ok=True)
+        with locks.locked(target):
+            return _copy(source, target)
+    except OSError as error:
+        raise InputError(f"{target} cannot be written: {error.strerror or error}.") from error
+
+
+def _copy(source: Path, target: Path) -> Path:
     wanted, present = read_truth(source), read_truth(target)
     if wanted and present and wanted["key"] == present["key"]:
         return target
@@ -83,10 +88,9 @@ def copy(source: Path, target: Path) -> Path:
     partial = target.with_name(f".{target.name}.partial")
     try:
         shutil.rmtree(partial, ignore_errors=True)
-        target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copytree(source, partial)
         partial.replace(target)
-    except OSError as error:
+    except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
-        raise InputError(f"{target} cannot be written: {error.strerror or error}.") from error
+        raise
     return target

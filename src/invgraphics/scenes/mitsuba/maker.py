@@ -53,9 +53,9 @@ def make(
         job, folder = smaller, cache.root() / smaller.folder_name
     report = progress or (lambda done, total, what: None)
     if cache.read_truth(folder) is None:
-        with cache.locked(folder, waiting=lambda: report(0, job.total, "waiting for another process that renders it")):
+        with cache.locked(folder, waiting=lambda: report(0, job.total, "waiting for another process that renders it")) as lock:
             if cache.read_truth(folder) is None:  # that process may have made it meanwhile
-                _make(job, folder, report)
+                _make(job, folder, report, lock)
     return folder if out is None else cache.copy(folder, Path(out))
 
 
@@ -78,7 +78,7 @@ def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int |
     return Job(spec, size or spec.size, Counts(train, spec.views.val, test), samples, seed, llvm.status().variant)
 
 
-def _make(job: Job, folder: Path, progress: Progress) -> None:
+def _make(job: Job, folder: Path, progress: Progress, lock: int) -> None:
     """Render into a folder beside the final one, which appears only when it is whole."""
     partial = folder.with_name(f"{folder.name}.partial")
     request = partial / cache.REQUEST
@@ -86,14 +86,14 @@ def _make(job: Job, folder: Path, progress: Progress) -> None:
         shutil.rmtree(folder, ignore_errors=True)  # a broken one, see `cache.read_truth`
         partial.mkdir(exist_ok=True)
         request.write_text(json.dumps(job.table()), encoding="utf-8")
-        _run(job, partial, progress)
+        _run(job, partial, progress, lock)
         request.unlink()
         partial.replace(folder)
     except OSError as error:
         raise cache.unwritable(partial, error) from error
 
 
-def _run(job: Job, partial: Path, progress: Progress) -> None:
+def _run(job: Job, partial: Path, progress: Progress, lock: int) -> None:
     width, height = job.size
     if job.source is None:
         module, progress = "render", RenderingForecast(job, partial, progress, _say)
@@ -108,6 +108,7 @@ def _run(job: Job, partial: Path, progress: Progress) -> None:
         subject=f"The scene '{job.spec.name}' could not be rendered",
         remedy="If memory ran out, make it smaller (--size, --spp).",
         environment=llvm.status().environment(),
+        lock=lock,
     )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
+from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.mitsuba import folder as folders
 from invgraphics.scenes.mitsuba import ply, stage
 from invgraphics.scenes.mitsuba.build import BUILDERS
@@ -125,6 +126,7 @@ def _report(done: int, total: int, what: str) -> None:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     try:
         main(Path(sys.argv[1]))
     except InputError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import shutil
 from collections.abc import Iterator, Sequence
@@ -10,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from invgraphics import locks
 from invgraphics.errors import InputError
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, TOP_VIEW, PhotoJob
 from invgraphics.scenes.process import Progress, run_worker
@@ -17,7 +17,7 @@ from invgraphics.scenes.process import Progress, run_worker
 WORK = ".import"
 """Where unfinished work lies inside the folder of the result; features and matches stay there for another try."""
 
-JOB, LOCK, RESULT = "job.json", "lock", "result"
+JOB, RESULT = "job.json", "result"
 MATCHES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm")
 RESULTS = ("images", "sparse", TOP_VIEW, QUALITY)
 """What the work process leaves for the folder, the proof of completeness last."""
@@ -44,17 +44,29 @@ def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> d
     _check_source(job)
     key = job.key()
     report = progress or (lambda done, total, what: None)
-    try:
+    with writing(out) as lock:
         _check_target(job, out)
         (out / WORK).mkdir(parents=True, exist_ok=True)
-        with _locked(out):
-            quality = read_quality(out)
-            if quality is None or quality["key"] != key:
-                quality = _make(job, key, out, report)
-            _clear(out / WORK, (JOB, LOCK, *MATCHES))
+        quality = read_quality(out)
+        if quality is None or quality["key"] != key:
+            quality = _make(job, key, out, report, lock)
+        _clear(out / WORK, (JOB, *MATCHES))
+    return quality
+
+
+@contextmanager
+def writing(out: Path) -> Iterator[int]:
+    """Lock the folder ``out``, which need not be there yet; yields the lock's descriptor.
+
+    Raises:
+        InputError: it cannot be written, or another process is writing it.
+    """
+    try:
+        out.absolute().parent.mkdir(parents=True, exist_ok=True)
+        with locks.locked(out) as lock:
+            yield lock
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror or error}.", "Choose another --out.") from error
-    return quality
 
 
 def read_quality(out: Path) -> dict[str, Any] | None:
@@ -85,30 +97,33 @@ def _check_target(job: PhotoJob, out: Path) -> None:
         raise InputError(f"{out} lies inside the folder of the photographs.", "Choose an --out beside it.")
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file.", "Name a new or empty folder.")
-    quality = read_quality(out)
-    if quality is not None and Path(quality["job"]["folder"]).resolve() != job.path.resolve():
-        raise InputError(f"{out} holds the scene of {quality['job']['folder']}.", "Choose a new or empty folder.")
+    quality, left = read_quality(out), _read_json(out / WORK / JOB)
+    for found, what in ((quality, "scene"), (left, "unfinished import")):
+        if found is not None and Path(found["job"]["folder"]).resolve() != job.path.resolve():
+            raise InputError(f"{out} holds the {what} of {found['job']['folder']}.", "Choose a new or empty folder.")
     if quality is not None or not out.exists() or not any(out.iterdir()) or (out / WORK).is_dir():
         return
     raise InputError(f"{out} already exists and holds something else.", "Choose a new or empty folder.")
 
 
-def _make(job: PhotoJob, key: str, out: Path, progress: Progress) -> dict[str, Any]:
+def _make(job: PhotoJob, key: str, out: Path, progress: Progress, lock: int) -> dict[str, Any]:
     work = out / WORK
     request = work / JOB
     asked = {"key": key, "matches": job.matches_key(), "job": json.loads(job.text())}
     left = _read_json(request)
     if left is None or left.get("matches") != asked["matches"]:  # of no use
-        _clear(work, (LOCK,))
+        _clear(work, ())
     elif left != asked:
-        _clear(work, (LOCK, JOB, *MATCHES))
-    request.write_text(json.dumps(asked), encoding="utf-8")
+        _clear(work, (JOB, *MATCHES))
+    request.with_suffix(".partial").write_text(json.dumps(asked), encoding="utf-8")
+    request.with_suffix(".partial").replace(request)
     run_worker(
         "invgraphics.scenes.photos.work",
         work,
         progress,
         subject=f"The photographs of {job.folder} could not be put together",
         remedy="If memory ran out, make them smaller (--max-size). What is done is kept: the same command goes on from there.",
+        lock=lock,
     )
     for name in reversed(RESULTS):  # an old report goes first, a new one comes last
         _remove(out / name)
@@ -132,14 +147,3 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-@contextmanager
-def _locked(out: Path) -> Iterator[None]:
-    """Hold an exclusive lock on ``out``; the system releases it when a process dies."""
-    with (out / WORK / LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"Another process is filling {out}.", "Wait for it, or choose another --out.") from None
-        yield

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
+from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.photos import sfm
 from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, SCHEMA, TOP_VIEW, PhotoJob
@@ -118,6 +119,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
 
 
 if __name__ == "__main__":
+    end_with_parent()
     try:
         main(Path(sys.argv[1]))
     except InputError as error:

@@ -1,0 +1,62 @@
+"""Ends of processes: within two seconds of SIGTERM wherever they are, and with the process that started them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from types import FrameType
+
+INTERRUPTED = 130
+"""Exit status of a process that was interrupted or terminated."""
+GRACE_SECONDS = 1.5
+"""Time after SIGTERM in which a process may end by itself."""
+WITH_PARENT = "--while-stdin-is-open"
+"""Argument of programs that tie their life to that of the process that started them."""
+GIVEN_UP = f"Terminated; not even a step was over within {GRACE_SECONDS:g} s. What was saved before remains."
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came: something that has no time, unlike somebody at a terminal, wants the process to end."""
+
+
+def terminate(number: int, frame: FrameType | None) -> None:
+    """Handle a signal by raising `Terminated`."""
+    raise Terminated
+
+
+def end_on_sigterm() -> None:
+    """Let SIGTERM raise `Terminated` in the main thread, and end the process after `GRACE_SECONDS` whatever comes of that.
+
+    Python handles signals between two instructions of the main thread, which may be inside a compiler, a kernel or a library
+    for longer; and an exception may be caught on its way. The operating system's handler itself writes to a pipe, which a
+    thread reads.
+    """
+    signal.signal(signal.SIGTERM, terminate)
+    receiver, sender = os.pipe()
+    os.set_blocking(sender, False)
+    signal.set_wakeup_fd(sender, warn_on_full_buffer=False)
+    threading.Thread(target=_end_later, args=(receiver,), daemon=True).start()
+
+
+def _end_later(receiver: int) -> None:
+    while number := os.read(receiver, 1):
+        if number[0] == signal.SIGTERM:
+            time.sleep(GRACE_SECONDS)
+            os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"{GIVEN_UP}\n".encode())
+            os._exit(INTERRUPTED)
+
+
+def end_with_parent() -> None:
+    """Terminate this process when its standard input closes, as it does however the parent dies, if it was asked to."""
+    if WITH_PARENT not in sys.argv[2:]:
+        return
+
+    def watch() -> None:
+        while os.read(0, 1):  # not sys.stdin.read, whose lock would outlive the interpreter
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
