@@ -17,13 +17,14 @@ from PIL import Image
 from invgraphics import locks
 from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.errors import NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.metrics.cost import model_bytes, parameter_count
-from invgraphics.metrics.protocols import protocol_named, score, summarise
+from invgraphics.metrics.protocols import non_finite_pixels, protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
@@ -100,8 +101,13 @@ def score_model(
         title: what the model is called, on the progress bar, in sentences and in the scores.
         poses: of the training views, where the fit has refined them: test poses are then aligned and refined first.
         keep: is given each picture with the number of its view.
+
+    Raises:
+        NumericalError: a value of the model is not finite.
     """
     rules = protocol_named(protocol)
+    if found := model.non_finite_values():
+        raise NumericalError(f"{title} cannot be scored: {found}.")
     scores, seconds, statistics_of_views = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
     with Reporter(f"{title} evaluation") as reporter:
@@ -114,6 +120,8 @@ def score_model(
             picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
             keep(index, picture)
             scores.append(score(picture, view, scene, rules))
+            if sentence := non_finite_pixels(picture):
+                warn(f"Warning: view {view.name}: {sentence}.")
             statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
+from invgraphics.core.finite import non_finite_values
+from invgraphics.errors import NumericalError
 from invgraphics.experiments.clocks import fit_record
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
@@ -101,6 +103,7 @@ class Recorder:
         self.history: list[Moment] = []
         self._monitor = Monitor(fit.plan.scene, fit.plan.device)
         self._saved_at = (fit.steps, time.monotonic())
+        self._finite_at = fit.steps
         self._marks = [mark for mark in MARKS if mark > fit.progress]
         self._snapshots = snapshots
         self._stopped_by = 0
@@ -111,6 +114,7 @@ class Recorder:
 
         Raises:
             KeyboardInterrupt: Ctrl-C or SIGTERM came; the run folder holds a checkpoint of the last whole step.
+            NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
         """
         self._stopped_by = 0
         # Only a program's main thread hears signals.
@@ -158,7 +162,19 @@ class Recorder:
             return self._fit.steps - step >= self._cadence.steps
         return time.monotonic() - moment >= (self._cadence.seconds or 30.0)
 
+    def _check_finite(self) -> None:
+        """Check every tensor of the fit, which kernels may hide: before anything of it is recorded.
+
+        Raises:
+            NumericalError: a value is not finite; the sentence names the steps between which that happened.
+        """
+        if found := non_finite_values(self._fit.state()):
+            since = f" (all were at step {self._finite_at})" if self._finite_at < self._fit.steps else ""
+            raise NumericalError(f"Step {self._fit.steps}: {found}{since}; the fit stops here.")
+        self._finite_at = self._fit.steps
+
     def _save(self) -> None:
+        self._check_finite()
         if self._folder is not None:
             checkpoint.save(self._folder.checkpoint, self._fit.state())
             self._folder.write(fit_record(self._fit.steps, self._fit.clocks()))
@@ -170,11 +186,13 @@ class Recorder:
             return
         path = self._folder.snapshot(math.floor(progress * self._snapshots))
         if not path.is_file():
+            self._check_finite()
             path.parent.mkdir(exist_ok=True)
             state = self._fit.state()
             checkpoint.save(path, {part: state[part] for part in ("field", "renderer", "fit")})
 
     def _record(self) -> float:
+        self._check_finite()
         fit = self._fit
         psnr = self._monitor.psnr(fit)
         dead = dead_gaussians(fit.plan.model.field, [view.camera for view in fit.plan.scene.train])

@@ -75,9 +75,8 @@ def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) 
     if 2 * protocol.crop >= min(height, width):
         raise InputError(f"Protocol '{protocol.name}' crops {protocol.crop} pixels of every side; '{view.name}' has no more.")
     rendering = rendering.detach()
-    broken = ~(rendering.rgb.isfinite().all(dim=-1) & rendering.alpha.isfinite())
-    if broken.any():
-        raise Skip(f"the predicted colour or alpha is not finite at {int(broken.sum())} of {broken.numel()} pixels")
+    if sentence := non_finite_pixels(rendering):
+        raise Skip(sentence)
     image, truth, mask = _masked(*_composited(rendering, view, scene, protocol), view, protocol)
     pair = Pair(
         image=image,
@@ -91,6 +90,13 @@ def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) 
         mask=mask,
     )
     return pair.cropped(protocol.crop) if protocol.crop else pair
+
+
+def non_finite_pixels(rendering: Rendering) -> str:
+    """Describe how many pixels have a NaN or infinite colour or alpha; empty if none has."""
+    broken = ~(rendering.rgb.isfinite().all(dim=-1) & rendering.alpha.isfinite())
+    count = int(broken.sum())
+    return f"the predicted colour or alpha is not finite at {count} of {broken.numel()} pixels" if count else ""
 
 
 def _composited(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) -> tuple[Image, Image]:
@@ -203,7 +209,7 @@ def summarise(
     """Average scores over views by the protocol's rule: the ``quality`` and ``skipped`` parts of a ``scores.json``.
 
     A metric that is missing in any view gets no mean: means over different views cannot be compared. Why it is missing, and
-    in which view first, goes to ``skipped``.
+    in which view first unless all views say the same, goes to ``skipped``.
     """
     names = list(dict.fromkeys(name for one in scores for name in (*one.values, *one.skipped)))
     quality: dict[str, Score] = {}
@@ -211,8 +217,9 @@ def summarise(
     for name in names:
         missing = [one for one in scores if name not in one.values]
         if missing:
-            reason = missing[0].skipped.get(name, "not computed")
-            skipped[name] = reason if len(missing) == len(scores) else f"view {missing[0].view}: {reason}"
+            reasons = [one.skipped.get(name, "not computed") for one in missing]
+            general = len(missing) == len(scores) and len(set(reasons)) == 1
+            skipped[name] = reasons[0] if general else f"view {missing[0].view}: {reasons[0]}"
             continue
         quality[name] = _joined(name, [one.values[name] for one in scores], protocol)
     return quality, skipped

@@ -10,12 +10,19 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from invgraphics.errors import InputError
+from invgraphics.core.finite import non_finite_values
+from invgraphics.errors import InputError, NumericalError
 from invgraphics.runs.schema import replacing
 
 
 def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
-    """Write ``parts`` (section -> name -> tensor) atomically: an interruption leaves either the old file or the new one."""
+    """Write ``parts`` (section -> name -> tensor) atomically: an interruption leaves either the old file or the new one.
+
+    Raises:
+        NumericalError: a value is not finite; the old file stays.
+    """
+    if found := non_finite_values(parts):
+        raise NumericalError(f"{path} is not written: {found}.")
     flat = {
         f"{section}|{name}": value.detach().cpu().contiguous().clone()
         for section, part in parts.items()
@@ -34,7 +41,7 @@ def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, 
     """Read a checkpoint as section -> name -> tensor (inverse of `save`).
 
     Raises:
-        InputError: the file is missing or is not a whole checkpoint.
+        InputError: the file is missing or is not a whole checkpoint, or a value in it is not finite.
     """
     try:
         flat = load_file(path, device=str(device or "cpu"))
@@ -48,4 +55,6 @@ def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, 
         if not bar:
             raise InputError(f"{path} was not written by invgraphics: it holds '{key}'.")
         parts.setdefault(section, {})[name] = value
+    if found := non_finite_values(parts):
+        raise InputError(f"{path} cannot be used: {found}.", "The fit diverged, or the file was damaged: fit again.")
     return parts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from invgraphics.core import Batch, Context, Model, RayRenderer, Rendering, Scene, Trace
+from invgraphics.core.finite import non_finite_values
 from invgraphics.errors import NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.openmp import limit_spinning
@@ -103,7 +105,7 @@ class Fit:
         """One optimisation step: draw a batch, render, composite, sum the losses, backpropagate, update. Returns the loss.
 
         Raises:
-            NumericalError: the loss is not finite; names the step and the first tensor that is not.
+            NumericalError: the loss is not finite; names the step and the first tensor, rendering or loss that is not.
         """
         began, cpu_began = time.perf_counter(), time.process_time()
         plan, ctx = self.plan, self.context()
@@ -114,10 +116,11 @@ class Fit:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
         composited = replace(rendering, rgb=rendering.over(batch.background))
-        loss = torch.stack([loss(composited, trace, batch, ctx) for loss in plan.losses]).sum()
+        terms = torch.stack([loss(composited, trace, batch, ctx) for loss in plan.losses])
+        loss = terms.sum()
         value = loss.item()
         if not torch.isfinite(loss):
-            raise NumericalError(self._first_not_finite(rendering))
+            raise NumericalError(self._first_not_finite(rendering, terms))
         self._optimiser.zero_grad()
         if loss.requires_grad:
             loss.backward()
@@ -151,17 +154,15 @@ class Fit:
             rendering, trace = renderer.render_image(fitted, camera, ctx)
         return rendering, trace, batch
 
-    def _first_not_finite(self, rendering: Rendering) -> str:
-        """A sentence that names the first tensor that is not finite: parameters first, then the rendering."""
-        candidates: dict[str, Tensor] = {
-            f"{owner}.{name}": parameter
-            for owner, module in self.plan.modules.items()
-            for name, parameter in module.named_parameters()
-        }
-        candidates |= {"rendering.rgb": rendering.rgb, "rendering.alpha": rendering.alpha}
-        broken = [name for name, value in candidates.items() if not bool(torch.isfinite(value).all())]
-        where = broken[0] if broken else "the loss"
-        return f"Step {self.steps}: {where} is not finite; the fit stops here."
+    def _first_not_finite(self, rendering: Rendering, terms: Tensor) -> str:
+        """A sentence that names the first values that are not finite: parameters first, then the rendering, then the losses."""
+        modules = self.plan.modules.items()
+        parts: dict[str, dict[str, Tensor]] = {owner: dict(module.named_parameters()) for owner, module in modules}
+        parts["rendering"] = {"rgb": rendering.rgb, "alpha": rendering.alpha}
+        names = [type(loss).__name__ for loss in self.plan.losses]
+        broken = [name for name, term in zip(names, terms.tolist(), strict=True) if not math.isfinite(term)]
+        where = non_finite_values(parts) or f"the loss is not finite ({', '.join(broken) or 'the sum of ' + ', '.join(names)})"
+        return f"Step {self.steps}: {where}; the fit stops here."
 
     def warmup_step(self) -> None:
         """Take one step and restore the state before it, so that compiling and allocating at first use is on no clock."""
