@@ -162,8 +162,8 @@ def test_a_strangers_renderer_with_state_takes_part(environment: dict[str, str],
 def test_a_run_whose_package_is_gone_names_it(environment: dict[str, str], toy_folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     _invgraphics(environment, "fit", "volumetric/fog", str(toy_folder), "--budget", "2steps", "--out", str(run))
-    brought = {"fog": "stranger-fog 1.0", "volumetric/fog": "stranger-fog 1.0"}
-    assert json.loads((run / "provenance.json").read_text())["plugins"] == brought
+    plugins = {"fog": "stranger-fog 1.0", "volumetric/fog": "stranger-fog 1.0"}
+    assert json.loads((run / "provenance.json").read_text())["plugins"] == plugins
     shutil.rmtree(tmp_path / "site")
     command = [sys.executable, "-m", "invgraphics", "evaluate", str(run)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

@@ -142,7 +142,7 @@ def test_labels_are_pushed_apart_no_further_than_needed() -> None:
 
 
 def _with_shortfall(run: Run) -> Run:
-    return replace(run, scores=replace(run.scores, shortfall=f"{run.method}: fog."))
+    return replace(run, scores=replace(run.scores, below_baseline=f"{run.method}: fog."))
 
 
 def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:

@@ -201,7 +201,7 @@ def test_missing_metric_is_shown_with_its_reason(comparison_folder: Path, edit: 
 def test_suspicious_poses_are_told_above_the_numbers(comparison_folder: Path, edit: Callable[..., None]) -> None:
     sentence = "3 of the 20 best matched pairs of photographs contradict the poses"
     assert "suspicious" not in build_report(comparison_folder).read_text()
-    edit(comparison_folder / "compare.json", lambda table: table["scene_info"]["notes"].update(suspicion=sentence))
+    edit(comparison_folder / "compare.json", lambda table: table["scene_info"]["notes"].update(inconsistent_poses=sentence))
     page = build_report(comparison_folder).read_text()
     assert page.index("camera poses are suspicious") < page.index(sentence) < page.index("<table")
     assert sentence in (comparison_folder / "index.md").read_text().split("## Summary")[0]

@@ -92,11 +92,11 @@ def status_bytes(entry: str) -> int:
 
 
 def _splats() -> Callable[[], int]:
-    from invgraphics.bench.splat_cases import both_ways, splat_pipeline
+    from invgraphics.bench.splat_cases import forward_backward, splat_pipeline
     from invgraphics.bench.workload import activated, camera, gaussian_field, leaves
 
     gaussians, viewpoint = activated(gaussian_field(GAUSSIANS)), camera(WIDTH)
-    return _counted(both_ways(lambda: splat_pipeline(gaussians, viewpoint), leaves(gaussians)), GAUSSIANS)
+    return _counted(forward_backward(lambda: splat_pipeline(gaussians, viewpoint), leaves(gaussians)), GAUSSIANS)
 
 
 def _case(operation: str, count: int, **sizes: int) -> Callable[[], Callable[[], int]]:

@@ -91,9 +91,9 @@ def show_quality(quality: Mapping[str, Any]) -> None:
             print(f"{kind}: {name}: {why}")
         if len(files) > _MOST_FILES:
             print(f"{kind}: {len(files) - _MOST_FILES} more, see quality.json")
-    suspicion = quality["suspicion"]
-    if suspicion is not None and suspicion["suspicious"]:
-        print(f"SUSPICIOUS: {suspicion['sentence']}")
+    consistency = quality["consistency"]
+    if consistency is not None and consistency["suspicious"]:
+        print(f"SUSPICIOUS: {consistency['sentence']}")
 
 
 def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -105,8 +105,8 @@ def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         models = Counter(lens["model"] for lens in quality["lenses"])
         lenses = ", ".join(f"{count} {model}" for model, count in models.items())
         yield "cameras", f"{lenses}; distortion moves pixels by up to {quality['bend_px']:.1f} px"
-    if quality["suspicion"] is not None:
-        found = quality["suspicion"]
+    if quality["consistency"] is not None:
+        found = quality["consistency"]
         yield "pairs against poses", f"{found['contradicting']} of the {found['pairs']} best matched contradict them"
         yield "photographs in doubt", f"{len(found['doubtful'])} of {found['asked']}"
         yield "matches explained", f"{100 * found['support']:.0f} %"

@@ -43,8 +43,8 @@ def show_scores(scores: Scores) -> None:
         print(f"Test poses: {scores.test_poses}. Pose errors are medians over the training views.")
     if scores.skipped:
         print(not_scored(scores.skipped))
-    if scores.shortfall:
-        print(scores.shortfall)
+    if scores.below_baseline:
+        print(scores.below_baseline)
 
 
 def not_scored(skipped: Mapping[str, str]) -> str:

@@ -90,7 +90,7 @@ def write_report(folder: Path, out: Path | None = None, public: bool = False) ->
         cells = [row.cells[index] for row in summary.rows]
         rows.append([column.heading, *(f"{cell.text} {cell.spread}{' *' if cell.best else ''}".strip() for cell in cells)])
     show_table(f"{comparison.question} (* best)", ["", *(row.label for row in summary.rows)], rows)
-    for sentence in dict.fromkeys(run.scores.shortfall for run in comparison.runs if run.scores.shortfall):
+    for sentence in dict.fromkeys(run.scores.below_baseline for run in comparison.runs if run.scores.below_baseline):
         print(sentence)
     for failure in comparison.failures:
         print(

@@ -124,7 +124,7 @@ def score_model(
         cost=_model_costs(model, scene, statistics.median(seconds)),
         quality=joined if posed is None else joined | posed.quality(),
         skipped=skipped,
-        shortfall=below_baseline(title, quality, statistics_of_views, scene, rules),
+        below_baseline=below_baseline(title, quality, statistics_of_views, scene, rules),
     )
 
 

@@ -100,8 +100,8 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
                 folder.clear()
             folder.write(describe(job, (scene, shown), identity))
             forecast = _warm_up(job, fit, memory)
-            if "suspicion" in scene.notes:
-                warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
+            if "inconsistent_poses" in scene.notes:
+                warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
             for sentence in (*announcements([method.choice]), _prediction(job, fit, forecast)):
                 print(sentence, file=sys.stderr)
             Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots, on_step).run()
@@ -203,7 +203,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance
         data=job.data.changes(),
         notes=shown.notes,
         code_version=code_version(),
-        plugins=plugins.brought(method.table, method.name),
+        plugins=plugins.used_plugins(method.table, method.name),
         command=request.shell(),
         options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
         device=str(job.device),

@@ -15,7 +15,7 @@ from invgraphics.core import harmonics
 from invgraphics.errors import InputError
 from invgraphics.formats.base import Splats, cut_off
 from invgraphics.formats.spz_attributes import Bytes, fraction_bits, pack, unpack, widths
-from invgraphics.memory import check_fits, spelt
+from invgraphics.memory import check_fits, format_bytes
 
 MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 VERSION = 4
@@ -130,7 +130,9 @@ def _gunzip(path: Path, data: bytes) -> bytes:
         raise InputError(f"'{path}' cannot be decompressed: {error}.", "Copy the file again.") from error
     if not inflate.eof:
         longer = len(result) == HEADER.size + most
-        wrong = f"it goes on after its Gaussians and {spelt(MOST_EXTENSIONS)} of extensions" if longer else "it is cut off"
+        wrong = (
+            f"it goes on after its Gaussians and {format_bytes(MOST_EXTENSIONS)} of extensions" if longer else "it is cut off"
+        )
         raise InputError(f"'{path}' cannot be decompressed: {wrong}.", "Copy the file again.")
     return result
 

@@ -131,7 +131,7 @@ class GaussianRays(RayRenderer):
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
         """List the Gaussians that the pixel's ray intersects; see `Renderer.contributions`."""
         primitives = precompute(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest, camera.position)
-        rays = _clipped(camera.ray(pixel), ctx)
+        rays = _clip_near(camera.ray(pixel), ctx)
         return self._listed(intersect(primitives, rays), primitives, rays, camera.cam_to_world[:3, 2])
 
     @abstractmethod
@@ -141,7 +141,7 @@ class GaussianRays(RayRenderer):
         """Contributions of one ray's intersections, in compositing order."""
 
     def _render(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, ctx: Context) -> Rendering:
-        rays = _clipped(rays, ctx)
+        rays = _clip_near(rays, ctx)
         intersections = intersect(primitives, rays)
         geometry = ctx.geometry or not ctx.training
         weights, distances = self.weigh(intersections, rays, axis, geometry)
@@ -245,7 +245,7 @@ class GaussianSorted(GaussianRays):
         return order[intersections.ray[order].argsort(stable=True)]
 
 
-def _clipped(rays: Rays, ctx: Context) -> Rays:
+def _clip_near(rays: Rays, ctx: Context) -> Rays:
     """Clip rays to the near distance of the bounds."""
     return rays.within(rays.near.clamp_min(ctx.bounds.near), rays.far)
 

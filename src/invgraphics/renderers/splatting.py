@@ -167,7 +167,7 @@ class Splatting(Renderer):
             return to_rendering(sums[..., :3], alpha, distance, None, far)
         normal, directions = sums[..., 6:], camera.rays().directions.view(*alpha.shape, 3)
         if self.config.normals == "depth":
-            normal = _slope(distance / alpha.clamp_min(SEEN), alpha >= SEEN, directions)
+            normal = _normals_from_depth(distance / alpha.clamp_min(SEEN), alpha >= SEEN, directions)
         return to_rendering(sums[..., :3], alpha, distance, normal, far, directions)
 
 
@@ -192,7 +192,9 @@ def _normals(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
     return torch.where(away, -normal, normal)
 
 
-def _slope(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+def _normals_from_depth(
+    depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w 3"]:
     """Normals of a depth map by central differences of its points, one-sided where a neighbour is empty.
 
     A pixel without a neighbour in one direction gets its own viewing direction, reversed.

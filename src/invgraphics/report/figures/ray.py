@@ -22,7 +22,7 @@ SIZE = (1120.0, 640.0)
 SHARPNESS = 2.0
 """Pixels of the PNG per CSS pixel."""
 LIGHT, DENSITY, PASS = SERIES[0].light, SERIES[3].light, SERIES[6].light
-LOOKS = {
+DEPTH_STYLES = {
     "true_depth": ("true depth", INK.light, "-"),
     "expected": ("mean", SERIES[1].light, (0, (5, 2))),
     "median": ("median", SERIES[2].light, (0, (1.5, 1.5))),
@@ -221,7 +221,7 @@ def _depths(panels: tuple[Axes, ...], ray: Ray) -> None:
     """Draw vertical lines at true, expected and median depth, labelled above the first panel."""
     strip, shares = panels[0], panels[1]
     low, high = strip.get_xlim()
-    found = sorted((value, *LOOKS[key]) for key, value in ray.depths.items() if low <= value <= high)
+    found = sorted((value, *DEPTH_STYLES[key]) for key, value in ray.depths.items() if low <= value <= high)
     for value, _, colour, dash in found:
         for axes in panels[1:]:
             axes.axvline(value, color=colour, linestyle=dash, linewidth=1.4, zorder=4.5)

@@ -142,8 +142,8 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
         sentences.append(f"No gradient can change {share} of the primitives of {run.method} (seed {run.seed}).")
     told: dict[str, str] = {}
     for run in comparison.runs:
-        if run.scores.shortfall:
-            told.setdefault(run.method, run.scores.shortfall)
+        if run.scores.below_baseline:
+            told.setdefault(run.method, run.scores.below_baseline)
     sentences += told.values()
     short = [row.label for row in summary.methods if not row.complete]
     if short:

@@ -58,9 +58,11 @@ def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> d
 
 
 def read_quality(out: Path) -> dict[str, Any] | None:
-    """The report of a finished import; ``None`` where there is none."""
+    """Read the report of a finished import; ``None`` where there is none."""
     quality = _read_json(out / QUALITY)
-    return quality if quality is not None and "key" in quality else None
+    if quality is None or "key" not in quality:
+        return None
+    return {"consistency" if name == "suspicion" else name: value for name, value in quality.items()}  # its first name
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:

@@ -108,7 +108,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         **figures,
         "bend_px": bend,
         "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],
-        "suspicion": best.consistency,
+        "consistency": best.consistency,
         "usable": refused is None,
         "refusal": refused,
         "skipped": skipped,
