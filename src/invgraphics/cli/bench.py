@@ -52,7 +52,7 @@ class Bench:
         began, record = time.perf_counter(), self._record()
         results = bench(self.request(parts))
         record |= {"seconds": round(time.perf_counter() - began), "load at the end": _load()}
-        page = write(results, record, self.out, _look())
+        page = write(results, record, self.out, _plot_style())
 
         for title, table in (("Kernels", kernel_table(results)), ("Whole steps", step_table(results))):
             if table.rows:
@@ -109,7 +109,7 @@ def _load() -> str:
     return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
 
 
-def _look() -> PlotStyle:
+def _plot_style() -> PlotStyle:
     """The look of the reports."""
     from importlib.resources import files
 

@@ -70,7 +70,7 @@ def _print_matrix() -> None:
 
 
 def _list_methods() -> None:
-    from invgraphics.recipes.presets import described
+    from invgraphics.recipes.presets import preset_summary
     from invgraphics.recipes.recipe import methods, source
 
     ours = find("renderers")
@@ -78,7 +78,7 @@ def _list_methods() -> None:
         (
             name,
             summary,
-            described(source(name).get("presets", {})),
+            preset_summary(source(name).get("presets", {})),
             "built in" if (ours / f"{name}.toml").is_file() else plugins.origin("recipes", name),
         )
         for name, summary in methods().items()

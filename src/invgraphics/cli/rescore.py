@@ -43,7 +43,7 @@ class Rescore:
 
         from invgraphics.tools.predictions import open_pictures
         from invgraphics.tools.rescore import protocols_named, rescore
-        from invgraphics.tools.rescoring import reasons, rows_of, winners, write_scores, write_tables
+        from invgraphics.tools.rescoring import best_sets, rows_of, skip_reasons, write_scores, write_tables
 
         protocols = protocols_named(self.protocol)
         compared = {folder: RunFolder(folder).has(ComparisonRecord) for folder in self.folders}
@@ -53,10 +53,10 @@ class Rescore:
             width, height = one.pictures.size
             title = f"{one.label}: {len(one.pictures.names)} views of {width}x{height}, truth {one.pictures.sha256[:12]}"
             show_table(title, *rows_of(one))
-            for line in reasons(one):
+            for line in skip_reasons(one):
                 print(line)
             write_scores(one, None if self.out is None else self.out / one.label.replace("/", "-"))
-        for sentence in (winners(results, "psnr"), winners(results, "ssim")):
+        for sentence in (best_sets(results, "psnr"), best_sets(results, "ssim")):
             if sentence:
                 print(sentence)
         if self.out is not None:

@@ -52,11 +52,11 @@ class View:
 
         runs = (self.folder,) if self.other is None else (self.folder, self.other)
         config = ViewerConfig(runs, self.live, self.view, self.host, self.port, self.max_size, self.scene)
-        with open_viewer(config, _say) as viewer:
+        with open_viewer(config, _notify) as viewer:
             host = self.host if is_loopback(self.host) else "localhost"
             url = f"http://{f'[{host}]' if ':' in host else host}:{viewer.port}"
             if not is_loopback(self.host):
-                _say(f"Everyone who can reach port {viewer.port} of this machine can look at these runs.")
+                _notify(f"Everyone who can reach port {viewer.port} of this machine can look at these runs.")
             print(f"Looking at {' and '.join(map(str, runs))}: {url} (Ctrl-C ends)", flush=True)
             if self.open and _has_screen():
                 webbrowser.open(url)
@@ -70,5 +70,5 @@ def _has_screen() -> bool:
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def _say(sentence: str) -> None:
+def _notify(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)

@@ -17,7 +17,7 @@ from invgraphics.core.samples import Samples
 from invgraphics.errors import NotComposableError
 
 
-class _Learning(nn.Module):
+class _StatefulModule(nn.Module):
     """A module whose state a fit may learn, and for which constants may stand in."""
 
     def untrained(self) -> Self:
@@ -33,7 +33,7 @@ class _Learning(nn.Module):
         return self
 
 
-class Sampler(_Learning, ABC):
+class Sampler(_StatefulModule, ABC):
     """Places samples along rays. May own parameters (proposal networks) and buffers (occupancy grids)."""
 
     @abstractmethod
@@ -44,7 +44,7 @@ class Sampler(_Learning, ABC):
         """Refresh what is learnt without gradients (an occupancy grid); called once after each training step."""
 
 
-class Renderer(_Learning, ABC):
+class Renderer(_StatefulModule, ABC):
     """Renders a field from a camera, differentiably in the field and in the camera's pose.
 
     Attributes:

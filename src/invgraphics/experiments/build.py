@@ -87,7 +87,7 @@ def use_kernels(name: str | None) -> None:
     kernels.warm_up()
 
 
-def repeatable(device: torch.device) -> None:
+def use_deterministic_algorithms(device: torch.device) -> None:
     """Use torch's deterministic algorithms on a CPU, where the same seed and thread count then give the same bits."""
     torch.use_deterministic_algorithms(device.type == "cpu", warn_only=True)
     torch.utils.deterministic.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]  # a debugging aid, slow

@@ -20,7 +20,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import (
     build_plan,
     open_with_progress,
-    repeatable,
+    use_deterministic_algorithms,
     use_kernels,
 )
 from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average, processor_share
@@ -34,7 +34,7 @@ from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder
 from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
-from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
+from invgraphics.experiments.start import MemoryForecast, initialise_field, memory_forecast
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs import checkpoint
@@ -43,7 +43,7 @@ from invgraphics.runs.folder import TRUTH, RunFolder
 from invgraphics.runs.provenance import LoadAverage, Options, Provenance
 from invgraphics.runs.schema import write_json
 from invgraphics.scenes.degrade import degrade
-from invgraphics.scenes.open import choices
+from invgraphics.scenes.open import selection_notes
 from invgraphics.training.fit import Fit
 
 
@@ -73,7 +73,7 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
     """
     folder, method, request = job.folder, job.method, job.request
     _check_existing(folder, request)
-    repeatable(job.device)
+    use_deterministic_algorithms(job.device)
     with folder.held():
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
@@ -121,7 +121,7 @@ def prepare(job: Job, shown: Scene) -> Fit:
         InputError: method and scene do not go together, or what the method starts from cannot be used.
     """
     plan = build_plan(job.method, shown, job.budget, job.request.seed, job.device)
-    return Fit(started(plan, job.method, job.request.scene))
+    return Fit(initialise_field(plan, job.method, job.request.scene))
 
 
 def _check_existing(folder: RunFolder, request: FitRequest) -> None:
@@ -153,7 +153,7 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     scene = fit.plan.scene
-    return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
+    return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{selection_notes(scene)}"
 
 
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:

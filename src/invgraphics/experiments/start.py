@@ -32,7 +32,7 @@ BASE_BYTES = 50 * 10**6
 the forecast, or exceeded it by 12."""
 
 
-def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
+def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:
     """Initialise the plan's field by conversion from the run that the recipe's ``field.source`` names, if any.
 
     Raises:

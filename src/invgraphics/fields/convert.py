@@ -20,7 +20,7 @@ SAMPLES = 512
 """Intervals along a ray."""
 RAYS = 512
 """Rays that are looked along at once."""
-EFFORT = 64
+MAX_RAYS_PER_POINT = 64
 """Rays tried per wanted point before a field counts as empty enough."""
 
 
@@ -47,7 +47,7 @@ def visible_points(field: Field, scene: Scene, count: int) -> Points:
         raise InputError(f"{type(field).__name__} provides {field.provides.words()}, not density and radiance.", remedy)
     device = next((parameter.device for parameter in field.parameters()), torch.device("cpu"))
     parts, found = [], 0
-    for rays in _random_rays(scene, EFFORT * count):
+    for rays in _random_rays(scene, MAX_RAYS_PER_POINT * count):
         part = _sample_surface_points(field, rays.to(device), scene.bounds.to(device))
         parts.append(part)
         found += len(part)
