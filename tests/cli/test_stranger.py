@@ -168,7 +168,7 @@ def test_a_run_whose_package_is_gone_names_it(environment: dict[str, str], toy_f
     command = [sys.executable, "-m", "invgraphics", "evaluate", str(run)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "was made with stranger-fog 1.0, which brings 'fog', 'volumetric/fog' and is not installed here" in done.stderr
+    assert "was made with stranger-fog 1.0, which provides 'fog', 'volumetric/fog' and is not installed here" in done.stderr
 
 
 def test_a_stranger_that_fails_to_import_is_named(environment: dict[str, str], tmp_path: Path) -> None:

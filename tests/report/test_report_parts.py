@@ -166,7 +166,7 @@ def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
     pair = replace(pair, runs=tuple(map(scattered, pair.runs)))
     told = " ".join(verdict(pair, summarise(pair)))
     # Student's t with one degree of freedom: 12.71 times the standard error of the mean difference, which is 1 dB.
-    assert "2 seeds cannot tell that lead from chance: only one above about 12.71 dB" in told
+    assert "2 seeds cannot tell that lead from chance: it would have to exceed about 12.71 dB" in told
     better = replace(comparison.runs[0].scores.quality["psnr"], mean=28.0)
     bad = replace(comparison, baselines={"nearest view": {"psnr": better}})
     assert "did not beat the trivial baseline 'nearest view'" in " ".join(verdict(bad, summarise(bad)))

@@ -148,7 +148,7 @@ def test_eight_bits_stand_in_for_floats_only_when_allowed(folders) -> None:
     assert why_unsuited(pictures, PROTOCOLS["multinerf"]) == ""
     scores = rescore([pictures], protocols_named("gsplat,float,default"), allow_8bit=True)[0].scores
     assert scores["gsplat"].quality["psnr"].mean == pytest.approx(scores["default"].quality["psnr"].mean, abs=1e-6)
-    assert any("8-bit pictures stand in" in note for note in scores["gsplat"].notes)
+    assert any("8-bit pictures were used" in note for note in scores["gsplat"].notes)
     assert not any("8-bit" in note for note in scores["default"].notes)
 
 

@@ -101,7 +101,7 @@ def fit(
     except KeyboardInterrupt:
         if not folder.resumable:
             raise
-        print(f"Interrupted; the same call goes on from {folder.root}.", file=sys.stderr)
+        print(f"Interrupted; the same call continues from {folder.root}.", file=sys.stderr)
     return FolderRun(load_fitted(folder, scene))
 
 

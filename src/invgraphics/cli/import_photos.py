@@ -1,4 +1,4 @@
-"""``invgraphics import-photos``: a folder of photographs becomes a scene, camera poses included."""
+"""``invgraphics import-photos``: reconstruct a scene with camera poses from a folder of photographs."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _MOST_FILES = 10
 
 @dataclass(frozen=True, kw_only=True)
 class ImportPhotos:
-    """Find out where photographs were taken and what they show (structure from motion), and write a scene that fits can use.
+    """Reconstruct camera poses and points from photographs (structure from motion), and write them as a scene.
 
     The folder of the scene gets straight pictures, poses and points in COLMAP's format, quality.json, and a plot of cameras and
     points. Where a check finds the poses suspicious, other strategies are tried and the best result is kept. An interrupted
-    import goes on when the same command is given again; another mapper or lens finds the features and matches of the last one
+    import continues when the same command is given again; another mapper or lens finds the features and matches of the last one
     in FOLDER/.import, which may be deleted.
     """
 
@@ -50,7 +50,7 @@ class ImportPhotos:
     """Seed of all random choices."""
 
     def run(self) -> int:
-        """Reconstruct; print the quality and where the scene lies."""
+        """Reconstruct; prints the quality and the scene's folder. Returns exit status 0."""
         if self.single_camera and self.camera_per_photo:
             raise InputError("--single-camera and --camera-per-photo exclude each other.")
         if self.truth is not None and not self.truth.exists():
@@ -84,7 +84,7 @@ class ImportPhotos:
 
 
 def show_quality(quality: Mapping[str, Any]) -> None:
-    """Print how well the photographs could be put together, and what was left out."""
+    """Print the quality of the reconstruction, and the photographs that were left out."""
     show_table("Structure from motion", ("what", "found"), list(_rows(quality)))
     for kind, files in (("left out", quality["skipped"]), ("not placed", quality["unplaced"])):
         for name, why in list(files.items())[:_MOST_FILES]:

@@ -1,4 +1,4 @@
-"""``invgraphics list``: what there is, and where each comes from. Imports no implementation."""
+"""``invgraphics list``: list methods, scenes and components with their origins. Imports no implementation."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class List:
     model-formats, exporters, executors, protocols; or matrix, the table of fields and renderers as Markdown."""
 
     def run(self) -> int:
-        """Print the tables."""
+        """Print the tables; returns exit status 0."""
         for kind in self.kinds:
             if kind not in KINDS:
                 raise InputError(f"There is no list of '{kind}'.{did_you_mean(kind, KINDS)}", f"Lists: {', '.join(KINDS)}.")

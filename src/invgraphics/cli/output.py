@@ -1,4 +1,4 @@
-"""What commands print on standard output: tables."""
+"""Tables on standard output."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PIPED_WIDTH = 160
 
 
 def show_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; its first column is never broken."""
+    """Print a table whose first column is never wrapped."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -32,7 +32,7 @@ def show_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
 
 
 def show_scores(scores: Scores) -> None:
-    """Print a run's scores, and what could not be computed."""
+    """Print a run's scores and costs, and the metrics that were skipped."""
     rows = [
         (name, "-" if score.mean is None else f"{score.mean:.4g}", score.unit, "higher" if score.higher_is_better else "lower")
         for name, score in scores.quality.items()
@@ -48,7 +48,7 @@ def show_scores(scores: Scores) -> None:
 
 
 def not_scored(skipped: Mapping[str, str]) -> str:
-    """One line on the metrics that have no value and why, those with one reason together."""
+    """Format the skipped metrics and their reasons in a line, grouped by reason; empty without any."""
     reasons: dict[str, list[str]] = {}
     for name, why in skipped.items():
         absent = why.removeprefix(NO_TRUTH)

@@ -1,4 +1,4 @@
-"""``invgraphics rescore``: score saved pictures again, under the conventions of other tools."""
+"""``invgraphics rescore``: score saved pictures under the conventions of other tools."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Rescore:
     """Score saved pictures again under named protocols: those of a run, or of any tool. `list protocols` explains them."""
 
     folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|FOLDER ...", help_behavior_hint="(one or more)")]
-    """Runs, comparisons, or folders of predicted pictures (3DGS's renders/ + gt/ and nerfbaselines' color/ + gt-color/ bring
+    """Runs, comparisons, or folders of predicted pictures (3DGS's renders/ + gt/ and nerfbaselines' color/ + gt-color/ contain
     their truth). Several must share their truth."""
     protocol: Annotated[str, arg(metavar="NAME,NAME|all")] = "all"
     """Protocols, with commas between them."""
@@ -31,12 +31,12 @@ class Rescore:
     background: Annotated[str | None, arg(metavar="white|black|R,G,B", help_behavior_hint="(default: not stated)")] = None
     """The data set's background, and what pictures without alpha show where the scene is transparent; runs know theirs."""
     allow_8bit: bool = False
-    """Let 8-bit pictures stand in where a protocol wants unrounded predictions."""
+    """Accept 8-bit pictures where a protocol needs unrounded predictions."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: into the run)")] = None
     """Where to write scores, and the table as Markdown and CSV."""
 
     def run(self) -> int:
-        """Score; print a table for each set of pictures."""
+        """Score; prints a table for each set of pictures. Returns exit status 0."""
         background = None if self.background is None else parse_colour(self.background)
         if not self.folders:
             raise InputError("There is nothing to score.", "Give a run, or a folder of predicted pictures.")
@@ -66,7 +66,7 @@ class Rescore:
 
 
 def parse_colour(text: str) -> tuple[float, float, float]:
-    """Read ``white``, ``black``, or three numbers in [0, 1].
+    """Parse ``white``, ``black``, or three numbers in [0, 1].
 
     Raises:
         InputError: anything else.

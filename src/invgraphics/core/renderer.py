@@ -18,17 +18,17 @@ from invgraphics.errors import NotComposableError
 
 
 class _StatefulModule(nn.Module):
-    """A module whose state a fit may learn, and for which constants may stand in."""
+    """Module whose learnt state may have a constant substitute."""
 
     def untrained(self) -> Self:
         """This module with constants in place of learnt state, for fields that it was not trained with; may be itself.
 
         Raises:
-            NotComposableError: it has state, and no constants stand in for it.
+            NotComposableError: it has state without a constant substitute.
         """
         if self.state_dict():
             raise NotComposableError(
-                f"{type(self).__name__} has learnt state for which no constants stand in.", "It needs a fit of its own."
+                f"{type(self).__name__} has learnt state without a constant substitute.", "It needs a fit of its own."
             )
         return self
 

@@ -36,7 +36,7 @@ def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method
     """Check before fitting that each renderer can render the methods' fields.
 
     Raises:
-        InputError: a renderer is named twice, has learnt state for which no constants stand in, or needs what a field does
+        InputError: a renderer is named twice, has learnt state without a constant substitute, or needs what a field does
             not provide.
     """
     if len({variant.folder for variant in variants}) != len(variants):

@@ -127,7 +127,7 @@ def prepare(job: Job, shown: Scene) -> Fit:
 def _check_existing(folder: RunFolder, request: FitRequest) -> None:
     present = folder.has(Provenance)
     if request.existing == "refuse" and present:
-        raise InputError(f"{folder.root} already holds a run.", "Add --resume to go on with it, or choose another --out.")
+        raise InputError(f"{folder.root} already holds a run.", "Add --resume to continue it, or choose another --out.")
     if request.existing == "resume" and not present:
         raise InputError(f"{folder.root} holds no run to resume.", "Leave --resume away to start one.")
     folder.create()

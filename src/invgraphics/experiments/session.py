@@ -141,7 +141,7 @@ class FittedRun(ABC):
             renderer: a method's name; settings of its renderer may follow, ``gaussian-volume/exact:steps=8``.
 
         Raises:
-            InputError: that renderer needs what the field does not provide, or learnt state for which no constants stand in.
+            InputError: that renderer needs what the field does not provide, or has learnt state without a constant substitute.
         """
         variant = variant_named(renderer)
         check_variants([variant], [self.method], self.scene)
@@ -192,7 +192,7 @@ class MemoryRun(FittedRun):
         try:
             recorder.run()
         except KeyboardInterrupt:
-            print(f"Interrupted after {self.fit.steps} steps; resume() goes on.", file=sys.stderr)
+            print(f"Interrupted after {self.fit.steps} steps; resume() continues.", file=sys.stderr)
         finally:
             self._history += recorder.history
             self._scores = None

@@ -131,7 +131,7 @@ def _gunzip(path: Path, data: bytes) -> bytes:
     if not inflate.eof:
         longer = len(result) == HEADER.size + most
         wrong = (
-            f"it goes on after its Gaussians and {format_bytes(MOST_EXTENSIONS)} of extensions" if longer else "it is cut off"
+            f"it continues after its Gaussians and {format_bytes(MOST_EXTENSIONS)} of extensions" if longer else "it is cut off"
         )
         raise InputError(f"'{path}' cannot be decompressed: {wrong}.", "Copy the file again.")
     return result

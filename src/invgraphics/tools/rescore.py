@@ -143,7 +143,7 @@ def _scores(pictures: PictureSet, protocol: Protocol, views: Sequence[ViewScore]
         quality, skipped = summarise(views, protocol)
     run, own = pictures.provenance, scores_of(pictures, DEFAULT)
     eight_bit = pictures.eight_bit and protocol.prediction == "none"
-    caution = ("Unrounded predictions are wanted; 8-bit pictures stand in for them.",) if eight_bit and not lacking else ()
+    caution = ("The protocol needs unrounded predictions; 8-bit pictures were used.",) if eight_bit and not lacking else ()
     truth = ScoredTruth(
         sha256=pictures.sha256, size=pictures.size, background=pictures.background, transparency=pictures.transparency
     )

@@ -67,7 +67,7 @@ def _resolution(comparison: Comparison, summary: Summary, column: Quantity, rank
     if len(ranking) < 2:
         return ""
     if max(row.seeds for _, row in ranking) < 2:
-        return "One seed per method: how much of a small difference is chance cannot be told from this page."
+        return "One seed per method: small differences may be due to chance."
     first, second = (row.label for _, row in ranking[:2])
     runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
     effects = effects_on(column, [Factor(METHOD, (first, second), second)], runs)
@@ -80,10 +80,10 @@ def _resolution(comparison: Comparison, summary: Summary, column: Quantity, rank
     half = lead.text(lead.estimate.half_width)
     if lead.estimate.seeds[1] == 2:
         return (
-            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: only one above about "
-            f"{half}{unit} could be told from it; three seeds or more see smaller ones."
+            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: it would have to exceed "
+            f"about {half}{unit}; three seeds or more resolve smaller leads."
         )
-    return f"Over {lead.estimate.size} that lead may be chance: only one above about {half}{unit} could be told from it."
+    return f"Over {lead.estimate.size} that lead may be due to chance: it would have to exceed about {half}{unit}."
 
 
 def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> str:
