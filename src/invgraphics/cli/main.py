@@ -34,14 +34,14 @@ COMMANDS = {
     "rescore": ("invgraphics.cli.rescore:Rescore", "score saved pictures again, under the conventions of other tools"),
     "compare": (
         "invgraphics.cli.compare:Compare",
-        "fit several methods to one scene under one budget, and report which is best",
+        "fit several methods to one scene under one budget, and rank them",
     ),
     "ablate": ("invgraphics.cli.ablate:Ablate", "run a study: factors, levels and seeds, on this machine or a cluster"),
     "view": ("invgraphics.cli.view:View", "view a run interactively in a browser, during its fit too, or compare two"),
     "render": ("invgraphics.cli.render:Render", "film a run: around the scene, from photograph to photograph, or its fit"),
     "explain": (
         "invgraphics.cli.explain:Explain",
-        "list and plot everything along one pixel's ray: alpha, weight, transmittance, colour",
+        "list and plot the contributions along one pixel's ray",
     ),
     "locate": ("invgraphics.cli.locate:Locate", "find a photograph's camera pose by gradient descent through a fitted scene"),
     "report": ("invgraphics.cli.report:Report", "write page, tables and figures from finished runs"),

@@ -33,7 +33,7 @@ class View:
     view: Annotated[int, arg(metavar="N")] = 0
     """Test view to start at."""
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen at. The default is reachable from this machine only; 0.0.0.0 accepts connections from any machine that can reach it."""
+    """Address to listen at. The default is reachable from this machine only; 0.0.0.0 from any machine."""
     port: Annotated[int, arg(metavar="N")] = 8080
     """Port to listen at; 0 for any that is free."""
     max_size: Annotated[int, arg(metavar="N")] = 800

@@ -156,9 +156,7 @@ def _sides(folder: Path, truth: Path | None) -> tuple[Path, Path]:
             return root / predictions, truth or root / true
     if truth is None:
         layouts = " and ".join("/ + ".join(pair) + "/" for pair in LAYOUTS)
-        raise InputError(
-            f"'{root}' is no run and contains no true pictures.", f"Name them with --truth DIR (known: {layouts})."
-        )
+        raise InputError(f"'{root}' is no run and has no true pictures.", f"Name them with --truth DIR (known: {layouts}).")
     return root, truth
 
 

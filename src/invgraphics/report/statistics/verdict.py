@@ -80,8 +80,8 @@ def _resolution(comparison: Comparison, summary: Summary, column: Quantity, rank
     half = lead.text(lead.estimate.half_width)
     if lead.estimate.seeds[1] == 2:
         return (
-            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: it would have to exceed "
-            f"about {half}{unit}; three seeds or more resolve smaller leads."
+            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: it would have to "
+            f"exceed about {half}{unit}; three seeds or more resolve smaller leads."
         )
     return f"Over {lead.estimate.size} that lead may be due to chance: it would have to exceed about {half}{unit}."
 

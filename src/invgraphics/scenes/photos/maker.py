@@ -110,7 +110,7 @@ def _make(job: PhotoJob, key: str, out: Path, progress: Progress) -> dict[str, A
         work,
         progress,
         subject=f"The photographs of {job.folder} could not be put together",
-        remedy="If memory ran out, make them smaller (--max-size). Finished steps are kept: the same command continues from there.",
+        remedy="If memory ran out, make them smaller (--max-size). Finished steps are kept for the same command.",
     )
     for name in reversed(RESULTS):  # an old report goes first, a new one comes last
         _remove(out / name)
