@@ -17,7 +17,7 @@ from pathlib import Path
 from invgraphics.bench.results import PeakMemory, Results, Skipped
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-PEAK_TO_NOW = "5"
+RESET_PEAK = "5"
 """Written to `CLEAR`, resets the peak resident set to the current one (Linux 4.0)."""
 
 GAUSSIANS, WIDTH = 50_000, 100
@@ -79,7 +79,7 @@ def measure(name: str, kernels: str) -> tuple[int, int]:
     dispatch.warm_up()
     run = _PREPARE[name]()
     before = status_bytes("VmRSS")
-    CLEAR.write_text(PEAK_TO_NOW)
+    CLEAR.write_text(RESET_PEAK)
     count = run()
     return status_bytes("VmHWM") - before, count
 

@@ -91,16 +91,16 @@ def sentences(explanation: Explanation) -> list[str]:
     found, record, pixel = explanation.contributions, explanation.record, explanation.record.pixel
     through = 1 - found.opacity
     difference = float((explanation.rendered - explanation.composited).abs().max())
-    told = [
+    lines = [
         f"Σ T·α·colour = {_colour(found.colour.tolist())}, and {through:.4f} of the background {_colour(record.background)}",
         f"add up to {_colour(explanation.composited.tolist())}; the renderer's picture has "
         f"{_colour(explanation.rendered.tolist())} (largest difference {difference:.1e}), the truth {_colour(pixel.true)}.",
     ]
     if record.dead is not None:
-        told.append(f"In the whole model, {record.dead.sentence}")
+        lines.append(f"In the whole model, {record.dead.sentence}")
     depths = {"mean": pixel.expected, "median": pixel.median, "true": pixel.true_depth}
     known = [f"{name} {value:.4g}" for name, value in depths.items() if value is not None]
-    return [*told, f"Depth in world units: {', '.join(known)}."] if known else told
+    return [*lines, f"Depth in world units: {', '.join(known)}."] if known else lines
 
 
 def _colour(values: Sequence[float | None]) -> str:

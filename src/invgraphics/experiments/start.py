@@ -11,7 +11,7 @@ import torch
 from invgraphics.core import RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
-from invgraphics.experiments.requested import COPIES, RAY_BYTES
+from invgraphics.experiments.memory_check import COPIES, RAY_BYTES
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder, check_run

@@ -57,12 +57,12 @@ def integrated(opacity: Literal["peak", "physical"] = "peak", steps: int = 64) -
 
 def affine_projection() -> Analysis:
     """Analyse the affine projection: largest alpha error of one isotropic Gaussian over its angle from the optical axis."""
-    curves, told = [], {}
+    curves, at_45 = [], {}
     for size in SIZES:
         errors = [affine_error(math.radians(angle), math.radians(size)) for angle in ANGLES]
         curves.append(Curve(f"standard deviation {size:g}°", tuple(map(float, ANGLES)), tuple(errors)))
-        told[size] = errors[ANGLES.index(45)]
-    listed = ", ".join(f"{error:.2g} for a Gaussian of {size:g}°" for size, error in told.items())
+        at_45[size] = errors[ANGLES.index(45)]
+    listed = ", ".join(f"{error:.2g} for a Gaussian of {size:g}°" for size, error in at_45.items())
     return Analysis(
         title="Affine projection: distance from the optical axis",
         sentence=f"45° off the axis, replacing perspective by its derivative at the centre changes alpha by up to {listed}.",

@@ -219,8 +219,8 @@ def _sentence(effect: Effect) -> str:
         return f"{effect.label}: no effect detectable above {effect.text(value.half_width)} {unit}, {size}.{note}"
     # The verb (gains, costs) carries the sign, so the interval's ends are magnitudes.
     low, high = sorted((abs(value.low), abs(value.high)))
-    told = f"{effect.label} {magnitude} [{effect.text(low)}, {effect.text(high)}], {size}"
+    sentence = f"{effect.label} {magnitude} [{effect.text(low)}, {effect.text(high)}], {size}"
     if effect.found:
-        return f"{told}.{note}"
+        return f"{sentence}.{note}"
     chance = f"with {effect.comparisons} comparisons in this study that may be chance (corrected p = {effect.adjusted:.2g})"
-    return f"{told}; {chance}.{note}"
+    return f"{sentence}; {chance}.{note}"

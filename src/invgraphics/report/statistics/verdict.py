@@ -140,11 +140,11 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
     for run in dead:
         share = f"{100 * (run.scores.cost['dead'] or 0):.2g} %"
         sentences.append(f"No gradient can change {share} of the primitives of {run.method} (seed {run.seed}).")
-    told: dict[str, str] = {}
+    reasons: dict[str, str] = {}
     for run in comparison.runs:
         if run.scores.below_baseline:
-            told.setdefault(run.method, run.scores.below_baseline)
-    sentences += told.values()
+            reasons.setdefault(run.method, run.scores.below_baseline)
+    sentences += reasons.values()
     short = [row.label for row in summary.methods if not row.complete]
     if short:
         words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"
