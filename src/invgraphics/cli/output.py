@@ -16,7 +16,13 @@ PIPED_WIDTH = 160
 
 
 def show_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table whose first column is never wrapped."""
+    """Print a table whose first column is never wrapped.
+
+    Args:
+        title: line above the table.
+        columns: headings.
+        rows: texts, one per column.
+    """
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -48,7 +54,11 @@ def show_scores(scores: Scores) -> None:
 
 
 def not_scored(skipped: Mapping[str, str]) -> str:
-    """Format the skipped metrics and their reasons in a line, grouped by reason; empty without any."""
+    """Format the skipped metrics and their reasons in a line, grouped by reason.
+
+    Args:
+        skipped: metric -> reason, as in `Scores.skipped`.
+    """
     reasons: dict[str, list[str]] = {}
     for name, why in skipped.items():
         absent = why.removeprefix(NO_TRUTH)

@@ -76,7 +76,16 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def write_report(folder: Path, out: Path | None = None, public: bool = False) -> None:
-    """Write a comparison's report into its folder or ``out``; prints its table and the page's path."""
+    """Write a comparison's report into its folder or ``out``; prints its table and the page's path.
+
+    Args:
+        folder: of a comparison.
+        out: folder of the page; ``None`` for ``folder`` itself.
+        public: whether absolute paths, user names and host names are left out.
+
+    Raises:
+        InputError: the folder is no comparison, or a file in it is missing or broken.
+    """
     from invgraphics.report.build import build_report
     from invgraphics.report.data.comparison import read_comparison
     from invgraphics.report.statistics.summary import summarise

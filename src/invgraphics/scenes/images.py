@@ -126,7 +126,13 @@ def _is_turned(image: Any, like: tuple[int, int] | None) -> bool:
 
 
 def area_resize(values: Float[np.ndarray, "h w c"], width: int, height: int) -> Float[np.ndarray, "height width c"]:
-    """Downscale by exact area average; pixels that are cut contribute by their covered share. Never enlarges."""
+    """Downscale by exact area average; pixels that are cut contribute by their covered share.
+
+    Args:
+        values: picture, colours premultiplied where it has alpha.
+        width: new width in pixels, at most the present one.
+        height: new height, likewise.
+    """
     return _average(_average(values, height).swapaxes(0, 1), width).swapaxes(0, 1)
 
 

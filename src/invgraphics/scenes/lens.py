@@ -155,7 +155,12 @@ def _folded_error(camera: Any) -> InputError:
 
 
 def undistort(values: Float[np.ndarray, "h w c"], straight: Straight) -> Float[np.ndarray, "h w c"]:
-    """Resample a picture bilinearly to the pinhole; colours premultiplied where it has alpha."""
+    """Resample a picture bilinearly to the pinhole.
+
+    Args:
+        values: distorted picture, colours premultiplied where it has alpha.
+        straight: resampling map (see `straighten`), for a picture of this size.
+    """
     source = torch.from_numpy(values).permute(2, 0, 1)[None]
     result = torch.nn.functional.grid_sample(source, straight.grid[None], align_corners=False, padding_mode="border")
     return result[0].permute(1, 2, 0).numpy()

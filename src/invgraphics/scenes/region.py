@@ -26,7 +26,11 @@ FEWEST = 16
 
 
 def subject_half(points: Float[Tensor, "n 3"]) -> float:
-    """Half edge of the cube around the origin that holds the subject with a margin, local units, at most 1."""
+    """Half edge of the cube around the origin that holds the subject with a margin, local units, at most 1.
+
+    Args:
+        points: surface points, local frame.
+    """
     if len(points) < FEWEST:
         return 1.0
     radius = float(points.norm(dim=1).double().quantile(SUBJECT_SHARE))
