@@ -38,7 +38,7 @@ from invgraphics.renderers.quadrature import integrate
 from invgraphics.renderers.samplers import (
     StratifiedConfig,
     from_spacing,
-    hitting,
+    hit_indices,
     invert,
     pack,
     quantiles,
@@ -73,7 +73,7 @@ class ProposalSampler(Sampler):
         self.net = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1))
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
-        hit = hitting(rays)
+        hit = hit_indices(rays)
         spacing = strata(rays[hit], self.coarse, ctx)
         coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds))
         own = softplus(5 * self.net(2 * ctx.bounds.to_unit(coarse.position) - 1)[:, 0])

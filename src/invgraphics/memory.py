@@ -45,10 +45,10 @@ def check_fits(needed: float, what: str, remedy: str) -> None:
     """
     free = available_bytes()
     if needed > _SHARE * free:
-        raise InputError(f"{what} needs about {spelt(needed)} of memory, and {spelt(free)} are free.", remedy)
+        raise InputError(f"{what} needs about {format_bytes(needed)} of memory, and {format_bytes(free)} are free.", remedy)
 
 
-def spelt(size: float) -> str:
+def format_bytes(size: float) -> str:
     """Format bytes as GB or MB, two digits."""
     if size >= 1e11:
         return f"{size / 1e9:,.0f} GB"

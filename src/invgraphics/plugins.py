@@ -65,7 +65,7 @@ def origin(registry: str, name: str) -> str:
     return point.dist.name if point is not None and point.dist is not None else "unknown package"
 
 
-def brought(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
+def used_plugins(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
     """Map the plug-ins among a recipe's ``type`` entries, and the recipe itself, to distribution and version.
 
     Args:
@@ -90,7 +90,7 @@ def brought(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
 
 
 def installed(package: str) -> bool:
-    """Whether the distribution that `brought` names as ``name version`` is installed, in any version."""
+    """Whether the distribution that `used_plugins` names as ``name version`` is installed, in any version."""
     try:
         distribution(package.partition(" ")[0])
     except PackageNotFoundError:

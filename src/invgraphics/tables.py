@@ -22,7 +22,7 @@ from typing import IO, Any
 import numpy as np
 
 from invgraphics.errors import InputError
-from invgraphics.memory import check_fits, spelt
+from invgraphics.memory import check_fits, format_bytes
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def read_text(path: Path, most: int) -> str:
     except (OSError, ValueError) as error:  # a NUL in the path is a ValueError
         raise InputError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
     if len(data) > most:
-        raise InputError(f"{path} is longer than {spelt(most)}, which no file of this kind is.")
+        raise InputError(f"{path} is longer than {format_bytes(most)}, which no file of this kind is.")
     return text
 
 

@@ -52,7 +52,7 @@ def test_failed_cells_are_named_and_decide_the_status(study, capsys) -> None:
 
 def test_a_long_study_asks(study, monkeypatch, capsys) -> None:
     assert study(LONG) == main.BAD_INPUT  # under pytest there is nobody to ask
-    assert "about 5 h, and nobody can be asked" in capsys.readouterr().err
+    assert "about 5 h, and there is no terminal to confirm it" in capsys.readouterr().err
     assert study(LONG, "--yes") == main.DONE
     for answer, status in (("y\n", main.DONE), ("\n", main.BAD_INPUT), ("no\n", main.BAD_INPUT), ("", main.BAD_INPUT)):
         terminal = io.StringIO(answer)

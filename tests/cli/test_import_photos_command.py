@@ -16,7 +16,7 @@ HONEST = {
 FIRST = {"strategy": "incremental mapper, radial lens", "outcome": "9 placed", "seconds": 4.0, "kept": True}
 QUALITY = {
     "registered": 9, "used": 10, "points": 1234, "track_length": 4.25, "reprojection_error_px": 0.512, "bend_px": 1.25,
-    "lenses": [LENS, LENS], "other_pieces": [], "suspicion": HONEST, "usable": True, "refusal": None,
+    "lenses": [LENS, LENS], "other_pieces": [], "consistency": HONEST, "usable": True, "refusal": None,
     "skipped": {"a.heic": "nothing here decodes HEIC"}, "unplaced": {"b.jpg": "blurred"}, "seconds": {"matches": 3.2},
     "attempts": [FIRST],
 }  # fmt: skip
@@ -65,7 +65,7 @@ def test_figures_are_printed_and_the_folder_last(given, capsys, tmp_path) -> Non
 
 def test_a_suspicious_scene_says_so(given, capsys) -> None:
     _, run = given
-    assert run(QUALITY | {"suspicion": HONEST | {"suspicious": True, "sentence": "folded"}}) == main.DONE
+    assert run(QUALITY | {"consistency": HONEST | {"suspicious": True, "sentence": "folded"}}) == main.DONE
     assert "SUSPICIOUS: folded" in capsys.readouterr().out
 
 
@@ -86,7 +86,7 @@ def test_too_few_photographs_are_refused_with_what_is_kept(given, capsys, tmp_pa
     assert "a separate piece of 2" in captured.out
     kept = f"Take more. What could be placed is kept in {tmp_path / 'scene'}."
     assert captured.err == f"Only 2 of 10 photographs could be placed.\n{kept}\n"
-    nothing = refused | {"registered": 0, "suspicion": None, "unplaced": {f"{n}.jpg": "blurred" for n in range(25)}}
+    nothing = refused | {"registered": 0, "consistency": None, "unplaced": {f"{n}.jpg": "blurred" for n in range(25)}}
     assert run(nothing) == main.BAD_INPUT
     captured = capsys.readouterr()
     assert "kept" not in captured.err

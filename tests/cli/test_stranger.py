@@ -164,13 +164,13 @@ def test_a_strangers_renderer_with_state_takes_part(environment: dict[str, str],
 def test_a_run_whose_package_is_gone_names_it(environment: dict[str, str], toy_folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     _invgraphics(environment, "fit", "volumetric/fog", str(toy_folder), "--budget", "2steps", "--out", str(run))
-    brought = {"fog": "stranger-fog 1.0", "volumetric/fog": "stranger-fog 1.0"}
-    assert json.loads((run / "provenance.json").read_text())["plugins"] == brought
+    plugins = {"fog": "stranger-fog 1.0", "volumetric/fog": "stranger-fog 1.0"}
+    assert json.loads((run / "provenance.json").read_text())["plugins"] == plugins
     shutil.rmtree(tmp_path / "site")
     command = [sys.executable, "-m", "invgraphics", "evaluate", str(run)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "was made with stranger-fog 1.0, which brings 'fog', 'volumetric/fog' and is not installed here" in done.stderr
+    assert "was made with stranger-fog 1.0, which provides 'fog', 'volumetric/fog' and is not installed here" in done.stderr
 
 
 def test_a_stranger_that_fails_to_import_is_named(environment: dict[str, str], tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def test_text_becomes_values() -> None:
     ("wrong", "sentence"),
     [
         ({"budget": "long"}, "'long' is not a budget"),
-        ({"checkpoint_every": "never"}, "'never' says no interval"),
+        ({"checkpoint_every": "never"}, "'never' is no interval"),
         ({"overrides": ("data.siez=9",)}, "Unknown key 'data.siez'"),
         ({"device": "tpu"}, "--device cannot be 'tpu'"),
         ({"protocol": "flaot"}, "There is no protocol 'flaot'"),

@@ -19,7 +19,7 @@ from invgraphics.experiments.compare import compare
 from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.renderings import check_variants, rendered
+from invgraphics.experiments.renderings import check_variants, renderings_complete
 from invgraphics.experiments.request import AblateRequest, CompareRequest, FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.experiments.variants import variant_named
@@ -109,19 +109,19 @@ def _stamps(run: Path) -> dict[str, int]:
 
 def test_what_is_there_is_kept(run: Path, request_one: FitRequest) -> None:
     before = _stamps(run)
-    assert rendered(Job.of(request_one))
+    assert renderings_complete(Job.of(request_one))
     fit_run(request_one)
     assert _stamps(run) == before
     # One rendering is lost: it alone is made again, and the fit is not.
     (run / "rendered" / "gaussian-volume-exact-steps=8" / "scores.json").unlink()
     (run / "renderings.json").unlink()
-    assert not rendered(Job.of(request_one))
+    assert not renderings_complete(Job.of(request_one))
     fit_run(request_one)
     changed = {name for name, stamp in _stamps(run).items() if before[name] != stamp}
     assert changed == {"rendered/gaussian-volume-exact-steps=8/scores.json"}
     # One more is asked for.
     more = replace(request_one, render_with=(*OTHERS, "gaussian-volume/sorted"))
-    assert not rendered(Job.of(more))
+    assert not renderings_complete(Job.of(more))
     fit_run(more)
     assert len(_record(run)["renderings"]) == 4 and len(_record(run)["differences"]) == 6
     fit_run(request_one)

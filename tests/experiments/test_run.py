@@ -80,12 +80,12 @@ def test_a_run_is_whole(run: Path) -> None:
 def test_what_an_import_suspects_is_repeated_before_the_fit(
     toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    suspect = {"suspicion": "3 of 9 contradict"}
+    suspect = {"inconsistent_poses": "3 of 9 contradict"}
     scene = open_scene(str(toy_folder), SceneOptions())
     monkeypatch.setattr(module, "open_with_progress", lambda *_: replace(scene, notes=scene.notes | suspect))
     out = fit_run(_request(toy_folder, tmp_path / "run", budget="2steps"))
     assert "SUSPICIOUS poses: 3 of 9 contradict" in capsys.readouterr().err
-    assert json.loads((out / "provenance.json").read_text())["notes"]["suspicion"] == "3 of 9 contradict"
+    assert json.loads((out / "provenance.json").read_text())["notes"]["inconsistent_poses"] == "3 of 9 contradict"
 
 
 def test_scores_can_be_recomputed_from_the_saved_pictures(run: Path) -> None:

@@ -96,7 +96,7 @@ BAD: dict[str, tuple[str, Callable[[Path], bytes], str]] = {
         "cannot be decompressed",
     ),
     "cut legacy": ("a.spz", lambda _: gzip.compress(LEGACY[:-4]), "cut off: 36 bytes are expected, 32 are there"),
-    "gzip bomb": ("a.spz", lambda _: gzip.compress(LEGACY + bytes(50_000_000)), "goes on after its Gaussians"),
+    "gzip bomb": ("a.spz", lambda _: gzip.compress(LEGACY + bytes(50_000_000)), "continues after its Gaussians"),
     "gzip claim": ("a.spz", lambda _: gzip.compress(_claiming(LEGACY, 2_000_000_000) + bytes(1000)), "claims 2,000,000,000"),
     "zstd claim": ("a.spz", lambda _: _zstd_bomb(60_000_000), "claims 60,000,000 Gaussians"),
     "half a packed PLY": (

@@ -219,7 +219,7 @@ def test_masks_are_those_of_the_tool() -> None:
     image, truth = shown(rendering, view, scene(), PROTOCOLS["nerfbaselines"])
     assert bool((image[:10] == 0).all()) and bool((truth[:10] == 0).all()) and float(image[10:].sum()) > 0
     result = score(rendering, view, scene(), PROTOCOLS["gsplat"])
-    assert result.values == {} and "gsplat knows no masks" in result.skipped["psnr"]
+    assert result.values == {} and "gsplat does not support masks" in result.skipped["psnr"]
 
 
 def test_predictions_that_are_not_finite_are_skipped() -> None:

@@ -14,7 +14,7 @@ from invgraphics.recipes.presets import announcements, preset_for
 from invgraphics.recipes.recipe import load_method
 from invgraphics.report.pages.facts import preset_facts
 from invgraphics.runs.run import read_run
-from invgraphics.studies.ablate import _kind
+from invgraphics.studies.ablate import _cost_key
 from invgraphics.studies.cells import make_plan
 from invgraphics.studies.reading import read_study
 from invgraphics.training.budget import Budget
@@ -122,7 +122,7 @@ def test_the_budget_of_each_cell_chooses(recipe: str, tmp_path: Path) -> None:
     plan = make_plan(read_study(study), AblateRequest(study=str(study), out=str(tmp_path)))
     assert [planned.method.preset for planned in plan] == ["laptop", "long", "laptop"]
     assert [planned.method.recipe.field.width for planned in plan] == [16, 32, 16]
-    assert len({_kind(planned) for planned in plan}) == 2  # two forecasts
+    assert len({_cost_key(planned) for planned in plan}) == 2  # two forecasts
     for planned in plan:  # the process that fits comes to the same preset
         assert Job.of(planned.fit).method.digest == planned.method.digest
 

@@ -47,8 +47,8 @@ def test_median_depth_ignores_what_is_behind(make_camera: Callable[..., Camera])
 def test_normals_from_depth_are_those_of_the_plane(make_camera: Callable[..., Camera]) -> None:
     """Also where the Gaussians are round, and have no shortest axis."""
     view = make_camera(24, 20, 40.0)
-    round_ones = gaussians(1, **(sheet(30, 0.0, 0.9) | {"scales": torch.full((900, 3), 0.05, dtype=F64)}))
-    for splats in (gaussians(1, **sheet(30, 0.0, 0.9)), round_ones):
+    round_gaussians = gaussians(1, **(sheet(30, 0.0, 0.9) | {"scales": torch.full((900, 3), 0.05, dtype=F64)}))
+    for splats in (gaussians(1, **sheet(30, 0.0, 0.9)), round_gaussians):
         rendering = render(splats, view, normals="depth")
         assert rendering.normal is not None
         middle = rendering.normal[6:14, 7:17]

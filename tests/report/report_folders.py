@@ -244,11 +244,11 @@ def write_comparison(root: Path) -> Path:
         },
         "protocol": {
             "name": "default",
-            "quantise": True,
-            "background": "scene",
-            "crop": 0,
-            "aggregation": "mean_of_views",
             "summary": "8-bit pictures over the scene's background, no crop, mean over views",
+            "background": "scene",
+            "prediction": "nearest",
+            "truth": "nearest",
+            "masks": "excluded",
         },
         "scene_info": {
             "train": 40,

@@ -13,7 +13,7 @@ from invgraphics.errors import InputError
 from invgraphics.report.build import build_report
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import read_comparison
-from invgraphics.report.statistics.cross_render import cross
+from invgraphics.report.statistics.cross_render import cross_table
 from invgraphics.report.study import build_study_report
 from invgraphics.runs.study import Approximation
 
@@ -42,7 +42,7 @@ def crossed_folder(comparison_folder: Path) -> Path:
 
 
 def test_scores_and_differences_are_means_over_seeds_and_views(crossed_folder: Path) -> None:
-    crossed = cross(read_comparison(crossed_folder), [PAIR], Folder(crossed_folder))
+    crossed = cross_table(read_comparison(crossed_folder), [PAIR], Folder(crossed_folder))
     assert crossed is not None
     assert (crossed.renderers, crossed.seeds, [row.method for row in crossed.rows]) == ((OWN, OTHER), 2, [OWN])
     own, other = crossed.rows[0].cells
@@ -69,20 +69,20 @@ def test_the_page_shows_it(crossed_folder: Path) -> None:
 
 
 def test_without_renderings_there_is_no_section(pristine_comparison: Path, built_report: Path) -> None:
-    assert cross(read_comparison(pristine_comparison), [], Folder(built_report)) is None
+    assert cross_table(read_comparison(pristine_comparison), [], Folder(built_report)) is None
     assert 'id="crossed"' not in (built_report / "index.html").read_text()
 
 
 def test_equal_pictures_are_called_the_same(comparison_folder: Path) -> None:
     add_renderings(comparison_folder / "runs" / "splatting-gaussians" / "seed-0", OWN, 0.0)
-    crossed = cross(read_comparison(comparison_folder), [PAIR], Folder(comparison_folder))
+    crossed = cross_table(read_comparison(comparison_folder), [PAIR], Folder(comparison_folder))
     assert crossed is not None and crossed.steps[0].differences == ("same",)
 
 
 def test_a_broken_record_is_explained(crossed_folder: Path) -> None:
     (crossed_folder / "runs" / "splatting-gaussians" / "seed-0" / "renderings.json").write_text('{"renderings": 3}')
     with pytest.raises(InputError, match="'renderings' cannot be 3"):
-        cross(read_comparison(crossed_folder), [], Folder(crossed_folder))
+        cross_table(read_comparison(crossed_folder), [], Folder(crossed_folder))
 
 
 def test_a_study_shows_approximations_and_analyses(small_study: Path) -> None:

@@ -141,8 +141,8 @@ def test_labels_are_pushed_apart_no_further_than_needed() -> None:
     assert spread_labels([0.1, 0.2], gap=1.0, low=0.0, high=10.0)[0] == pytest.approx(0.0)
 
 
-def _with_shortfall(run: Run) -> Run:
-    return replace(run, scores=replace(run.scores, shortfall=f"{run.method}: fog."))
+def _below_baseline(run: Run) -> Run:
+    return replace(run, scores=replace(run.scores, below_baseline=f"{run.method}: fog."))
 
 
 def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
@@ -166,11 +166,11 @@ def test_verdict_counts_what_seeds_cannot_resolve(built_report: Path) -> None:
     pair = replace(pair, runs=tuple(map(scattered, pair.runs)))
     told = " ".join(verdict(pair, summarise(pair)))
     # Student's t with one degree of freedom: 12.71 times the standard error of the mean difference, which is 1 dB.
-    assert "2 seeds cannot tell that lead from chance: only one above about 12.71 dB" in told
+    assert "2 seeds cannot tell that lead from chance: it would have to exceed about 12.71 dB" in told
     better = replace(comparison.runs[0].scores.quality["psnr"], mean=28.0)
     bad = replace(comparison, baselines={"nearest view": {"psnr": better}})
     assert "did not beat the trivial baseline 'nearest view'" in " ".join(verdict(bad, summarise(bad)))
-    foggy = replace(comparison, runs=tuple(_with_shortfall(run) for run in comparison.runs))
+    foggy = replace(comparison, runs=tuple(_below_baseline(run) for run in comparison.runs))
     told = verdict(foggy, summarise(foggy))
     assert [told.count(f"{method}: fog.") for method in comparison.methods] == [1] * len(comparison.methods)
 

@@ -106,7 +106,7 @@ def test_page_says_what_was_asked_found_and_lost(built_study: Path) -> None:
         "1 of 36 cells has not run yet",
         "The loss is not finite at step 7.",
         "34 done, 1 failed, 1 missing",
-        "The unit is the seed: intervals speak of new fits on these scenes",
+        "The unit is the seed: intervals hold for new fits on these scenes",
         "2 seeds, not ranked",
         "How to read this",
         "Time to quality",

@@ -8,13 +8,17 @@ import json
 import re
 import statistics
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from invgraphics.metrics.conventions import PROTOCOLS, Protocol
 from invgraphics.report.build import build_report
+from invgraphics.report.data.comparison import read_comparison
+from invgraphics.report.pages.facts import protocol_facts
 
 HIGHER = {"psnr", "ssim", "alpha_iou", "render_fps"}
 LOWER = {"flip", "depth_abs_rel", "normal_deg", "peak_memory_bytes", "model_bytes"}
@@ -198,10 +202,25 @@ def test_missing_metric_is_shown_with_its_reason(comparison_folder: Path, edit: 
     assert "<b>LPIPS</b> (the lpips extra is not installed)" in page
 
 
+def test_protocol_settings_are_shown_in_words(pristine_comparison: Path) -> None:
+    comparison = read_comparison(pristine_comparison)
+
+    def facts(protocol: Protocol) -> dict[str, str]:
+        return dict(protocol_facts(replace(comparison, protocol=protocol.record())))
+
+    found = facts(PROTOCOLS["default"])
+    assert (found["pictures"], found["masks"]) == ("both rounded to 8 bits", "masked pixels excluded")
+    assert facts(PROTOCOLS["float"])["pictures"] == "both unrounded"
+    mixed = replace(PROTOCOLS["float"], prediction="down")
+    assert facts(mixed)["pictures"] == "prediction truncated to 8 bits, truth unrounded"
+    keys = {"nearest", "down", "none", "unknown", "scene"}
+    assert all(not keys & set(facts(protocol).values()) for protocol in PROTOCOLS.values())
+
+
 def test_suspicious_poses_are_told_above_the_numbers(comparison_folder: Path, edit: Callable[..., None]) -> None:
     sentence = "3 of the 20 best matched pairs of photographs contradict the poses"
     assert "suspicious" not in build_report(comparison_folder).read_text()
-    edit(comparison_folder / "compare.json", lambda table: table["scene_info"]["notes"].update(suspicion=sentence))
+    edit(comparison_folder / "compare.json", lambda table: table["scene_info"]["notes"].update(inconsistent_poses=sentence))
     page = build_report(comparison_folder).read_text()
     assert page.index("camera poses are suspicious") < page.index(sentence) < page.index("<table")
     assert sentence in (comparison_folder / "index.md").read_text().split("## Summary")[0]

@@ -148,6 +148,30 @@ def test_locations_of_schema_1_had_rounds_among_their_keys(tmp_path: Path) -> No
     assert Location.read(tmp_path / "x.json").starts[0].rounds == {"0.25": 0.2, "1": 0.1}
 
 
+@pytest.mark.parametrize(
+    ("kind", "first", "today"),
+    [
+        (Scores, {"shortfall": "why"}, {"below_baseline": "why"}),
+        (Provenance, {"notes": {"summary": "s", "suspicion": "why"}}, {"notes": {"summary": "s", "inconsistent_poses": "why"}}),
+        (
+            ComparisonRecord,
+            {"scene_info": {"train": 3, "notes": {"suspicion": "why"}}},
+            {"scene_info": {"train": 3, "notes": {"inconsistent_poses": "why"}}},
+        ),
+    ],
+)
+def test_keys_are_read_under_their_first_names(
+    kind: type[Record], first: dict[str, Any], today: dict[str, Any], tmp_path: Path
+) -> None:
+    table = {key: value for key, value in example(kind).to_table().items() if key not in today}
+    (tmp_path / "first.json").write_text(json.dumps(table | first))
+    (tmp_path / "today.json").write_text(json.dumps(table | today))
+    found = kind.read(tmp_path / "first.json")
+    assert found == kind.read(tmp_path / "today.json")
+    written = found.to_table()
+    assert {key: written[key] for key in today} == today and not first.keys() - today.keys() & written.keys()
+
+
 def test_a_history_is_read_to_the_line_that_was_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "history.jsonl"
     for step in (0, 10, 20):

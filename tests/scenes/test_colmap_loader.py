@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap import Colmap
 from invgraphics.scenes.layout import SceneOptions
-from invgraphics.scenes.open import choices, find_loader, validate
+from invgraphics.scenes.open import find_loader, selection_notes, validate
 
 
 def radial(k: float):
@@ -123,7 +123,7 @@ def test_workspace_is_found_from_any_of_its_folders(tmp_path: Path, given: str) 
     assert len(scene.train) + len(scene.test) == 9 and "undistortion" not in scene.notes
     assert_dots_are_found(scene)
     said = scene.notes.get("model", "")
-    assert choices(scene) == (f"\n  model: {said}" if said else "")
+    assert selection_notes(scene) == (f"\n  model: {said}" if said else "")
     assert (given == ".") == ("dense/0/sparse (9 photographs)" in said and "sparse/0 (0 of 9" in said)
 
 

@@ -155,8 +155,8 @@ def test_a_walk_has_no_outliers() -> None:
     assert isolation(np.column_stack([places, 0 * places, 0 * places])).max() == pytest.approx(10 / 3)
 
 
-@pytest.mark.parametrize("suspicious", [True, False])
-def test_a_scene_repeats_what_its_import_suspects(suspicious: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("key", "suspicious"), [("consistency", True), ("consistency", False), ("suspicion", True)])
+def test_a_scene_repeats_the_inconsistency_of_its_import(key: str, suspicious: bool, tmp_path: Path) -> None:
     model = pycolmap.Reconstruction()
     for index, eye in enumerate(ring(9, distortion=None), start=1):
         save(eye.picture(), tmp_path / "images" / f"{index}.png")
@@ -168,11 +168,11 @@ def test_a_scene_repeats_what_its_import_suspects(suspicious: bool, tmp_path: Pa
     (tmp_path / "sparse/0").mkdir(parents=True)
     model.write(str(tmp_path / "sparse/0"))
     assert "poses" not in open_scene(str(tmp_path), SceneOptions()).notes
-    quality = {"key": "k", "choice": "global mapper", "suspicion": {"suspicious": suspicious, "sentence": "3 of 9 contradict"}}
+    quality = {"key": "k", "choice": "global mapper", key: {"suspicious": suspicious, "sentence": "3 of 9 contradict"}}
     (tmp_path / "quality.json").write_text(json.dumps(quality))
     notes = open_scene(str(tmp_path), SceneOptions()).notes
     assert notes["poses"] == "global mapper"
-    assert notes.get("suspicion") == ("3 of 9 contradict" if suspicious else None)
+    assert notes.get("inconsistent_poses") == ("3 of 9 contradict" if suspicious else None)
 
 
 @pytest.mark.slow
@@ -184,7 +184,7 @@ def test_photographs_around_a_table_look_at_it(tmp_path: Path) -> None:
     folder = Path(os.environ["INVGRAPHICS_DATA"]) / "bonsai_photos"
     quality = reconstruct(PhotoJob(str(folder)), tmp_path / "scene")
     assert quality["registered"] >= 60
-    assert not quality["suspicion"]["suspicious"]
+    assert not quality["consistency"]["suspicious"]
     assert quality["reprojection_error_px"] < 0.7
     poses = np.array([camera["cam_to_world"] for camera in quality["cameras"]])
     centre, forward = poses[:, :3, 3], poses[:, :3, 2]

@@ -7,9 +7,9 @@ import pycolmap
 import pytest
 from dots import ring
 
-from invgraphics.scenes.photos.consistency import MATCHES, check_consistency, explained, parallax, sampson
+from invgraphics.scenes.photos.consistency import MATCHES, check_consistency, explained_share, parallax, sampson
 from invgraphics.scenes.photos.pairs import MatchedPair, VerifiedMatches
-from invgraphics.scenes.photos.plausible import folds, implausible
+from invgraphics.scenes.photos.plausible import implausible_parameters, is_folded
 from invgraphics.scenes.photos.prepare import Prepared
 
 EYES = ring(8, distortion=None)
@@ -38,8 +38,8 @@ def matches(first: int, second: int, count: int = 60, seen_as: int | None = None
 def test_true_matches_are_explained_and_others_are_not() -> None:
     model = model_of(EYES)
     images = [model.images[index + 1] for index in range(8)]
-    assert explained(images[0], images[1], matches(0, 1)) == 1
-    assert explained(images[0], images[4], matches(0, 4, seen_as=1)) < 0.5
+    assert explained_share(images[0], images[1], matches(0, 1)) == 1
+    assert explained_share(images[0], images[4], matches(0, 4, seen_as=1)) < 0.5
 
 
 def test_a_folded_reconstruction_is_suspicious() -> None:
@@ -125,21 +125,21 @@ def test_rays_meet_under_their_angle() -> None:
 
 
 def test_impossible_cameras_are_named() -> None:
-    assert implausible(model_of(EYES)) == []
-    assert "focal length is 20" in implausible(model_of(EYES, 20 * 160 / 152.5))[0]
+    assert implausible_parameters(model_of(EYES)) == []
+    assert "focal length is 20" in implausible_parameters(model_of(EYES, 20 * 160 / 152.5))[0]
     radial = {
         strength: pycolmap.Camera(model="SIMPLE_RADIAL", width=100, height=100, params=[100, 50, 50, strength])
         for strength in (-0.3, 0.3, -1)
     }
     # The radius r (1 + k r²) falls from r² = -1 / 3 k on; the corner is at r² = 1/2.
-    assert [folds(camera) for camera in radial.values()] == [False, False, True]
+    assert [is_folded(camera) for camera in radial.values()] == [False, False, True]
     model, eye = model_of(EYES), EYES[0]
     track = pycolmap.Track()
     for image in (1, 2):
         model.images[image].points2D = pycolmap.Point2DList([pycolmap.Point2D([80.0, 60.0])])
         track.add_element(image, 0)
     model.add_point3D(eye.cam_to_world[:3, 3] + 1e4 * eye.R[2], track)
-    assert "stand within 0.1 %" in implausible(model)[0]
+    assert "stand within 0.1 %" in implausible_parameters(model)[0]
 
 
 def test_weak_pairs_and_photographs_without_a_pose_are_no_witnesses() -> None:

@@ -63,7 +63,7 @@ def test_poses_points_and_figures_are_right(imported) -> None:
     assert float(errors.translation_per_cent.max()) < 3
     assert 0 < quality["reprojection_error_px"] < 1
     assert quality["track_length"] > 2.5
-    assert not quality["suspicion"]["suspicious"]
+    assert not quality["consistency"]["suspicious"]
     assert [row["kept"] for row in quality["attempts"]] == [True]
     assert quality["choice"] == "incremental mapper, pinhole lens"
     assert Image.open(out / "top-view.png").size == (1200, 600)
@@ -304,7 +304,7 @@ def test_a_repeated_picture_is_suspicious_and_a_unique_one_is_not(tmp_path: Path
         eyes = orbit(36, 320)
         folder = shoot(tmp_path / f"repeated {repeated}", Box(repeated), eyes)
         quality = reconstruct(PhotoJob(str(folder), lens="pinhole"), tmp_path / f"scene {repeated}")
-        found[repeated] = quality["suspicion"]["suspicious"], float(truth_errors(quality, eyes).rotation_degrees.max())
+        found[repeated] = quality["consistency"]["suspicious"], float(truth_errors(quality, eyes).rotation_degrees.max())
         assert quality["registered"] >= 34
         assert quality["reprojection_error_px"] < 1
     assert found[False][0] is False and found[False][1] < 1

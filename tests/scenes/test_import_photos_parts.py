@@ -16,7 +16,7 @@ from invgraphics.scenes.lens import Lens
 from invgraphics.scenes.photos import PhotoJob
 from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
 from invgraphics.scenes.photos.prepare import Preparation, natural, prepare
-from invgraphics.scenes.photos.result import bend, write_scene
+from invgraphics.scenes.photos.result import max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
 from invgraphics.scenes.process import run_worker
 
@@ -177,8 +177,10 @@ def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None
 
 
 def test_how_much_a_lens_bends() -> None:
-    assert bend(Lens("PINHOLE", (100.0, 100.0, 50.0, 50.0), 100, 100)) == 0
-    assert bend(Lens("SIMPLE_RADIAL", (100.0, 50.0, 50.0, 1e-4), 100, 100)) == pytest.approx(100 * 1e-4 * 0.5**1.5, rel=0.01)
+    assert max_distortion(Lens("PINHOLE", (100.0, 100.0, 50.0, 50.0), 100, 100)) == 0
+    assert max_distortion(Lens("SIMPLE_RADIAL", (100.0, 50.0, 50.0, 1e-4), 100, 100)) == pytest.approx(
+        100 * 1e-4 * 0.5**1.5, rel=0.01
+    )
 
 
 def test_settings_are_checked() -> None:

@@ -169,7 +169,7 @@ def study(tmp_path: Path):
 def test_listed_cells_say_where_they_hold_and_how(study) -> None:
     cells = '[[cells]]\nscenes = ["b"]\nmethods = ["volumetric/hash"]\nseeds = [1]\nsize = [40, 30]\nbudget = "9s"\n'
     cells += '[[cells]]\npreset = "laptop"\n[[cells]]\npreset = "paper"\nscenes = ["a"]\nseeds = [0]\n'
-    with pytest.raises(InputError, match="cell 1 does not say 'preset'"):
+    with pytest.raises(InputError, match="cell 1 has no 'preset'"):
         study(LIST + cells)
     found = study(LIST + cells + '[base]\npreset = "laptop"\n')
     fits = [found.fit_request(cell, AblateRequest(study="trial", out="o")) for cell in found.expand()]

@@ -126,7 +126,7 @@ def test_folders_are_named_by_what_defines_the_run(study, tmp_path: Path) -> Non
         (HEAD + '[factors]\n"a" = [1, 2]\n"volumetric/*:a" = [3, 4]\n', "'a' is set by two entries for volumetric/hash"),
         (HEAD + 'design = "list"\n', r"needs \[\[cells\]\]"),
         (HEAD + "[[cells]]\na = 1\n", r"needs \[\[cells\]\]"),
-        (HEAD + 'design = "list"\n[[cells]]\na = 1\n[[cells]]\nb = 1\n', "cell 2 does not say 'a'"),
+        (HEAD + 'design = "list"\n[[cells]]\na = 1\n[[cells]]\nb = 1\n', "cell 2 has no 'a'"),
     ],
 )
 def test_bad_studies_are_refused(study, text: str, sentence: str) -> None:

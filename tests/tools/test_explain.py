@@ -21,7 +21,7 @@ from invgraphics.renderers.gaussian_volume import GaussianExact, GaussianExactCo
 from invgraphics.renderers.samplers import Hierarchical, HierarchicalConfig, Stratified, StratifiedConfig
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.renderers.volumetric import Volumetric
-from invgraphics.studies.approximations import field_of, round_ones
+from invgraphics.studies.approximations import field_of, isotropic_gaussians
 from invgraphics.tools.explain import ExplainRequest, explain
 
 METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians", "gaussian-volume/exact", "gaussian-volume/sorted")
@@ -69,7 +69,7 @@ def test_what_is_listed_adds_up_to_the_rendered_pixel(runs: dict[str, Path], tmp
 def test_two_splats_by_hand() -> None:
     """A red one of opacity 1/2 in front of a blue one of opacity 4/5, both on the axis."""
     means, rgb = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 1.0]]), torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-    field = field_of(round_ones(means, torch.tensor([0.1, 0.1]), torch.tensor([0.8, 0.5]), rgb)).float()
+    field = field_of(isotropic_gaussians(means, torch.tensor([0.1, 0.1]), torch.tensor([0.8, 0.5]), rgb)).float()
     found = Splatting(SplattingConfig(dilation=0.0)).contributions(field, HEAD_ON, (10, 10), CTX)
     assert found.kind == "splats"
     for name, expected in {
@@ -109,7 +109,7 @@ def test_every_way_to_show_gaussians_adds_up(renderer) -> None:
     """A cloud so dense that splatting stops before its end."""
     generator = torch.Generator().manual_seed(1)
     means = torch.rand(400, 3, generator=generator) * 1.6 - 0.8 + torch.tensor([0.0, 0.0, 3.0])
-    some = round_ones(means, torch.full((400,), 0.1), torch.full((400,), 0.6), torch.rand(400, 3, generator=generator))
+    some = isotropic_gaussians(means, torch.full((400,), 0.1), torch.full((400,), 0.6), torch.rand(400, 3, generator=generator))
     turned = torch.randn(400, 4, generator=generator).double()
     scales = 0.05 + 0.2 * torch.rand(400, 3, generator=generator).double()
     field = field_of(type(some)(some.means, turned, scales, some.opacities, some.sh)).float()
@@ -151,8 +151,8 @@ def test_a_ball_of_fog_in_closed_form(sampler: str) -> None:
 
 def test_overlapping_gaussians_share_their_light() -> None:
     """Two equal Gaussians at one place: half of the light each when integrated, unequal when one comes first."""
-    twins = round_ones(torch.tensor([[0.0, 0.0, 2.0]] * 2), torch.tensor([0.1, 0.1]), torch.tensor([0.6, 0.6])).means
-    field = field_of(round_ones(twins, torch.tensor([0.1, 0.1]), torch.tensor([0.6, 0.6]))).float()
+    twins = isotropic_gaussians(torch.tensor([[0.0, 0.0, 2.0]] * 2), torch.tensor([0.1, 0.1]), torch.tensor([0.6, 0.6])).means
+    field = field_of(isotropic_gaussians(twins, torch.tensor([0.1, 0.1]), torch.tensor([0.6, 0.6]))).float()
     exact = GaussianExact(GaussianExactConfig()).contributions(field, HEAD_ON, (10, 10), CTX)
     ordered = GaussianSorted(GaussianSortedConfig()).contributions(field, HEAD_ON, (10, 10), CTX)
     assert exact.weight.tolist() == pytest.approx([0.42, 0.42], abs=1e-4)
@@ -165,7 +165,9 @@ def test_overlapping_gaussians_share_their_light() -> None:
 def test_the_order_of_centres_is_shown_where_it_is_wrong() -> None:
     """A long Gaussian whose centre is nearer, but which the ray meets behind another one."""
     turn = math.pi / 4
-    gaussians = round_ones(torch.tensor([[-1.0, 0.0, 1.9], [0.0, 0.0, 2.0]]), torch.tensor([0.05] * 2), torch.tensor([0.5] * 2))
+    gaussians = isotropic_gaussians(
+        torch.tensor([[-1.0, 0.0, 1.9], [0.0, 0.0, 2.0]]), torch.tensor([0.05] * 2), torch.tensor([0.5] * 2)
+    )
     quaternion = torch.tensor([[math.cos(-turn / 2), 0.0, math.sin(-turn / 2), 0.0], [1.0, 0, 0, 0]]).double()
     scales = torch.tensor([[1.2, 0.05, 0.05], [0.05, 0.05, 0.05]]).double()
     field = field_of(type(gaussians)(gaussians.means, quaternion, scales, gaussians.opacities, gaussians.sh)).float()
@@ -174,7 +176,7 @@ def test_the_order_of_centres_is_shown_where_it_is_wrong() -> None:
 
 
 def test_a_ray_that_meets_nothing(tmp_path: Path) -> None:
-    field = field_of(round_ones(torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([0.1]), torch.tensor([0.8]))).float()
+    field = field_of(isotropic_gaussians(torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([0.1]), torch.tensor([0.8]))).float()
     for renderer in (
         Splatting(SplattingConfig()),
         GaussianExact(GaussianExactConfig()),

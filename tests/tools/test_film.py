@@ -18,7 +18,7 @@ from invgraphics.recipes.recipe import load_method
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT, RunFolder
 from invgraphics.testing import toy_scene
-from invgraphics.tools.film import FilmRequest, explanation, film
+from invgraphics.tools.film import FilmRequest, film, path_explanation
 from invgraphics.tools.paths import classify_capture, interpolate, orbit, spiral
 
 METHOD = "splatting/gaussians"
@@ -126,7 +126,7 @@ def test_film_says_why_it_takes_its_path(run: Path, tmp_path: Path, capsys) -> N
 
 
 def test_orbit_of_a_forward_facing_capture_is_warned_of() -> None:
-    words = explanation("orbit", classify_capture(_captured(_ring(-20, 20))))
+    words = path_explanation("orbit", classify_capture(_captured(_ring(-20, 20))))
     assert "elsewhere nothing was fitted" in words and "--path spiral" in words
 
 

@@ -20,7 +20,7 @@ from invgraphics.experiments.run import fit_run
 from invgraphics.fields.analytic import GaussianBlob, Sphere
 from invgraphics.metrics.surfaces import points_on, surface_distance
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
-from invgraphics.studies.approximations import field_of, round_ones
+from invgraphics.studies.approximations import field_of, isotropic_gaussians
 from invgraphics.testing import TwoBalls, toy_cameras
 from invgraphics.tools.export import ExportRequest, export_run
 from invgraphics.tools.surface_extraction import Lattice, Surface, default_level, field_surface, fused_surface, without_specks
@@ -134,7 +134,7 @@ def test_gaussians_on_a_sphere_fuse_to_the_sphere() -> None:
     """Splats are fat: seen aslant, their surface lies up to two standard deviations outside of their centres."""
     direction = torch.nn.functional.normalize(torch.randn(3000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     means = 0.55 * direction
-    field = field_of(round_ones(means, torch.full((3000,), 0.02), torch.full((3000,), 0.95), (means + 1) / 2)).float()
+    field = field_of(isotropic_gaussians(means, torch.full((3000,), 0.02), torch.full((3000,), 0.95), (means + 1) / 2)).float()
     renderer, cameras = Splatting(SplattingConfig(depth="median", normals="depth")), _all_around()[::2]
 
     def render(index: int) -> Rendering:

@@ -60,7 +60,7 @@ def test_errors_are_those_of_the_poses_by_name(data_set) -> None:
 
 def test_strangers_are_refused(data_set) -> None:
     folder, poses = data_set
-    with pytest.raises(InputError, match="knows the poses of 0 of the 9"):
+    with pytest.raises(InputError, match="has poses of 0 of the 9"):
         compare(folder / "images", report(poses, [f"other{index}.png" for index in range(9)]), folder)
 
 

@@ -21,7 +21,7 @@ from invgraphics.report.data.comparison import check_comparable
 from invgraphics.runs.run import read_run
 from invgraphics.tools.predictions import open_pictures
 from invgraphics.tools.rescore import check_same_truth, protocols_named, rescore, why_unsuited
-from invgraphics.tools.rescoring import Rescored, labels, rows_of, spread_of, winners, write_scores, write_tables
+from invgraphics.tools.rescoring import Rescored, best_sets, labels, rows_of, spread_of, write_scores, write_tables
 
 METHOD = "splatting/gaussians"
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -148,7 +148,7 @@ def test_eight_bits_stand_in_for_floats_only_when_allowed(folders) -> None:
     assert why_unsuited(pictures, PROTOCOLS["multinerf"]) == ""
     scores = rescore([pictures], protocols_named("gsplat,float,default"), allow_8bit=True)[0].scores
     assert scores["gsplat"].quality["psnr"].mean == pytest.approx(scores["default"].quality["psnr"].mean, abs=1e-6)
-    assert any("8-bit pictures stand in" in note for note in scores["gsplat"].notes)
+    assert any("8-bit pictures were used" in note for note in scores["gsplat"].notes)
     assert not any("8-bit" in note for note in scores["default"].notes)
 
 
@@ -236,10 +236,10 @@ def test_the_winner_may_depend_on_the_protocol(run: Path) -> None:
     ]
     _gain(results[1], "float", 1)
     _gain(results[0], "gsplat", 1)
-    assert winners(results, "psnr") == "Best psnr depends on the protocol: b under float; a under gsplat."
+    assert best_sets(results, "psnr") == "Best psnr depends on the protocol: b under float; a under gsplat."
     _gain(results[1], "gsplat", 2)
-    assert winners(results, "psnr") == "Best psnr: b, whatever the protocol."
-    assert winners(results[:1], "psnr") == winners(results, "lpips") == ""
+    assert best_sets(results, "psnr") == "Best psnr: b, whatever the protocol."
+    assert best_sets(results[:1], "psnr") == best_sets(results, "lpips") == ""
 
 
 def test_labels_are_the_shortest_ends_that_differ(tmp_path: Path) -> None:

@@ -193,19 +193,23 @@ def test_window_opens_from_coarse_to_fine() -> None:
     points = torch.rand(5, 3)
     for settings in (FrequencyConfig(octaves=4), HashConfig(levels=5, log2_size=8, finest=64)):
         encoding = settings.build()
-        assert not any("detail" in key for key in encoding.state_dict())
+        assert not any("window_alpha" in key for key in encoding.state_dict())
         plain = encoding(points)
         encoding.add_window()
         assert torch.equal(encoding(points), plain)
-        assert encoding.detail is not None
-        encoding.detail.fill_(0.4)
+        assert encoding.window_alpha is not None
+        encoding.window_alpha.fill_(0.4)
         reached = encoding.always + 0.4 * (encoding.levels - encoding.always)
         expected = [(1 - math.cos(math.pi * min(max(reached - k, 0), 1))) / 2 for k in range(encoding.levels)]
         weights = encoding.level_weights()
         assert weights is not None
         assert weights.tolist() == pytest.approx(expected, abs=1e-6)
-        encoding.detail.fill_(0.0)
+        older = {name.replace("window_alpha", "detail"): value.clone() for name, value in encoding.state_dict().items()}
+        assert "detail" in older
+        encoding.window_alpha.fill_(0.0)
         assert int((encoding(points) - plain).abs().gt(0).any(dim=0).sum()) > 0
+        encoding.load_state_dict(older)  # of a checkpoint of an earlier version
+        assert float(encoding.window_alpha) == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -238,8 +242,8 @@ def test_resumed_with_poses_equals_uninterrupted(name: str, scene: Scene, small:
     assert same(whole.state(), second.state())
     assert whole.plan.poses is not None
     assert all(bool(turn.any()) for turn in whole.plan.poses.rotation)
-    opened = [encoding.detail for encoding in coarse_to_fine_encodings(whole.plan.model)]
-    assert all(detail is not None and float(detail) == 1.0 for detail in opened)
+    opened = [encoding.window_alpha for encoding in coarse_to_fine_encodings(whole.plan.model)]
+    assert all(alpha is not None and float(alpha) == 1.0 for alpha in opened)
     assert bool(opened) == name.startswith("volumetric")
 
 

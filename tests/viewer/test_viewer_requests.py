@@ -114,7 +114,7 @@ def test_the_command_serves_this_machine_until_it_is_interrupted(runs: dict[str,
     words = [sys.executable, "-m", "invgraphics", "view", str(runs["volumetric/hash"]), "--port", "0", "--no-open"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process, ended(process):
         line = process.stdout.readline()
-        port = int(re.search(r"http://127.0.0.1:(\d+) \(Ctrl-C ends\)", line).group(1))
+        port = int(re.search(r"http://127.0.0.1:(\d+) \(Ctrl-C to stop\)", line).group(1))
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as page:
             assert b"<title>" in page.read()
         # Linux answers at all of 127.0.0.0/8, so this is another address of this machine.

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from invgraphics.api.loading import MethodLike, load_run, name_of, opened, place_of
+from invgraphics.api.loading import MethodLike, as_scene, load_run, name_of, reopenable_scene
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import compare as comparing
@@ -57,7 +57,7 @@ class ComparisonResult:
         Raises:
             InputError: there is no such run, or it failed.
         """
-        return load_run(self._place(method, seed))
+        return load_run(self._run_folder(method, seed))
 
     def scores(self, method: str, seed: int = 0) -> ScoreTable:
         """Scores of a method.
@@ -65,9 +65,9 @@ class ComparisonResult:
         Raises:
             InputError: there is no such run, or it failed.
         """
-        return ScoreTable(RunFolder(self._place(method, seed)).read_scores())
+        return ScoreTable(RunFolder(self._run_folder(method, seed)).read_scores())
 
-    def _place(self, method: str, seed: int) -> Path:
+    def _run_folder(self, method: str, seed: int) -> Path:
         for run in self.record.runs:
             if (run.method, run.seed) == (method, seed):
                 return run.folder
@@ -124,10 +124,10 @@ def compare(
         >>> report.methods, report.failures, report.page.name
         (('splatting/gaussians', 'volumetric/hash:field.width=16:batches.rays=64'), (), 'index.html')
     """
-    scene = opened(scene)
+    scene = as_scene(scene)
     folder = Path("reports") / f"compare-{scene.name}" if out is None else Path(out)
     names = [name_of(method, folder / "methods" / f"{index}.toml", budget)[0] for index, method in enumerate(methods)]
-    _, place = place_of(scene, folder)
+    _, place = reopenable_scene(scene, folder)
     settings: dict[str, Any] = {"budget": budget, "device": device, "render_with": tuple(render_with), **place}
     root, _ = comparing.compare(CompareRequest(methods=tuple(names), seeds=tuple(seeds), out=str(folder), **settings))
     return ComparisonResult(root)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal, overload
 
-from invgraphics.api.loading import MethodLike, name_of, opened, place_of
+from invgraphics.api.loading import MethodLike, as_scene, name_of, reopenable_scene
 from invgraphics.core import Model, Scene
 from invgraphics.experiments.evaluate import score_model
 from invgraphics.experiments.fitted import load_fitted
@@ -83,7 +83,7 @@ def fit(
         >>> picture.rgb.shape, fit.finished, fit.history[-1].step
         (torch.Size([16, 16, 3]), True, 20)
     """
-    scene = opened(scene)
+    scene = as_scene(scene)
     if out is None:
         source = source_of(scene)
         name, table = name_of(method, None, budget)
@@ -95,14 +95,14 @@ def fit(
     existing: Literal["resume", "refuse"] = "resume" if folder.identity else "refuse"
     name, _ = name_of(method, folder.root / "method.toml", budget)
     settings: dict[str, Any] = {"budget": budget, "seed": seed, "device": device, "snapshots": snapshots}
-    scene, place = place_of(scene, folder.root)
+    scene, place = reopenable_scene(scene, folder.root)
     request = FitRequest(method=name, out=str(out), existing=existing, **settings, **place)
     try:
         make_run(Job.of(request), scene, on_step)
     except KeyboardInterrupt as error:
         if isinstance(error, Terminated) or not folder.resumable:
             raise
-        print(f"Interrupted; the same call goes on from {folder.root}.", file=sys.stderr)
+        print(f"Interrupted; the same call continues from {folder.root}.", file=sys.stderr)
     return FolderRun(load_fitted(folder, scene))
 
 
@@ -124,6 +124,6 @@ def evaluate(model: Model, scene: Scene | str, protocol: str = "default") -> Sco
         >>> scores["psnr"] == sum(scores.per_view("psnr")) / len(scene.test), scores.unit("psnr")
         (True, 'dB')
     """
-    scene = opened(scene)
+    scene = as_scene(scene)
     title = f"{type(model.field).__name__} through {type(model.renderer).__name__}"
     return ScoreTable(score_model(model, scene, protocol, title))

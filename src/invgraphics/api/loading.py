@@ -129,7 +129,7 @@ def load_run(folder: str | os.PathLike[str], scene: str | None = None) -> Folder
     return FolderRun(open_fitted(Path(folder), scene))
 
 
-def opened(scene: Scene | str | os.PathLike[str]) -> Scene:
+def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
     """Open a scene by name, or check one that is already open.
 
     Raises:
@@ -162,7 +162,7 @@ def name_of(method: MethodLike, file: Path | None, budget: str) -> tuple[str, Me
     return str(file), None
 
 
-def place_of(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:
+def reopenable_scene(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:
     """Scene and name by which other processes open it: as it was opened, or as a copy written to ``folder``.
 
     Raises:

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from invgraphics.bench.results import BOTH, Measurement
 from invgraphics.bench.splat_cases import GATE as SPLAT_GATE
-from invgraphics.bench.splat_cases import both_ways, splat_pipeline
+from invgraphics.bench.splat_cases import forward_backward, splat_pipeline
 from invgraphics.bench.timing import Effort, alternate
 from invgraphics.bench.workload import activated, gaussian_field, leaves, scene
 from invgraphics.core import Model, Scene, harmonics
@@ -53,7 +53,8 @@ def splat_step(n: int, width: int, effort: Effort) -> list[Measurement]:
     pictures = scene(field, VIEWS, width)
     primitives, fit = activated(field), splat_fit(field, pictures)
     draws = [
-        both_ways(lambda camera=view.camera: splat_pipeline(primitives, camera), leaves(primitives)) for view in pictures.train
+        forward_backward(lambda camera=view.camera: splat_pipeline(primitives, camera), leaves(primitives))
+        for view in pictures.train
     ]
     views = cycle(draws)
 

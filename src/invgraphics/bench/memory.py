@@ -17,7 +17,7 @@ from pathlib import Path
 from invgraphics.bench.results import PeakMemory, Results, Skipped
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-PEAK_TO_NOW = "5"
+RESET_PEAK = "5"
 """Written to `CLEAR`, resets the peak resident set to the current one (Linux 4.0)."""
 
 GAUSSIANS, WIDTH = 50_000, 100
@@ -79,7 +79,7 @@ def measure(name: str, kernels: str) -> tuple[int, int]:
     dispatch.warm_up()
     run = _PREPARE[name]()
     before = status_bytes("VmRSS")
-    CLEAR.write_text(PEAK_TO_NOW)
+    CLEAR.write_text(RESET_PEAK)
     count = run()
     return status_bytes("VmHWM") - before, count
 
@@ -92,11 +92,11 @@ def status_bytes(entry: str) -> int:
 
 
 def _splats() -> Callable[[], int]:
-    from invgraphics.bench.splat_cases import both_ways, splat_pipeline
+    from invgraphics.bench.splat_cases import forward_backward, splat_pipeline
     from invgraphics.bench.workload import activated, camera, gaussian_field, leaves
 
     gaussians, viewpoint = activated(gaussian_field(GAUSSIANS)), camera(WIDTH)
-    return _counted(both_ways(lambda: splat_pipeline(gaussians, viewpoint), leaves(gaussians)), GAUSSIANS)
+    return _counted(forward_backward(lambda: splat_pipeline(gaussians, viewpoint), leaves(gaussians)), GAUSSIANS)
 
 
 def _case(operation: str, count: int, **sizes: int) -> Callable[[], Callable[[], int]]:

@@ -19,7 +19,7 @@ from invgraphics.bench.results import BOTH, FORWARD, PEERS, Measurement, Results
 from invgraphics.bench.sample_cases import BASE, FINEST, ray_ordered
 from invgraphics.bench.sample_cases import GATE as HASH_GATE
 from invgraphics.bench.splat_cases import GATE as SPLAT_GATE
-from invgraphics.bench.splat_cases import both_ways, splat_pipeline, without_gradient
+from invgraphics.bench.splat_cases import forward_backward, splat_pipeline, without_gradient
 from invgraphics.bench.timing import Effort, Timing, alternate
 from invgraphics.bench.workload import activated, camera, gaussian_field
 from invgraphics.core.ngp import HashGrid
@@ -82,7 +82,7 @@ def _our_hash() -> dict[str, Run]:
     grid = HashGrid(HASH_GATE["levels"], 2, HASH_GATE["log2_size"], BASE, FINEST)
     table, unit = torch.rand(grid.entries, 2).requires_grad_(), ray_ordered(HASH_GATE["points"])
     encode = lambda: kernels.hash_encode(unit, table, grid)[0]  # noqa: E731
-    return {FORWARD: without_gradient(encode), BOTH: both_ways(encode, [table])}
+    return {FORWARD: without_gradient(encode), BOTH: forward_backward(encode, [table])}
 
 
 def _our_splats() -> dict[str, Run]:
@@ -106,7 +106,7 @@ def _nerfstudio() -> dict[str, Run]:
     )
     unit = ray_ordered(HASH_GATE["points"])
     encode = lambda: encoding(unit)  # noqa: E731
-    return {FORWARD: without_gradient(encode), BOTH: both_ways(encode, list(encoding.parameters()))}
+    return {FORWARD: without_gradient(encode), BOTH: forward_backward(encode, list(encoding.parameters()))}
 
 
 def _use_llvm() -> None:

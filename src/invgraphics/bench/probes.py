@@ -21,10 +21,10 @@ def exp2_passes(values, passes):
 
 
 @parallel
-def gather_sum(table, places, jobs, sums):
-    """Gather and sum the entries of ``table`` at ``places``, which are split evenly among jobs; one sum per job."""
+def gather_sum(table, indices, jobs, sums):
+    """Gather and sum the entries of ``table`` at ``indices``, which are split evenly among jobs; one sum per job."""
     for job in prange(jobs):
         total = np.int64(0)
-        for number in range(job_start(len(places), jobs, job), job_start(len(places), jobs, job + 1)):
-            total += table[index(places[index(number)])]
+        for number in range(job_start(len(indices), jobs, job), job_start(len(indices), jobs, job + 1)):
+            total += table[index(indices[index(number)])]
         sums[job] = total

@@ -14,7 +14,7 @@ from invgraphics import kernels
 from invgraphics.bench import limits
 from invgraphics.bench.case import LARGE, Case, KernelPass
 from invgraphics.bench.results import BOTH, FORWARD
-from invgraphics.bench.splat_cases import both_ways, without_gradient
+from invgraphics.bench.splat_cases import forward_backward, without_gradient
 from invgraphics.bench.workload import bounds, camera, occupied
 from invgraphics.core import Rays
 from invgraphics.core.ngp import FusedNGP, HashGrid
@@ -105,7 +105,7 @@ def _hash(log2_size: int, points: int) -> dict[str, KernelPass]:
     amount = 8.0 * LEVELS * points
     return {
         FORWARD: KernelPass(without_gradient(encode), amount, limit, "look-ups"),
-        BOTH: KernelPass(both_ways(encode, [table]), 2 * amount, limit, "look-ups"),
+        BOTH: KernelPass(forward_backward(encode, [table]), 2 * amount, limit, "look-ups"),
     }
 
 
@@ -117,7 +117,7 @@ def _grid(points: int) -> dict[str, KernelPass]:
     limit = limits.gather(4 * values.numel())
     return {
         FORWARD: KernelPass(without_gradient(sample), 8.0 * points, limit, "look-ups"),
-        BOTH: KernelPass(both_ways(sample, [values]), 16.0 * points, limit, "look-ups"),
+        BOTH: KernelPass(forward_backward(sample, [values]), 16.0 * points, limit, "look-ups"),
     }
 
 
@@ -168,5 +168,5 @@ def _composite(samples: int) -> dict[str, KernelPass]:
     amount = {direction: float(size) * samples for direction, size in COMPOSITE_BYTES.items()}
     return {
         FORWARD: KernelPass(without_gradient(run), amount[FORWARD], limit, "bytes"),
-        BOTH: KernelPass(both_ways(run, [depth, channels]), amount[BOTH], limit, "bytes"),
+        BOTH: KernelPass(forward_backward(run, [depth, channels]), amount[BOTH], limit, "bytes"),
     }

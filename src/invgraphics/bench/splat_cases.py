@@ -69,7 +69,7 @@ def alpha_evaluations(footprints: Footprints, rgb: Tensor, width: int, height: i
     return float(image.grad_fn.tile_state.work.sum()) * float(LANES)
 
 
-def both_ways(outputs: Run, inputs: list[Tensor]) -> Run:
+def forward_backward(outputs: Run, inputs: list[Tensor]) -> Run:
     """A call that computes ``outputs`` and backpropagates fixed gradients to ``inputs``."""
     gradients: list[Tensor] = []
 
@@ -120,7 +120,7 @@ def _alpha_passes(draw: Run, inputs: list[Tensor], amount: float) -> dict[str, K
     limit, unit = limits.exp2(), "alpha evaluations"
     return {
         FORWARD: KernelPass(without_gradient(draw), amount, limit, unit),
-        BOTH: KernelPass(both_ways(draw, inputs), 2 * amount, limit, unit),
+        BOTH: KernelPass(forward_backward(draw, inputs), 2 * amount, limit, unit),
     }
 
 
@@ -136,7 +136,7 @@ def _project(gaussians: int, width: int) -> dict[str, KernelPass]:
     limit = limits.triad()
     return {
         FORWARD: KernelPass(without_gradient(project), forward, limit, "bytes"),
-        BOTH: KernelPass(both_ways(project, leaves(primitives)), forward + backward, limit, "bytes"),
+        BOTH: KernelPass(forward_backward(project, leaves(primitives)), forward + backward, limit, "bytes"),
     }
 
 
@@ -149,5 +149,5 @@ def _ssim(width: int) -> dict[str, KernelPass]:
     amount = {direction: float(flops) * 3 * width * width for direction, flops in SSIM_FLOPS.items()}
     return {
         FORWARD: KernelPass(without_gradient(compare), amount[FORWARD], limit, "flop"),
-        BOTH: KernelPass(both_ways(compare, [image]), amount[BOTH], limit, "flop"),
+        BOTH: KernelPass(forward_backward(compare, [image]), amount[BOTH], limit, "flop"),
     }

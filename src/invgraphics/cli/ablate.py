@@ -1,4 +1,4 @@
-"""``invgraphics ablate``: a study with factors, levels and seeds."""
+"""``invgraphics ablate``: run a study with factors, levels and seeds, and write its report."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST_HOURS = 4.0
 class Ablate:
     """Run a study: methods and scenes under every level of its factors, with several seeds; then write its report.
 
-    The same command again keeps what is finished and goes on with what is not. Exit status 1 means that some runs failed.
+    The same command again keeps finished runs and continues the others. Exit status 1: some runs failed.
     """
 
     study: Annotated[Positional[str], arg(metavar="STUDY")]
@@ -54,11 +54,11 @@ class Ablate:
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the study's)")] = None
     """Samples per pixel of the training views of scenes that are rendered."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
-    """Where to compute."""
+    """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
     """Force an implementation of the hot operations: numba, or reference (plain torch)."""
     checkpoint_every: Annotated[str, arg(metavar="30s|100steps")] = "30s"
-    """How much work an interruption may cost."""
+    """Interval between checkpoints, the most work that an interruption costs."""
     keep: bool = False
     """Keep finished cells whose recipe, scene and request are the same although the code has changed since."""
     cells: Annotated[str | None, arg(metavar="PATTERN", help_behavior_hint="(default: all)")] = None
@@ -67,7 +67,7 @@ class Ablate:
     """Leave fits with a longer budget for later."""
 
     def run(self) -> int:
-        """Make what is missing; print what failed, and the page's path."""
+        """Run the missing cells; prints failures and the page's path. Returns the exit status, 1 if cells failed."""
         request = self.request()
         with_request(read_study(locate(request.study)), request)  # refuses most mistakes before torch is imported
 
@@ -83,7 +83,7 @@ class Ablate:
         return 1 if failed else 0
 
     def request(self) -> AblateRequest:
-        """The same as plain values, checked as far as that needs no data."""
+        """Convert the options to a validated request, without opening any data."""
         if self.budget is not None:
             Budget.parse(self.budget)
         if self.jobs < 1:
@@ -113,7 +113,7 @@ class Ablate:
         )
 
     def _confirm(self, forecast: Forecast) -> None:
-        """Say what is ahead, and ask where it is long.
+        """Print the forecast, and ask for confirmation where it is long.
 
         Raises:
             InputError: the answer was no, or there is nobody to ask.
@@ -123,7 +123,9 @@ class Ablate:
             return
         advice = "Fewer --seeds or a smaller --budget make it shorter."
         if not sys.stdin.isatty():
-            raise InputError(f"The study needs about {forecast.hours:.2g} h, and nobody can be asked.", f"Add --yes. {advice}")
+            raise InputError(
+                f"The study needs about {forecast.hours:.2g} h, and there is no terminal to confirm it.", f"Add --yes. {advice}"
+            )
         print("Start it? [y/N] ", end="", file=sys.stderr, flush=True)
         if sys.stdin.readline().strip().lower() not in ("y", "yes"):
             raise InputError("The study was not started.", advice)

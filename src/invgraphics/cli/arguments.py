@@ -1,4 +1,4 @@
-"""Reading arguments: tyro's parser with errors of at most four lines, the options that commands share, and their texts."""
+"""Parsing of command-line arguments: tyro with errors of at most four lines, options shared by commands, and their texts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _POSITIONAL = get_args(Positional[int])[1]
 
 @dataclass(frozen=True, kw_only=True)
 class Shared:
-    """What ``fit`` and ``compare`` have in common."""
+    """Options shared by ``fit`` and ``compare``."""
 
     budget: Annotated[str, arg(metavar="60s|5000steps")] = "60s"
     """How long each fit may optimise: seconds (60s, 2m, 1h), or steps (5000steps)."""
@@ -43,22 +43,22 @@ class Shared:
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
     """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
-    """Most Gaussians a method may make; short for --set max_primitives=N."""
+    """Largest number of Gaussians; short for --set max_primitives=N."""
     optimise: Annotated[str, arg(metavar="poses")] = ""
     """Fit the training cameras' poses too; short for --set training.poses.optimise=true."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
-    """Where to compute."""
+    """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
     """Force an implementation of the hot operations: numba, or reference (plain torch)."""
     protocol: Annotated[str, arg(metavar="NAME")] = "default"
     """How pictures are scored: default (rounded to 8 bits), or float."""
     checkpoint_every: Annotated[str, arg(metavar="30s|100steps")] = "30s"
-    """How much work an interruption may cost."""
+    """Interval between checkpoints, the most work that an interruption costs."""
     render_with: Annotated[str, arg(metavar="A,B")] = ""
     """Show the fitted fields through the renderers of other methods, too; METHOD:key=value changes a renderer's setting."""
 
     def settings(self) -> dict[str, Any]:
-        """These options as keyword arguments of a request, checked.
+        """Convert the options to validated keyword arguments of a request.
 
         Raises:
             InputError: one of them cannot be read.
@@ -85,7 +85,7 @@ class Shared:
 
 
 def parse(command: type[T], program: str, arguments: Sequence[str]) -> T:
-    """Make a command from its arguments; ``--help`` prints its help and exits.
+    """Parse arguments to a command; ``--help`` prints its help and exits.
 
     Raises:
         InputError: an argument is missing, unknown or of the wrong type.
@@ -109,7 +109,7 @@ def parse(command: type[T], program: str, arguments: Sequence[str]) -> T:
 
 
 def required_options(command: type) -> list[str]:
-    """The options of a command that have no default, as ``--name METAVAR``; its positional arguments are not among them."""
+    """List a command's required options as ``--name METAVAR``, without positional arguments."""
     words = []
     hints = get_type_hints(command, include_extras=True)
     for field in dataclasses.fields(command):
@@ -122,7 +122,7 @@ def required_options(command: type) -> list[str]:
 
 
 def condense(box: str) -> tuple[str, str]:
-    """Tyro's framed message as a sentence (of one or two lines) and a remedy."""
+    """Condense tyro's framed error message to a sentence (one or two lines) and a remedy."""
     lines = [line.strip(_BOX + " ") for line in box.splitlines()]
     # Inside the frame, horizontal rules part the message from suggestions, the argument's help and the pointer to --help.
     parts = [" ".join(part.split()) for part in re.split(r"─{4,}", "\n".join(lines[1:]))]
@@ -135,7 +135,7 @@ def condense(box: str) -> tuple[str, str]:
 
 
 def parse_size(text: str) -> int | tuple[int, int]:
-    """Read ``480`` (longest side) or ``640x480``.
+    """Parse ``480`` (longest side) or ``640x480`` to pixels.
 
     Raises:
         InputError: anything else, or less than `SMALLEST` pixels.
@@ -151,7 +151,7 @@ def parse_size(text: str) -> int | tuple[int, int]:
 
 
 def parse_views(text: str) -> int | None:
-    """Read a number of views, ``None`` for ``all``.
+    """Parse a number of views; ``all`` gives ``None``.
 
     Raises:
         InputError: anything else.
@@ -164,7 +164,7 @@ def parse_views(text: str) -> int | None:
 
 
 def parse_samples(count: int | None) -> int | None:
-    """Check a number of samples per pixel.
+    """Validate a number of samples per pixel; ``None`` passes.
 
     Raises:
         InputError: it is less than one.
@@ -175,7 +175,7 @@ def parse_samples(count: int | None) -> int | None:
 
 
 def parse_list(text: str, option: str) -> tuple[str, ...]:
-    """Read a comma-separated list; commas within brackets do not separate.
+    """Split a comma-separated list; commas within brackets do not separate.
 
     Raises:
         InputError: nothing in it.
@@ -187,7 +187,7 @@ def parse_list(text: str, option: str) -> tuple[str, ...]:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Read comma-separated seeds.
+    """Parse comma-separated seeds to integers.
 
     Raises:
         InputError: one of them is not a whole number, 0 or more.

@@ -1,4 +1,4 @@
-"""``invgraphics bench``: how fast the kernels are, against the plain reference, the machine's limits and peers."""
+"""``invgraphics bench``: time the kernels against the plain reference, the machine's limits and peers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Bench:
     """Exit with status 1 if a promise is missed or was not measured."""
 
     def run(self) -> int:
-        """Measure; print the promises and the page's path."""
+        """Measure; prints the gates and the page's path. Returns the exit status."""
         parts = self.parts()
 
         from invgraphics.bench.gates import gates
@@ -52,7 +52,7 @@ class Bench:
         began, record = time.perf_counter(), self._record()
         results = bench(self.request(parts))
         record |= {"seconds": round(time.perf_counter() - began), "load at the end": _load()}
-        page = write(results, record, self.out, _look())
+        page = write(results, record, self.out, _plot_style())
 
         for title, table in (("Kernels", kernel_table(results)), ("Whole steps", step_table(results))):
             if table.rows:
@@ -66,7 +66,7 @@ class Bench:
         return int(self.check and any(gate.verdict != "PASS" for gate in found))
 
     def parts(self) -> tuple[str, ...]:
-        """What to measure, in order.
+        """Names of the parts to measure, in order.
 
         Raises:
             InputError: there is no such part.
@@ -80,7 +80,7 @@ class Bench:
         return parts
 
     def request(self, parts: tuple[str, ...]) -> BenchRequest:
-        """The same as plain values, checked.
+        """Convert the options to a validated request.
 
         Raises:
             InputError: the kernels are unknown, or do not work here.
@@ -105,12 +105,12 @@ class Bench:
 
 
 def _load() -> str:
-    """Processes that wanted to run during the last minute, as the system counts them."""
+    """System load: mean number of runnable processes over the last minute."""
     return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
 
 
-def _look() -> PlotStyle:
-    """The look of the reports."""
+def _plot_style() -> PlotStyle:
+    """Plot style of the reports."""
     from importlib.resources import files
 
     from invgraphics.bench.plots import PlotStyle

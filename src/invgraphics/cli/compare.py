@@ -1,4 +1,4 @@
-"""``invgraphics compare``: the main job. Fit, evaluate, report."""
+"""``invgraphics compare``: fit, evaluate and report several methods on one scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from invgraphics.runs.folder import RUNS, RunFolder
 class Compare(Shared):
     """Fit several methods to one scene under one budget, each in its own process; score them; write a report.
 
-    The same command again keeps what is finished and goes on with what is not. Exit status 1 means that some fits failed.
+    The same command again keeps finished runs and continues the others. Exit status 1: some fits failed.
     """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
@@ -33,7 +33,7 @@ class Compare(Shared):
     """Folder of the report and its runs."""
 
     def run(self) -> int:
-        """Compare; print the table and the page's path."""
+        """Run the comparison; prints the table and the page's path. Returns the exit status, 1 if fits failed."""
         request = self.request()
         for method in request.methods:
             presets(method)  # refuses an unknown method before torch is imported
@@ -51,7 +51,7 @@ class Compare(Shared):
         return 1 if failures else 0
 
     def request(self) -> CompareRequest:
-        """The same as plain values, checked as far as that needs no data."""
+        """Convert the options to a validated request, without opening any data."""
         out = Path("reports") / f"compare-{Path(self.scene).resolve().name}" if self.out is None else self.out
         methods, seeds = parse_list(self.methods, "--methods"), parse_seeds(self.seeds)
         return CompareRequest(scene=self.scene, methods=methods, seeds=seeds, out=str(out), **self.settings())

@@ -1,4 +1,4 @@
-"""``invgraphics doctor``: what this machine offers, and what to do about what is missing."""
+"""``invgraphics doctor``: check processor, kernels, LLVM, CUDA and extras of this machine, with remedies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from invgraphics.cli.output import show_table
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the doctor's report.
+    """Result of one check of the machine.
 
     Attributes:
         subject: what was looked at.
@@ -30,13 +30,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Tell what this machine offers (processor, kernels, LLVM for Mitsuba, CUDA, extras), and how to get what is missing."""
+    """Check this machine: processor, kernels, LLVM for Mitsuba, CUDA and extras, with a remedy for what is missing."""
 
     warm_up: bool = False
     """Compile the kernels now, so that no later command waits for it."""
 
     def run(self) -> int:
-        """Print the findings."""
+        """Run the checks and print them; returns exit status 0."""
         findings = list(examine(self.warm_up))
         rows = [("!" if finding.remedy else "ok", finding.subject, finding.found) for finding in findings]
         show_table("This machine", ("", "subject", "found"), rows)
@@ -49,7 +49,7 @@ class Doctor:
 
 
 def examine(warm_up: bool) -> Iterator[Finding]:
-    """Look at the machine, part by part."""
+    """Run all checks of the machine; compiles the kernels if ``warm_up``."""
     yield Finding("invgraphics", f"{version('invgraphics')}, Python {platform.python_version()}, {platform.platform()}")
     yield from _processor()
     yield _kernels(warm_up)

@@ -1,4 +1,4 @@
-"""``invgraphics evaluate``: score a run again from its model."""
+"""``invgraphics evaluate``: render and score a finished run again from its model."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Evaluate:
     """How pictures are scored: default (rounded to 8 bits), or float."""
 
     def run(self) -> int:
-        """Score; print the scores."""
+        """Score the run and print the scores; returns exit status 0."""
         check_run(self.folder)
 
         from invgraphics.experiments.evaluate import evaluate_run

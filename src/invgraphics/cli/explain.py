@@ -1,4 +1,4 @@
-"""``invgraphics explain``: everything along one ray."""
+"""``invgraphics explain``: list and plot the contributions along one pixel's ray."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROWS = 24
 
 @dataclass(frozen=True)
 class Explain:
-    """Take one pixel apart: what its ray meets, how much light each thing adds, and how much it leaves for the next.
+    """List what one pixel's ray intersects: alpha, weight, transmittance and colour of every sample or Gaussian.
 
     Writes a figure (ray.png, ray.svg), a table (ray.csv) and the numbers of both (ray.json).
     """
@@ -42,7 +42,7 @@ class Explain:
     """Another copy of the scene, for instance where the data set has moved."""
 
     def run(self) -> int:
-        """Write; print the table and the figure's path."""
+        """Write figure and table; prints the table and the figure's path. Returns exit status 0."""
         pixel = parse_pixel(self.pixel)
         check_run(self.folder)
 
@@ -59,7 +59,7 @@ class Explain:
 
 
 def parse_pixel(text: str) -> tuple[int, int]:
-    """Read ``40,71``: column and row.
+    """Parse ``40,71`` to column and row.
 
     Raises:
         InputError: anything else.
@@ -71,7 +71,7 @@ def parse_pixel(text: str) -> tuple[int, int]:
 
 
 def show_contributions(explanation: Explanation) -> None:
-    """Print the contributions that weigh most, in the order in which they are composited."""
+    """Print the contributions of largest weight, in compositing order."""
     found = explanation.contributions
     heaviest = sorted(found.weight.argsort(descending=True)[:ROWS].tolist())
     names = ["distance (world)", "from", "to", "alpha", "T", "weight", "red", "green", "blue"]
@@ -87,20 +87,20 @@ def show_contributions(explanation: Explanation) -> None:
 
 
 def sentences(explanation: Explanation) -> list[str]:
-    """What the numbers add up to."""
+    """Summarise an explanation in sentences: opacity, colour against the truth, dead primitives and depths."""
     found, record, pixel = explanation.contributions, explanation.record, explanation.record.pixel
     through = 1 - found.opacity
     difference = float((explanation.rendered - explanation.composited).abs().max())
-    told = [
+    lines = [
         f"Σ T·α·colour = {_colour(found.colour.tolist())}, and {through:.4f} of the background {_colour(record.background)}",
         f"add up to {_colour(explanation.composited.tolist())}; the renderer's picture has "
         f"{_colour(explanation.rendered.tolist())} (largest difference {difference:.1e}), the truth {_colour(pixel.true)}.",
     ]
     if record.dead is not None:
-        told.append(f"In the whole model, {record.dead.sentence}")
+        lines.append(f"In the whole model, {record.dead.sentence}")
     depths = {"mean": pixel.expected, "median": pixel.median, "true": pixel.true_depth}
     known = [f"{name} {value:.4g}" for name, value in depths.items() if value is not None]
-    return [*told, f"Depth in world units: {', '.join(known)}."] if known else told
+    return [*lines, f"Depth in world units: {', '.join(known)}."] if known else lines
 
 
 def _colour(values: Sequence[float | None]) -> str:

@@ -1,4 +1,4 @@
-"""``invgraphics export``: a run's model as a file for other programs."""
+"""``invgraphics export``: write a run's model as a file for other programs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from invgraphics.runs.folder import check_run
 class Export:
     """Write a run's model, in the coordinates of the data set's world, as a file that other programs read.
 
-    Files of Gaussians are read back and rendered from the run's test cameras, to say what they lost.
+    Files of Gaussians are read back and rendered from the run's test cameras, to report the loss as PSNR.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -44,7 +44,7 @@ class Export:
     """For ply and spz: degree of the spherical harmonics in the file; bands that the run does not have are zeros."""
 
     def run(self) -> int:
-        """Write; print facts about the file."""
+        """Write the file and print facts about it; returns exit status 0."""
         known = plugins.names("exporters")
         if self.to not in known:
             raise InputError(

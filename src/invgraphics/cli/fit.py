@@ -1,4 +1,4 @@
-"""``invgraphics fit``: one run, which ends with its evaluation."""
+"""``invgraphics fit``: fit one method to one scene, and evaluate it."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Fit(Shared):
     snapshots: Annotated[int, arg(metavar="N")] = 0
     """Keep N states of the model, evenly over the fit, besides the first, for `invgraphics render RUN --path timelapse`."""
     resume: bool = False
-    """Go on with the run that --out holds, from its last checkpoint."""
+    """Continue the run in --out from its last checkpoint."""
 
     def run(self) -> int:
-        """Make the run; print its scores and its folder."""
+        """Run the fit; prints its scores and its folder. Returns exit status 0."""
         request = self.request()
         presets(self.method)  # refuses an unknown method before torch is imported
 
@@ -46,14 +46,14 @@ class Fit(Shared):
             folder = fit_run(request)
         except KeyboardInterrupt:
             if RunFolder(Path(request.out)).checkpoint.is_file():
-                print(f"{request.out} holds what was done; --resume goes on from there.", file=sys.stderr)
+                print(f"{request.out} holds the last checkpoint; --resume continues from there.", file=sys.stderr)
             raise
         show_scores(RunFolder(folder).read_scores())
         print(folder)
         return 0
 
     def request(self) -> FitRequest:
-        """The same as plain values, checked as far as that needs no data."""
+        """Convert the options to a validated request, without opening any data."""
         name = f"{Path(self.scene).resolve().name}-{slug(self.method)}-seed-{self.seed}"
         out = Path("runs") / name if self.out is None else self.out
         existing = "resume" if self.resume else "refuse"

@@ -1,4 +1,4 @@
-"""``invgraphics import``: a model that was trained elsewhere becomes a run."""
+"""``invgraphics import``: make a run of a file of Gaussians that was trained elsewhere."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class ImportFile:
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
     """How many test views are scored, evenly spaced."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
-    """Where to compute."""
+    """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
     """Force an implementation of the hot operations: numba, or reference (plain torch)."""
     protocol: Annotated[str, arg(metavar="NAME")] = "default"
     """How pictures are scored: default (rounded to 8 bits), or float."""
 
     def run(self) -> int:
-        """Make the run; print its scores and its folder."""
+        """Import and evaluate the file; prints scores and run folder. Returns exit status 0."""
         size = None if self.size is None else parse_size(self.size)
         views = parse_views(self.test_views)
         presets(self.method)  # refuses an unknown method before torch is imported

@@ -1,4 +1,4 @@
-"""``invgraphics import-photos``: a folder of photographs becomes a scene, camera poses included."""
+"""``invgraphics import-photos``: reconstruct a scene with camera poses from a folder of photographs."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _MOST_FILES = 10
 
 @dataclass(frozen=True, kw_only=True)
 class ImportPhotos:
-    """Find out where photographs were taken and what they show (structure from motion), and write a scene that fits can use.
+    """Reconstruct camera poses and points from photographs (structure from motion), and write them as a scene.
 
     The folder of the scene gets straight pictures, poses and points in COLMAP's format, quality.json, and a plot of cameras and
     points. Where a check finds the poses suspicious, other strategies are tried and the best result is kept. An interrupted
-    import goes on when the same command is given again; another mapper or lens finds the features and matches of the last one
+    import continues when the same command is given again; another mapper or lens finds the features and matches of the last one
     in FOLDER/.import, which may be deleted.
     """
 
@@ -50,7 +50,7 @@ class ImportPhotos:
     """Seed of all random choices."""
 
     def run(self) -> int:
-        """Reconstruct; print the quality and where the scene lies."""
+        """Reconstruct; prints the quality and the scene's folder. Returns exit status 0."""
         if self.single_camera and self.camera_per_photo:
             raise InputError("--single-camera and --camera-per-photo exclude each other.")
         if self.truth is not None and not self.truth.exists():
@@ -84,16 +84,16 @@ class ImportPhotos:
 
 
 def show_quality(quality: Mapping[str, Any]) -> None:
-    """Print how well the photographs could be put together, and what was left out."""
+    """Print the quality of the reconstruction, and the photographs that were left out."""
     show_table("Structure from motion", ("what", "found"), list(_rows(quality)))
     for kind, files in (("left out", quality["skipped"]), ("not placed", quality["unplaced"])):
         for name, why in list(files.items())[:_MOST_FILES]:
             print(f"{kind}: {name}: {why}")
         if len(files) > _MOST_FILES:
             print(f"{kind}: {len(files) - _MOST_FILES} more, see quality.json")
-    suspicion = quality["suspicion"]
-    if suspicion is not None and suspicion["suspicious"]:
-        print(f"SUSPICIOUS: {suspicion['sentence']}")
+    consistency = quality["consistency"]
+    if consistency is not None and consistency["suspicious"]:
+        print(f"SUSPICIOUS: {consistency['sentence']}")
 
 
 def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -105,8 +105,8 @@ def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         models = Counter(lens["model"] for lens in quality["lenses"])
         lenses = ", ".join(f"{count} {model}" for model, count in models.items())
         yield "cameras", f"{lenses}; distortion moves pixels by up to {quality['bend_px']:.1f} px"
-    if quality["suspicion"] is not None:
-        found = quality["suspicion"]
+    if quality["consistency"] is not None:
+        found = quality["consistency"]
         yield "pairs against poses", f"{found['contradicting']} of the {found['pairs']} best matched contradict them"
         yield "photographs in doubt", f"{len(found['doubtful'])} of {found['asked']}"
         yield "matches explained", f"{100 * found['support']:.0f} %"

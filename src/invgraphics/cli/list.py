@@ -1,4 +1,4 @@
-"""``invgraphics list``: what there is, and where each comes from. Imports no implementation."""
+"""``invgraphics list``: list methods, scenes and components with their origins. Imports no implementation."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class List:
     model-formats, exporters, executors, protocols; or matrix, the table of fields and renderers as Markdown."""
 
     def run(self) -> int:
-        """Print the tables."""
+        """Print the tables; returns exit status 0."""
         for kind in self.kinds:
             if kind not in KINDS:
                 raise InputError(f"There is no list of '{kind}'.{did_you_mean(kind, KINDS)}", f"Lists: {', '.join(KINDS)}.")
@@ -70,7 +70,7 @@ def _print_matrix() -> None:
 
 
 def _list_methods() -> None:
-    from invgraphics.recipes.presets import described
+    from invgraphics.recipes.presets import preset_summary
     from invgraphics.recipes.recipe import methods, source
 
     ours = find("renderers")
@@ -78,7 +78,7 @@ def _list_methods() -> None:
         (
             name,
             summary,
-            described(source(name).get("presets", {})),
+            preset_summary(source(name).get("presets", {})),
             "built in" if (ours / f"{name}.toml").is_file() else plugins.origin("recipes", name),
         )
         for name, summary in methods().items()

@@ -1,4 +1,4 @@
-"""``invgraphics locate``: where a photograph of a fitted scene was taken."""
+"""``invgraphics locate``: find the camera pose of a photograph of a fitted scene."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Locate:
     """File to write."""
 
     def run(self) -> int:
-        """Search; print the pose, the loss, and the error where the pose is known."""
+        """Search; prints the pose, the loss, and the error where the pose is known. Returns exit status 0."""
         check_run(self.folder)
         out = Path(f"{self.photo.stem}-located.json") if self.out is None else self.out
         if out.suffix != ".json":

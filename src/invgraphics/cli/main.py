@@ -1,4 +1,4 @@
-"""The console script: finds the command, reads its arguments, and turns what goes wrong into a sentence and an exit status.
+"""Console script: dispatches commands, and turns exceptions into a sentence and an exit status.
 
 Exit status: 0 done, 1 some cells failed, 2 bad input, 130 interrupted or terminated.
 """
@@ -21,27 +21,33 @@ from invgraphics.interruption import INTERRUPTED, end_on_sigterm
 COMMANDS = {
     "list": (
         "invgraphics.cli.list:List",
-        "what there is: methods, scenes, fields, renderers, metrics, and where each comes from",
+        "list methods, scenes, fields, renderers, metrics, and where each comes from",
     ),
-    "doctor": ("invgraphics.cli.doctor:Doctor", "what this machine offers, and what to do about what is missing"),
+    "doctor": ("invgraphics.cli.doctor:Doctor", "check this machine: processor, kernels, CUDA, extras, and what to install"),
     "make-scene": ("invgraphics.cli.make_scene:MakeScene", "render a scene's ground truth with Mitsuba"),
     "import-photos": (
         "invgraphics.cli.import_photos:ImportPhotos",
-        "find out where photographs were taken, and make a scene of them",
+        "structure from motion: make a scene of photographs, camera poses included",
     ),
     "fit": ("invgraphics.cli.fit:Fit", "fit one method to one scene, and evaluate it"),
     "evaluate": ("invgraphics.cli.evaluate:Evaluate", "score a run again from its model"),
     "rescore": ("invgraphics.cli.rescore:Rescore", "score saved pictures again, under the conventions of other tools"),
-    "compare": ("invgraphics.cli.compare:Compare", "fit several methods to one scene under one budget, and report who wins"),
+    "compare": (
+        "invgraphics.cli.compare:Compare",
+        "fit several methods to one scene under one budget, and rank them",
+    ),
     "ablate": ("invgraphics.cli.ablate:Ablate", "run a study: factors, levels and seeds, on this machine or a cluster"),
-    "view": ("invgraphics.cli.view:View", "look around in a run in a browser, during its fit too, or compare two"),
+    "view": ("invgraphics.cli.view:View", "view a run interactively in a browser, during its fit too, or compare two"),
     "render": ("invgraphics.cli.render:Render", "film a run: around the scene, from photograph to photograph, or its fit"),
-    "explain": ("invgraphics.cli.explain:Explain", "take one pixel apart: everything along its ray, as a figure and a table"),
-    "locate": ("invgraphics.cli.locate:Locate", "where a photograph was taken: its pose, found by descent in a fitted scene"),
+    "explain": (
+        "invgraphics.cli.explain:Explain",
+        "list and plot the contributions along one pixel's ray",
+    ),
+    "locate": ("invgraphics.cli.locate:Locate", "find a photograph's camera pose by gradient descent through a fitted scene"),
     "report": ("invgraphics.cli.report:Report", "write page, tables and figures from finished runs"),
-    "export": ("invgraphics.cli.export:Export", "write a run's model as a file for other programs, and say what it lost"),
+    "export": ("invgraphics.cli.export:Export", "write a run's model as a file for other programs, and report the loss"),
     "import": ("invgraphics.cli.import_file:ImportFile", "make a run of a model that was trained elsewhere, and evaluate it"),
-    "bench": ("invgraphics.cli.bench:Bench", "how fast the kernels are here, and what share of the machine they use"),
+    "bench": ("invgraphics.cli.bench:Bench", "time the kernels against the reference, the machine's limits and peers"),
 }
 """Name -> (``module:class`` of its arguments, summary). A class is imported when its command is given."""
 
@@ -76,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def run(arguments: Sequence[str], debug: bool = False) -> int:
-    """Run one command and return its exit status; with ``debug``, the traceback of what went wrong is shown."""
+    """Run one command and return its exit status; ``debug`` shows tracebacks of failures."""
     try:
         status = _dispatch(arguments)
         sys.stdout.flush()  # here, where a reader that has gone is no accident
@@ -108,12 +114,12 @@ def _dispatch(arguments: Sequence[str]) -> int:
 
 
 def overview() -> str:
-    """The text of ``invgraphics --help``."""
+    """Format the text of ``invgraphics --help``."""
     width = max(map(len, COMMANDS))
     commands = "\n".join(f"  {name:{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
-    return f"""usage: invgraphics COMMAND ...   (invgraphics COMMAND --help tells more; --debug shows tracebacks)
+    return f"""usage: invgraphics COMMAND ...   (invgraphics COMMAND --help for details; --debug shows tracebacks)
 
-Compare differentiable renderers: neural radiance fields, hash grids and Gaussian splats on one ruler.
+Compare differentiable renderers: neural radiance fields, hash grids and Gaussian splats under one protocol.
 
 {commands}
 
@@ -121,7 +127,7 @@ Start with:  invgraphics compare bricks --methods volumetric/hash,splatting/gaus
 
 
 def explain(error: Exception) -> tuple[int, list[str]]:
-    """Exit status and lines for a person."""
+    """Map an exception to an exit status and lines for standard error."""
     if isinstance(error, InputError):
         return BAD_INPUT, str(error).splitlines()
     if isinstance(error, NumericalError):
@@ -141,7 +147,7 @@ def explain(error: Exception) -> tuple[int, list[str]]:
 
 
 def _command(name: str) -> Any:
-    """The class of a command's arguments."""
+    """Import the class of a command's arguments."""
     if name not in COMMANDS:
         raise InputError(f"There is no command '{name}'.{did_you_mean(name, COMMANDS)}", f"Commands: {', '.join(COMMANDS)}.")
     module, _, attribute = COMMANDS[name][0].partition(":")

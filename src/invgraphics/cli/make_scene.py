@@ -1,4 +1,4 @@
-"""``invgraphics make-scene``: ground truth with Mitsuba, cached by content."""
+"""``invgraphics make-scene``: render a scene's ground truth with Mitsuba, cached by content."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class MakeScene:
     """Copy the data set here."""
 
     def run(self) -> int:
-        """Render, or find in the cache; print where the data set lies."""
+        """Render, or find in the cache; prints the data set's folder. Returns exit status 0."""
         size = None if self.size is None else self._size(self.size)
         if self.out is not None:
             _check_target(self.out)
@@ -55,7 +55,7 @@ class MakeScene:
         return 0
 
     def _size(self, text: str) -> tuple[int, int]:
-        """Width and height; a longest side alone keeps the scene's own proportions."""
+        """Width and height in pixels; a longest side alone keeps the scene's aspect ratio."""
         size = parse_size(text)
         if isinstance(size, tuple):
             return size
@@ -67,7 +67,7 @@ class MakeScene:
 
 
 def _check_target(out: Path) -> None:
-    """Find out before anything is rendered whether the copy can be put there."""
+    """Check before rendering that the copy can be written."""
     taken = out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / "truth.json").is_file()))
     if taken:
         raise InputError(f"{out} already exists and holds something else.", "Choose a new or empty folder.")

@@ -1,4 +1,4 @@
-"""What commands print on standard output: tables."""
+"""Tables on standard output."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ PIPED_WIDTH = 160
 
 
 def show_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; its first column is never broken."""
+    """Print a table whose first column is never wrapped.
+
+    Args:
+        title: line above the table.
+        columns: headings.
+        rows: texts, one per column.
+    """
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -32,7 +38,7 @@ def show_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
 
 
 def show_scores(scores: Scores) -> None:
-    """Print a run's scores, and what could not be computed."""
+    """Print a run's scores and costs, and the metrics that were skipped."""
     rows = [
         (name, "-" if score.mean is None else f"{score.mean:.4g}", score.unit, "higher" if score.higher_is_better else "lower")
         for name, score in scores.quality.items()
@@ -43,12 +49,16 @@ def show_scores(scores: Scores) -> None:
         print(f"Test poses: {scores.test_poses}. Pose errors are medians over the training views.")
     if scores.skipped:
         print(not_scored(scores.skipped))
-    if scores.shortfall:
-        print(scores.shortfall)
+    if scores.below_baseline:
+        print(scores.below_baseline)
 
 
 def not_scored(skipped: Mapping[str, str]) -> str:
-    """One line on the metrics that have no value and why, those with one reason together."""
+    """Format the skipped metrics and their reasons in a line, grouped by reason.
+
+    Args:
+        skipped: metric -> reason, as in `Scores.skipped`.
+    """
     reasons: dict[str, list[str]] = {}
     for name, why in skipped.items():
         absent = why.removeprefix(NO_TRUTH)

@@ -1,4 +1,4 @@
-"""``invgraphics render``: a film of a run."""
+"""``invgraphics render``: film a run along a camera path, or its fit over time."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Render:
     """Another copy of the scene, for instance where the data set has moved."""
 
     def run(self) -> int:
-        """Film; print the file."""
+        """Render the film and print its path; returns exit status 0."""
         size = None if self.size is None else parse_size(self.size)
         check_run(self.folder)
 
@@ -60,7 +60,7 @@ class Render:
 
 
 def parse_path(text: str | None) -> FilmPath | Path | None:
-    """The name of a camera path, or the file of a saved one.
+    """Parse the name of a camera path or the file of a saved one.
 
     Raises:
         InputError: neither.

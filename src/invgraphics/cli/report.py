@@ -1,4 +1,4 @@
-"""``invgraphics report``: page, tables and figures from run folders."""
+"""``invgraphics report``: write page, tables and figures from run folders."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Report:
     """Leave out absolute paths, user names and host names; writes to FOLDER-public unless --out says otherwise."""
 
     def run(self) -> int:
-        """Write the report; print the page's path."""
+        """Write the report and print the page's path; returns exit status 0."""
         from invgraphics.report.data.studies import is_study
 
         if not self.folders:
@@ -48,7 +48,7 @@ class Report:
         return 0
 
     def _study(self, folder: Path, out: Path | None) -> int:
-        """Write a study's report; print what its factors do and the page's path."""
+        """Write a study's report; prints the effects of its factors and the page's path."""
         if len(self.folders) > 1:
             raise InputError("A study is reported alone.", "Give one study's folder, and nothing else.")
         from invgraphics.report.study import build_study_report, study_sentences
@@ -61,7 +61,7 @@ class Report:
 
 
 def runs_in(folder: Path) -> list[Path]:
-    """The run that ``folder`` is, or the finished runs of the comparison that it is.
+    """List the finished runs of a folder: itself if it is a run, else those of the comparison.
 
     Raises:
         InputError: it is neither.
@@ -76,7 +76,16 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def write_report(folder: Path, out: Path | None = None, public: bool = False) -> None:
-    """Write the report of a comparison's folder, into itself or into ``out``; print its table and the page's path."""
+    """Write a comparison's report into its folder or ``out``; prints its table and the page's path.
+
+    Args:
+        folder: of a comparison.
+        out: folder of the page; ``None`` for ``folder`` itself.
+        public: whether absolute paths, user names and host names are left out.
+
+    Raises:
+        InputError: the folder is no comparison, or a file in it is missing or broken.
+    """
     from invgraphics.report.build import build_report
     from invgraphics.report.data.comparison import read_comparison
     from invgraphics.report.statistics.summary import summarise
@@ -90,7 +99,7 @@ def write_report(folder: Path, out: Path | None = None, public: bool = False) ->
         cells = [row.cells[index] for row in summary.rows]
         rows.append([column.heading, *(f"{cell.text} {cell.spread}{' *' if cell.best else ''}".strip() for cell in cells)])
     show_table(f"{comparison.question} (* best)", ["", *(row.label for row in summary.rows)], rows)
-    for sentence in dict.fromkeys(run.scores.shortfall for run in comparison.runs if run.scores.shortfall):
+    for sentence in dict.fromkeys(run.scores.below_baseline for run in comparison.runs if run.scores.below_baseline):
         print(sentence)
     for failure in comparison.failures:
         print(

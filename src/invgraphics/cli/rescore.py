@@ -1,4 +1,4 @@
-"""``invgraphics rescore``: score saved pictures again, under the conventions of other tools."""
+"""``invgraphics rescore``: score saved pictures under the conventions of other tools."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Rescore:
     """Score saved pictures again under named protocols: those of a run, or of any tool. `list protocols` explains them."""
 
     folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|FOLDER ...", help_behavior_hint="(one or more)")]
-    """Runs, comparisons, or folders of predicted pictures (3DGS's renders/ + gt/ and nerfbaselines' color/ + gt-color/ bring
+    """Runs, comparisons, or folders of predicted pictures (3DGS's renders/ + gt/ and nerfbaselines' color/ + gt-color/ contain
     their truth). Several must share their truth."""
     protocol: Annotated[str, arg(metavar="NAME,NAME|all")] = "all"
     """Protocols, with commas between them."""
@@ -31,19 +31,19 @@ class Rescore:
     background: Annotated[str | None, arg(metavar="white|black|R,G,B", help_behavior_hint="(default: not stated)")] = None
     """The data set's background, and what pictures without alpha show where the scene is transparent; runs know theirs."""
     allow_8bit: bool = False
-    """Let 8-bit pictures stand in where a protocol wants unrounded predictions."""
+    """Accept 8-bit pictures where a protocol needs unrounded predictions."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: into the run)")] = None
     """Where to write scores, and the table as Markdown and CSV."""
 
     def run(self) -> int:
-        """Score; print a table for each set of pictures."""
+        """Score; prints a table for each set of pictures. Returns exit status 0."""
         background = None if self.background is None else parse_colour(self.background)
         if not self.folders:
             raise InputError("There is nothing to score.", "Give a run, or a folder of predicted pictures.")
 
         from invgraphics.tools.predictions import open_pictures
         from invgraphics.tools.rescore import protocols_named, rescore
-        from invgraphics.tools.rescoring import reasons, rows_of, winners, write_scores, write_tables
+        from invgraphics.tools.rescoring import best_sets, rows_of, skip_reasons, write_scores, write_tables
 
         protocols = protocols_named(self.protocol)
         compared = {folder: RunFolder(folder).has(ComparisonRecord) for folder in self.folders}
@@ -53,10 +53,10 @@ class Rescore:
             width, height = one.pictures.size
             title = f"{one.label}: {len(one.pictures.names)} views of {width}x{height}, truth {one.pictures.sha256[:12]}"
             show_table(title, *rows_of(one))
-            for line in reasons(one):
+            for line in skip_reasons(one):
                 print(line)
             write_scores(one, None if self.out is None else self.out / one.label.replace("/", "-"))
-        for sentence in (winners(results, "psnr"), winners(results, "ssim")):
+        for sentence in (best_sets(results, "psnr"), best_sets(results, "ssim")):
             if sentence:
                 print(sentence)
         if self.out is not None:
@@ -66,7 +66,7 @@ class Rescore:
 
 
 def parse_colour(text: str) -> tuple[float, float, float]:
-    """Read ``white``, ``black``, or three numbers in [0, 1].
+    """Parse ``white``, ``black``, or three numbers in [0, 1].
 
     Raises:
         InputError: anything else.

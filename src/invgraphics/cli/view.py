@@ -1,4 +1,4 @@
-"""``invgraphics view``: interactive viewer of a run in a browser."""
+"""``invgraphics view``: interactive viewer of runs in a browser."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from invgraphics.errors import InputError
 class View:
     """View a run in a browser, or two of one scene side by side: at reduced resolution while moving, at full size at rest.
 
-    Shows prediction, truth, error, depth and normals, and the photographs where they were taken. Ctrl-C ends it.
+    Shows prediction, truth, error, depth and normals, and the photographs where they were taken. Ctrl-C stops it.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -33,7 +33,7 @@ class View:
     view: Annotated[int, arg(metavar="N")] = 0
     """Test view to start at."""
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen at. The default is reachable from this machine only; 0.0.0.0 lets everyone in who can reach it."""
+    """Address to listen at. The default is reachable from this machine only; 0.0.0.0 from any machine."""
     port: Annotated[int, arg(metavar="N")] = 8080
     """Port to listen at; 0 for any that is free."""
     max_size: Annotated[int, arg(metavar="N")] = 800
@@ -44,7 +44,7 @@ class View:
     """Another copy of the scene, for instance where the data set has moved."""
 
     def run(self) -> int:
-        """Serve until Ctrl-C."""
+        """Serve until Ctrl-C; returns exit status 0."""
         if self.max_size < SMALLEST:
             raise InputError(f"--max-size cannot be {self.max_size}.", f"Expected {SMALLEST} pixels or more.")
 
@@ -52,12 +52,12 @@ class View:
 
         runs = (self.folder,) if self.other is None else (self.folder, self.other)
         config = ViewerConfig(runs, self.live, self.view, self.host, self.port, self.max_size, self.scene)
-        with open_viewer(config, _say) as viewer:
+        with open_viewer(config, _notify) as viewer:
             host = self.host if is_loopback(self.host) else "localhost"
             url = f"http://{f'[{host}]' if ':' in host else host}:{viewer.port}"
             if not is_loopback(self.host):
-                _say(f"Everyone who can reach port {viewer.port} of this machine can look at these runs.")
-            print(f"Looking at {' and '.join(map(str, runs))}: {url} (Ctrl-C ends)", flush=True)
+                _notify(f"Everyone who can reach port {viewer.port} of this machine can view these runs.")
+            print(f"Serving {' and '.join(map(str, runs))}: {url} (Ctrl-C to stop)", flush=True)
             if self.open and _has_screen():
                 webbrowser.open(url)
             with contextlib.suppress(KeyboardInterrupt):
@@ -66,9 +66,9 @@ class View:
 
 
 def _has_screen() -> bool:
-    """Whether there is a display; without one a text browser would take over the terminal."""
+    """Whether there is a display; without one ``webbrowser`` would start a text browser in the terminal."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def _say(sentence: str) -> None:
+def _notify(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)

@@ -18,7 +18,7 @@ from invgraphics.core.spacing import from_spacing, to_spacing
 
 POINTS = 512
 """Points of a profile."""
-DARK = 1e-6
+MIN_TRANSMITTANCE = 1e-6
 """Transmittance below which opacities cannot be told from weights: they are lost in rounding."""
 
 
@@ -173,7 +173,7 @@ def sampled_contributions(field: Field, trace: Trace, rays: Rays, ctx: Context) 
 def opacities(weight: Float[Tensor, " k"]) -> tuple[Float[Tensor, " k"], Float[Tensor, " k_plus_1"]]:
     """Opacities of a ray's samples from their weights; and the transmittance before each and at the end."""
     reached = 1 - torch.nn.functional.pad(weight.double().cumsum(0), (1, 0))
-    alpha = (weight / reached[:-1].clamp_min(DARK)).clamp(0, 1)
+    alpha = (weight / reached[:-1].clamp_min(MIN_TRANSMITTANCE)).clamp(0, 1)
     return alpha.to(weight.dtype), reached.clamp(0, 1).to(weight.dtype)
 
 

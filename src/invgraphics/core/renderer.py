@@ -18,23 +18,23 @@ from invgraphics.core.samples import Samples
 from invgraphics.errors import NotComposableError
 
 
-class _Learning(nn.Module):
-    """A module whose state a fit may learn, and for which constants may stand in."""
+class _StatefulModule(nn.Module):
+    """Module whose learnt state may have a constant substitute."""
 
     def untrained(self) -> Self:
         """This module with constants in place of learnt state, for fields that it was not trained with; may be itself.
 
         Raises:
-            NotComposableError: it has state, and no constants stand in for it.
+            NotComposableError: it has state without a constant substitute.
         """
         if self.state_dict():
             raise NotComposableError(
-                f"{type(self).__name__} has learnt state for which no constants stand in.", "It needs a fit of its own."
+                f"{type(self).__name__} has learnt state without a constant substitute.", "It needs a fit of its own."
             )
         return self
 
 
-class Sampler(_Learning, ABC):
+class Sampler(_StatefulModule, ABC):
     """Places samples along rays. May own parameters (proposal networks) and buffers (occupancy grids)."""
 
     @abstractmethod
@@ -62,7 +62,7 @@ class Sampler(_Learning, ABC):
         return None
 
 
-class Renderer(_Learning, ABC):
+class Renderer(_StatefulModule, ABC):
     """Renders a field from a camera, differentiably in the field and in the camera's pose.
 
     Attributes:

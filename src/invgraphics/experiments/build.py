@@ -7,8 +7,8 @@ import torch
 from invgraphics import kernels
 from invgraphics.core import Model, RayRenderer, Renderer, Scene
 from invgraphics.errors import InputError
+from invgraphics.experiments.memory_check import check_memory
 from invgraphics.experiments.progress import Reporter
-from invgraphics.experiments.requested import check_request
 from invgraphics.recipes.recipe import Method
 from invgraphics.recipes.schema import Recipe
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -44,7 +44,7 @@ def open_with_progress(spec: str, options: SceneOptions) -> Scene:
 
 def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -> Model:
     """Build a method's field and renderer for a scene; initial values depend on ``seed`` only."""
-    check_request(method, scene)
+    check_memory(method, scene)
     torch.manual_seed(seed)
     model = Model(method.recipe.field.build(scene), method.recipe.renderer.build(scene), scene.bounds)
     training = method.recipe.training
@@ -87,7 +87,7 @@ def use_kernels(name: str | None) -> None:
     kernels.warm_up()
 
 
-def repeatable(device: torch.device) -> None:
+def use_deterministic_algorithms(device: torch.device) -> None:
     """Use torch's deterministic algorithms on a CPU, where the same seed and thread count then give the same bits."""
     torch.use_deterministic_algorithms(device.type == "cpu", warn_only=True)
     torch.utils.deterministic.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]  # a debugging aid, slow

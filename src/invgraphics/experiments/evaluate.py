@@ -133,7 +133,7 @@ def score_model(
         cost=_model_costs(model, scene, statistics.median(seconds)),
         quality=quality if posed is None else quality | posed.quality(),
         skipped=skipped,
-        shortfall=below_baseline(title, quality, statistics_of_views, scene, rules),
+        below_baseline=below_baseline(title, quality, statistics_of_views, scene, rules),
     )
 
 

@@ -114,5 +114,5 @@ def _method(folder: RunFolder, provenance: Provenance) -> Method:
         if not missing:
             raise
         names = ", ".join(f"'{name}'" for name, package in used.items() if package in missing)
-        sentence = f"{folder.root} was made with {', '.join(missing)}, which brings {names} and is not installed here."
+        sentence = f"{folder.root} was made with {', '.join(missing)}, which provides {names} and is not installed here."
         raise InputError(sentence, "Install the package into this environment.") from error

@@ -53,7 +53,7 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
             "truth": truth.pixels,
             "cameras": truth.cameras,
             "data": job.data.changes(),
-            "request": _asked(job),
+            "request": _result_settings(job),
             "code": code_version(),
             "threads": threads,
         }
@@ -92,10 +92,10 @@ def define(job: Job) -> str:
     scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}
     scene |= {} if request.spp is None else {"spp": request.spp}  # so that studies without keep their folders' names
     parts = {"method": job.method.name, "recipe": job.method.digest, "data": job.data.changes()}
-    return sha256_of(_asked(job) | scene | parts)
+    return sha256_of(_result_settings(job) | scene | parts)
 
 
-def _asked(job: Job) -> dict[str, Any]:
+def _result_settings(job: Job) -> dict[str, Any]:
     """Collect the request's settings that determine a result; budgets are normalised, whatever their spelling."""
     settings = {key: getattr(job.request, key) for key in ("seed", "device", "kernels", "protocol")}
     return settings | {"budget": str(job.budget)}

@@ -36,7 +36,7 @@ def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method
     """Check before fitting that each renderer can render the methods' fields.
 
     Raises:
-        InputError: a renderer is named twice, has learnt state for which no constants stand in, or needs what a field does
+        InputError: a renderer is named twice, has learnt state without a constant substitute, or needs what a field does
             not provide.
     """
     if len({variant.folder for variant in variants}) != len(variants):
@@ -52,7 +52,7 @@ def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method
                 raise InputError(sentence, error.remedy) from error
 
 
-def rendered(job: Job) -> bool:
+def renderings_complete(job: Job) -> bool:
     """Whether every rendering requested by a job exists and belongs to the current fit."""
     if not job.variants:
         return True
@@ -70,7 +70,7 @@ def render_missing(job: Job, scene: Scene) -> None:
         job: of the fit.
         scene: the scene as loaded.
     """
-    if rendered(job):
+    if renderings_complete(job):
         return
     folder, method = job.folder, job.method
     folder.remove(Renderings)

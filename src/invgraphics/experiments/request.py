@@ -1,4 +1,4 @@
-"""What a run or a comparison is asked to do: plain values, light to import, able to travel to another process as JSON."""
+"""Requests of fits, comparisons and studies: plain values, light to import, serialisable as JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DATA = "data."
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What single runs and comparisons have in common.
+    """Settings shared by fits and comparisons.
 
     Attributes:
         scene: built-in scene or path of a data set.
@@ -51,16 +51,16 @@ class Settings:
 
     @property
     def recipe_overrides(self) -> tuple[str, ...]:
-        """The overrides of the recipe."""
+        """``key=value`` overrides of the recipe."""
         return tuple(item for item in self.overrides if not item.startswith(DATA))
 
     @property
     def data_overrides(self) -> tuple[str, ...]:
-        """The overrides of the training data, with their prefix."""
+        """``data.key=value`` overrides of the training data, prefix included."""
         return tuple(item for item in self.overrides if item.startswith(DATA))
 
     def flags(self) -> list[str]:
-        """The common part of the command that reproduces this request."""
+        """Command-line flags of the shared settings."""
         words = ["--budget", self.budget]
         words += ["--preset", self.preset] if self.preset else []
         if self.size is not None:
@@ -77,7 +77,7 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class FitRequest(Settings):
-    """One run.
+    """Request of one fit: method, scene, seed and folder.
 
     Attributes:
         method: ``renderer/recipe`` or the path of a recipe; changes may follow (see `invgraphics.recipes.recipe.split_name`).
@@ -95,24 +95,24 @@ class FitRequest(Settings):
     snapshots: int = 0
 
     def shell(self) -> str:
-        """The command that makes this run."""
+        """Shell command that repeats this fit."""
         kept = ["--snapshots", str(self.snapshots)] if self.snapshots else []
         return shlex.join(["invgraphics", "fit", self.method, self.scene, "--seed", str(self.seed), *kept, *self.flags()])
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for a job file."""
+        """Convert the request to plain JSON values."""
         return asdict(self)
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> FitRequest:
-        """Inverse of `to_json`; JSON knows no tuples."""
+        """Parse a request (inverse of `to_json`; lists become tuples)."""
         plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
         return FitRequest(**plain)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompareRequest(Settings):
-    """Several methods on one scene.
+    """Request of a comparison: several methods on one scene.
 
     Attributes:
         methods: in the order of the report.
@@ -123,7 +123,7 @@ class CompareRequest(Settings):
     seeds: tuple[int, ...] = (0,)
 
     def fits(self) -> list[FitRequest]:
-        """One request per method and seed."""
+        """List the fit requests, one per method and seed."""
         shared: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(Settings)}
         shared |= {"existing": "reuse", "truth": str(Path(self.out) / "truth")}
         return [
@@ -133,18 +133,18 @@ class CompareRequest(Settings):
         ]
 
     def folder(self, method: str, seed: int) -> Path:
-        """The run folder of one cell."""
+        """Run folder of one method and seed."""
         return Path(self.out) / "runs" / slug(method) / f"seed-{seed}"
 
     def shell(self) -> str:
-        """The command that makes this comparison."""
+        """Shell command that repeats this comparison."""
         chosen = ["--methods", ",".join(self.methods), "--seeds", ",".join(map(str, self.seeds))]
         return shlex.join(["invgraphics", "compare", self.scene, *chosen, *self.flags()])
 
 
 @dataclass(frozen=True, kw_only=True)
 class AblateRequest:
-    """A study, and what the command line says about it.
+    """Request of a study, with the overrides of the command line.
 
     Attributes:
         study: a built-in study's name, or the path of a ``study.toml``.
@@ -185,7 +185,7 @@ class AblateRequest:
     most_seconds: float | None = None
 
     def shell(self) -> str:
-        """The command that makes this study."""
+        """Shell command that repeats this study."""
         size = self.size if not isinstance(self.size, tuple) else "x".join(map(str, self.size))
         given = {
             "--out": self.out,

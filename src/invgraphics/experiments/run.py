@@ -18,7 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import (
     build_plan,
     open_with_progress,
-    repeatable,
+    use_deterministic_algorithms,
     use_kernels,
 )
 from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average, processor_share
@@ -32,7 +32,7 @@ from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder
 from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
-from invgraphics.experiments.start import MemoryForecast, memory_forecast, started
+from invgraphics.experiments.start import MemoryForecast, initialise_field, memory_forecast
 from invgraphics.interruption import INTERRUPTED, end_on_sigterm, end_with_parent
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
@@ -43,7 +43,7 @@ from invgraphics.runs.folder import TRUTH, RunFolder
 from invgraphics.runs.provenance import LoadAverage, Options, Provenance
 from invgraphics.runs.schema import write_json
 from invgraphics.scenes.degrade import degrade
-from invgraphics.scenes.open import choices
+from invgraphics.scenes.open import selection_notes
 from invgraphics.training.fit import Fit
 
 
@@ -75,7 +75,7 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
     if request.existing == "resume":
         _check_existing(job)  # before the folder is made
     folder.create()
-    repeatable(job.device)
+    use_deterministic_algorithms(job.device)
     with folder.held(wait=request.existing == "reuse"):  # by a child of a killed comparison or study, which is about to end
         _check_existing(job)
         scene = scene or open_with_progress(request.scene, job.options)
@@ -104,8 +104,8 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
             folder.write(describe(job, (scene, shown), identity))
             forecast = warm_up(fit, method, memory)
             folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
-            if "suspicion" in scene.notes:
-                warn(f"SUSPICIOUS poses: {scene.notes['suspicion']}")
+            if "inconsistent_poses" in scene.notes:
+                warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
             for sentence in (*announcements([method.choice]), _prediction(job, fit, forecast)):
                 print(sentence, file=sys.stderr)
             Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots, on_step).run()
@@ -125,14 +125,14 @@ def prepare(job: Job, shown: Scene) -> Fit:
         InputError: method and scene do not go together, or what the method starts from cannot be used.
     """
     plan = build_plan(job.method, shown, job.budget, job.request.seed, job.device)
-    return Fit(started(plan, job.method, job.request.scene))
+    return Fit(initialise_field(plan, job.method, job.request.scene))
 
 
 def _check_existing(job: Job) -> None:
     folder, request = job.folder, job.request
     present = folder.has(Provenance)
     if request.existing == "refuse" and present:
-        raise InputError(f"{folder.root} already holds a run.", "Add --resume to go on with it, or choose another --out.")
+        raise InputError(f"{folder.root} already holds a run.", "Add --resume to continue it, or choose another --out.")
     if request.existing == "resume" and not present:
         raise InputError(f"{folder.root} holds no run to resume.", "Leave --resume away to start one.")
     if request.existing == "reuse":
@@ -156,7 +156,7 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     scene = fit.plan.scene
-    return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{choices(scene)}"
+    return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{selection_notes(scene)}"
 
 
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
@@ -206,7 +206,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance
         data=job.data.changes(),
         notes=shown.notes,
         code_version=code_version(),
-        plugins=plugins.brought(method.table, method.name),
+        plugins=plugins.used_plugins(method.table, method.name),
         command=request.shell(),
         options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
         device=str(job.device),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import final
 
 from invgraphics.core import Model, Scene
-from invgraphics.experiments.build import repeatable, use_kernels
+from invgraphics.experiments.build import use_deterministic_algorithms, use_kernels
 from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.display import curve_svg, table_html
 from invgraphics.experiments.evaluate import score_model
@@ -141,7 +141,7 @@ class FittedRun(ABC):
             renderer: a method's name; settings of its renderer may follow, ``gaussian-volume/exact:steps=8``.
 
         Raises:
-            InputError: that renderer needs what the field does not provide, or learnt state for which no constants stand in.
+            InputError: that renderer needs what the field does not provide, or has learnt state without a constant substitute.
         """
         variant = variant_named(renderer)
         check_variants([variant], [self.method], self.scene)
@@ -178,7 +178,7 @@ class MemoryRun(FittedRun):
         self._job, self._on_step = job, on_step
         self._history: list[Moment] = []
         self._scores: ScoreTable | None = None
-        repeatable(job.device)
+        use_deterministic_algorithms(job.device)
         use_kernels(job.request.kernels)
         with PeakMemory(job.device) as memory:
             self.fit = prepare(job, degrade(scene, job.data, job.request.seed))
@@ -192,7 +192,7 @@ class MemoryRun(FittedRun):
         except Terminated:
             raise
         except KeyboardInterrupt:
-            print(f"Interrupted after {self.fit.steps} steps; resume() goes on.", file=sys.stderr)
+            print(f"Interrupted after {self.fit.steps} steps; resume() continues.", file=sys.stderr)
         finally:
             self._history += recorder.history
             self._scores = None

@@ -11,7 +11,7 @@ import torch
 from invgraphics.core import RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
-from invgraphics.experiments.requested import COPIES, RAY_BYTES
+from invgraphics.experiments.memory_check import COPIES, RAY_BYTES
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder, check_run
@@ -32,7 +32,7 @@ BASE_BYTES = 50 * 10**6
 the forecast, or exceeded it by 12."""
 
 
-def started(plan: Plan, method: Method, scene_spec: str) -> Plan:
+def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:
     """Initialise the plan's field by conversion from the run that the recipe's ``field.source`` names, if any.
 
     Raises:

@@ -20,7 +20,7 @@ SAMPLES = 512
 """Intervals along a ray."""
 RAYS = 512
 """Rays that are looked along at once."""
-EFFORT = 64
+MAX_RAYS_PER_POINT = 64
 """Rays tried per wanted point before a field counts as empty enough."""
 
 
@@ -47,8 +47,8 @@ def visible_points(field: Field, scene: Scene, count: int) -> Points:
         raise InputError(f"{type(field).__name__} provides {field.provides.words()}, not density and radiance.", remedy)
     device = next((parameter.device for parameter in field.parameters()), torch.device("cpu"))
     parts, found = [], 0
-    for rays in _random_rays(scene, EFFORT * count):
-        part = _drawn(field, rays.to(device), scene.bounds.to(device))
+    for rays in _random_rays(scene, MAX_RAYS_PER_POINT * count):
+        part = _sample_surface_points(field, rays.to(device), scene.bounds.to(device))
         parts.append(part)
         found += len(part)
         if found >= count:
@@ -67,7 +67,7 @@ def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
         yield camera.rays(torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5)
 
 
-def _drawn(field: Field, rays: Rays, bounds: Bounds) -> Points:
+def _sample_surface_points(field: Field, rays: Rays, bounds: Bounds) -> Points:
     """Sample at most one point per ray by its rendering weights; rays pass through with probability 1 - alpha."""
     rays = bounds.clip(rays)
     edges = _edges(rays, bounds)

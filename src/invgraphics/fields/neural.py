@@ -106,20 +106,20 @@ class NeuralFieldConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class _Answers:
+class _NetworkOutputs:
     """Outputs of both networks on one chunk.
 
     Attributes:
         raw: density before its activation, or signed distance.
         radiance: colour; ``None`` where it is not wanted.
-        slope: gradient of ``raw`` in the encoding's features; ``None`` without normals.
-        handed: features that the geometry network hands to the colour network; ``None`` where they are not wanted.
+        feature_grad: gradient of ``raw`` in the encoding's features; ``None`` without normals.
+        geometry_features: outputs of the geometry network that the colour network takes; ``None`` where they are not wanted.
     """
 
     raw: Float[Tensor, " m"]
     radiance: Float[Tensor, "m 3"] | None
-    slope: Float[Tensor, "m f"] | None
-    handed: Float[Tensor, "m h"] | None
+    feature_grad: Float[Tensor, "m f"] | None
+    geometry_features: Float[Tensor, "m h"] | None
 
 
 class NeuralField(Field):
@@ -187,21 +187,21 @@ class NeuralField(Field):
             if with_normal and not (training and position.requires_grad):
                 position = position.detach().requires_grad_()
             features = self._encode(samples, position)
-            parts = [self._answer(*chunk, want, training) for chunk in self._chunks(features, samples.direction)]
+            parts = [self._evaluate(*chunk, want, training) for chunk in self._chunks(features, samples.direction)]
             raw = torch.cat([part.raw for part in parts])
             normal = None
             if with_normal:
-                slope = torch.cat([part.slope for part in parts if part.slope is not None])
-                (gradient,) = torch.autograd.grad(features, position, slope, create_graph=training)
+                feature_grad = torch.cat([part.feature_grad for part in parts if part.feature_grad is not None])
+                (gradient,) = torch.autograd.grad(features, position, feature_grad, create_graph=training)
                 normal = normalize(gradient if self.config.geometry == "sdf" else -gradient, dim=1)
         radiances = [part.radiance for part in parts if part.radiance is not None]
-        handed = [part.handed for part in parts if part.handed is not None]
+        geometry_features = [part.geometry_features for part in parts if part.geometry_features is not None]
         return FieldValues(
             density=self._density(raw, samples.position) if Quantity.DENSITY in want else None,
             sdf=raw * self.bounds.half.mean() if Quantity.SDF in want else None,
             radiance=torch.cat(radiances) if Quantity.RADIANCE in want else None,
             normal=normal,
-            features=torch.cat(handed) if Quantity.FEATURES in want else None,
+            features=torch.cat(geometry_features) if Quantity.FEATURES in want else None,
         )
 
     @override
@@ -217,7 +217,7 @@ class NeuralField(Field):
         if not plain or not here or not isinstance(encoding, HashEncoding):
             return None
         # Entries of other widths have no compiled kernel, and the plain one keeps every sample of a picture.
-        if encoding.detail is not None or encoding.grid.features != 2:
+        if encoding.window_alpha is not None or encoding.grid.features != 2:
             return None
         geometry, colour = (net.layers() for net in (self.geometry_net, self.colour_net))
         bands = config.direction_degree if config.direction == "sh" else 0
@@ -246,22 +246,22 @@ class NeuralField(Field):
         size = CPU_CHUNK if features.device.type == "cpu" else max(len(features), 1)
         return zip(features.split(size), direction.split(size), strict=True)
 
-    def _answer(self, features: Tensor, direction: Tensor, want: Quantity, training: bool) -> _Answers:
+    def _evaluate(self, features: Tensor, direction: Tensor, want: Quantity, training: bool) -> _NetworkOutputs:
         """Evaluate both networks on one chunk; detached unless ``training``."""
         with_colour = Quantity.RADIANCE in want
         if Quantity.NORMAL in want and not training:
             # Starting the chunk's graph here keeps it from growing over all chunks.
             features = features.detach().requires_grad_()
         outputs = self.geometry_net(features, None if with_colour or Quantity.FEATURES in want else 1)
-        raw, slope = outputs[:, 0], None
+        raw, feature_grad = outputs[:, 0], None
         if Quantity.NORMAL in want:
-            (slope,) = torch.autograd.grad(raw.sum(), features, create_graph=training)
+            (feature_grad,) = torch.autograd.grad(raw.sum(), features, create_graph=training)
         if not training:
             raw, outputs = raw.detach(), outputs.detach()
         with torch.set_grad_enabled(training):
-            handed = outputs[:, 1:]
-            radiance = self._radiance(handed, direction) if with_colour else None
-            return _Answers(raw, radiance, slope, handed if Quantity.FEATURES in want else None)
+            geometry_features = outputs[:, 1:]
+            radiance = self._radiance(geometry_features, direction) if with_colour else None
+            return _NetworkOutputs(raw, radiance, feature_grad, geometry_features if Quantity.FEATURES in want else None)
 
     def _radiance(self, geometry: Tensor, direction: Tensor) -> Float[Tensor, "m 3"]:
         degree = self.config.direction_degree

@@ -121,7 +121,7 @@ def checked(splats: Splats, path: Path) -> Splats:
     return replace(splats, gaussians=mended, notes=(*splats.notes, f"{int(still.sum())} rotations of length zero."))
 
 
-def cut_off(path: Path, expected: int, present: int) -> InputError:
+def truncation_error(path: Path, expected: int, present: int) -> InputError:
     """The error for a truncated file, with both sizes in bytes."""
     return InputError(f"'{path}' is cut off: {expected} bytes are expected, {present} are there.", "Copy the file again.")
 

@@ -62,11 +62,11 @@ class CompressedPly:
         rgba = unpack(table["packed_color"], BYTES)
         rgb = rgba[:, :3]
         if not missing(chunks, COLOUR_RANGES):
-            rgb = between(columns(chunks, COLOUR_RANGES)[chunk], rgb)
+            rgb = lerp(columns(chunks, COLOUR_RANGES)[chunk], rgb)
         gaussians = Gaussians(
-            means=between(columns(chunks, RANGES[:6])[chunk], unpack(table["packed_position"], THIRDS)),
+            means=lerp(columns(chunks, RANGES[:6])[chunk], unpack(table["packed_position"], THIRDS)),
             quaternions=rotations(table["packed_rotation"]),
-            scales=between(columns(chunks, RANGES[6:])[chunk], unpack(table["packed_scale"], THIRDS)).exp(),
+            scales=lerp(columns(chunks, RANGES[6:])[chunk], unpack(table["packed_scale"], THIRDS)).exp(),
             opacities=rgba[:, 3],
             sh=coefficients((rgb - 0.5) / harmonics.BAND_0, self._rest(path, tables, len(table))),
         )
@@ -92,7 +92,7 @@ def unpack(packed: np.ndarray, parts: tuple[tuple[int, int], ...]) -> Float[Tens
     return torch.stack([((words >> shift) & ((1 << bits) - 1)).float() / ((1 << bits) - 1) for shift, bits in parts], dim=1)
 
 
-def between(ends: Float[Tensor, "n 6"], share: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+def lerp(ends: Float[Tensor, "n 6"], share: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Values at ``share`` of the way between the lower ends (first three columns) and the upper ones."""
     return ends[:, :3] * (1 - share) + ends[:, 3:] * share
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from invgraphics.errors import InputError
-from invgraphics.formats.base import HEAD_BYTES, cut_off
+from invgraphics.formats.base import HEAD_BYTES, truncation_error
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -101,7 +101,7 @@ def read_elements(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     for name, (count, record) in header.elements.items():
         end = start + count * record.itemsize
         if end > len(data):
-            raise cut_off(path, end, len(data))
+            raise truncation_error(path, end, len(data))
         tables[name] = np.frombuffer(data, record, count, start) if record.itemsize else np.empty(0, record)
         start = end
     return tables, header.comments

@@ -13,9 +13,9 @@ import numpy as np
 
 from invgraphics.core import harmonics
 from invgraphics.errors import InputError
-from invgraphics.formats.base import Splats, cut_off
+from invgraphics.formats.base import Splats, truncation_error
 from invgraphics.formats.spz_attributes import Bytes, fraction_bits, pack, unpack, widths
-from invgraphics.memory import check_fits, spelt
+from invgraphics.memory import check_fits, format_bytes
 
 MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 VERSION = 4
@@ -130,7 +130,9 @@ def _gunzip(path: Path, data: bytes) -> bytes:
         raise InputError(f"'{path}' cannot be decompressed: {error}.", "Copy the file again.") from error
     if not inflate.eof:
         longer = len(result) == HEADER.size + most
-        wrong = f"it goes on after its Gaussians and {spelt(MOST_EXTENSIONS)} of extensions" if longer else "it is cut off"
+        wrong = (
+            f"it continues after its Gaussians and {format_bytes(MOST_EXTENSIONS)} of extensions" if longer else "it is cut off"
+        )
         raise InputError(f"'{path}' cannot be decompressed: {wrong}.", "Copy the file again.")
     return result
 
@@ -154,7 +156,7 @@ def _bounded(path: Path, header: Header, packed: int) -> int:
 
 def _header(path: Path, data: bytes) -> Header:
     if len(data) < HEADER.size:
-        raise cut_off(path, HEADER.size, len(data))
+        raise truncation_error(path, HEADER.size, len(data))
     magic, version, count, degree, fraction, flags, streams = HEADER.unpack_from(data)
     if magic != MAGIC:
         raise InputError(f"'{path}' is no SPZ file: it begins with {magic!r}, not {MAGIC!r}.")
@@ -170,7 +172,7 @@ def _single_stream(path: Path, data: bytes, header: Header) -> tuple[dict[str, B
     attributes, start = {}, HEADER.size
     expected = start + sum(header.sizes.values())
     if expected > len(data):
-        raise cut_off(path, expected, len(data))
+        raise truncation_error(path, expected, len(data))
     for name, size in header.sizes.items():
         attributes[name] = header.table(name, data[start : start + size])
         start += size
@@ -183,14 +185,14 @@ def _streams(path: Path, data: bytes, header: Header) -> tuple[dict[str, Bytes],
     contents = EXTENDED.unpack_from(data, HEADER.size)[0] if len(data) >= first else first
     start = contents + STREAM.size * header.streams
     if start > len(data):
-        raise cut_off(path, start, len(data))
+        raise truncation_error(path, start, len(data))
     table = [STREAM.unpack_from(data, contents + STREAM.size * i) for i in range(header.streams)]
     present = [name for name, size in header.sizes.items() if size]
     if [large for _, large in table] != [header.sizes[name] for name in present] or contents < first:
         raise InputError(f"'{path}' is a damaged SPZ file: its streams do not hold {header.count} Gaussians.")
     expected = start + sum(small for small, _ in table)
     if expected > len(data):
-        raise cut_off(path, expected, len(data))
+        raise truncation_error(path, expected, len(data))
     streams = dict.fromkeys(header.sizes, b"")
     for name, (small, large) in zip(present, table, strict=True):
         streams[name] = _unzstd(path, data[start : start + small], large)

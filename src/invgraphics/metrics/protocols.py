@@ -115,7 +115,7 @@ def _masked(image: Image, truth: Image, view: View, protocol: Protocol) -> tuple
     if view.mask is None or (protocol.masks != "excluded" and bool(view.mask.all())):
         return image, truth, None
     if protocol.masks == "unknown":
-        raise Skip(f"the view has a mask, and {protocol.name} knows no masks")
+        raise Skip(f"the view has a mask, and {protocol.name} does not support masks")
     mask = view.mask.to(image.device, torch.bool)
     if protocol.masks == "zero":
         return image * mask[..., None], truth * mask[..., None], None

@@ -73,7 +73,7 @@ def select_preset(method: str, asked: str | None, budget: Budget | None, known: 
     return Preset(name, choice, tuple(scenes), table)
 
 
-def described(known: Mapping[str, Any]) -> str:
+def preset_summary(known: Mapping[str, Any]) -> str:
     """List a recipe's presets in a line, by length of budget, each with the scenes that it was tuned on.
 
     Args:

@@ -70,13 +70,13 @@ class Recipe:
         Raises:
             InputError: names the hook, what it needs, and the field.
         """
-        field = _built(self.field)
-        for hook in map(_built, self.hooks):
+        field = _build_type(self.field)
+        for hook in map(_build_type, self.hooks):
             if field is not None and hook is not None and issubclass(hook, Hook):
                 hook.check(field)
 
 
-def _built(config: Any) -> type | None:
+def _build_type(config: Any) -> type | None:
     """Return annotation of a config's ``build``; ``None`` without one."""
     try:
         result = get_type_hints(type(config).build).get("return")

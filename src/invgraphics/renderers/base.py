@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from invgraphics.core import Rendering
 
-SEEN = 0.5
+MIN_SURFACE_ALPHA = 0.5
 """A pixel with less alpha than this has no depth and no normal (CONVENTIONS.md)."""
 
 
@@ -28,11 +28,11 @@ def to_rendering(
         alpha: sum of w.
         distance: sum of w * t.
         normal: sum of w * normal, or ``None``.
-        far: depth of pixels with alpha below `SEEN`.
+        far: depth of pixels with alpha below `MIN_SURFACE_ALPHA`.
         directions: unit ray directions, which tell a normal's front from its back; needed where there are normals.
     """
-    seen = alpha >= SEEN
-    depth = torch.where(seen, distance / alpha.clamp_min(SEEN), far)
+    seen = alpha >= MIN_SURFACE_ALPHA
+    depth = torch.where(seen, distance / alpha.clamp_min(MIN_SURFACE_ALPHA), far)
     if normal is not None:
         assert directions is not None
         unit = normalize(normal, dim=-1)

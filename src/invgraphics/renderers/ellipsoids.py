@@ -46,7 +46,7 @@ def draw_ellipsoids(gaussians: Gaussians, camera: Camera, reach: float = 1.0) ->
         rays = torch.nn.functional.normalize(torch.nn.functional.pad(plane, (0, 1), value=1.0), dim=1)
         return _nearest(rays, mean[near], inside_out[near], rgb[near])
 
-    sums = over_tiles(_squares(mean, axes, camera), (camera.width, camera.height), TILE, paint)
+    sums = over_tiles(_bounding_squares(mean, axes, camera), (camera.width, camera.height), TILE, paint)
     normal = sums[..., 5:] @ camera.cam_to_world[:3, :3].T
     return Rendering(sums[..., :3], sums[..., 3], sums[..., 4], normal)
 
@@ -74,7 +74,7 @@ def _nearest(
     return torch.where(torch.isfinite(distance)[:, None], drawn, blank)
 
 
-def _squares(mean: Float[Tensor, "n 3"], axes: Float[Tensor, "n 3 3"], camera: Camera) -> Footprints:
+def _bounding_squares(mean: Float[Tensor, "n 3"], axes: Float[Tensor, "n 3 3"], camera: Camera) -> Footprints:
     """Screen-space bounding squares of the ellipsoids, for `over_tiles`."""
     n = len(mean)
     means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]

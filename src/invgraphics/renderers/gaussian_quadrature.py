@@ -11,14 +11,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from invgraphics.core import Rays
-from invgraphics.renderers.gaussian_rays import SURE, Intersections
+from invgraphics.renderers.gaussian_rays import MAX_DEVIATIONS, Intersections
 
 Weights = tuple[Float[Tensor, " p"], Float[Tensor, " p"] | None]
 """Each Gaussian's share of a ray's light; and the same times the distance from which it comes, or ``None``."""
 
 EDGES = (-3.6, -2.7, -1.8, -0.9, 0.0, 0.9, 1.8, 2.7, 3.6)
 """Standard deviations between which a Gaussian is taken for constant while intervals are being placed."""
-DARK = 9.2
+MAX_OPTICAL_DEPTH = 9.2
 """Optical depth behind which less than 1/10000 of the light comes from: nothing there is worth a short interval."""
 MOST_AT_ONCE = 1 << 18
 """Error functions that are in memory at once."""
@@ -80,8 +80,8 @@ def _interval(
     t: Float[Tensor, "n k"], sigma: Float[Tensor, "n k"], there: Bool[Tensor, "n k"], near: Tensor, far: Tensor
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Integration interval of each ray, which covers its Gaussians; finite, so that gradients are."""
-    low = torch.where(there, t - SURE * sigma, torch.inf).amin(dim=1).maximum(near)
-    return low, torch.where(there, t + SURE * sigma, -torch.inf).amax(dim=1).minimum(far).maximum(low)
+    low = torch.where(there, t - MAX_DEVIATIONS * sigma, torch.inf).amin(dim=1).maximum(near)
+    return low, torch.where(there, t + MAX_DEVIATIONS * sigma, -torch.inf).amax(dim=1).minimum(far).maximum(low)
 
 
 def _integrate(
@@ -92,7 +92,7 @@ def _integrate(
     with_distances: bool,
 ) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k"] | None]:
     # Clamped, because functions of large numbers underflow, and numbers that do are slow.
-    z = ((nodes[:, :, None] - t[:, None]) / sigma[:, None]).clamp(-SURE, SURE)
+    z = ((nodes[:, :, None] - t[:, None]) / sigma[:, None]).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
     own = phi(z).diff(dim=1)
     total = torch.einsum("nsk,nk->ns", own, depth)
     before = total.cumsum(dim=1) - total
@@ -116,7 +116,7 @@ def place_nodes(
     interval: tuple[Float[Tensor, " n"], Float[Tensor, " n"]],
     steps: int,
 ) -> Float[Tensor, "n steps_plus_1"]:
-    """Edges of quadrature intervals with about equal shares of alpha, and of optical depth up to `DARK`.
+    """Edges of quadrature intervals with about equal shares of alpha, and of optical depth up to `MAX_OPTICAL_DEPTH`.
 
     Splitting an interval's light in proportion is wrong by about its light times its optical depth times how much the mixture
     changes in it, so both are kept small. Only the places are approximate; what happens between them is not.
@@ -132,7 +132,9 @@ def place_nodes(
     density = rises.double().cumsum(dim=1)[:, :-1].clamp_min(0.0)
     reached = pad((density * edges.diff(dim=1)).cumsum(dim=1), (1, 0)).to(edges.dtype)
     total = reached[:, -1:].clamp_min(torch.finfo(reached.dtype).tiny)
-    grown = torch.expm1(-reached) / torch.expm1(-total) + reached.clamp_max(DARK) / total.clamp_max(DARK)
+    grown = torch.expm1(-reached) / torch.expm1(-total) + reached.clamp_max(MAX_OPTICAL_DEPTH) / total.clamp_max(
+        MAX_OPTICAL_DEPTH
+    )
     wanted = torch.linspace(0, 2, steps + 1, dtype=grown.dtype, device=grown.device)[1:-1].expand(len(t), -1).contiguous()
     after = torch.searchsorted(grown.contiguous(), wanted).clamp(1, grown.shape[1] - 1)
     low, high = grown.gather(1, after - 1), grown.gather(1, after)

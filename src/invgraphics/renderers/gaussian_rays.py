@@ -29,7 +29,7 @@ Opacity = Literal["peak", "physical", "splat"]
 - ``splat``: alpha is ``a G``, as splatters have it, which ignores that light is absorbed along the way.
 """
 
-SURE = 8.0
+MAX_DEVIATIONS = 8.0
 """Standard deviations beyond which nothing of a Gaussian is left, even in float64."""
 THOMSEN = 1.6075
 """Exponent of Thomsen's formula for the surface of an ellipsoid, whose relative error is at most 1.1%."""
@@ -137,12 +137,12 @@ def mean_inverse_scale(scales: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
 
 def intersect(primitives: Primitives, rays: Rays) -> Intersections:
     """Intersect rays with Gaussians within their reach, differentiably in Gaussians and rays."""
-    ray, gaussian = _search(primitives, rays)
+    ray, gaussian = _candidate_pairs(primitives, rays)
     table = torch.cat([primitives.means, primitives.whitening.flatten(1), primitives.strength[:, None]], dim=1)
     # index_select has a faster gradient than indexing.
     means, whitening, strength = table.index_select(0, gaussian).split([3, 9, 1], dim=1)
     offset = means - rays.origins.index_select(0, ray)
-    t, sigma, squared = _along(whitening.view(-1, 3, 3), offset, rays.directions.index_select(0, ray))
+    t, sigma, squared = _restrict_to_rays(whitening.view(-1, 3, 3), offset, rays.directions.index_select(0, ray))
     response = strength[:, 0] * torch.exp(-0.5 * squared)
     if primitives.opacity == "peak":
         depth = response
@@ -172,7 +172,7 @@ def _colour(sh: Float[Tensor, "p c 3"], offset: Float[Tensor, "p 3"]) -> Float[T
     return harmonics.colour(sh, normalize(offset, dim=1))
 
 
-def _along(
+def _restrict_to_rays(
     whitening: Float[Tensor, "*p 3 3"], offset: Float[Tensor, "*p 3"], direction: Float[Tensor, "*p 3"]
 ) -> tuple[Float[Tensor, "*p"], Float[Tensor, "*p"], Float[Tensor, "*p"]]:
     """Restrict Gaussians to rays: distance of the peak, standard deviation, squared Mahalanobis distance from the centre."""
@@ -184,7 +184,7 @@ def _along(
 
 
 @torch.no_grad()
-def _search(primitives: Primitives, rays: Rays) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
+def _candidate_pairs(primitives: Primitives, rays: Rays) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
     """Find pairs of rays and Gaussians within the Gaussians' reach, sorted by ray, then by Gaussian."""
     some = _in_cone(primitives, rays)
     centres, exact = primitives.means[some], 1 - ROUNDING
@@ -198,9 +198,9 @@ def _search(primitives: Primitives, rays: Rays) -> tuple[Int[Tensor, " p"], Int[
         ray, chosen = (across <= along.square_()).nonzero(as_tuple=True)
         gaussian = some[chosen]
         offset = primitives.means[gaussian] - part.origins[ray]
-        t, sigma, squared = _along(primitives.whitening[gaussian], offset, part.directions[ray])
+        t, sigma, squared = _restrict_to_rays(primitives.whitening[gaussian], offset, part.directions[ray])
         kept = squared < primitives.reach[gaussian].square()
-        kept &= (t + SURE * sigma > part.near[ray]) & (t - SURE * sigma < part.far[ray])
+        kept &= (t + MAX_DEVIATIONS * sigma > part.near[ray]) & (t - MAX_DEVIATIONS * sigma < part.far[ray])
         found.append((ray[kept] + first, gaussian[kept]))
         first += len(part)
     return torch.cat([ray for ray, _ in found]), torch.cat([gaussian for _, gaussian in found])

@@ -19,7 +19,7 @@ from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.gaussian_profile import density_profile, transmittance
 from invgraphics.renderers.gaussian_quadrature import Weights, integrate_overlapping, phi
 from invgraphics.renderers.gaussian_rays import (
-    SURE,
+    MAX_DEVIATIONS,
     Intersections,
     Opacity,
     Primitives,
@@ -98,7 +98,9 @@ class GaussianRays(RayRenderer):
         self._smallest = smallest
 
     @abstractmethod
-    def weigh(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool) -> Weights:
+    def blending_weights(
+        self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool
+    ) -> Weights:
         """Weight of each intersection: its share of the ray's light.
 
         Args:
@@ -131,20 +133,20 @@ class GaussianRays(RayRenderer):
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
         """List the Gaussians that the pixel's ray intersects; see `Renderer.contributions`."""
         primitives = precompute(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest, camera.position)
-        rays = _clipped(camera.ray(pixel), ctx)
-        return self._listed(intersect(primitives, rays), primitives, rays, camera.cam_to_world[:3, 2])
+        rays = _clip_near(camera.ray(pixel), ctx)
+        return self._list_contributions(intersect(primitives, rays), primitives, rays, camera.cam_to_world[:3, 2])
 
     @abstractmethod
-    def _listed(
+    def _list_contributions(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
         """Contributions of one ray's intersections, in compositing order."""
 
     def _render(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, ctx: Context) -> Rendering:
-        rays = _clipped(rays, ctx)
+        rays = _clip_near(rays, ctx)
         intersections = intersect(primitives, rays)
         geometry = ctx.geometry or not ctx.training
-        weights, distances = self.weigh(intersections, rays, axis, geometry)
+        weights, distances = self.blending_weights(intersections, rays, axis, geometry)
         values = [weights[:, None], weights[:, None] * colours(primitives, intersections)]
         if distances is not None:
             values.append(distances[:, None])
@@ -165,15 +167,17 @@ class GaussianExact(GaussianRays):
         super().__init__(config.opacity, config.smallest)
         self.config = config
 
-    def weigh(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool) -> Weights:
+    def blending_weights(
+        self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool
+    ) -> Weights:
         """Integrate overlapping densities to weights (see `integrate_overlapping`), independent of order."""
         return integrate_overlapping(intersections, rays, self.config.steps, with_distances)
 
-    def _listed(
+    def _list_contributions(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
         """Contributions by distance, with the transmittance of the whole mixture."""
-        weight, _ = self.weigh(intersections, rays, axis, False)
+        weight, _ = self.blending_weights(intersections, rays, axis, False)
         order = intersections.t.argsort(stable=True)
         order = order[intersections.depth[order] > 0]
         t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
@@ -198,13 +202,16 @@ class GaussianSorted(GaussianRays):
         super().__init__(config.opacity, config.smallest)
         self.config = config
 
-    def weigh(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool) -> Weights:
+    def blending_weights(
+        self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool
+    ) -> Weights:
         """Composite front to back: w_i = alpha_i times the product of (1 - alpha_j) before it, alpha_i = 1 - exp(-tau_i)."""
         near, far = rays.near[intersections.ray], rays.far[intersections.ray]
         t, sigma, depth = intersections.t, intersections.sigma, intersections.depth
         if self.config.opacity != "splat":
             start, end = (
-                ((limit - t) / sigma).clamp(-SURE, SURE) for limit in (near, far.minimum((t + SURE * sigma).detach()))
+                ((limit - t) / sigma).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+                for limit in (near, far.minimum((t + MAX_DEVIATIONS * sigma).detach()))
             )
             depth = depth * (phi(end) - phi(start))
         order = self.order(intersections, rays, axis)
@@ -212,11 +219,11 @@ class GaussianSorted(GaussianRays):
         weights = ordered[order.argsort()]
         return weights, weights * t.clamp(near, far) if with_distances else None
 
-    def _listed(
+    def _list_contributions(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
         """Contributions in compositing order, with the profile of the same Gaussians as overlapping densities."""
-        weight, _ = self.weigh(intersections, rays, axis, False)
+        weight, _ = self.blending_weights(intersections, rays, axis, False)
         order = self.order(intersections, rays, axis)
         order = order[intersections.depth[order] > 0]  # those below the splats' limit are on the ray all the same
         t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
@@ -245,7 +252,7 @@ class GaussianSorted(GaussianRays):
         return order[intersections.ray[order].argsort(stable=True)]
 
 
-def _clipped(rays: Rays, ctx: Context) -> Rays:
+def _clip_near(rays: Rays, ctx: Context) -> Rays:
     """Clip rays to the near distance of the bounds."""
     return rays.within(rays.near.clamp_min(ctx.bounds.near), rays.far)
 

@@ -20,7 +20,7 @@ from invgraphics.renderers.samplers import uniform
 from invgraphics.renderers.termination import visible_samples
 from invgraphics.renderers.visibility import visible_cells
 
-LATE = 0.5
+LATE_STEPS_START = 0.5
 """Progress of a fit at which its late steps begin to replace the usual ones."""
 
 
@@ -103,7 +103,11 @@ class OccupancyConfig:
         """Number of march steps across the bounds' diagonal in training, at a progress of the fit in [0, 1]."""
         usual = self.steps_per_diagonal
         early, late = self.early_steps or usual, self.late_steps or usual
-        return early * (usual / early) ** min(1.0, 4 * progress) * (late / usual) ** max(0.0, (progress - LATE) / (1 - LATE))
+        return (
+            early
+            * (usual / early) ** min(1.0, 4 * progress)
+            * (late / usual) ** max(0.0, (progress - LATE_STEPS_START) / (1 - LATE_STEPS_START))
+        )
 
     def build(self, scene: Scene) -> Occupancy:
         """Build the sampler with every cell occupied, in unbounded space only cells visible in a training view."""
@@ -220,13 +224,13 @@ class Occupancy(Sampler):
         step = int(self.step)
         self.step += 1
         if step >= self.config.grace and step % self.config.every == 0:
-            cells = self._all_cells() if step < self.config.warmup else self._some_cells(ctx)
+            cells = self._all_cells() if step < self.config.warmup else self._sampled_cells(ctx)
             self._refresh(cells, field, ctx)
 
     def _all_cells(self) -> Int[Tensor, " k"]:
         return torch.arange(self.ema.numel(), device=self.ema.device)
 
-    def _some_cells(self, ctx: Context) -> Int[Tensor, " k"]:
+    def _sampled_cells(self, ctx: Context) -> Int[Tensor, " k"]:
         """Draw flat cell indices with replacement: half uniform, half from occupied cells."""
         occupied = torch.nonzero(self.occupied.flatten())[:, 0]
         half = self.config.cells // 2
@@ -241,7 +245,7 @@ class Occupancy(Sampler):
         """Update the EMA at one random point in each of ``cells``, and threshold it to the occupancy grid."""
         fresh = torch.full_like(self.ema, -1.0).flatten()
         for part in cells.split(ctx.chunk):
-            thickness = self._thickness(part, field, ctx).to(fresh.dtype)
+            thickness = self._step_optical_depth(part, field, ctx).to(fresh.dtype)
             fresh.scatter_reduce_(0, part, thickness, reduce="amax")
         fresh, decay = fresh.view_as(self.ema), self.config.decay_at(ctx.progress)
         self.ema.copy_(torch.where(fresh < 0, self.ema, torch.maximum(self.ema * decay, fresh)))
@@ -251,7 +255,7 @@ class Occupancy(Sampler):
         if self.visible is not None:
             self.occupied &= self.visible
 
-    def _thickness(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> Float[Tensor, " k"]:
+    def _step_optical_depth(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> Float[Tensor, " k"]:
         """Optical depth of one step at a random point of each cell.
 
         Steps of equal contracted length are taken along the radius. With a cone they grow with the distance from the camera,
@@ -261,7 +265,7 @@ class Occupancy(Sampler):
         corner = torch.stack(torch.unravel_index(cells, self.ema.shape), dim=1)
         unit = (corner + uniform((len(cells), 3), ctx, like=self.ema)) / self.config.resolution
         position = ctx.bounds.from_unit(unit.to(ctx.bounds.lo.dtype))
-        steps = self.steps(replace(ctx, progress=min(ctx.progress, LATE)))
+        steps = self.steps(replace(ctx, progress=min(ctx.progress, LATE_STEPS_START)))
         if steps.contracted:
             return field.density_no_grad(Samples.at(position)) * steps.step / ctx.bounds.radial_scale(position)
         distance = (position - ctx.bounds.centre).norm(dim=1)

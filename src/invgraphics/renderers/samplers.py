@@ -48,8 +48,8 @@ class Stratified(Sampler):
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Sample every ray that intersects the bounds, without querying the field."""
-        hit = hitting(rays)
-        knee = far_side(rays[hit], ctx.bounds)
+        hit = hit_indices(rays)
+        knee = unit_ball_exit(rays[hit], ctx.bounds)
         edges = from_spacing(strata(rays[hit], self.config.count, ctx, knee), ctx.bounds, knee)
         return pack(rays, hit, edges), ()
 
@@ -95,21 +95,21 @@ class Hierarchical(Sampler):
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Sample by two passes; returns the first pass's trace too, in training only if its proposal field is trained."""
-        hit = hitting(rays)
+        hit = hit_indices(rays)
         spacing, trace = self._coarse_pass(rays, field, ctx)
         assert trace.weights is not None
         with torch.no_grad():
             weights = trace.weights.reshape(len(hit), self.config.coarse)
             drawn = invert(spacing, weights + PADDING, quantiles(len(hit), self.config.fine, ctx, like=spacing))
         both = torch.cat([spacing, drawn], dim=1).sort(dim=1).values
-        edges = from_spacing(both, ctx.bounds, far_side(rays[hit], ctx.bounds))
+        edges = from_spacing(both, ctx.bounds, unit_ball_exit(rays[hit], ctx.bounds))
         hidden = ctx.training and self.proposal is None
         return pack(rays, hit, edges), () if hidden else (trace,)
 
     def _coarse_pass(self, rays: Rays, field: Field, ctx: Context) -> tuple[Float[Tensor, "k edges"], Trace]:
         """Edges of the coarse strata in spacing coordinates, for the rays that meet the bounds, and their weights."""
-        hit = hitting(rays)
-        knee = far_side(rays[hit], ctx.bounds)
+        hit = hit_indices(rays)
+        knee = unit_ball_exit(rays[hit], ctx.bounds)
         spacing = strata(rays[hit], self.config.coarse, ctx, knee)
         coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds, knee))
         if self.proposal is None:
@@ -122,12 +122,12 @@ class Hierarchical(Sampler):
         return spacing, Trace(coarse, values, weights, rays=len(rays))
 
 
-def hitting(rays: Rays) -> Int[Tensor, " k"]:
+def hit_indices(rays: Rays) -> Int[Tensor, " k"]:
     """Indices of the rays that hit the bounds: far > near."""
     return torch.nonzero(rays.far > rays.near)[:, 0]
 
 
-def far_side(rays: Rays, bounds: Bounds) -> Float[Tensor, "k 1"]:
+def unit_ball_exit(rays: Rays, bounds: Bounds) -> Float[Tensor, "k 1"]:
     """Distance beyond which a ray has left the bounds' unit ball, from any origin."""
     return (rays.origins - bounds.centre).norm(dim=1, keepdim=True) + bounds.half.max()
 

@@ -28,7 +28,7 @@ from invgraphics.core import (
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.kernels.reference.splat_raster import blending_weights, responses_at, visible_alphas
 from invgraphics.kernels.types import Footprints
-from invgraphics.renderers.base import SEEN, to_rendering
+from invgraphics.renderers.base import MIN_SURFACE_ALPHA, to_rendering
 from invgraphics.renderers.gaussian_profile import density_profile
 
 
@@ -167,7 +167,7 @@ class Splatting(Renderer):
             return to_rendering(sums[..., :3], alpha, distance, None, far)
         normal, directions = sums[..., 6:], camera.rays().directions.view(*alpha.shape, 3)
         if self.config.normals == "depth":
-            normal = _slope(distance / alpha.clamp_min(SEEN), alpha >= SEEN, directions)
+            normal = _normals_from_depth(distance / alpha.clamp_min(MIN_SURFACE_ALPHA), alpha >= MIN_SURFACE_ALPHA, directions)
         return to_rendering(sums[..., :3], alpha, distance, normal, far, directions)
 
 
@@ -192,7 +192,9 @@ def _normals(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
     return torch.where(away, -normal, normal)
 
 
-def _slope(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+def _normals_from_depth(
+    depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w 3"]:
     """Normals of a depth map by central differences of its points, one-sided where a neighbour is empty.
 
     A pixel without a neighbour in one direction gets its own viewing direction, reversed.
@@ -200,7 +202,7 @@ def _slope(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, 
     points = depth[..., None] * directions
     along_x, along_y = _difference(points, seen, 1), _difference(points, seen, 0)
     normal = torch.nn.functional.normalize(torch.linalg.cross(along_x, along_y), dim=-1)
-    alone = normal.square().sum(dim=-1, keepdim=True) < SEEN
+    alone = normal.square().sum(dim=-1, keepdim=True) < 0.5  # of a unit vector or zero
     return torch.where(alone, -directions, normal)
 
 

@@ -32,13 +32,17 @@ def visible_samples(rays: Rays, march: March, query: Query, transmittance: float
         transmittance: least transmittance, in [0, 1).
         chunk: intervals per ray of the first query, >= 1.
     """
-    kept, found = _reached(rays, march, query, -math.log(transmittance) if transmittance > 0 else math.inf, chunk)
+    kept, found = _intervals_before_depth(
+        rays, march, query, -math.log(transmittance) if transmittance > 0 else math.inf, chunk
+    )
     samples = Samples.on(rays, march.ray[kept], march.t0[kept], march.t1[kept])
     return replace(samples, density=found.density, features=found.features)
 
 
 @torch.no_grad()
-def _reached(rays: Rays, march: March, query: Query, most: float, chunk: int) -> tuple[Int[Tensor, " k"], FieldValues]:
+def _intervals_before_depth(
+    rays: Rays, march: March, query: Query, most: float, chunk: int
+) -> tuple[Int[Tensor, " k"], FieldValues]:
     """Intervals behind an optical depth of ``most`` at most, and their values."""
     counts = torch.bincount(march.ray, minlength=len(rays))
     first = counts.cumsum(0) - counts

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from invgraphics.core import Bounds, Camera
 
-ROOM = 0.1
+IMAGE_MARGIN = 0.1
 """Share of the picture's size by which cells may lie outside it: poses are never exact."""
 
 
@@ -33,6 +33,6 @@ def _corners(bounds: Bounds, resolution: int, offset: float, cameras: Sequence[C
         at = camera.to(position.dtype).to(position.device)
         pixel, depth = at.project(position)
         size = pixel.new_tensor([camera.width, camera.height])
-        inside = ((pixel >= -ROOM * size) & (pixel <= (1 + ROOM) * size)).all(dim=1)
+        inside = ((pixel >= -IMAGE_MARGIN * size) & (pixel <= (1 + IMAGE_MARGIN) * size)).all(dim=1)
         seen |= inside & (depth > 0) & ((position - at.position).norm(dim=1) >= bounds.near)
     return seen.view(count, count, count)

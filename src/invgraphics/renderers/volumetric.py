@@ -79,7 +79,7 @@ class Volumetric(RayRenderer):
             # A normal costs several looks at the density, which few samples deserve.
             samples = replace(samples, density=query(field, samples, Quantity.DENSITY, ctx.chunk).density)
         if samples.density is not None and not torch.is_grad_enabled():
-            values = _seen(field, samples, len(rays), want, ctx.chunk)
+            values = _query_contributing(field, samples, len(rays), want, ctx.chunk)
         else:
             values = query(field, samples, want, ctx.chunk)
         assert values.density is not None
@@ -125,7 +125,7 @@ def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldVa
     return replace(values, density=density, radiance=torch.lerp(values.radiance.detach(), values.radiance, scale[:, None]))
 
 
-def _seen(field: Field, samples: Samples, rays: int, want: Quantity, chunk: int) -> FieldValues:
+def _query_contributing(field: Field, samples: Samples, rays: int, want: Quantity, chunk: int) -> FieldValues:
     """Query samples of known density; radiance of samples with negligible weight is skipped and stays zero."""
     assert samples.density is not None
     weights, _, _ = kernels.composite(samples.density * samples.delta, samples.density[:, None], samples.ray, rays)

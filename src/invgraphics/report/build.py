@@ -11,7 +11,7 @@ from invgraphics.errors import InputError
 from invgraphics.report.data.assets import Folder, writing
 from invgraphics.report.data.comparison import Comparison, check_comparable, read_comparison
 from invgraphics.report.data.pictures import read_picture
-from invgraphics.report.data.redact import check_apart, redactor_for
+from invgraphics.report.data.redact import check_runs_outside, redactor_for
 from invgraphics.report.pages.comparison import write_html, write_markdown
 from invgraphics.report.pages.longtable import write_comparison_table
 from invgraphics.report.pages.parts import draw_part, method_contrasts
@@ -56,7 +56,7 @@ def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Pa
     folders = list({path.resolve(): path for path in runs}.values())
     read = [read_run(path) for path in folders]
     check_comparable(tuple(read))
-    labelled = _tell_apart(read)
+    labelled = _with_unique_names(read)
     methods = tuple(dict.fromkeys(run.method for run in labelled))
     first = labelled[0]
     picture = read_picture(truth_picture(first.truth, 0))
@@ -78,7 +78,7 @@ def _write(comparison: Comparison, out: Path, base: Path, public: bool) -> Path:
     """Write all outputs of a comparison into ``out``; tables name runs by their path from ``base``."""
     redactor = None
     if public:
-        check_apart(out, [run.folder for run in comparison.runs])
+        check_runs_outside(out, [run.folder for run in comparison.runs])
         redactor = redactor_for([comparison])
         comparison = redactor.value(comparison)
     folder = Folder(out, redactor=redactor)
@@ -99,7 +99,7 @@ def _common(values: Sequence[str]) -> str:
     return values[0] if len(set(values)) == 1 else ""
 
 
-def _tell_apart(runs: Sequence[Run]) -> list[Run]:
+def _with_unique_names(runs: Sequence[Run]) -> list[Run]:
     """Make (method, seed) unique: append the preset, the budget or else the folder to the method's name."""
     cells = [(run.method, run.seed) for run in runs]
     if len(set(cells)) == len(cells):

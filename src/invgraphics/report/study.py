@@ -9,7 +9,7 @@ from pathlib import Path
 
 from invgraphics.report.data.assets import Folder, writing
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.redact import check_apart, redactor_for
+from invgraphics.report.data.redact import check_runs_outside, redactor_for
 from invgraphics.report.data.studies import Study, read_study, scene_comparisons
 from invgraphics.report.figures.analyses import draw_analyses
 from invgraphics.report.figures.effects import draw_heat_maps
@@ -46,7 +46,7 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
     study, target = read_study(folder), folder if out is None else out
     redactor = None
     if public:
-        check_apart(target, [folder])
+        check_runs_outside(target, [folder])
         redactor = redactor_for([study])
         study = redactor.value(study)
     place = Folder(target, redactor=redactor)

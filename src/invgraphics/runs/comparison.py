@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -71,6 +72,7 @@ class ComparisonRecord(Record):
     """
 
     FILE: ClassVar[str] = "compare.json"
+    RENAMED: ClassVar[Mapping[str, str]] = {"scene_info.notes.suspicion": "inconsistent_poses"}
 
     scene: str
     question: str = ""

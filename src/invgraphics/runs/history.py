@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.runs.schema import NOT_STORED, from_table, guarded, plain, write_text
+from invgraphics.runs.schema import NOT_STORED, from_table, plain, read_checked, write_text
 
 FILE = "history.jsonl"
 
@@ -68,7 +68,7 @@ def cut_history(path: Path, step: int) -> None:
 
 
 def _tables(path: Path) -> Iterator[dict[str, Any]]:
-    lines = guarded(path, lambda: path.read_text(encoding="utf-8")).splitlines()
+    lines = read_checked(path, lambda: path.read_text(encoding="utf-8")).splitlines()
     for number, line in enumerate(lines, 1):
         try:
             table = json.loads(line)

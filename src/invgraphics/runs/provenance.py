@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -83,7 +84,7 @@ class Provenance(Record):
         data: what was changed of the training data: key -> value.
         notes: on the scene, by topic.
         code_version: version and hash of the package's sources.
-        plugins: name of a component -> package that brought it.
+        plugins: name of a component -> package that provides it.
         command: makes the run again.
         options: how the scene was opened.
         device: that computed.
@@ -98,6 +99,7 @@ class Provenance(Record):
     """
 
     FILE: ClassVar[str] = "provenance.json"
+    RENAMED: ClassVar[Mapping[str, str]] = {"notes.suspicion": "inconsistent_poses"}
 
     cell_sha256: str
     method: str

@@ -2,7 +2,8 @@
 
 A field without a default is a key that every file has. For another, absence and null stand for the default, and a default that
 says nothing (null, empty, false) is left out. Keys that a reader does not know are ignored, so that keys can be added; what
-readers must not overlook raises the record's ``SCHEMA``, and `Record.migrate` brings older tables up to date.
+readers must not overlook raises the record's ``SCHEMA``, and `Record.migrate` brings older tables up to date. `Record.RENAMED`
+lists keys that had another name.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ class Record:
     """Version of the format that is written; files without the key ``schema`` have version 1."""
     FILE: ClassVar[str] = ""
     """Name of the file in its folder; empty where the name depends on the content, see `file`."""
+    RENAMED: ClassVar[Mapping[str, str]] = {}
+    """Dotted path of a key in files of earlier versions -> the key's name today."""
 
     @property
     def file(self) -> str:
@@ -79,7 +82,7 @@ def plain(value: Any) -> Any:
         table = {"schema": value.SCHEMA} if isinstance(value, Record) else {}
         for field in dataclasses.fields(value):
             item = getattr(value, field.name)
-            if field.metadata.get("stored", True) and not _says_nothing(field, item):
+            if field.metadata.get("stored", True) and not _is_empty_default(field, item):
                 table[field.name] = plain(item)
         return table
     if isinstance(value, Mapping):
@@ -131,8 +134,8 @@ def read_table(path: Path) -> dict[str, Any]:
     return table
 
 
-def guarded(path: Path, read: Callable[[], T]) -> T:
-    """Call ``read`` on ``path``, with system errors turned into `InputError`.
+def read_checked(path: Path, read: Callable[[], T]) -> T:
+    """Call ``read`` on ``path`` and return its result, with system errors turned into `InputError`.
 
     Raises:
         InputError: the file is missing or cannot be read.
@@ -168,7 +171,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _current(kind: type[Record], table: Mapping[str, Any], source: Path, key: str) -> Mapping[str, Any]:
-    """Migrate a table to the schema of this version."""
+    """Migrate a table to the schema and the key names of this version."""
     schema = table.get("schema", 1)
     if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
         raise _wrong(source, _join(key, "schema"), schema, "a whole number, 1 or more")
@@ -180,7 +183,20 @@ def _current(kind: type[Record], table: Mapping[str, Any], source: Path, key: st
         )
     for older in range(schema, kind.SCHEMA):
         table = kind.migrate(dict(table), older)
+    for path, name in kind.RENAMED.items():
+        table = _rename(table, path.split("."), name)
     return table
+
+
+def _rename(table: Mapping[str, Any], path: list[str], name: str) -> Mapping[str, Any]:
+    """Copy of ``table`` in which the key at ``path`` is called ``name``; unchanged without that key, or with both."""
+    old = path[0]
+    if len(path) > 1:
+        inner = table.get(old)
+        return {**table, old: _rename(inner, path[1:], name)} if isinstance(inner, Mapping) else table
+    if old not in table or name in table:
+        return table
+    return {name if key == old else key: value for key, value in table.items()}
 
 
 def _converted(hint: Any, value: Any, source: Path, key: str) -> Any:
@@ -258,7 +274,7 @@ def _has_default(field: dataclasses.Field[Any]) -> bool:
     return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
-def _says_nothing(field: dataclasses.Field[Any], value: Any) -> bool:
+def _is_empty_default(field: dataclasses.Field[Any], value: Any) -> bool:
     """Whether a value is the field's default, and null, empty or false."""
     if not _has_default(field):
         return False

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from invgraphics.runs.schema import Record
 
@@ -84,7 +85,7 @@ class Scores(Record):
         quality: metric -> score.
         skipped: metric -> why it has no score.
         disturbed: why the times say nothing, the subject left out; empty where they do.
-        shortfall: why the method may have lost to the mean training image, and what to try; empty where it has not.
+        below_baseline: why the method may have lost to the mean training image, and what to try; empty where it has not.
         test_poses: how test poses were found; empty where they were taken as given.
         rescored: whether saved pictures were scored, rather than the model.
         conventions: of a rescoring: everything that the protocol states.
@@ -103,13 +104,14 @@ class Scores(Record):
     quality: dict[str, Score]
     skipped: dict[str, str] = field(default_factory=dict)
     disturbed: str = ""
-    shortfall: str = ""
+    below_baseline: str = ""
     test_poses: str = ""
     rescored: bool = False
     conventions: dict[str, Any] = field(default_factory=dict)
     truth: ScoredTruth | None = None
     notes: tuple[str, ...] = ()
 
+    RENAMED: ClassVar[Mapping[str, str]] = {"shortfall": "below_baseline"}
     FILES = "scores*.json"
     """Pattern of all files of scores."""
 

@@ -9,7 +9,7 @@ import torch
 from invgraphics.core import Bounds, Scene
 from invgraphics.scenes.frames import Frames
 from invgraphics.scenes.images import Photo
-from invgraphics.scenes.layout import Frame, SceneOptions, Split, compose, evenly, present
+from invgraphics.scenes.layout import Frame, SceneOptions, Split, compose, evenly_spaced, existing_photos
 
 HALF_EXTENT = 1.5
 """The objects of NeRF-synthetic lie within ±1.5 world units (instant-ngp and TensoRF use the same box)."""
@@ -21,11 +21,11 @@ class Blender:
     """Loader of NeRF-synthetic folders: OpenGL axes, straight alpha, white background, a box of ±1.5."""
 
     def matches(self, path: Path) -> bool:
-        """Whether ``path`` is such a folder."""
+        """Whether ``path`` is a folder with a ``transforms_train.json``."""
         return (path / "transforms_train.json").is_file()
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Read the folder.
+        """Load the three splits as a scene in a box, photographs read and resized by ``options``.
 
         Raises:
             InputError: a file is missing or unusable.
@@ -33,12 +33,12 @@ class Blender:
         notes: dict[str, str] = {"loader": "blender"}
         train, test = self._photos(path, "train", notes), self._photos(path, "test", notes)
         val = self._photos(path, "val", notes) if (path / "transforms_val.json").is_file() else []
-        split = Split(train, test, evenly(val, _VAL_VIEWS), "the data set's own")
+        split = Split(train, test, evenly_spaced(val, _VAL_VIEWS), "the data set's own")
         box = torch.full((3,), HALF_EXTENT)
         return compose(path.resolve().name, split, Frame(Bounds(-box, box)), options, notes)
 
     def _photos(self, path: Path, split: str, notes: dict[str, str]) -> list[Photo]:
         source = path / f"transforms_{split}.json"
-        photos, missing = present(Frames.read(source).photos(), source)
+        photos, missing = existing_photos(Frames.read(source).photos(), source)
         notes |= {f"{key}_{split}": value for key, value in missing.items()}
         return photos

@@ -14,7 +14,7 @@ from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap_workspace import find_model, model_folders
 from invgraphics.scenes.images import Photo
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, present, scene_name
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, existing_photos, pose, scene_name
 from invgraphics.scenes.lens import Lens
 from invgraphics.scenes.photos.notes import pose_notes
 
@@ -32,14 +32,14 @@ class Colmap:
         return bool(model_folders(path))
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Read the model and the photographs it registers.
+        """Load a reconstruction as an unbounded scene: poses, photographs and SfM points.
 
         Raises:
             InputError: the model is unusable or its photographs are missing.
         """
         model = find_model(path)
         folder = model.images or path
-        photos, notes = present([_photo(image, folder) for image in model.registered], model.folder)
+        photos, notes = existing_photos([_photo(image, folder) for image in model.registered], model.folder)
         notes |= {"loader": "colmap", "points": f"{model.reconstruction.num_points3D()} from SfM"} | pose_notes(path)
         notes |= {"model": model.note} if model.note else {}
         poses = torch.stack([photo.camera.cam_to_world for photo in photos])

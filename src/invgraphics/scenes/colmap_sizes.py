@@ -24,30 +24,30 @@ _DATUM = _SENSOR.size + 8
 
 
 class _TooShortError(Exception):
-    """A record reaches beyond the end of the file."""
+    """A record extends beyond the end of the file."""
 
 
 class _Bytes:
-    """A file's content and a place in it."""
+    """Cursor over the bytes of a file."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.place = data, 0
 
     def take(self, record: struct.Struct) -> tuple[float, ...]:
-        """The next record."""
+        """Read one record and advance."""
         start = self.place
         self.skip(record.size)
         return record.unpack_from(self.data, start)
 
     def skip(self, size: int) -> None:
-        """Pass over bytes that must be there."""
+        """Advance by ``size`` bytes, which must exist."""
         if size > len(self.data) - self.place:
             raise _TooShortError
         self.place += size
 
 
 def check_sizes(folder: Path) -> None:
-    """Compare every binary file of a model with the counts in it.
+    """Check that every binary file of a COLMAP model is as long as its own counts say.
 
     Raises:
         InputError: a file is longer or shorter than its counts say, or names an unknown camera model.
@@ -123,7 +123,7 @@ _WALKS: dict[str, Callable[[_Bytes, Path], None]] = {
 
 @cache
 def _parameter_counts() -> dict[int, int]:
-    """COLMAP's number of a camera model -> number of its parameters."""
+    """Map COLMAP's id of a camera model to its number of parameters."""
     from invgraphics.scenes.colmap_library import pycolmap
 
     models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]

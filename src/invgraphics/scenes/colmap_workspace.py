@@ -36,12 +36,12 @@ class Model:
 
     @property
     def registered(self) -> list[Any]:
-        """Its ``pycolmap.Image`` objects that have a pose, by name."""
+        """Its ``pycolmap.Image`` objects with a pose, sorted by name."""
         return sorted((image for image in self.reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
 
 
 def model_folders(path: Path) -> list[Path]:
-    """Folders of COLMAP models of the workspace ``path``, which may be any of its folders, the photographs' included."""
+    """List the folders of COLMAP models in the workspace that ``path`` is, or is a folder of."""
     root = path.resolve().parent if is_image_folder(path.resolve()) and not _holds_model(path) else path
     found: dict[Path, Path] = {}
     for place in (*PLACES, *UNDISTORTED):
@@ -52,7 +52,7 @@ def model_folders(path: Path) -> list[Path]:
 
 
 def find_model(path: Path) -> Model:
-    """The model with the most photographs on disk; of equal ones the first in the order of the places.
+    """Select the model with the most photographs on disk; of equal ones the first in the order of `PLACES`.
 
     Raises:
         InputError: there is no model, none can be read, none registers an image, or no photograph of any exists.
@@ -121,7 +121,7 @@ def _present(folder: Path, names: Sequence[str]) -> int:
 
 
 def _image_folders(model: Path) -> Iterator[Path]:
-    """Where a model's photographs may be, nearest first: below it, or beside it and the folders that merely hold it.
+    """List folders that may hold a model's photographs, nearest first: below it, or beside it and its parents.
 
     The search ends at the folder that holds ``sparse``: photographs farther up are not those of an undistorted model.
     """

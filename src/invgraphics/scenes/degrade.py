@@ -64,12 +64,12 @@ class TrainingData:
             raise ValueError(f"'background' has channels in [0, 1], not {list(self.background)}.")
 
     def changes(self) -> dict[str, object]:
-        """The settings that differ from their defaults, as plain values."""
+        """Settings that differ from their defaults, as plain values by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self) if getattr(self, field.name) != field.default}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def check(self, scene: Scene) -> None:
-        """Refuse settings that ``scene`` cannot have.
+        """Check that the settings can be applied to ``scene``.
 
         Raises:
             InputError: it has fewer views, smaller photographs, or no transparency to put a background behind.
@@ -89,7 +89,9 @@ class TrainingData:
 
 
 def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
-    """The scene with degraded training views; the same object where ``data`` changes nothing.
+    """Degrade a scene's training views: choice, pose errors, size, exposure, noise and background.
+
+    Returns ``scene`` itself where ``data`` changes nothing.
 
     Args:
         scene: as loaded.
@@ -114,7 +116,7 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
 
 
 def chosen_views(scene: Scene, count: int | None) -> list[int]:
-    """Indices of the training views that stay, in their old order.
+    """Select ``count`` training views by farthest-point order; returns their indices, ascending.
 
     Farthest-point order (Gonzalez 1985) over position, in units of the scene's extent, and viewing direction; it begins with
     the view closest to the mean. The choice for fewer views is the beginning of the same order.
@@ -132,7 +134,7 @@ def chosen_views(scene: Scene, count: int | None) -> list[int]:
 
 
 def _degraded(view: View, index: int, scene: Scene, data: TrainingData, seed: int) -> View:
-    """One training view with pose errors, resized, then exposure and noise."""
+    """Degrade one training view: pose errors, resizing, then exposure and noise."""
     if data.pose_noise:
         generator = _generator(seed, "pose", index)
         # Three equal axes share the mean square.
@@ -155,13 +157,13 @@ def _degraded(view: View, index: int, scene: Scene, data: TrainingData, seed: in
 
 
 def _generator(seed: int, degradation: str, index: int) -> torch.Generator:
-    """Randomness of one degradation of one view."""
+    """Seeded generator of one degradation of one view."""
     digest = hashlib.sha256(f"{degradation} {seed} {index}".encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
 
 
 def _rotation(vector: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:
-    """The matrix of a rotation vector (radians along its axis)."""
+    """Rotation matrix of a rotation vector (axis times radians)."""
     x, y, z = vector.tolist()
     return torch.linalg.matrix_exp(vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
 
@@ -171,7 +173,7 @@ def _recoloured(view: View, change: Callable[[Tensor], Tensor]) -> View:
 
 
 def _like(colour: Float[Tensor, "h w 3"], view: View) -> Tensor:
-    """Colours in the number format of the view's photograph."""
+    """Convert colours to the number format of the view's photograph."""
     return quantise(colour) if view.image.dtype == torch.uint8 else colour.clamp_min(0)
 
 
@@ -180,7 +182,7 @@ def _exposed(colour: Float[Tensor, "*p"], gain: float, linear: bool) -> Float[Te
 
 
 def _resized(view: View, size: int) -> View:
-    """The photograph at another size: area average of premultiplied colour; a pixel counts if all of it did."""
+    """Resize a view by area average of premultiplied colour; a pixel is masked unless all of it was valid."""
     width, height = wanted_size(view.camera.width, view.camera.height, size)
     alpha = view.opacity()[..., None]
     mask = torch.ones_like(alpha) if view.mask is None else view.mask[..., None].float()

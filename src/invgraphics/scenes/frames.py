@@ -26,7 +26,7 @@ _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """A ``transforms*.json``, read and checked for its outline.
+    """Content of a ``transforms*.json``, with validated top-level structure.
 
     Attributes:
         path: the file.
@@ -40,7 +40,7 @@ class Frames:
 
     @staticmethod
     def read(path: Path) -> Frames:
-        """Read a file.
+        """Read and validate a ``transforms*.json``.
 
         Raises:
             InputError: it is missing, no JSON (line and column are given), or has no frames.
@@ -54,7 +54,7 @@ class Frames:
         return Frames(path, table, frames)
 
     def photos(self) -> list[Photo]:
-        """One photograph per frame, in the file's order, whether its picture exists or not.
+        """Convert the frames to photographs with cameras, in the file's order, whether their files exist or not.
 
         Raises:
             InputError: a key is missing or a value unusable; the sentence names the file, the frame and the key.
@@ -73,7 +73,7 @@ class Frames:
         return value
 
     def _number(self, index: int, key: str) -> float | None:
-        """A value of the frame, or else of the file."""
+        """Number under ``key`` of the frame, else of the file."""
         value = self.frames[index].get(key, self.table.get(key))
         if value is None:
             return None
@@ -95,7 +95,7 @@ class Frames:
         return Photo(file, camera, name, self._lens(index, (*focal, *centre), (width, height)))
 
     def _size(self, index: int, existing: Path | None) -> tuple[int, int]:
-        """Width and height that the file states, or else those of the first picture there is."""
+        """Width and height stated by the file, else of the first existing photograph."""
         w, h = self._number(index, "w"), self._number(index, "h")
         if w is None or h is None:
             return image_size(existing) if existing is not None else (1, 1)
@@ -118,7 +118,7 @@ class Frames:
         return fx, fy
 
     def _lens(self, index: int, pinhole: tuple[float, ...], size: tuple[int, int]) -> Lens | None:
-        """OPENCV (k1 k2 p1 p2, with k3 and k4 its rational extension) or OPENCV_FISHEYE (k1 k2 k3 k4); None for a pinhole."""
+        """Lens of OPENCV (k1 k2 p1 p2; rational with k3, k4) or OPENCV_FISHEYE (k1 k2 k3 k4); ``None`` for a pinhole."""
         k1, k2, p1, p2, k3, k4 = (self._number(index, key) or 0.0 for key in _COEFFICIENTS)
         model = str(self.frames[index].get("camera_model", self.table.get("camera_model", "OPENCV")))
         fisheye = model == "OPENCV_FISHEYE" or self.table.get("is_fisheye") is True
@@ -137,7 +137,7 @@ class Frames:
 
 
 def _find(folder: Path, file_path: str) -> Path:
-    """The picture that a frame names, whose suffix may be left out."""
+    """Find the file of a frame's photograph, whose suffix may be left out."""
     path = folder / file_path.replace("\\", "/")
     if path.is_file():
         return path

@@ -30,11 +30,11 @@ class Idr:
     """
 
     def matches(self, path: Path) -> bool:
-        """Whether ``path`` is such a folder."""
+        """Whether ``path`` is a folder with ``cameras*.npz`` and pictures, or such a file."""
         return _source(path) is not None
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Read the folder.
+        """Load cameras, photographs and masks: a box with masks, else a contracted scene.
 
         Raises:
             InputError: a file or a key is missing or unusable, or there are fewer matrices or masks than pictures.
@@ -89,7 +89,7 @@ def _matrix(arrays: Mapping[str, np.ndarray], key: str, source: Path) -> Float[n
 
 
 def decompose(projection: Float[np.ndarray, "3 4"], size: tuple[int, int], where: str) -> Camera:
-    """Split a projection matrix into a camera by RQ decomposition (Hartley and Zisserman, §6.2.4).
+    """Decompose a projection matrix to a camera by RQ decomposition (Hartley and Zisserman, §6.2.4).
 
     DTU's pixel coordinates put the first pixel's centre at (0, 0), ours at (0.5, 0.5).
 

@@ -30,7 +30,7 @@ _TURNED = (5, 6, 7, 8)  # orientations that exchange width and height
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photograph that has not been read yet.
+    """Path and camera of a photograph whose pixels are not read yet.
 
     Attributes:
         path: the file.
@@ -48,14 +48,14 @@ class Photo:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Photographs directly in ``folder``, by name."""
+    """List the photographs directly in ``folder``, sorted by name."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
 
 
 def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Width and height from the file's header; ``like`` as in `read_pixels`.
+    """Read width and height in pixels from a file's header; ``like`` as in `read_pixels`.
 
     Raises:
         InputError: the file is missing, no picture, or cut short.
@@ -65,7 +65,7 @@ def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, in
 
 
 def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w c"]:
-    """Read a photograph as bytes.
+    """Read a photograph as 8-bit colour, upright.
 
     Sixteen-bit greys are rounded, palettes and greys become RGB. The EXIF orientation is applied unless that would
     turn the picture away from the shape its camera was calibrated for.
@@ -95,7 +95,7 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
 
 @contextmanager
 def _naming_damaged_file(path: Path, image: Any) -> Iterator[None]:
-    """Say which file it was that could not be decoded; even its EXIF tags may lie behind the pixels."""
+    """Turn decoding errors into an `InputError` that names the file; even its EXIF tags may lie behind the pixels."""
     width, height = image.size
     try:
         yield
@@ -119,14 +119,20 @@ def _is_sideways(image: Any) -> bool:
 
 
 def _is_turned(image: Any, like: tuple[int, int] | None) -> bool:
-    """Whether reading exchanges width and height: the file says so, and the camera does not contradict."""
+    """Whether reading exchanges width and height: EXIF says so, and the camera's shape does not contradict."""
     if not _is_sideways(image):
         return False
     return like is None or (like[0] < like[1]) != (image.width < image.height) or like[0] == like[1]
 
 
 def area_resize(values: Float[np.ndarray, "h w c"], width: int, height: int) -> Float[np.ndarray, "height width c"]:
-    """Average over each new pixel's area; old pixels that are cut count by the part that is inside. Never enlarges."""
+    """Downscale by exact area average; pixels that are cut contribute by their covered share.
+
+    Args:
+        values: picture, colours premultiplied where it has alpha.
+        width: new width in pixels, at most the present one.
+        height: new height, likewise.
+    """
     return _average(_average(values, height).swapaxes(0, 1), width).swapaxes(0, 1)
 
 
@@ -145,7 +151,7 @@ def _average(values: Float[np.ndarray, "n m c"], count: int) -> Float[np.ndarray
 
 
 def wanted_size(width: int, height: int, size: int | tuple[int, int] | None) -> tuple[int, int]:
-    """The size a picture is resized to; pictures are never enlarged.
+    """Compute the (width, height) to which a photograph is resized; never enlarged.
 
     Args:
         width: present width in pixels.
@@ -169,7 +175,7 @@ def wanted_size(width: int, height: int, size: int | tuple[int, int] | None) -> 
 
 
 def match_sizes(photos: Sequence[Photo]) -> list[Photo]:
-    """Fit each camera to its file: a set that was down-scaled as a whole keeps its calibration, scaled.
+    """Scale each camera to its file's size: photographs downscaled as a whole keep their calibration.
 
     Reads file headers only.
 
@@ -219,7 +225,7 @@ def make_view(
     size: int | tuple[int, int] | None = None,
     lens: Lens | None = None,
 ) -> View:
-    """A view from pixels in memory: colours end as bytes, the camera in float32.
+    """Make a view from pixels in memory, undistorted and resized: 8-bit colours, float32 camera.
 
     Args:
         camera: of these pixels; its focal lengths and principal point are replaced if there is a ``lens``.

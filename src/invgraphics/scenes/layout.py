@@ -37,7 +37,7 @@ _PARALLEL = 0.01  # mean squared sine of the angle between viewing directions (6
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What a person chooses about any scene.
+    """Options of opening a scene: picture size, numbers of views, samples per pixel.
 
     Attributes:
         size: longest side in pixels, or (width, height); ``None`` leaves pictures as they are.
@@ -64,7 +64,7 @@ class SceneOptions:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Photographs by their use.
+    """Photographs of each split.
 
     Attributes:
         train: to fit.
@@ -80,13 +80,13 @@ class Split:
 
     @property
     def photos(self) -> list[Photo]:
-        """All of them."""
+        """Photographs of all splits."""
         return [*self.train, *self.val, *self.test]
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The local frame and the region to describe in it.
+    """Local frame of a scene, its bounds and known points.
 
     Attributes:
         bounds: local.
@@ -100,7 +100,7 @@ class Frame:
 
 
 def pose(values: object, where: str) -> Float[Tensor, "4 4"]:
-    """A rigid 4x4 in float64 from nested lists or an array with 3 or 4 rows; rounding errors are polished away.
+    """Convert nested lists or an array of 3 or 4 rows to a rigid 4x4 pose in float64, orthonormalised.
 
     Raises:
         InputError: wrong shape, not finite, or not rigid; ``where`` names the file and the view.
@@ -126,12 +126,12 @@ def pose(values: object, where: str) -> Float[Tensor, "4 4"]:
 
 
 def is_image_folder(path: Path) -> bool:
-    """Whether the folder's name says that it holds a scene's photographs."""
+    """Whether a folder's name is one that conventionally holds a scene's photographs."""
     return path.name in IMAGE_FOLDERS
 
 
 def scene_name(path: Path) -> str:
-    """The name of a data set: that of the first folder upwards whose name is not a convention (``sparse/0``, ``images``)."""
+    """Name of a data set: of the first folder upwards that is not conventional (``sparse/0``, ``images``)."""
     folder = path.resolve()
     for each in (folder, *folder.parents):
         numbered = each.name.isdecimal() and each.parent.name in _HOLDERS
@@ -141,7 +141,7 @@ def scene_name(path: Path) -> str:
 
 
 def every_eighth(photos: Sequence[Photo]) -> Split:
-    """LLFF's split: of the photographs in name order, every eighth is scored and the others are fitted."""
+    """Split photographs in name order: every eighth is a test view, the others train (LLFF)."""
     ordered = sorted(photos, key=lambda photo: photo.name)
     test = ordered[::HOLD_OUT]
     train = [photo for index, photo in enumerate(ordered) if index % HOLD_OUT]
@@ -150,15 +150,15 @@ def every_eighth(photos: Sequence[Photo]) -> Split:
     return Split(train, test, rule=f"every {HOLD_OUT}th photograph by name")
 
 
-def evenly(items: Sequence[T], count: int | None) -> list[T]:
-    """``count`` items, evenly spaced in the middle of equal parts; all of them if there are no more."""
+def evenly_spaced(items: Sequence[T], count: int | None) -> list[T]:
+    """Select ``count`` evenly spaced items, in the middle of equal parts; all of them if there are no more."""
     if count is None or count >= len(items):
         return list(items)
     return [items[int((index + 0.5) * len(items) / count)] for index in range(count)]
 
 
-def present(photos: Sequence[Photo], source: Path) -> tuple[list[Photo], dict[str, str]]:
-    """The photographs whose files exist, and a note about those that do not.
+def existing_photos(photos: Sequence[Photo], source: Path) -> tuple[list[Photo], dict[str, str]]:
+    """Select the photographs whose files exist; also returns a note about missing ones.
 
     Raises:
         InputError: none of them exists.
@@ -178,7 +178,7 @@ def present(photos: Sequence[Photo], source: Path) -> tuple[list[Photo], dict[st
 def contracted_frame(
     poses: Float[Tensor, "n 4 4"], points: Points | None = None, distance: float | None = None, near: float | None = None
 ) -> Frame:
-    """A frame for an unbounded scene: +z is the cameras' mean up, the subject is at the origin, cameras within distance 1.
+    """Compute the local frame of an unbounded scene: +z is the mean up, the subject at the origin, cameras in the unit ball.
 
     The subject is where the optical axes come closest to each other. Where they are too parallel for that it lies ``distance``
     ahead of the cameras, and where it would be behind them (an inside-out rig) it is the middle of the cameras. The box is
@@ -219,7 +219,7 @@ def contracted_frame(
 
 
 def _turn_z_to(up: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation that takes +z to ``up``; none where the cameras have no common up."""
+    """Smallest rotation from +z to ``up``; identity where the cameras have no common up."""
     length = float(up.norm())
     if length < 0.1:
         return torch.eye(3, dtype=up.dtype)
@@ -232,13 +232,15 @@ def _turn_z_to(up: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:
 
 
 def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes: dict[str, str]) -> Scene:
-    """Read the chosen photographs and put their cameras into the local frame.
+    """Read the chosen photographs and compose the scene: cameras in the local frame, bounds, background, notes.
 
     Scenes with alpha are declared to be on white, others on black (which then nothing shows through to).
     """
     if not split.test:
         raise InputError(f"{name} has no photographs to score.")
-    chosen = replace(split, train=evenly(split.train, options.train_views), test=evenly(split.test, options.test_views))
+    chosen = replace(
+        split, train=evenly_spaced(split.train, options.train_views), test=evenly_spaced(split.test, options.test_views)
+    )
     notes = notes | {
         "split": split.rule,
         "train_views": f"{len(chosen.train)} of {len(split.train)}, evenly spaced",
@@ -265,7 +267,7 @@ def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes:
 
 
 def local_points(frame: Frame) -> Points | None:
-    """The frame's points, moved from the world into it."""
+    """Transform the frame's points from the world to the local frame; ``None`` without points."""
     if frame.points is None:
         return None
     position = transform_points(torch.linalg.inv(frame.world_from_local), frame.points.position.double())
@@ -273,7 +275,7 @@ def local_points(frame: Frame) -> Points | None:
 
 
 def _read(photos: Sequence[Photo], local_from_world: Float[Tensor, "4 4"], size: int | tuple[int, int] | None) -> list[View]:
-    """Read photographs one at a time; only their final pixels are kept.
+    """Read photographs one at a time, keeping only their final pixels.
 
     Those have their place before the first picture is read: allocated in between, they would be scattered among the large
     work arrays and keep the C library from using that space again (1 GB for a hundred photographs of 1 MP).

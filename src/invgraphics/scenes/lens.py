@@ -24,7 +24,7 @@ SHRINKS = 60
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens in COLMAP's terms.
+    """Camera model with lens distortion, in COLMAP's terms.
 
     Attributes:
         model: name of a COLMAP camera model, for instance ``OPENCV``.
@@ -39,7 +39,7 @@ class Lens:
     height: int
 
     def colmap(self) -> Any:
-        """The lens as a ``pycolmap.Camera``.
+        """Convert the lens to a ``pycolmap.Camera``.
 
         Raises:
             InputError: the model is unknown, is no perspective camera, or has another number of parameters.
@@ -55,13 +55,13 @@ class Lens:
         return camera
 
     def is_pinhole(self) -> bool:
-        """Whether there is nothing to remove."""
+        """Whether the lens has no distortion."""
         return self.colmap().is_undistorted()
 
 
 @dataclass(frozen=True, eq=False)
 class Straight:
-    """How to make a pinhole picture of the same size from a distorted one.
+    """Resampling map from a distorted picture to a pinhole's of equal size.
 
     Attributes:
         focal: focal lengths (fx, fy) of the pinhole, pixels.
@@ -76,7 +76,7 @@ class Straight:
 
 @lru_cache(maxsize=2)
 def straighten(lens: Lens) -> Straight:
-    """The pinhole that shows the largest part of the photograph without any blank pixel, at the photograph's size.
+    """Compute the pinhole with the largest field of view without blank pixels, at the photograph's size.
 
     The border of the photograph is mapped to the plane z = 1; the pinhole's viewport is the rectangle inside that curve, cut
     to the photograph's aspect ratio. The ratio of the focal lengths is kept.
@@ -98,7 +98,7 @@ def straighten(lens: Lens) -> Straight:
 
 
 def _inner_rectangle(camera: Any, width: int, height: int) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of a rectangle on the plane z = 1 that the photograph covers."""
+    """Rectangle (left, right, top, bottom) on the plane z = 1 that the photograph covers."""
     # Half a pixel inside the border, so that bilinear interpolation never asks for a pixel that is not there.
     x, y = np.linspace(0.5, width - 0.5, 129), np.linspace(0.5, height - 0.5, 129)
     sides = [(np.full_like(y, x[0]), y), (np.full_like(y, x[-1]), y), (x, np.full_like(x, y[0])), (x, np.full_like(x, y[-1]))]
@@ -110,17 +110,17 @@ def _inner_rectangle(camera: Any, width: int, height: int) -> tuple[float, float
         back = camera.img_from_cam(np.concatenate([plane, np.ones((len(plane), 1))], axis=1))
         believable = np.abs(back - border).max(axis=1) < 0.01
         trusted += int(believable.sum())
-        reach = plane[believable, axis] * sign if believable.any() else [_reach(camera, axis, sign)]
+        reach = plane[believable, axis] * sign if believable.any() else [_valid_extent(camera, axis, sign)]
         limits.append(sign * min(float(np.min(reach)), WIDEST))
     for _ in range(SHRINKS):
         if limits[0] < limits[1] and limits[2] < limits[3] and (areas := _areas(camera, limits)).min() > 0:
             break
         limits = [0.95 * limit for limit in limits]
     else:
-        raise _folded(camera)
+        raise _folded_error(camera)
     # Without any border there must at least be a picture up to WIDEST, as of a fisheye beyond 180 degrees.
     if not (trusted or min(map(abs, limits)) == WIDEST):
-        raise _folded(camera)
+        raise _folded_error(camera)
     if areas.max() > MOST_STRETCH * areas.min():
         raise InputError(
             f"The distortion parameters of a {camera.model_name} camera smear its picture: the areas of its pixels differ "
@@ -130,8 +130,8 @@ def _inner_rectangle(camera: Any, width: int, height: int) -> tuple[float, float
     return limits[0], limits[1], limits[2], limits[3]
 
 
-def _reach(camera: Any, axis: int, sign: float) -> float:
-    """How far from the optical axis along x or y the projection does not turn back, on the plane z = 1; up to `WIDEST`."""
+def _valid_extent(camera: Any, axis: int, sign: float) -> float:
+    """Largest distance from the optical axis along x or y on z = 1 with a monotonic projection; up to `WIDEST`."""
     plane = np.zeros((257, 3))
     plane[:, axis], plane[:, 2] = sign * np.linspace(0, WIDEST, 257), 1
     growing = sign * np.diff(camera.img_from_cam(plane)[:, axis]) > 0  # not of NaN either
@@ -139,7 +139,7 @@ def _reach(camera: Any, axis: int, sign: float) -> float:
 
 
 def _areas(camera: Any, limits: Sequence[float]) -> Float[np.ndarray, " n"]:
-    """Determinants of the projection's Jacobian on a lattice in left, right, top and bottom; -1 where one is not finite."""
+    """Determinant of the projection's Jacobian on a lattice in a rectangle; -1 where it is not finite."""
     left, right, top, bottom = limits
     corners = np.stack([*np.meshgrid(np.linspace(left, right, 33), np.linspace(top, bottom, 33)), np.ones((33, 33))], axis=-1)
     step = 1e-4 * min(right - left, bottom - top)
@@ -150,12 +150,17 @@ def _areas(camera: Any, limits: Sequence[float]) -> Float[np.ndarray, " n"]:
     return np.where(np.isfinite(area), area, -1.0)
 
 
-def _folded(camera: Any) -> InputError:
+def _folded_error(camera: Any) -> InputError:
     return InputError(f"The distortion parameters of a {camera.model_name} camera fold its picture.", "Check their signs.")
 
 
 def undistort(values: Float[np.ndarray, "h w c"], straight: Straight) -> Float[np.ndarray, "h w c"]:
-    """Resample a picture (premultiplied where it has alpha) bilinearly to the pinhole."""
+    """Resample a picture bilinearly to the pinhole.
+
+    Args:
+        values: distorted picture, colours premultiplied where it has alpha.
+        straight: resampling map (see `straighten`), for a picture of this size.
+    """
     source = torch.from_numpy(values).permute(2, 0, 1)[None]
     result = torch.nn.functional.grid_sample(source, straight.grid[None], align_corners=False, padding_mode="border")
     return result[0].permute(1, 2, 0).numpy()

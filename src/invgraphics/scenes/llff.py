@@ -26,11 +26,11 @@ class Llff:
     """
 
     def matches(self, path: Path) -> bool:
-        """Whether ``path`` is such a folder."""
+        """Whether ``path`` is a folder with ``poses_bounds.npy``, or that file."""
         return (path / "poses_bounds.npy").is_file()
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Read the folder.
+        """Load poses, near and far bounds and photographs as an unbounded scene.
 
         Raises:
             InputError: a file is missing or unusable, or there are more or fewer pictures than poses.
@@ -60,7 +60,7 @@ def _read(source: Path) -> Float[np.ndarray, "n 17"]:
 
 
 def _pictures(path: Path) -> list[Path]:
-    """The photographs at the highest resolution there is: ``images``, or else ``images_4`` and the like."""
+    """List the photographs at the highest available resolution: ``images``, else ``images_4`` and the like."""
     scaled = sorted((int(f.name[7:]), f) for f in path.glob("images_*") if f.is_dir() and f.name[7:].isdecimal())
     for folder in (path / "images", *(folder for _, folder in scaled)):
         if files := image_files(folder):

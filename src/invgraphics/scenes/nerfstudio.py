@@ -8,7 +8,7 @@ import torch
 
 from invgraphics.core import Scene
 from invgraphics.scenes.frames import Frames
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, present, scene_name
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, existing_photos, scene_name
 
 
 class Nerfstudio:
@@ -23,14 +23,14 @@ class Nerfstudio:
         return _source(path).is_file()
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Read the folder.
+        """Load cameras, lenses and photographs as an unbounded scene.
 
         Raises:
             InputError: a file is missing or unusable.
         """
         source = _source(path)
         frames = Frames.read(source)
-        photos, notes = present(frames.photos(), source)
+        photos, notes = existing_photos(frames.photos(), source)
         notes["loader"] = "nerfstudio"
         if "ply_file_path" in frames.table:
             notes["points"] = f"{frames.table['ply_file_path']} is not read"

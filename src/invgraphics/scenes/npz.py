@@ -32,7 +32,7 @@ from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
-from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
+from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly_spaced, local_points, pose
 from invgraphics.tables import read_arrays
 
 Arrays = Mapping[str, np.ndarray]
@@ -41,14 +41,14 @@ _REQUIRED = ("images", "cam_to_world", "focal")
 
 
 class Npz:
-    """Loader of the convention in this module's docstring."""
+    """Loader of one ``.npz`` file with the keys of this module's docstring."""
 
     def matches(self, path: Path) -> bool:
         """Whether ``path`` is an ``.npz`` file."""
         return path.is_file() and path.suffix == ".npz"
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Read the file.
+        """Load images, cameras and optional geometry; keys and shapes as in this module's docstring.
 
         Raises:
             InputError: it is damaged, or a key is missing or has another shape.
@@ -62,7 +62,7 @@ class Npz:
         if not train or not test:
             raise InputError(f"{path} has {len(train)} views to fit and {len(test)} to score; it needs at least one of each.")
         final = wanted_size(width, height, options.size)
-        chosen = (evenly(train, options.train_views), evenly(test, options.test_views))
+        chosen = (evenly_spaced(train, options.train_views), evenly_spaced(test, options.test_views))
         notes = {
             "loader": "npz",
             "train_views": f"{len(chosen[0])} of {len(train)}, evenly spaced",
@@ -85,7 +85,7 @@ class Npz:
 
 
 def _read(path: Path) -> Arrays:
-    """All arrays, with the shapes that the convention asks for."""
+    """Read all arrays, with validated shapes."""
     arrays = read_arrays(path)
     missing = [key for key in _REQUIRED if key not in arrays]
     if missing:
@@ -172,7 +172,7 @@ def _view(path: Path, arrays: Arrays, i: int, frame: Frame, final: tuple[int, in
 
 
 def _parts(similarity: Float[Tensor, "4 4"]) -> tuple[float, Float[Tensor, "3 3"]]:
-    """Scale and rotation."""
+    """Scale and rotation of a similarity."""
     scale = float(torch.linalg.det(similarity[:3, :3]) ** (1 / 3))
     return scale, similarity[:3, :3] / scale
 
@@ -186,13 +186,13 @@ def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shap
 
 
 def save_npz(scene: Scene, path: Path) -> None:
-    """Write a scene as this convention has it, so that `Npz` reads the same scene; points' colours are rounded to bytes.
+    """Write a scene as one ``.npz`` file that `Npz` reads as the same scene; points' colours are rounded to 8 bits.
 
     Raises:
         InputError: it holds what the convention does not: no box, validation views, linear or unrounded colours, masks, another
             background, pictures of several sizes; the sentence says what. Nothing is written then.
     """
-    if beyond := _beyond(scene):
+    if beyond := _unsupported_parts(scene):
         raise InputError(
             f"The scene '{scene.name}' cannot be kept as a data set: it has {beyond}.",
             "Write it in a format that `load_scene` reads, and load it from there.",
@@ -216,8 +216,8 @@ def save_npz(scene: Scene, path: Path) -> None:
     np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]  # numpy's stub takes keywords for switches
 
 
-def _beyond(scene: Scene) -> str:
-    """What a scene has that the convention cannot hold; empty where there is nothing."""
+def _unsupported_parts(scene: Scene) -> str:
+    """List what a scene has that the format cannot store, in words; empty for nothing."""
     views = [*scene.train, *scene.test]
     cameras = [view.camera for view in views]
     mixed = [key for key in ("alpha", "depth", "normal") if len({getattr(view, key) is None for view in views}) > 1]

@@ -21,11 +21,11 @@ __all__ = [
     "Loader",
     "SceneOptions",
     "SceneSource",
-    "absent_data",
-    "choices",
     "find_loader",
     "is_rendered",
+    "missing_data_reason",
     "open_scene",
+    "selection_notes",
     "source_of",
     "validate",
 ]
@@ -34,20 +34,20 @@ _SAME_POSE = 1e-6  # entries of two poses that are closer than this are one came
 
 
 class Loader(Protocol):
-    """A format of data sets on disk."""
+    """Interface of a loader: recognises and reads one format of data sets."""
 
     def matches(self, path: Path) -> bool:
         """Whether ``path`` is in this format."""
         ...
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Read the data set; bad input raises `InputError`."""
+        """Load the data set; bad input raises `InputError`."""
         ...
 
 
 @dataclass(frozen=True)
 class SceneSource:
-    """What `open_scene` was given, so that another process can open the same scene.
+    """Arguments with which a scene was opened, so that another process can open the same.
 
     Attributes:
         spec: a built-in scene's name or the path of a data set.
@@ -62,14 +62,14 @@ _SOURCES: WeakKeyDictionary[Scene, SceneSource] = WeakKeyDictionary()
 
 
 def source_of(scene: Scene) -> SceneSource | None:
-    """Where a scene was opened; ``None`` for one that was made in Python, changed copies of an opened one included."""
+    """Arguments with which a scene was opened; ``None`` for scenes made or changed in Python."""
     return _SOURCES.get(scene)
 
 
 def open_scene(
     spec: str, options: SceneOptions | None = None, progress: Callable[[int, int, str], None] | None = None
 ) -> Scene:
-    """Open a scene and check it.
+    """Open a built-in scene or a data set, and validate it.
 
     Args:
         spec: a built-in scene's name, which is rendered first unless its truth is in the cache, at this size or at a larger
@@ -94,7 +94,7 @@ def _load(spec: str, options: SceneOptions, progress: Callable[[int, int, str], 
         return plugins.load("scenes", "truth")().load(path, options)
     path = _path(spec)
     if not path.exists():
-        if reason := absent_data(spec):
+        if reason := missing_data_reason(spec):
             raise InputError(f"'{spec}' cannot be opened: {reason}.", "Set the variable to the folder that holds it.")
         raise InputError(
             f"'{spec}' is neither a built-in scene nor an existing path.{did_you_mean(spec, _built_in())}",
@@ -106,7 +106,7 @@ def _load(spec: str, options: SceneOptions, progress: Callable[[int, int, str], 
 
 
 def find_loader(path: Path) -> Loader:
-    """The first format that fits ``path``, in the registry's order.
+    """Find the first loader that matches ``path``, in the registry's order.
 
     Raises:
         InputError: none fits; the sentence says what was looked for.
@@ -124,8 +124,8 @@ def find_loader(path: Path) -> Loader:
     )
 
 
-def absent_data(spec: str) -> str:
-    """Why the data that a path names through a variable is not on this machine; empty where it is, and for other paths."""
+def missing_data_reason(spec: str) -> str:
+    """Reason why data behind an environment variable is absent here; empty where it exists, and for other paths."""
     variable, slash, name = spec.removeprefix("$").partition("/")
     if not spec.startswith("$") or not slash:
         return ""
@@ -135,17 +135,17 @@ def absent_data(spec: str) -> str:
 
 
 def _path(spec: str) -> Path:
-    """The path that a person wrote, with its variables and its home filled in."""
+    """Expand environment variables and ``~`` in a path."""
     return Path(os.path.expandvars(spec)).expanduser()
 
 
 def is_rendered(spec: str) -> bool:
-    """Whether a scene's truth is rendered here, so that its samples per pixel can be chosen."""
+    """Whether a scene is rendered here (built in, or a ``scene.toml``), so that its samples per pixel can be chosen."""
     return _description(spec) is not None
 
 
-def choices(scene: Scene) -> str:
-    """The scene's notes on which model and photographs were taken, a line each to print before work starts; mostly empty."""
+def selection_notes(scene: Scene) -> str:
+    """Format the scene's notes on the chosen model and on missing photographs, a line each; mostly empty."""
     return "".join(f"\n  {key}: {scene.notes[key]}" for key in ("model", "missing") if key in scene.notes)
 
 
@@ -156,7 +156,7 @@ def _built_in() -> tuple[str, ...]:
 
 
 def _description(spec: str) -> str | None:
-    """What `make` calls the scene: a built-in scene's name or the path of a ``scene.toml``; ``None`` for a data set."""
+    """Name for `make`: a built-in scene or the path of a ``scene.toml``; ``None`` for a data set."""
     from invgraphics.scenes.mitsuba.spec import FILE
 
     path = _path(spec)
@@ -184,7 +184,7 @@ def _render(description: str, options: SceneOptions, progress: Callable[[int, in
 
 
 def validate(scene: Scene) -> Scene:
-    """Check what everything later relies on; returns the scene.
+    """Validate a scene's poses, pixels, splits and ranges; returns the scene.
 
     Raises:
         InputError: a pose is not rigid, pixels are not finite or not of the camera's size, a split is empty, a test camera is

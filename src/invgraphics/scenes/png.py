@@ -11,7 +11,7 @@ _HEAD = struct.Struct(">I4s")  # length of the data and type; then the data and 
 
 
 def damage(path: Path) -> str:
-    """What is wrong with the chunks of a PNG file (PNG specification, 5.3), in words; empty for none, and for other formats."""
+    """Check the chunks of a PNG file (PNG specification, 5.3); returns the damage in words, empty for none or other formats."""
     data = path.read_bytes()
     if not data.startswith(SIGNATURE):
         return ""

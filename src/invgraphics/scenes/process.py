@@ -22,12 +22,12 @@ Progress = Callable[[int, int, str], None]
 
 
 def write_progress(done: int, total: int, what: str) -> None:
-    """Report a worker's progress on its standard output."""
+    """Write a worker's progress as a line of standard output."""
     print(f"progress {done} {total} {what}", flush=True)
 
 
 def write_error(error: InputError) -> None:
-    """Report a worker's failure on its standard output."""
+    """Write a worker's failure as a line of standard output."""
     print(f"error {json.dumps([error.sentence, error.remedy])}", flush=True)
 
 
@@ -40,7 +40,9 @@ def run_worker(
     environment: Mapping[str, str] | None = None,
     lock: int | None = None,
 ) -> None:
-    """Run ``python -m module folder`` to its end; it ends with this process, and an interruption here ends it too.
+    """Run ``python -m module folder`` to its end, forwarding its progress.
+
+    It ends with this process, and an interruption here ends it too.
 
     Args:
         module: what to run.
@@ -74,7 +76,7 @@ def run_worker(
 
 
 def _follow(process: subprocess.Popen[str], progress: Progress) -> InputError | None:
-    """Forward progress until the process closes its output; returns the failure that it reported, if any."""
+    """Forward progress until the process closes its output; returns its reported failure, if any."""
     failure = None
     for line in process.stdout or ():
         word, _, rest = line.rstrip("\n").partition(" ")
@@ -87,7 +89,7 @@ def _follow(process: subprocess.Popen[str], progress: Progress) -> InputError | 
 
 
 def _explain(subject: str, remedy: str, status: int, complaints: IO[str]) -> InputError:
-    """The failure of a process that reported none: its signal, or the last line of its standard error."""
+    """Make the error of a process that reported none: its signal, or the last line of its standard error."""
     if status < 0:
         return InputError(f"{subject}: its process died of {signal.Signals(-status).name}.", remedy)
     complaints.seek(0)

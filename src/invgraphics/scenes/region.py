@@ -1,4 +1,4 @@
-"""What known points say about the region of an unbounded scene: how large its subject is, and how near anything comes."""
+"""Region of an unbounded scene, estimated from known surface points: extent of the subject, and near distance."""
 
 from __future__ import annotations
 
@@ -26,7 +26,11 @@ FEWEST = 16
 
 
 def subject_half(points: Float[Tensor, "n 3"]) -> float:
-    """Half-edge of the box around the origin that holds the subject with some room, local units, at most 1."""
+    """Half edge of the cube around the origin that holds the subject with a margin, local units, at most 1.
+
+    Args:
+        points: surface points, local frame.
+    """
     if len(points) < FEWEST:
         return 1.0
     radius = float(points.norm(dim=1).double().quantile(SUBJECT_SHARE))
@@ -34,7 +38,7 @@ def subject_half(points: Float[Tensor, "n 3"]) -> float:
 
 
 def near_plane(poses: Float[Tensor, "k 4 4"], points: Float[Tensor, "n 3"]) -> float | None:
-    """Distance from cameras at which samples may begin: a share of the nearest point's; ``None`` if points say nothing.
+    """Near distance of cameras: a share of the nearest point's distance; ``None`` with too few points.
 
     Args:
         poses: camera-to-world; ``points`` are in the same frame.

@@ -12,7 +12,7 @@ import torch
 from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, Photo, load_view
-from invgraphics.scenes.layout import SceneOptions, evenly, pose
+from invgraphics.scenes.layout import SceneOptions, evenly_spaced, pose
 from invgraphics.scenes.mitsuba import cache, ply
 from invgraphics.tables import read_arrays
 
@@ -26,11 +26,11 @@ class Truth:
     """Loader of rendered scenes; the local frame is the renderer's world, +z up."""
 
     def matches(self, path: Path) -> bool:
-        """Whether ``path`` is such a folder."""
+        """Whether ``path`` is a folder with a ``truth.json``."""
         return (path / cache.TRUTH).is_file()
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Read the folder.
+        """Load a rendered scene: pictures with alpha, depth, normals, points and mesh.
 
         Another size than the rendered is area-averaged; depth and normals, which belong to pixel centres, are then left out.
 
@@ -50,7 +50,7 @@ class Truth:
         views = {
             split: tuple(
                 _view(path, split, index, truth["cameras"][split][index], options)
-                for index in evenly(range(len(truth["cameras"][split])), count)
+                for index in evenly_spaced(range(len(truth["cameras"][split])), count)
             )
             for split, count in wanted.items()
         }
@@ -115,7 +115,7 @@ def _notes(truth: Mapping[str, Any], view: View) -> dict[str, str]:
 
 
 def _resizes(truth: Mapping[str, Any], final: tuple[int, int]) -> list[str]:
-    """How pictures came to their size: from a larger rendering to the folder's, and from the folder's to the view's."""
+    """Describe how pictures were resized: from a larger rendering to the folder's size, and to the view's."""
     width, height = truth["size"]
     source = truth.get(cache.AVERAGED_FROM)
     steps = [] if source is None else [f"{LINEAR_RESIZE}, {source['size'][0]}x{source['size'][1]} to {width}x{height}"]

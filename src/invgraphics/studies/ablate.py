@@ -20,14 +20,14 @@ from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.progress import Reporter
-from invgraphics.experiments.renderings import check_variants, rendered
+from invgraphics.experiments.renderings import check_variants, renderings_complete
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.study import CellRecord
-from invgraphics.scenes.open import absent_data
+from invgraphics.scenes.open import missing_data_reason
 from invgraphics.studies.analyses import write_analyses
 from invgraphics.studies.cells import Planned, make_plan, select
 from invgraphics.studies.forecast import Cost, Forecast, total, try_method
@@ -92,14 +92,14 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         states = {name: _state(planned, request.keep, name in chosen) for name, planned in fits.items()}
         samples, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
         for name, planned in fits.items():
-            if states[name].status == "missing" and _is_finished(planned, truths[_place(planned)], threads):
+            if states[name].status == "missing" and _is_finished(planned, truths[_truth_key(planned)], threads):
                 states[name] = CellState("done")
         missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
         costs = _try_methods(missing, samples)
-        missing.sort(key=lambda planned: _expense(planned, study, costs))
-        expected = {planned.id: costs[_kind(planned)].seconds(planned.job.budget) for planned in missing}
+        missing.sort(key=lambda planned: _execution_order(planned, study, costs))
+        expected = {planned.id: costs[_cost_key(planned)].seconds(planned.job.budget) for planned in missing}
         later = sum(state.status in ("later", "skipped") for state in states.values())
-        forecast = total([(costs[_kind(p)], p.job.budget) for p in missing], len(fits), request.jobs, later)
+        forecast = total([(costs[_cost_key(p)], p.job.budget) for p in missing], len(fits), request.jobs, later)
         _check_disk(forecast, folder.root)
         for sentence in announcements(planned.method.choice for planned in plan):
             print(sentence, file=sys.stderr)
@@ -121,32 +121,32 @@ def _state(planned: Planned, keep: bool, chosen: bool) -> CellState:
     """
     if keep and _is_kept(planned):
         return CellState("done")
-    if reason := absent_data(planned.cell.scene):
+    if reason := missing_data_reason(planned.cell.scene):
         return CellState("skipped", reason)
     return CellState("missing" if chosen else "later")
 
 
 def _is_kept(planned: Planned) -> bool:
     run = planned.job.folder
-    if not run.finished or not rendered(planned.job):
+    if not run.finished or not renderings_complete(planned.job):
         return False
     return run.read(Provenance).recipe_sha256 == planned.method.digest
 
 
-def _place(planned: Planned) -> tuple[str, Size]:
+def _truth_key(planned: Planned) -> tuple[str, Size]:
     """Key of a cell's ground truth: scene and size."""
     return planned.cell.scene, planned.fit.size
 
 
-def _kind(planned: Planned) -> tuple[str, str, Size]:
+def _cost_key(planned: Planned) -> tuple[str, str, Size]:
     """Key of a cell's measured cost: method, preset and size."""
     return planned.cell.method, planned.method.preset, planned.fit.size
 
 
-def _expense(planned: Planned, study: Study, costs: dict[tuple[str, str, Size], Cost]) -> tuple[int, float, int]:
+def _execution_order(planned: Planned, study: Study, costs: dict[tuple[str, str, Size], Cost]) -> tuple[int, float, int]:
     """Sort key of the execution order: seed, then forecast seconds, then size."""
     size = planned.fit.size
-    seconds = costs[_kind(planned)].fit_seconds(planned.job.budget)
+    seconds = costs[_cost_key(planned)].fit_seconds(planned.job.budget)
     return study.seeds.index(planned.cell.seed), seconds, max(size) if isinstance(size, tuple) else size or 0
 
 
@@ -158,9 +158,9 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple
     """
     samples: dict[Size, Scene] = {}
     truths = {}
-    for place in dict.fromkeys(map(_place, plan)):
+    for place in dict.fromkeys(map(_truth_key, plan)):
         name, size = place
-        group = [planned for planned in plan if _place(planned) == place]
+        group = [planned for planned in plan if _truth_key(planned) == place]
         scene = open_with_progress(name, group[0].job.options)
         for data in dict.fromkeys(planned.job.data for planned in group):
             data.check(scene)
@@ -174,15 +174,15 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple
 def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
     run = planned.job.folder
     same = run.finished and run.identity == identify(planned.job, truth, threads)
-    return same and rendered(planned.job)
+    return same and renderings_complete(planned.job)
 
 
 def _try_methods(missing: Sequence[Planned], samples: dict[Size, Scene]) -> dict[tuple[str, str, Size], Cost]:
     """Measure the cost of a run of each method with each preset at each size, on one scene of that size."""
     costs: dict[tuple[str, str, Size], Cost] = {}
     for planned in missing:
-        if _kind(planned) not in costs:
-            costs[_kind(planned)] = try_method(planned.job, samples[planned.fit.size])
+        if _cost_key(planned) not in costs:
+            costs[_cost_key(planned)] = try_method(planned.job, samples[planned.fit.size])
     return costs
 
 

@@ -57,12 +57,12 @@ def integrated(opacity: Literal["peak", "physical"] = "peak", steps: int = 64) -
 
 def affine_projection() -> Analysis:
     """Analyse the affine projection: largest alpha error of one isotropic Gaussian over its angle from the optical axis."""
-    curves, told = [], {}
+    curves, at_45 = [], {}
     for size in SIZES:
         errors = [affine_error(math.radians(angle), math.radians(size)) for angle in ANGLES]
         curves.append(Curve(f"standard deviation {size:g}°", tuple(map(float, ANGLES)), tuple(errors)))
-        told[size] = errors[ANGLES.index(45)]
-    listed = ", ".join(f"{error:.2g} for a Gaussian of {size:g}°" for size, error in told.items())
+        at_45[size] = errors[ANGLES.index(45)]
+    listed = ", ".join(f"{error:.2g} for a Gaussian of {size:g}°" for size, error in at_45.items())
     return Analysis(
         title="Affine projection: distance from the optical axis",
         sentence=f"45° off the axis, replacing perspective by its derivative at the centre changes alpha by up to {listed}.",
@@ -88,7 +88,7 @@ def affine_error(angle: float, size: float, opacity: float = 0.9) -> float:
     principal = torch.tensor([PATCH / 2 - focal * math.tan(angle), PATCH / 2], dtype=torch.float64)
     lens = torch.full((2,), focal, dtype=torch.float64)
     camera = Camera(torch.eye(4, dtype=torch.float64), lens, principal, PATCH, PATCH)
-    one = round_ones(centre[None], torch.tensor([size]), torch.tensor([opacity]))
+    one = isotropic_gaussians(centre[None], torch.tensor([size]), torch.tensor([opacity]))
     return _largest_gap(one, camera, splat(), along_rays())
 
 
@@ -121,7 +121,7 @@ def cloud_error(view: float, scale: float) -> float:
     directions = torch.nn.functional.normalize(torch.randn(CLOUD, 3, generator=generator, dtype=torch.float64), dim=1)
     means = directions * torch.rand(CLOUD, 1, generator=generator, dtype=torch.float64) ** (1 / 3) * (1 - 3 * scale)
     opacities = 0.1 + 0.8 * torch.rand(CLOUD, generator=generator)
-    cloud = round_ones(means, torch.full((CLOUD,), scale), opacities, torch.rand(CLOUD, 3, generator=generator))
+    cloud = isotropic_gaussians(means, torch.full((CLOUD,), scale), opacities, torch.rand(CLOUD, 3, generator=generator))
     distance = 1 / math.sin(view / 2)
     pose = look_at(torch.tensor([0.0, -distance, 0.0]), torch.zeros(3), torch.tensor(UP)).double()
     lens = torch.full((2,), PATCH / 2 / math.tan(view / 2), dtype=torch.float64)
@@ -171,7 +171,7 @@ def crossing(renderer: Renderer, turns: int = TURNS) -> tuple[list[float], list[
 def crossing_pair(rgb: Float[Tensor, "2 3"]) -> Gaussians:
     """Make two elongated Gaussians of these colours that cross at the origin, turned by ±0.4 rad about z from x."""
     means = torch.tensor([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
-    pair = round_ones(means, torch.tensor([0.1, 0.1]), torch.tensor([0.8, 0.8]), rgb)
+    pair = isotropic_gaussians(means, torch.tensor([0.1, 0.1]), torch.tensor([0.8, 0.8]), rgb)
     scales = torch.tensor([[0.5, 0.1, 0.1], [0.5, 0.1, 0.1]]).double()
     turns = torch.tensor([[math.cos(0.2), 0.0, 0.0, math.sin(0.2)], [math.cos(0.2), 0.0, 0.0, -math.sin(0.2)]]).double()
     return replace(pair, quaternions=turns, scales=scales)
@@ -194,7 +194,7 @@ def opacity_convention() -> Analysis:
 
 def opacity_gap(opacity: float) -> float:
     """Largest difference of alpha over the pixels of one round Gaussian, splatted and marched along the same rays."""
-    one = round_ones(torch.zeros(1, 3), torch.tensor([0.1]), torch.tensor([opacity]))
+    one = isotropic_gaussians(torch.zeros(1, 3), torch.tensor([0.1]), torch.tensor([opacity]))
     pose = look_at(torch.tensor([0.0, -5.0, 0.0]), torch.zeros(3), torch.tensor(UP)).double()
     focal = RESPONSES / (3 * 0.1 / 5)
     centre = torch.tensor([0.0, 0.5], dtype=torch.float64)
@@ -209,7 +209,7 @@ def opacity_gap_formula(opacity: float) -> float:
     return 1 - math.exp(-rate * response) - opacity * response
 
 
-def round_ones(
+def isotropic_gaussians(
     means: Float[Tensor, "n 3"],
     sizes: Float[Tensor, " n"],
     opacities: Float[Tensor, " n"],

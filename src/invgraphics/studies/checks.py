@@ -33,7 +33,7 @@ def completed(study: Study, where: str) -> Study:
         if absent and name in defaults:
             base.setdefault(name, list(defaults[name]) if isinstance(defaults[name], tuple) else defaults[name])
         if absent and name not in base:
-            raise InputError(f"{where}: cell {absent[0] + 1} does not say '{name}', and neither does [base].")
+            raise InputError(f"{where}: cell {absent[0] + 1} has no '{name}', and neither has [base].")
         found = ([base[name]] if absent else []) + [cell[name] for cell in cells if name in cell]
         factors[name] = [level for index, level in enumerate(found) if level not in found[:index]]
     first = {name: levels[0] for name, levels in factors.items() if levels}
@@ -90,7 +90,7 @@ def _check_count(study: Study, where: str) -> None:
     count = points * len(study.scenes) * len(study.methods) * len(study.seeds)
     if count > MOST_CELLS:
         raise InputError(
-            f"{where} asks for {count:,} cells; a study has at most {MOST_CELLS:,}.",
+            f"{where} has {count:,} cells; a study has at most {MOST_CELLS:,}.",
             "Give fewer levels in [factors], or the design 'one-at-a-time'.",
         )
 

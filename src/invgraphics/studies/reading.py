@@ -63,5 +63,5 @@ def with_request(study: Study, request: AblateRequest) -> Study:
     names = ("seeds", "budget", "size", "test_views", "spp")
     given = {name: getattr(request, name) for name in names if getattr(request, name) is not None}
     if refused := [name for name in given if name in varied]:
-        raise InputError(f"--{refused[0]} cannot be given: the study itself says it in its factors, base or cells.")
+        raise InputError(f"--{refused[0]} cannot be given: the study itself sets it in its factors, base or cells.")
     return checked(replace(study, **given), f"The study '{request.study}'")

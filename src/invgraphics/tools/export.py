@@ -122,7 +122,7 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
 
     _, written = read_gaussians(request.out)
     back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
-    loss = agreement(local, on_device(back, fitted.model.device), fitted)
+    loss = psnr_between(local, on_device(back, fitted.model.device), fitted)
     degree = harmonics.degree_of(written.gaussians.sh.shape[1])
     had = harmonics.degree_of(local.sh.shape[1])
     return Exported(
@@ -146,19 +146,19 @@ def with_degree(gaussians: Gaussians, degree: int | None) -> Gaussians:
     return replace(gaussians, sh=sh)
 
 
-def agreement(gaussians: Gaussians, others: Gaussians, fitted: Fitted) -> list[float]:
+def psnr_between(gaussians: Gaussians, others: Gaussians, fitted: Fitted) -> list[float]:
     """PSNR in dB between the pictures of two sets of Gaussians, one value for each test view; infinite where equal."""
     psnr = []
     with Reporter("comparing") as reporter:
         for index, view in enumerate(fitted.scene.test):
-            ours, theirs = (shown(each, fitted, view.camera) for each in (gaussians, others))
+            ours, theirs = (render_gaussians(each, fitted, view.camera) for each in (gaussians, others))
             error = float((ours - theirs).square().mean())
             psnr.append(-10 * math.log10(error) if error else math.inf)
             reporter.show((index + 1) / len(fitted.scene.test), f"view {index + 1} of {len(fitted.scene.test)}")
     return psnr
 
 
-def shown(gaussians: Gaussians, fitted: Fitted, camera: Camera) -> Tensor:
+def render_gaussians(gaussians: Gaussians, fitted: Fitted, camera: Camera) -> Tensor:
     """Render Gaussians through a run's renderer: colours over the scene's background, in [0, 1], (height, width, 3)."""
     picture = replace(fitted.model, field=FixedGaussians(gaussians)).render(camera, normals=False)
     return picture.over(fitted.scene.background).clamp(0, 1)

@@ -89,22 +89,24 @@ def _film(fitted: Fitted, request: FilmRequest, saved: CameraPath | None) -> Pat
     elif saved is not None:
         count, like = request.frames or saved.frame_count(request.rate), _sized(fitted.scene.test[0].camera, request.size)
         cameras = saved.cameras(fitted.scene, count, (like.width, like.height))
-        total, pictures = count, _along(fitted, cameras, request)
+        total, pictures = count, _render_cameras(fitted, cameras, request)
     else:
         assert not isinstance(request.path, Path)
         capture = classify_capture(fitted.scene)
         path = request.path or capture.path
-        print(explanation(path, capture), file=sys.stderr)
+        print(path_explanation(path, capture), file=sys.stderr)
         request = replace(request, path=path)
         total = request.frames or FRAMES
-        pictures = _along(fitted, [_sized(camera, request.size) for camera in PATHS[path](fitted.scene, total)], request)
+        pictures = _render_cameras(
+            fitted, [_sized(camera, request.size) for camera in PATHS[path](fitted.scene, total)], request
+        )
     with Reporter(f"{request.path} of {request.run}") as reporter, FilmWriter(request.out, request.rate) as writer:
-        for picture in _reported(pictures, total, reporter):
+        for picture in _with_progress(pictures, total, reporter):
             writer.add(picture)
     return request.out
 
 
-def explanation(path: str, capture: Capture) -> str:
+def path_explanation(path: str, capture: Capture) -> str:
     """Explain in one line why the path was chosen, or why it does not suit the capture."""
     if path == capture.path:
         return f"Path: {path}, as the photographs {capture.words}."
@@ -113,7 +115,7 @@ def explanation(path: str, capture: Capture) -> str:
     return f"Path: {path}."
 
 
-def _reported(pictures: Iterator[np.ndarray], total: int, reporter: Reporter) -> Iterator[np.ndarray]:
+def _with_progress(pictures: Iterator[np.ndarray], total: int, reporter: Reporter) -> Iterator[np.ndarray]:
     for index, picture in enumerate(pictures):
         if index < total:  # a time-lapse holds its last picture
             reporter.show((index + 1) / total, f"picture {index + 1} of {total}")
@@ -145,7 +147,7 @@ def _timelapse(fitted: Fitted, request: FilmRequest) -> tuple[int, Iterator[np.n
     return len(snapshots), pictures()
 
 
-def _along(fitted: Fitted, cameras: Sequence[Camera], request: FilmRequest) -> Iterator[np.ndarray]:
+def _render_cameras(fitted: Fitted, cameras: Sequence[Camera], request: FilmRequest) -> Iterator[np.ndarray]:
     """Render the pictures of a path, depth in one shared range, which is printed."""
     geometry, span = request.show == "normal", None
 

@@ -91,7 +91,7 @@ def _locate(request: LocateRequest, pixels: UInt8[np.ndarray, "h w c"], fitted: 
         found, tried = _search(
             fitted, [replace(v, camera=transform_camera(v.camera, drift)) for v in starts], request, reporter
         )
-    return _written(request, fitted, (found, tried), drift.inverse())
+    return _location_record(request, fitted, (found, tried), drift.inverse())
 
 
 def _photo(pixels: UInt8[np.ndarray, "h w c"], request: LocateRequest, scene: Scene) -> View:
@@ -157,7 +157,7 @@ def _search(fitted: Fitted, starts: list[View], request: LocateRequest, reporter
     return kept[0][0], [Start(start=i, loss_at_start=losses[i], rounds=rounds[i]) for i in order]
 
 
-def _written(request: LocateRequest, fitted: Fitted, result: tuple[View, list[Start]], back: Similarity) -> Location:
+def _location_record(request: LocateRequest, fitted: Fitted, result: tuple[View, list[Start]], back: Similarity) -> Location:
     found, tried = result
     scene = fitted.scene
     loss = photometric_error(fitted.model, found, scene)

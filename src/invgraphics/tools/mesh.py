@@ -15,7 +15,7 @@ from invgraphics.fields.starting import depth_points
 from invgraphics.formats.mesh_ply import write_mesh
 from invgraphics.metrics.surfaces import points_on, surface_distance
 from invgraphics.tools.export import Exported, ExportRequest
-from invgraphics.tools.surface_extraction import BAND, Surface, default_level, field_surface, fused_surface
+from invgraphics.tools.surface_extraction import TRUNCATION, Surface, default_level, field_surface, fused_surface
 
 MOST_PICTURES = 64
 """Training views whose depth is fused, evenly spaced; more cost time and add little."""
@@ -33,9 +33,9 @@ def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
     """
     scene = fitted.scene
     if Quantity.SDF in fitted.model.field.provides or Quantity.DENSITY in fitted.model.field.provides:
-        surface, how = _cut(fitted, request)
+        surface, how = _marching_cubes(fitted, request)
     else:
-        surface, how = _fused(fitted, request)
+        surface, how = _fuse_depth(fitted, request)
     if not len(surface.faces):
         raise InputError(f"The model of '{request.run}' has no surface in the scene's bounds.", "Fit it for longer.")
     similarity = scene.world_from_local.cpu()
@@ -51,10 +51,10 @@ def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
         "small pieces left out": str(surface.dropped),
         "axes": "the data set's world",
     }
-    return Exported(request.out, facts | _against_truth(surface, scene))
+    return Exported(request.out, facts | _truth_distances(surface, scene))
 
 
-def _cut(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
+def _marching_cubes(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
     """Extract the surface by marching cubes; also names the method in words."""
     bounds = fitted.model.bounds
     surface = field_surface(fitted.model.field, bounds, request.resolution, request.level)
@@ -64,7 +64,7 @@ def _cut(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
     return surface, f"density {level:.3g} per local unit, {request.resolution} voxels along the longest edge"
 
 
-def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
+def _fuse_depth(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
     """Extract the surface by fusion of the training views' depth maps (median depth, where the renderer has it)."""
     if request.level is not None:
         remedy = "Leave --level out: its depth pictures are fused."
@@ -82,11 +82,11 @@ def _fused(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
 
         surface = fused_surface(cameras, render, scene.bounds, request.resolution)
     kind = model.renderer.depth_kind
-    how = f"{kind} depth of {count} training views, {request.resolution} voxels along the longest edge, band of {BAND:g}"
+    how = f"{kind} depth of {count} training views, {request.resolution} voxels along the longest edge, band of {TRUNCATION:g}"
     return surface, how
 
 
-def _against_truth(surface: Surface, scene: Scene) -> dict[str, str]:
+def _truth_distances(surface: Surface, scene: Scene) -> dict[str, str]:
     """Distances between the mesh and the true surface, in world units; empty where that is unknown.
 
     Completeness is measured on points of the training views' true depth only: the inside of objects is unobservable.

@@ -29,7 +29,7 @@ def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress:
     Args:
         job: which photographs, and how.
         out: folder of the scene.
-        truth: a data set with the true poses of these photographs, told by their file names. Without it, the folder of the
+        truth: a data set with the true poses of these photographs, matched by file name. Without it, the folder of the
             photographs and the one above are looked at for one.
         progress: called with (done, in all, what is being done).
 
@@ -77,8 +77,8 @@ def compare(folder: Path, quality: dict[str, Any], truth: Path) -> dict[str, Any
             true.append(pose)
     if len(true) < _LEAST:
         raise InputError(
-            f"{truth} knows the poses of {len(true)} of the {len(quality['cameras'])} placed photographs of {folder}.",
-            "Photographs are told by their file names, for instance 0001.jpg, or train/0001.png where splits share names.",
+            f"{truth} has poses of {len(true)} of the {len(quality['cameras'])} placed photographs of {folder}.",
+            "Photographs are matched by file name, for instance 0001.jpg, or train/0001.png where splits share names.",
         )
     errors = pose_errors(torch.stack(estimated), torch.stack(true))
     return {"source": str(truth), **errors.summary()}

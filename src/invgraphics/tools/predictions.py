@@ -18,7 +18,7 @@ from invgraphics.metrics.conventions import BLACK, Colour
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.images import image_files, read_pixels
-from invgraphics.tools.saved_pictures import is_baked, is_clear, read_picture, read_saved, read_truth
+from invgraphics.tools.saved_pictures import has_transparency, is_baked, read_picture, read_saved, read_truth
 
 LAYOUTS = (("renders", "gt"), ("color", "gt-color"))
 """Sub-folders of predictions and truth: of 3DGS's render.py and of nerfbaselines."""
@@ -156,7 +156,7 @@ def _sides(folder: Path, truth: Path | None) -> tuple[Path, Path]:
             return root / predictions, truth or root / true
     if truth is None:
         layouts = " and ".join("/ + ".join(pair) + "/" for pair in LAYOUTS)
-        raise InputError(f"'{root}' is no run and brings no true pictures.", f"Name them with --truth DIR (known: {layouts}).")
+        raise InputError(f"'{root}' is no run and has no true pictures.", f"Name them with --truth DIR (known: {layouts}).")
     return root, truth
 
 
@@ -194,7 +194,7 @@ def _any_alpha(matched: Sequence[tuple[Path, Path]]) -> bool:
         if pixels.shape[:2] != true_pixels.shape[:2]:
             (height, width), (true_height, true_width) = pixels.shape[:2], true_pixels.shape[:2]
             raise InputError(f"'{path}' is {width}x{height} pixels, its truth '{true}' is {true_width}x{true_height}.")
-        clear = clear or is_clear(pixels)
+        clear = clear or has_transparency(pixels)
     return clear
 
 

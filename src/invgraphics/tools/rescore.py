@@ -13,7 +13,7 @@ from invgraphics.metrics.conventions import PROTOCOLS, Protocol
 from invgraphics.metrics.protocols import ViewScore, score, summarise
 from invgraphics.runs.scores import DEFAULT, ScoredTruth, Scores
 from invgraphics.tools.predictions import PictureSet
-from invgraphics.tools.rescoring import Rescored, background_name, evaluated, labels, scores_of
+from invgraphics.tools.rescoring import Rescored, background_name, has_model_scores, labels, scores_of
 
 SHARED = ("psnr", "ssim", "lpips")
 """Metrics that are recomputed where a run's own scores hold the others already."""
@@ -115,7 +115,7 @@ def _metrics(pictures: PictureSet, protocol: Protocol) -> tuple[str, ...] | None
     """Metrics to compute: a protocol's own; of ours, the shared ones where the run has the others; ``None`` for all."""
     if protocol.measures is not None:
         return tuple(protocol.measures)
-    return SHARED if evaluated(pictures, protocol.name) else None
+    return SHARED if has_model_scores(pictures, protocol.name) else None
 
 
 def _wants_bytes(pictures: PictureSet, truth: View, protocol: Protocol) -> bool:
@@ -143,7 +143,7 @@ def _scores(pictures: PictureSet, protocol: Protocol, views: Sequence[ViewScore]
         quality, skipped = summarise(views, protocol)
     run, own = pictures.provenance, scores_of(pictures, DEFAULT)
     eight_bit = pictures.eight_bit and protocol.prediction == "none"
-    caution = ("Unrounded predictions are wanted; 8-bit pictures stand in for them.",) if eight_bit and not lacking else ()
+    caution = ("The protocol needs unrounded predictions; 8-bit pictures were used.",) if eight_bit and not lacking else ()
     truth = ScoredTruth(
         sha256=pictures.sha256, size=pictures.size, background=pictures.background, transparency=pictures.transparency
     )

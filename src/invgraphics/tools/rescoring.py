@@ -60,7 +60,7 @@ def write_scores(rescored: Rescored, out: Path | None) -> list[Path]:
     written = []
     with output_folder(folder):
         for protocol, scores in rescored.scores.items():
-            if not scores.quality or (out is None and evaluated(pictures, protocol)):
+            if not scores.quality or (out is None and has_model_scores(pictures, protocol)):
                 continue
             written.append(folder / scores.file)
             scores.write(written[-1])
@@ -77,7 +77,7 @@ def scores_of(pictures: PictureSet, protocol: str) -> Scores | None:
     return run.read_scores(protocol) if pictures.provenance and run.scores_path(protocol).is_file() else None
 
 
-def evaluated(pictures: PictureSet, protocol: str) -> bool:
+def has_model_scores(pictures: PictureSet, protocol: str) -> bool:
     """Whether the run has scores under a protocol that were made from its model."""
     scores = scores_of(pictures, protocol)
     return scores is not None and not scores.rescored
@@ -89,7 +89,7 @@ def rows_of(rescored: Rescored) -> tuple[list[str], list[list[str]]]:
     rows = []
     for name, scores in rescored.scores.items():
         cells = [_cell(scores.quality.get(key), decimals) for key, (_, decimals) in shown.items()]
-        rows.append([name, *cells, *stated(PROTOCOLS[name])])
+        rows.append([name, *cells, *protocol_words(PROTOCOLS[name])])
     if len(rows) > 1 and shown:
         spread = [f"{spread_of(rescored, key):.{decimals}f}" for key, (_, decimals) in shown.items()]
         rows.append(["spread", *spread, "", "", ""])
@@ -102,14 +102,14 @@ def spread_of(rescored: Rescored, metric: str) -> float:
     return max(values) - min(values)
 
 
-def stated(protocol: Protocol) -> tuple[str, str, str]:
+def protocol_words(protocol: Protocol) -> tuple[str, str, str]:
     """Describe a protocol's background and its rounding of prediction and truth."""
     words = {"none": "float", "nearest": "8-bit, rounded", "down": "8-bit, truncated"}
     background = protocol.background if isinstance(protocol.background, str) else background_name(protocol.background)
     return background, words[protocol.prediction], words[protocol.truth]
 
 
-def winners(results: Sequence[Rescored], metric: str) -> str:
+def best_sets(results: Sequence[Rescored], metric: str) -> str:
     """Name the best set under each protocol in a sentence; empty for a single set, or without the metric."""
     best: dict[str, list[str]] = {}
     for protocol in results[0].scores:
@@ -126,7 +126,7 @@ def winners(results: Sequence[Rescored], metric: str) -> str:
     return f"Best {metric} depends on the protocol: {parts}."
 
 
-def reasons(rescored: Rescored) -> list[str]:
+def skip_reasons(rescored: Rescored) -> list[str]:
     """List the skipped protocols with their reasons, then the assumptions, one line each."""
     skipped: dict[str, dict[str, list[str]]] = {}
     noted: dict[str, list[str]] = {}
@@ -151,7 +151,7 @@ def write_tables(results: Sequence[Rescored], out: Path) -> list[Path]:
         width, height = one.pictures.size
         lines += [f"## {one.label}", "", f"{len(one.pictures.names)} views of {width}x{height} pixels.", ""]
         lines += [_markdown(row) for row in (columns, ["---"] * len(columns), *rows)]
-        lines += ["", *(f"- {line}" for line in reasons(one)), ""]
+        lines += ["", *(f"- {line}" for line in skip_reasons(one)), ""]
     lines += ["## Sources", ""]
     lines += [
         f"- {name}: {protocol.summary}. {_source(protocol)}"
@@ -170,7 +170,7 @@ def _write_csv(results: Sequence[Rescored], path: Path) -> Path:
         writer.writerow(["pictures", "protocol", "metric", "mean", "unit", "background", "prediction", "truth", "skipped"])
         for one in results:
             for protocol, scores in one.scores.items():
-                rest = stated(PROTOCOLS[protocol])
+                rest = protocol_words(PROTOCOLS[protocol])
                 for metric, entry in scores.quality.items():
                     writer.writerow([one.label, protocol, metric, repr(entry.mean), entry.unit, *rest, ""])
                 for metric, reason in scores.skipped.items():

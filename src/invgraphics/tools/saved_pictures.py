@@ -29,7 +29,7 @@ def read_truth(path: Path, scene: Scene) -> View:
             alpha = (coverage * 255).round().to(torch.uint8) if image.dtype == torch.uint8 else coverage
     elif scene.colour == "linear":
         image = srgb_to_linear(image.float() / 255)
-    if is_clear(pixels):
+    if has_transparency(pixels):
         alpha = torch.from_numpy(pixels[..., 3].copy())
     maps = {key: torch.from_numpy(arrays[key]).float() for key in ("depth", "normal") if key in arrays}
     mask = torch.from_numpy(arrays["mask"]) if "mask" in arrays else None
@@ -43,7 +43,7 @@ def is_baked(truth: Path) -> bool:
     return "alpha" in arrays and "rgb" not in arrays and bool((arrays["alpha"] < 1).any())
 
 
-def is_clear(pixels: UInt8[np.ndarray, "h w c"]) -> bool:
+def has_transparency(pixels: UInt8[np.ndarray, "h w c"]) -> bool:
     """Whether a picture has transparent pixels."""
     return pixels.shape[2] == 4 and bool(pixels[..., 3].min() < 255)
 

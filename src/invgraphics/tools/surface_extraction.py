@@ -17,14 +17,14 @@ from invgraphics.renderers.volumetric import query
 
 HALF_OPAQUE = 0.01
 """The default level of a density is that of which this share of the bounds' diagonal has alpha 1/2."""
-BAND = 4.0
-"""How far from a surface a depth picture is believed, in voxels."""
+TRUNCATION = 4.0
+"""Truncation distance of signed distances, in voxels."""
 GRAZING = 0.05
 """Least weight of a picture that grazes a surface; one that faces it has 1."""
 SPECK = 1e-3
 """Pieces of a surface with a smaller share of its triangles are left out: fog and floaters."""
-AT_ONCE = 1 << 20
-"""Voxels that are looked at together."""
+CHUNK = 1 << 20
+"""Voxels that are evaluated together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +109,8 @@ def field_surface(field: Field, bounds: Bounds, resolution: int, level: float | 
     name, outside = ("sdf", math.inf) if wanted is Quantity.SDF else ("density", 0.0)
     level = level if level is not None else 0.0 if wanted is Quantity.SDF else default_level(bounds)
     parts = [
-        getattr(query(field, Samples.at(lattice.centres(first, first + AT_ONCE)), wanted, chunk), name)
-        for first in range(0, len(lattice), AT_ONCE)
+        getattr(query(field, Samples.at(lattice.centres(first, first + CHUNK)), wanted, chunk), name)
+        for first in range(0, len(lattice), CHUNK)
     ]
     volume = torch.cat(parts).view(lattice.shape)
     outside = min(outside, float(volume.max()) + lattice.step)
@@ -128,9 +128,9 @@ def field_surface(field: Field, bounds: Bounds, resolution: int, level: float | 
 def fused_surface(cameras: Sequence[Camera], render: Callable[[int], Rendering], bounds: Bounds, resolution: int) -> Surface:
     """Fuse depth maps to a surface by truncated signed distances (TSDF; Curless and Levoy 1996).
 
-    Each picture says of every voxel in front of its surface, and up to `BAND` voxels behind it, how far the surface is along
-    the ray; the mean over pictures is zero on the surface. Where pictures have normals, those that face the surface count more
-    than those that graze it. What no picture saw from near its surface stays open.
+    Each picture gives every voxel in front of its surface, and up to `TRUNCATION` voxels behind it, a signed distance along the
+    ray; the surface is where the mean over pictures is zero. Where pictures have normals, distances are weighted by the cosine
+    between ray and normal. Voxels that no picture observed near its surface stay open.
 
     Args:
         cameras: of the pictures.
@@ -142,14 +142,14 @@ def fused_surface(cameras: Sequence[Camera], render: Callable[[int], Rendering],
         InputError: the pictures show no surface.
     """
     lattice = Lattice.across(bounds, resolution)
-    band = BAND * lattice.step
+    band = TRUNCATION * lattice.step
     sums, counts, light = torch.zeros(len(lattice)), torch.zeros(len(lattice)), torch.zeros(len(lattice), 4)
     for index, camera in enumerate(cameras):
         picture = render(index)
-        worth = _facing(picture, camera)
-        for first in range(0, len(lattice), AT_ONCE):
-            part = slice(first, min(first + AT_ONCE, len(lattice)))
-            distance, pixel = _ahead(lattice.centres(part.start, part.stop), camera, picture.depth)
+        worth = _view_cosines(picture, camera)
+        for first in range(0, len(lattice), CHUNK):
+            part = slice(first, min(first + CHUNK, len(lattice)))
+            distance, pixel = _projective_distances(lattice.centres(part.start, part.stop), camera, picture.depth)
             weight = torch.where(distance >= -band, worth[pixel], 0.0)
             sums[part] += weight * (distance / band).clamp(-1, 1)
             counts[part] += weight
@@ -168,7 +168,7 @@ def fused_surface(cameras: Sequence[Camera], render: Callable[[int], Rendering],
     return without_specks(Surface(places[used], corners.view(-1, 3), colours[nearest][used]))
 
 
-def _facing(picture: Rendering, camera: Camera) -> Float[Tensor, " pixels"]:
+def _view_cosines(picture: Rendering, camera: Camera) -> Float[Tensor, " pixels"]:
     """Cosine between each pixel's ray and its surface's normal, at least `GRAZING`; 1 where there is no normal."""
     if picture.normal is None:
         return torch.ones(camera.width * camera.height)
@@ -177,7 +177,7 @@ def _facing(picture: Rendering, camera: Camera) -> Float[Tensor, " pixels"]:
     return torch.where(normal.any(dim=1), cosine.clamp(GRAZING, 1), 1.0)
 
 
-def _ahead(
+def _projective_distances(
     points: Float[Tensor, "n 3"], camera: Camera, depth: Float[Tensor, "h w"]
 ) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
     """Projective signed distance of each point before its pixel's depth, -inf outside the picture; and that pixel's index."""

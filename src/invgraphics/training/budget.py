@@ -65,6 +65,6 @@ class Cadence:
         """
         found = re.fullmatch(r"\s*([0-9]+)\s*(steps?|s)\s*", text)
         if found is None or int(found.group(1)) == 0:
-            raise InputError(f"'{text}' says no interval for checkpoints.", "Expected something like 100steps or 30s.")
+            raise InputError(f"'{text}' is no interval for checkpoints.", "Expected something like 100steps or 30s.")
         amount = int(found.group(1))
         return Cadence(seconds=float(amount)) if found.group(2) == "s" else Cadence(steps=amount)

@@ -140,8 +140,8 @@ class Fit:
 
     def _set_coarse_to_fine(self, progress: float) -> None:
         for encoding in self._coarse_to_fine:
-            if encoding.detail is not None and self.plan.poses is not None:
-                encoding.detail.fill_(self.plan.poses.config.alpha(progress))
+            if encoding.window_alpha is not None and self.plan.poses is not None:
+                encoding.window_alpha.fill_(self.plan.poses.config.alpha(progress))
 
     def _render(self, ctx: Context) -> tuple[Rendering, Trace, Batch]:
         renderer, fitted = self.plan.model.renderer, self.plan.model.field

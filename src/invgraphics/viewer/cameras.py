@@ -80,7 +80,10 @@ class LetterboxedView:
         across, down = 2 * max(cx, square.width - cx), 2 * max(cy, square.height - cy)
         height = math.ceil(max(down, across / aspect))
         width = max(math.ceil(across), round(height * aspect))
-        left, top = _between(width / 2 - cx, width - square.width), _between(height / 2 - cy, height - square.height)
+        left, top = (
+            _rounded_within(width / 2 - cx, width - square.width),
+            _rounded_within(height / 2 - cy, height - square.height),
+        )
         return LetterboxedView(square, width, height, left, top)
 
     @property
@@ -89,7 +92,7 @@ class LetterboxedView:
         return 2 * math.atan(self.height / 2 / float(self.camera.focal[1]))
 
 
-def _between(offset: float, most: int) -> int:
+def _rounded_within(offset: float, most: int) -> int:
     return max(0, min(round(offset), most))
 
 

@@ -159,7 +159,7 @@ class ProgressiveRenderer:
                 yield 0.0
         on_frame(self._compose(request, sides, letterbox))
         if moving:
-            self._learn(sides, self._clock() - began)
+            self._update_resolutions(sides, self._clock() - began)
         yield SETTLE_SECONDS if moving else 0.0
         while waiting := [side for side in sides if side.scales]:
             # The side with the least time so far: a fast run is fine long before a slow one.
@@ -167,7 +167,7 @@ class ProgressiveRenderer:
                 on_frame(self._compose(request, sides, letterbox))
             yield 0.0
 
-    def _learn(self, sides: Sequence[_Side], seconds: float) -> None:
+    def _update_resolutions(self, sides: Sequence[_Side], seconds: float) -> None:
         """Adapt the resolution of each side to a frame that took ``seconds``; composing and encoding are shared equally."""
         shared = (seconds - sum(side.spent for side in sides)) / len(sides)
         for side in sides:

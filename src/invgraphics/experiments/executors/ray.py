@@ -77,7 +77,7 @@ class RayExecutor:
             if most < wanted:
                 self._ray.shutdown()
                 raise InputError(
-                    f"Each fit asks for {wanted:g} {name}, and the cluster's largest node has {most:g}.",
+                    f"Each fit requests {wanted:g} {name}, and the cluster's largest node has {most:g}.",
                     "Give --jobs, which divides the cores among fits, or --gpus.",
                 )
 
@@ -94,7 +94,7 @@ def _fit(request: FitRequest, jobs: str, resources: Resources, folder: str) -> t
     """Run one fit on a worker. Paths in requests are relative to the driver's ``folder``."""
     for path in (jobs, folder):
         if not Path(path).is_dir():
-            return 1, f"A worker does not see {path}, which must be on a file system that all nodes share.", 0.0
+            return 1, f"A worker cannot access {path}, which must be on a file system that all nodes share.", 0.0
     os.chdir(folder)
     process = FitProcess(request, Path(jobs), resources)
     try:

@@ -26,7 +26,20 @@ QUOTED = re.compile(r"(['\"])((?:file://)?(?:~[\w.-]*)?/(?!/)[^'\"]*|[A-Za-z]:\\
 INSIDE = r"[^\s'\",;:()\[\]{}<>|/]"
 POSIX = re.compile(rf"(?:file://|(?<![\w./~…])(?:~[\w.-]*)?(?=/(?!/)))/(?:{INSIDE}|/)+")
 
-NOBODY = {"root", "user", "ubuntu", "admin", "runner", "nobody", "localhost", "docker", "shared", "public", "jovyan", "app"}
+GENERIC_NAMES = {
+    "root",
+    "user",
+    "ubuntu",
+    "admin",
+    "runner",
+    "nobody",
+    "localhost",
+    "docker",
+    "shared",
+    "public",
+    "jovyan",
+    "app",
+}
 """Names that identify no one, and that are words of ordinary sentences."""
 
 PRIVATE_KEYS = {"host", "hostname", "node", "user", "username", "login", "home", "cwd", "email"}
@@ -106,7 +119,7 @@ def redactor_for(records: Iterable[Any]) -> Redactor:
         found.add(getpass.getuser())
     for record in records:
         _gather(record, found)
-    names = {name for name in found if len(name) >= SHORTEST and name.lower() not in NOBODY}
+    names = {name for name in found if len(name) >= SHORTEST and name.lower() not in GENERIC_NAMES}
     paths = {name for name in found if _is_path(name)}
     longest = [tuple(sorted(group, key=lambda name: (-len(name), name))) for group in (names - paths, paths)]
     return Redactor(*longest)
@@ -134,7 +147,7 @@ def _gather(value: Any, found: set[str]) -> None:
             _gather(getattr(value, item.name), found)
 
 
-def check_apart(out: Path, runs: Iterable[Path]) -> None:
+def check_runs_outside(out: Path, runs: Iterable[Path]) -> None:
     """Refuse a public report whose folder would contain the runs themselves, which hold paths and names.
 
     Raises:

@@ -108,12 +108,12 @@ def read_study(folder: Path) -> Study:
         design=record.design,
         factors=factors,
         base=base,
-        scenes=_listed(record.scenes, (cell.scene for cell in cells)),
-        methods=_listed(record.methods, (cell.method for cell in cells)),
+        scenes=_in_stated_order(record.scenes, (cell.scene for cell in cells)),
+        methods=_in_stated_order(record.methods, (cell.method for cell in cells)),
         seeds=tuple(sorted({cell.seed for cell in cells})),
         budget=record.budget,
         preset=record.preset or "",
-        size=_written(record.size),
+        size=_size_text(record.size),
         protocol=record.protocol,
         command=record.command,
         environment=record.environment,
@@ -177,20 +177,20 @@ def _cell(record: CellRecord, base: Mapping[str, str], folder: Path, protocol: s
         seconds=record.seconds,
         run=read_run(folder / record.run, protocol) if record.status == "done" else None,
         label=record.label or f"{record.method} {record.scene}",
-        size=_written(record.size),
+        size=_size_text(record.size),
         budget=record.budget,
         amount=next(((unit, float(amount)) for unit, amount in amounts if amount is not None), None),
         forecast=record.forecast_seconds,
     )
 
 
-def _listed(stated: Sequence[str], found: Iterable[str]) -> tuple[str, ...]:
+def _in_stated_order(stated: Sequence[str], found: Iterable[str]) -> tuple[str, ...]:
     """Order ``found`` as ``stated``, unstated items last."""
     present = list(dict.fromkeys(found))
     return tuple(dict.fromkeys([*(item for item in stated if item in present), *present]))
 
 
-def _written(size: int | tuple[int, int] | None) -> str:
+def _size_text(size: int | tuple[int, int] | None) -> str:
     if size is None:
         return ""
     return str(size) if isinstance(size, int) else f"{size[0]} × {size[1]}"

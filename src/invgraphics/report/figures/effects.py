@@ -82,11 +82,11 @@ def _draw_row(axes: Axes, line: int, effect: Effect, colour: int, narrow: bool) 
     filled: dict[str, Any] = {} if effect.found else {"markerfacecolor": "none", "markeredgewidth": 1.8}
     axes.plot(value.mean * scale, line, look.marker, color=look.colour, markersize=9, zorder=4, **filled)
     unit = f" {effect.quantity.unit}" if effect.quantity.unit else ""
-    told = f"{effect.text(value.mean)}{unit} {effect.interval}".rstrip()
+    text = f"{effect.text(value.mean)}{unit} {effect.interval}".rstrip()
     place: dict[str, Any] = {"xycoords": axes.get_yaxis_transform(), "textcoords": "offset points", "va": "bottom"}
     axes.annotate(effect.label, (0, line), (2, 7), color=INK.light, fontsize=11.5, **place)
     if not narrow:
-        axes.annotate(told, (1, line), (-2, 7), color=look.colour, fontsize=11.5, ha="right", **place)
+        axes.annotate(text, (1, line), (-2, 7), color=look.colour, fontsize=11.5, ha="right", **place)
 
 
 @dataclass(frozen=True)
@@ -169,9 +169,9 @@ def _draw_heat(table: HeatMap, quantity: Quantity, stem: Path) -> Figure:
             spine.set_visible(False)
         axes.set_title(quantity.heading, fontsize=12.5)
         path = save(figure, stem)
-    told = "; ".join(f"{row}, {column}: {quantity.text(value)}" for (row, column), value in table.values.items())
+    text = "; ".join(f"{row}, {column}: {quantity.text(value)}" for (row, column), value in table.values.items())
     basis = f"mean over {table.runs} runs in each field" if table.matched else "fields rest on different runs"
-    return Figure(path, None, f"{title}, {basis}", f"{title}: {told}.")
+    return Figure(path, None, f"{title}, {basis}", f"{title}: {text}.")
 
 
 def _short(level: str) -> str:

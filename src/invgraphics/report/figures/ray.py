@@ -22,7 +22,7 @@ SIZE = (1120.0, 640.0)
 SHARPNESS = 2.0
 """Pixels of the PNG per CSS pixel."""
 LIGHT, DENSITY, PASS = SERIES[0].light, SERIES[3].light, SERIES[6].light
-LOOKS = {
+DEPTH_STYLES = {
     "true_depth": ("true depth", INK.light, "-"),
     "expected": ("mean", SERIES[1].light, (0, (5, 2))),
     "median": ("median", SERIES[2].light, (0, (1.5, 1.5))),
@@ -59,9 +59,9 @@ def draw_ray(folder: Path) -> Path:
         if close:
             _overview(figure.add_subplot(grid[0, 0]), ray, whole, close)
         _strip(strip, _nearest_colours(ray, strip), "colour")
-        _shares(main, ray)
+        _draw_weights(main, ray)
         _densities(below, ray)
-        _strip(total, _so_far(ray, total), "so far")
+        _strip(total, _composited_colours(ray, total), "so far")
         _depths((strip, main, below), ray)
         for axes in (strip, main, below):
             axes.tick_params(labelbottom=False, bottom=False)
@@ -110,7 +110,7 @@ def _nearest_colours(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
     return np.concatenate([ray.shown(ray.rgb[which]), np.asarray(there, float)[:, None]], axis=1)
 
 
-def _so_far(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
+def _composited_colours(ray: Ray, axes: Axes) -> Float[ndarray, "cells 4"]:
     """RGBA of the pixel composited up to each distance, over the background."""
     order = ray.columns["t"].argsort(kind="stable")
     weight, t = ray.columns["weight"][order], ray.columns["t"][order]
@@ -128,7 +128,7 @@ def _overview(axes: Axes, ray: Ray, whole: tuple[float, float], close: tuple[flo
     for start, stop, colour in zip(begin, end, ray.shown(ray.rgb), strict=True):
         axes.axvspan(start, stop, 0, 0.22, color=tuple(colour), linewidth=0)
     axes.axvspan(*close, color=GRID.light, zorder=0)
-    _light(axes, ray)
+    _draw_transmittance(axes, ray)
     axes.set(ylim=(-0.02, 1.06), yticks=[0, 1])
     axes.set_ylabel("whole ray", rotation=0, ha="right", va="center", labelpad=8)
 
@@ -145,7 +145,7 @@ def _strip(axes: Axes, colours: Float[ndarray, "cells 4"], name: str) -> None:
         spine.set_visible(False)
 
 
-def _shares(axes: Axes, ray: Ray) -> None:
+def _draw_weights(axes: Axes, ray: Ray) -> None:
     """Draw alpha (outlined), weight T·α (filled) and transmittance of all contributions."""
     columns, filled = ray.columns, ray.shown(ray.rgb)
     begin, end, t = columns["begin"], columns["end"], columns["t"]
@@ -155,7 +155,7 @@ def _shares(axes: Axes, ray: Ray) -> None:
     elif ray.record.kind == "samples":
         axes.bar(begin, columns["alpha"], end - begin, align="edge", facecolor="none", **edge, label="α")
         axes.bar(begin, columns["weight"], end - begin, align="edge", color=filled, **edge, label="weight T·α", zorder=3)
-        _gaps(axes, ray)
+        _shade_gaps(axes, ray)
     else:
         axes.vlines(t, 0, columns["alpha"], color=MUTED.light, linewidth=0.8, label="α", zorder=2)
         axes.plot(t, columns["alpha"], "_", color=MUTED.light, markersize=6, zorder=2)
@@ -164,7 +164,7 @@ def _shares(axes: Axes, ray: Ray) -> None:
     for index, earlier in enumerate(ray.record.passes):
         edges, weight = np.array([*earlier.t0, earlier.t1[-1]], float), np.array(earlier.weight, float)
         axes.stairs(weight, edges, color=PASS, linewidth=1.4, zorder=3.5, label=f"weights of pass {index + 1}, coarser")
-    _light(axes, ray)
+    _draw_transmittance(axes, ray)
     axes.set_ylim(0, 1.06)
     axes.set_ylabel("share of the light")
     if axes.get_legend_handles_labels()[0]:
@@ -173,7 +173,7 @@ def _shares(axes: Axes, ray: Ray) -> None:
         )
 
 
-def _light(axes: Axes, ray: Ray) -> None:
+def _draw_transmittance(axes: Axes, ray: Ray) -> None:
     """Draw transmittance: a curve where the density profile is known, else a step function."""
     profile, marched = curve_of(ray.record.profile), curve_of(ray.record.marched)
     if profile:
@@ -191,7 +191,7 @@ def _light(axes: Axes, ray: Ray) -> None:
         axes.plot(marched["t"], marched["transmittance"], label="T if they were marched", **style)
 
 
-def _gaps(axes: Axes, ray: Ray) -> None:
+def _shade_gaps(axes: Axes, ray: Ray) -> None:
     """Shade intervals of the ray without samples."""
     low, high = axes.get_xlim()
     begin, end = np.append(ray.columns["begin"], high), np.insert(ray.columns["end"], 0, low)
@@ -221,7 +221,7 @@ def _depths(panels: tuple[Axes, ...], ray: Ray) -> None:
     """Draw vertical lines at true, expected and median depth, labelled above the first panel."""
     strip, shares = panels[0], panels[1]
     low, high = strip.get_xlim()
-    found = sorted((value, *LOOKS[key]) for key, value in ray.depths.items() if low <= value <= high)
+    found = sorted((value, *DEPTH_STYLES[key]) for key, value in ray.depths.items() if low <= value <= high)
     for value, _, colour, dash in found:
         for axes in panels[1:]:
             axes.axvline(value, color=colour, linestyle=dash, linewidth=1.4, zorder=4.5)

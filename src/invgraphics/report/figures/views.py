@@ -232,7 +232,7 @@ def _error_layer(shown: Sequence[_Shown], truth: UInt8[ndarray, "h w 3"], index:
         means.append(float(error.mean()))
     if has_flip():
         pictures = _captioned(shown, pictures, ("flip",), index)
-        title, note = "FLIP error", "What an eye flipping between truth and method would notice, at 67 pixels per degree."
+        title, note = "FLIP error", "Visible difference when flipping between truth and method, at 67 pixels per degree."
     else:
         pictures = [replace(picture, caption=f"mean {mean:.3f}") for picture, mean in zip(pictures, means, strict=True)]
         title, note = "Absolute error", "Mean absolute difference of the colour channels; flip-evaluator is not installed."
@@ -271,7 +271,7 @@ def _normal_layer(shown: Sequence[_Shown], truth: Arrays, index: int, folder: Fo
     def save(arrays: Arrays, mask: Bool[ndarray, "h w"], path: Path) -> None:
         save_normals(path, arrays["normal"], mask)
 
-    note = "World x, y, z shown as red, green, blue; blank where opacity is below one half."
+    note = "x, y, z in the scene's local frame as red, green, blue; blank where opacity is below one half."
     truth_picture, pictures = _maps(shown, truth, "normal", (folder, target), save)
     methods = _with_methods(shown, _captioned(shown, pictures, ("normal_deg",), index))
     return Layer("normal", "Normals", note, "", "", "", truth_picture, methods)

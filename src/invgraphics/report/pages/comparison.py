@@ -11,7 +11,7 @@ from invgraphics.report.figures.views import has_flip
 from invgraphics.report.pages import facts
 from invgraphics.report.pages.parts import Contrasts, Part
 from invgraphics.report.pages.tables import escape_markdown, markdown_effects, markdown_table
-from invgraphics.report.statistics.cross_render import Crossed
+from invgraphics.report.statistics.cross_render import CrossTable
 from invgraphics.report.wording import listing
 
 
@@ -43,7 +43,7 @@ def write_html(part: Part, contrasts: Contrasts, folder: Folder) -> None:
         "scene_facts": facts.scene_facts(comparison),
         "scene_summary": facts.scene_sentence(comparison, "summary"),
         "scene_stresses": facts.scene_sentence(comparison, "stresses"),
-        "scene_suspicion": facts.scene_sentence(comparison, "suspicion"),
+        "inconsistent_poses": facts.scene_sentence(comparison, "inconsistent_poses"),
         "shared_facts": facts.shared_facts(comparison),
         "cells": facts.reproduction(comparison, folder),
     }
@@ -53,11 +53,11 @@ def write_html(part: Part, contrasts: Contrasts, folder: Folder) -> None:
 def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
     """Write ``index.md``, the page in Markdown for a repository."""
     comparison, text = part.comparison, escape_markdown
-    parts = [f"# {text(comparison.question)}", *(f"- {text(sentence)}" for sentence in part.told)]
+    parts = [f"# {text(comparison.question)}", *(f"- {text(sentence)}" for sentence in part.verdict)]
     settings = "; ".join(f"{name}: {value}" for name, value in facts.protocol_facts(comparison))
     stated = comparison.protocol.get("summary")
-    suspicion = facts.scene_sentence(comparison, "suspicion")
-    parts += ["", f"**The camera poses are suspicious.** {text(suspicion)}"] if suspicion else []
+    inconsistency = facts.scene_sentence(comparison, "inconsistent_poses")
+    parts += ["", f"**The camera poses are suspicious.** {text(inconsistency)}"] if inconsistency else []
     parts += [
         "",
         f"Scene **{text(comparison.scene)}**. {text(settings)}." + (f" Protocol: {text(str(stated))}." if stated else ""),
@@ -80,10 +80,10 @@ def markdown_part(part: Part) -> list[str]:
     lines = [markdown_table(part.summary), *(f"**{escape_markdown(text)}**\n" for text in part.summary.disturbances)]
     for why, labels in part.summary.skipped.items():
         lines.append(f"Not computed: {escape_markdown(listing(labels))} ({escape_markdown(why)}).")
-    return lines + markdown_crossed(part.crossed)
+    return lines + markdown_cross_table(part.cross_table)
 
 
-def markdown_crossed(crossed: Crossed | None) -> list[str]:
+def markdown_cross_table(crossed: CrossTable | None) -> list[str]:
     """Fit x render table in Markdown, with the picture difference of each approximation; empty without one."""
     if crossed is None:
         return []

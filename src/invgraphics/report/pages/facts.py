@@ -17,6 +17,16 @@ from invgraphics.text import duration
 Facts = tuple[tuple[str, str], ...]
 """(name, value) in the order in which they are shown."""
 
+ROUNDING = {"none": "unrounded", "nearest": "rounded to 8 bits", "down": "truncated to 8 bits"}
+"""Rounding of a protocol's pictures -> words."""
+SETTING_WORDS = {
+    ("background", "scene"): "the scene's",
+    ("masks", "excluded"): "masked pixels excluded",
+    ("masks", "zero"): "masked pixels set to zero",
+    ("masks", "unknown"): "not supported",
+}
+"""(Setting, value) of a protocol -> words."""
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -50,9 +60,22 @@ def protocol_facts(comparison: Comparison) -> Facts:
         facts["test views"] = str(len(comparison.runs[0].scores.views))
         facts["seeds"] = ", ".join(str(seed) for seed in sorted({run.seed for run in comparison.runs}))
     facts |= preset_facts(comparison.runs, comparison.preset)
-    for key, value in comparison.protocol.items():
-        if key not in ("name", "summary"):
-            facts[_words(key)] = _words(_text(value))
+    return (*facts.items(), *_scoring_facts(comparison.protocol))
+
+
+def _scoring_facts(protocol: Mapping[str, Any]) -> Facts:
+    """(name, value) facts of a protocol's settings, in words: rounding, background, masks, and the others as they are."""
+    settings = {key: value for key, value in protocol.items() if key not in ("name", "summary")}
+    sides = {side: _words(_text(settings.pop(side))) for side in ("prediction", "truth") if side in settings}
+    rounding = {side: ROUNDING.get(value, value) for side, value in sides.items()}
+    facts: dict[str, str] = {}
+    if len(rounding) == 2 and len(set(rounding.values())) == 1:
+        facts["pictures"] = f"both {rounding['truth']}"
+    elif rounding:
+        facts["pictures"] = ", ".join(f"{side} {words}" for side, words in rounding.items())
+    for key, value in settings.items():
+        text = _words(_text(value))
+        facts[_words(key)] = SETTING_WORDS.get((key, text), text)
     return tuple(facts.items())
 
 

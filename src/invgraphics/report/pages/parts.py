@@ -14,9 +14,9 @@ from invgraphics.report.figures.effects import draw_intervals
 from invgraphics.report.figures.style import Figure
 from invgraphics.report.figures.tradeoffs import draw_tradeoffs
 from invgraphics.report.figures.views import ViewPage, draw_views, publish_truth
-from invgraphics.report.statistics.cross_render import Crossed, cross
+from invgraphics.report.statistics.cross_render import CrossTable, cross_table
 from invgraphics.report.statistics.effects import Effect, effects_on
-from invgraphics.report.statistics.summary import Reach, Row, Summary, quality_columns, summarise, time_to_quality
+from invgraphics.report.statistics.summary import Row, Summary, TimeToQuality, quality_columns, summarise, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import Quantity
 from invgraphics.runs.study import Approximation
@@ -82,21 +82,21 @@ class Part:
         key: prefix of its anchors and folders; empty where the page has a single part.
         comparison: its methods or variants.
         summary: their table.
-        told: sentences of the verdict.
-        reach: time to quality; ``None`` without monitored runs.
+        verdict: its sentences.
+        time_to_quality: seconds to reach PSNR levels; ``None`` without monitored runs.
         drawn: plots and pictures.
         thumbnails: the truth of every test view.
-        crossed: the same fits through other renderers, where they were rendered.
+        cross_table: the same fits through other renderers, where they were rendered.
     """
 
     key: str
     comparison: Comparison
     summary: Summary
-    told: list[str]
-    reach: Reach | None
+    verdict: list[str]
+    time_to_quality: TimeToQuality | None
     drawn: Drawn
     thumbnails: list[Thumbnail]
-    crossed: Crossed | None
+    cross_table: CrossTable | None
 
     @property
     def groups(self) -> list[tuple[str, str, list[int]]]:
@@ -146,10 +146,16 @@ def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[A
         tradeoffs=draw_tradeoffs(summary, folder.figures),
         distributions=draw_distributions(comparison, summary, folder.figures),
     )
-    thumbnails = _thumbnails(comparison, drawn, folder)
-    told, reach = verdict(comparison, summary), time_to_quality(comparison)
-    crossed = cross(comparison, approximations, folder)
-    return Part(folder.part, comparison, summary, told, reach, drawn, thumbnails, crossed)
+    return Part(
+        key=folder.part,
+        comparison=comparison,
+        summary=summary,
+        verdict=verdict(comparison, summary),
+        time_to_quality=time_to_quality(comparison),
+        drawn=drawn,
+        thumbnails=_thumbnails(comparison, drawn, folder),
+        cross_table=cross_table(comparison, approximations, folder),
+    )
 
 
 def draw_contrasts(

@@ -119,7 +119,7 @@ def _progress(study: Study) -> list[str]:
         verb = "has" if missing == 1 else "have"
         sentences.append(f"{missing} of {total} cells {verb} not run yet: what follows may change.")
     if failed:
-        sentences.append(f"{failed} of {total} cells failed: see below the matrix. Comparisons leave their pairs out.")
+        sentences.append(f"{failed} of {total} cells failed: see below the matrix. Paired comparisons omit them.")
     if skipped := [cell for cell in study.cells if cell.status == "skipped"]:
         reasons = listing(dict.fromkeys(cell.error for cell in skipped))
         sentences.append(f"{len(skipped)} of {total} cells were skipped: {reasons}.")
@@ -132,9 +132,9 @@ def _scope(page: StudyPage) -> list[str]:
     if not estimates:
         return []
     if any(estimate.unit == "scene" for estimate in estimates):
-        return ["The unit is the scene: intervals speak of scenes like these."]
+        return ["The unit is the scene: intervals hold for scenes like these."]
     scenes = "this scene" if max(estimate.scenes for estimate in estimates) == 1 else "these scenes, each counted equally"
-    return [f"The unit is the seed: intervals speak of new fits on {scenes}, not of other scenes."]
+    return [f"The unit is the seed: intervals hold for new fits on {scenes}, not of other scenes."]
 
 
 def _matrix(page: StudyPage, folder: Folder) -> list[MatrixRow]:

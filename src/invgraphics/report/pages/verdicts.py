@@ -67,9 +67,9 @@ class Field:
     @property
     def hint(self) -> str:
         """Tooltip: the cell's standing and broken rules in words."""
-        told = [STANDINGS[self.judged.standing][0], *(verdict.sentence for verdict in self.judged.red)]
-        told += [self.judged.cell.error] if self.judged.standing == "skipped" else []
-        return f"{self.judged.cell.label}: {' '.join(told)}"
+        sentences = [STANDINGS[self.judged.standing][0], *(verdict.sentence for verdict in self.judged.red)]
+        sentences += [self.judged.cell.error] if self.judged.standing == "skipped" else []
+        return f"{self.judged.cell.label}: {' '.join(sentences)}"
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class StepRow:
 
 
 @dataclass(frozen=True)
-class Crossed:
+class CrossTable:
     """Fit x render table of one scene.
 
     Attributes:
@@ -115,7 +115,7 @@ def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendere
     return CrossRendered(run, seen, differences)
 
 
-def cross(comparison: Comparison, approximations: Sequence[Approximation], folder: Folder) -> Crossed | None:
+def cross_table(comparison: Comparison, approximations: Sequence[Approximation], folder: Folder) -> CrossTable | None:
     """Fit x render table of a scene; ``None`` without fits rendered by several renderers."""
     clean = folder.redactor.text if folder.redactor is not None else str
     fits = [found for run in comparison.runs if (found := read_renderings(run, clean)) is not None]
@@ -135,7 +135,7 @@ def cross(comparison: Comparison, approximations: Sequence[Approximation], folde
         for pair in approximations
         for exact, other in [(clean(pair.exact), clean(pair.approximate))]
     )
-    return Crossed(columns[0], renderers, tuple(rows), steps, max(map(len, groups)))
+    return CrossTable(columns[0], renderers, tuple(rows), steps, max(map(len, groups)))
 
 
 def _score(fits: Sequence[CrossRendered], name: str, quantity: Quantity) -> float | None:

@@ -108,7 +108,7 @@ def effects_on(quantity: Quantity, factors: Sequence[Factor], observations: Sequ
 Pair = tuple[Observation, Observation]
 
 
-def pair_up(path: str, before: str, after: str, observations: Sequence[Observation]) -> list[Pair]:
+def matched_pairs(path: str, before: str, after: str, observations: Sequence[Observation]) -> list[Pair]:
     """Pairs of runs that differ in one factor only: same scene, same seed, same other levels."""
     sides: dict[str, dict[tuple[Any, ...], Observation]] = {before: {}, after: {}}
     for observation in observations:
@@ -120,7 +120,7 @@ def pair_up(path: str, before: str, after: str, observations: Sequence[Observati
 
 
 def _effect(quantity: Quantity, path: str, levels: tuple[str, str], observations: Sequence[Observation]) -> Effect | None:
-    pairs = pair_up(path, *levels, observations)
+    pairs = matched_pairs(path, *levels, observations)
     differences = [(pair, found) for pair in pairs if (found := _difference(pair, quantity)) is not None]
     whole = estimate(_nest(differences))
     if whole is None:
@@ -219,8 +219,8 @@ def _sentence(effect: Effect) -> str:
         return f"{effect.label}: no effect detectable above {effect.text(value.half_width)} {unit}, {size}.{note}"
     # The verb (gains, costs) carries the sign, so the interval's ends are magnitudes.
     low, high = sorted((abs(value.low), abs(value.high)))
-    told = f"{effect.label} {magnitude} [{effect.text(low)}, {effect.text(high)}], {size}"
+    sentence = f"{effect.label} {magnitude} [{effect.text(low)}, {effect.text(high)}], {size}"
     if effect.found:
-        return f"{told}.{note}"
+        return f"{sentence}.{note}"
     chance = f"with {effect.comparisons} comparisons in this study that may be chance (corrected p = {effect.adjusted:.2g})"
-    return f"{told}; {chance}.{note}"
+    return f"{sentence}; {chance}.{note}"

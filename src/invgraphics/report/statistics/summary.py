@@ -154,7 +154,7 @@ def seconds_to_reach(run: Run, level: float) -> float | None:
 
 
 @dataclass(frozen=True)
-class Reach:
+class TimeToQuality:
     """Time to quality: median seconds of each method to reach each PSNR level.
 
     Attributes:
@@ -166,7 +166,7 @@ class Reach:
     rows: tuple[tuple[str, int, tuple[str, ...]], ...]
 
 
-def time_to_quality(comparison: Comparison, count: int = 4) -> Reach | None:
+def time_to_quality(comparison: Comparison, count: int = 4) -> TimeToQuality | None:
     """Median seconds over seeds to reach ``count`` round PSNR levels between the slowest start and the best end."""
     starts, peaks = [], []
     for method in comparison.methods:
@@ -188,7 +188,7 @@ def time_to_quality(comparison: Comparison, count: int = 4) -> Reach | None:
         runs = comparison.runs_of(method)
         if runs:
             rows.append((method, series, tuple(_reach_text(runs, level) for level in levels)))
-    return Reach(levels, tuple(rows))
+    return TimeToQuality(levels, tuple(rows))
 
 
 def _reach_text(runs: Sequence[Run], level: float) -> str:

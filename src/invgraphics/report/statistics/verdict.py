@@ -67,7 +67,7 @@ def _resolution(comparison: Comparison, summary: Summary, column: Quantity, rank
     if len(ranking) < 2:
         return ""
     if max(row.seeds for _, row in ranking) < 2:
-        return "One seed per method: how much of a small difference is chance cannot be told from this page."
+        return "One seed per method: small differences may be due to chance."
     first, second = (row.label for _, row in ranking[:2])
     runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
     effects = effects_on(column, [Factor(METHOD, (first, second), second)], runs)
@@ -80,10 +80,10 @@ def _resolution(comparison: Comparison, summary: Summary, column: Quantity, rank
     half = lead.text(lead.estimate.half_width)
     if lead.estimate.seeds[1] == 2:
         return (
-            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: only one above about "
-            f"{half}{unit} could be told from it; three seeds or more see smaller ones."
+            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: it would have to "
+            f"exceed about {half}{unit}; three seeds or more resolve smaller leads."
         )
-    return f"Over {lead.estimate.size} that lead may be chance: only one above about {half}{unit} could be told from it."
+    return f"Over {lead.estimate.size} that lead may be due to chance: it would have to exceed about {half}{unit}."
 
 
 def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> str:
@@ -140,11 +140,11 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
     for run in dead:
         share = f"{100 * (run.scores.cost['dead'] or 0):.2g} %"
         sentences.append(f"No gradient can change {share} of the primitives of {run.method} (seed {run.seed}).")
-    told: dict[str, str] = {}
+    reasons: dict[str, str] = {}
     for run in comparison.runs:
-        if run.scores.shortfall:
-            told.setdefault(run.method, run.scores.shortfall)
-    sentences += told.values()
+        if run.scores.below_baseline:
+            reasons.setdefault(run.method, run.scores.below_baseline)
+    sentences += reasons.values()
     short = [row.label for row in summary.methods if not row.complete]
     if short:
         words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"

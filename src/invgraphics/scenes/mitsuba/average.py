@@ -1,4 +1,4 @@
-"""The averaging process: smaller pictures of a scene as area averages of a larger rendering that the cache holds.
+"""Averaging process: smaller pictures of a scene as area averages of a larger cached rendering.
 
 A pixel's value is the mean radiance over its area (the film's box filter), so averages of linear, premultiplied pixels are what
 a rendering at the smaller size converges to, with all their samples. Depth and normals belong to pixel centres and cannot be
@@ -65,7 +65,7 @@ def _views(job: Job) -> Iterator[tuple[Split, int, Camera]]:
 
 
 def mean_picture(arrays: Path, job: Job) -> tuple[Float[np.ndarray, "h w 4"], float]:
-    """A view's linear picture at the new size, and the PSNR between two halves of its samples, to first order in the noise."""
+    """Average a view's linear RGBA to the job's size; also the PSNR in dB between halves of its samples, first order."""
     assert job.source is not None
     with np.load(arrays, allow_pickle=False) as table:
         linear, half_psnr = table["linear"].astype(np.float64), float(table["half_psnr"])
@@ -74,7 +74,7 @@ def mean_picture(arrays: Path, job: Job) -> tuple[Float[np.ndarray, "h w 4"], fl
 
 
 def _declare(folder: Path, source: Source) -> None:
-    """Say in ``truth.json`` what was averaged."""
+    """Record the averaged source in ``truth.json``."""
     path = folder / cache.TRUTH
     samples = {split: getattr(source.samples, split) for split in SPLITS}
     content = json.loads(path.read_text(encoding="utf-8"))

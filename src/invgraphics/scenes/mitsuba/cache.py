@@ -22,7 +22,7 @@ AVERAGED_FROM = "averaged_from"
 
 
 def root() -> Path:
-    """The folder of all rendered scenes, created if need be.
+    """Folder of all rendered scenes, created if need be.
 
     Raises:
         InputError: it cannot be written.
@@ -39,12 +39,12 @@ def root() -> Path:
 
 
 def unwritable(folder: Path, error: OSError) -> InputError:
-    """The error for a cache folder that cannot be written."""
+    """Make the error for a cache folder that cannot be written."""
     return InputError(f"{folder} cannot be written: {error.strerror or error}.", f"Set {VARIABLE} to a folder with free space.")
 
 
 def read_truth(folder: Path) -> dict[str, Any] | None:
-    """The content of a folder's ``truth.json``; ``None`` where it is missing, broken, or a listed file has lost bytes."""
+    """Read a folder's ``truth.json``; ``None`` where it is missing, broken, or a listed file has lost bytes."""
     try:
         content = read_json(folder / TRUTH)
         whole = content["schema"] == SCHEMA and all((folder / path).stat().st_size == n for path, n in content["files"].items())
@@ -66,7 +66,7 @@ def locked(folder: Path, waiting: Callable[[], None]) -> Iterator[int]:
 
 
 def copy(source: Path, target: Path) -> Path:
-    """Copy a whole scene to a folder that is new or empty, all at once; a folder that already holds it is left alone.
+    """Copy a complete scene atomically to a new or empty folder; a no-op if that already holds it.
 
     Raises:
         InputError: the target holds something else, or cannot be written.

@@ -17,7 +17,7 @@ SETTLED_SECONDS = 5.0
 
 
 class RenderingForecast:
-    """Forwards progress, and reports once how long the remaining views will take.
+    """Progress callback that forecasts the remaining duration once, from the time of the first view.
 
     Args:
         job: what is rendered.
@@ -49,7 +49,7 @@ class RenderingForecast:
         self._reported = self._pending == 0
 
     def __call__(self, done: int, total: int, what: str) -> None:
-        """Take a line of progress: ``what`` begins now, and what was before it is finished."""
+        """Receive progress: ``what`` begins now, and its predecessor is finished."""
         now = self._clock()
         if not self._reported and self._view in self._left:
             self._finish(self._view, now - self._began)

@@ -22,7 +22,7 @@ _SOURCES = (
 
 @dataclass(frozen=True)
 class Source:
-    """A larger rendering of the same scene, whose pictures are averaged.
+    """Larger rendering of the same scene from which pictures are averaged.
 
     Attributes:
         size: its width and height in pixels.
@@ -37,7 +37,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Job:
-    """One rendering of a scene.
+    """Settings of one rendering of a scene.
 
     Attributes:
         spec: the scene's description.
@@ -58,28 +58,28 @@ class Job:
     source: Source | None = None
 
     def table(self) -> dict[str, Any]:
-        """As plain values."""
+        """Convert the job to plain values."""
         return to_table(self)
 
     @staticmethod
     def from_json(text: str) -> Job:
-        """Inverse of ``json.dumps(job.table())``."""
+        """Parse a job (inverse of ``json.dumps(job.table())``)."""
         return fill(Job, json.loads(text))
 
     @property
     def folder_name(self) -> str:
-        """Name of its folder in the cache."""
+        """Name of the job's folder in the cache."""
         return f"{self.spec.name}-{self.key()}"
 
     def rendered_source(self) -> Job:
-        """The larger rendering that this one is averaged from."""
+        """Job of the larger rendering that is averaged."""
         assert self.source is not None, "only an averaged rendering has a source"
         size, views, samples = self.source.size, self.source.views, self.source.samples
         return replace(self, size=size, views=views, samples=samples, source=None)
 
     @property
     def total(self) -> int:
-        """Views to render."""
+        """Number of views to render."""
         return self.views.train + self.views.val + self.views.test
 
     def key(self) -> str:

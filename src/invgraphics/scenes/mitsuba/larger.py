@@ -1,4 +1,4 @@
-"""Find a larger cached rendering of a scene whose pictures can be area-averaged instead of rendering smaller ones."""
+"""Search for a larger cached rendering of a scene whose pictures can be area-averaged instead of rendering smaller ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel
 
 
 def averaged(job: Job) -> Job | None:
-    """The same pictures as an average of a larger rendering in the cache; ``None`` where none has enough samples.
+    """Job that averages a larger cached rendering to the same pictures; ``None`` where none has enough samples.
 
     Of several, one that has been averaged before is taken, then one whose pixels are whole parts of the new ones, then the
     smallest.
@@ -31,7 +31,7 @@ def _preference(job: Job) -> tuple[bool, bool, int]:
 
 
 def _sources(job: Job) -> Iterator[tuple[Source, SamplesPerPixel]]:
-    """Larger renderings of the same scene that serve, with the samples per pixel that their averages have."""
+    """List usable larger renderings of the scene, with the effective samples per pixel of their averages."""
     for folder in sorted(cache.root().glob(f"*/{cache.TRUTH}")):
         truth = cache.read_truth(folder.parent)
         if truth is None or truth.get("name") != job.spec.name or cache.AVERAGED_FROM in truth:
@@ -62,7 +62,7 @@ def _is_larger(source: Source, job: Job) -> bool:
 
 
 def _effective(source: Source, size: tuple[int, int]) -> SamplesPerPixel:
-    """Samples per averaged pixel."""
+    """Effective samples per averaged pixel."""
     pixels, new_pixels = math.prod(source.size), math.prod(size)
     train, val, half = (
         count * pixels // new_pixels for count in (source.samples.train, source.samples.val, source.samples.test // 2)

@@ -1,4 +1,4 @@
-"""Which variant of Mitsuba this machine can run: the fast one needs a working LLVM library.
+"""Selection of the Mitsuba variant for this machine: the vectorised one needs a working LLVM library.
 
 Dr.Jit takes the newest system library by itself, and one that is too old *aborts the process* at the first kernel rather than
 raising. So every candidate is tried in a process of its own, and the winner is passed on by ``DRJIT_LIBLLVM_PATH``.
@@ -29,7 +29,7 @@ _PROBE = "import drjit; from drjit.llvm import Float; assert drjit.minimum(drjit
 
 @dataclass(frozen=True)
 class Status:
-    """What Mitsuba will run on.
+    """Selected Mitsuba variant and its LLVM library.
 
     Attributes:
         variant: name of the Mitsuba variant.
@@ -44,13 +44,13 @@ class Status:
     remedy: str = ""
 
     def environment(self) -> dict[str, str]:
-        """The environment for a process that renders."""
+        """Environment variables for a rendering process."""
         return {**os.environ, VARIABLE: self.library} if self.library else dict(os.environ)
 
 
 @cache
 def status() -> Status:
-    """Probe this machine: the first candidate library that computes correctly in a process of its own wins."""
+    """Probe LLVM libraries; selects the first that computes correctly in a process of its own, else the scalar variant."""
     failures = []
     for library in _candidates():
         failure = _probe(library)
@@ -62,7 +62,7 @@ def status() -> Status:
 
 
 def _candidates() -> Iterator[str]:
-    """Libraries worth trying, best first. A user's own choice is the only one tried."""
+    """List candidate libraries, best first; a user's explicit choice excludes all others."""
     chosen = os.environ.get(VARIABLE)
     if chosen:
         yield chosen
@@ -82,7 +82,7 @@ def _version(path: Path) -> int:
 
 
 def _probe(library: str) -> str | None:
-    """Reason why ``library`` fails its test, or ``None``."""
+    """Test ``library``; returns the reason of failure, or ``None``."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _PROBE], env={**os.environ, VARIABLE: library}, capture_output=True, timeout=60, check=False

@@ -1,4 +1,4 @@
-"""`make`: a built-in scene's rendered truth, from the cache or else from a rendering process."""
+"""`make`: rendered ground truth of a scene, from the cache or by a rendering process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def make(
     out: Path | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Ground truth of a scene, rendered unless it has been before, at this size or at a larger one with samples enough.
+    """Render a scene's ground truth, or take it from the cache, at this size or averaged from a larger one.
 
     What takes time is announced on the terminal before it begins.
 
@@ -79,7 +79,7 @@ def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int |
 
 
 def _make(job: Job, folder: Path, progress: Progress, lock: int) -> None:
-    """Render into a folder beside the final one, which appears only when it is whole."""
+    """Render to a temporary folder, renamed when it is complete."""
     partial = folder.with_name(f"{folder.name}.partial")
     request = partial / cache.REQUEST
     try:
@@ -96,11 +96,11 @@ def _make(job: Job, folder: Path, progress: Progress, lock: int) -> None:
 def _run(job: Job, partial: Path, progress: Progress, lock: int) -> None:
     width, height = job.size
     if job.source is None:
-        module, progress = "render", RenderingForecast(job, partial, progress, _say)
+        module, progress = "render", RenderingForecast(job, partial, progress, _notify)
     else:
         module = "average"
         larger = "x".join(map(str, job.source.size))
-        _say(f"{job.spec.name} at {width}x{height}: {job.total} views averaged from those at {larger} in the cache.")
+        _notify(f"{job.spec.name} at {width}x{height}: {job.total} views averaged from those at {larger} in the cache.")
     run_worker(
         f"invgraphics.scenes.mitsuba.{module}",
         partial,
@@ -112,5 +112,5 @@ def _run(job: Job, partial: Path, progress: Progress, lock: int) -> None:
     )
 
 
-def _say(sentence: str) -> None:
+def _notify(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""The Polygon File Format, as far as triangle meshes need it: binary, little-endian."""
+"""Polygon File Format for triangle meshes: binary, little-endian."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write(
 
 
 def read(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices and faces of a mesh that `write` wrote.
+    """Read vertices and faces of a mesh written by `write`.
 
     Raises:
         InputError: it is not such a file.

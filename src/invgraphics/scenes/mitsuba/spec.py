@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class SamplesPerPixel:
-    """Samples per pixel of each split; those of ``test`` are taken in two independent halves."""
+    """Samples per pixel of each split; ``test`` is rendered in two independent halves."""
 
     train: int = 256
     val: int = 256
@@ -30,14 +30,14 @@ class SamplesPerPixel:
             raise ValueError("samples per pixel must be positive, and even for the test views")
 
     def scaled(self, train: int) -> SamplesPerPixel:
-        """The same proportions for another number of samples per training pixel."""
+        """Scale all splits to another number of samples per training pixel."""
         factor = train / self.train
         return SamplesPerPixel(train, max(1, round(self.val * factor)), 2 * max(1, round(self.test * factor / 2)))
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Views of each split."""
+    """Number of views of each split."""
 
     train: int = 40
     val: int = 4
@@ -50,7 +50,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """A scene description.
+    """Description of a scene, as in its ``scene.toml``.
 
     Attributes:
         name: short name, shown everywhere.
@@ -93,12 +93,12 @@ class SceneSpec:
 
 @cache
 def names() -> tuple[str, ...]:
-    """The built-in scenes."""
+    """List the built-in scenes."""
     return tuple(sorted(path.parent.name for path in data.find("scenes").glob(f"*/{FILE}")))
 
 
 def description_path(name: str) -> Path:
-    """The description of a built-in scene, or of one's own: the path of a ``scene.toml`` or of its folder.
+    """Find the description of a scene: built in, or the path of a ``scene.toml`` or of its folder.
 
     Raises:
         InputError: there is none; the built-in scenes are listed.
@@ -115,7 +115,7 @@ def description_path(name: str) -> Path:
 
 
 def read(path: Path) -> SceneSpec:
-    """The checked description in a ``scene.toml``.
+    """Read and validate a ``scene.toml``.
 
     Raises:
         InputError: not TOML, or a key is unknown, missing or wrong.

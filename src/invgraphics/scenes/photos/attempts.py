@@ -10,7 +10,7 @@ from typing import Any
 from invgraphics.scenes.photos.consistency import check_consistency
 from invgraphics.scenes.photos.mapping import Matched, reconstruct
 from invgraphics.scenes.photos.outlier_cameras import remove_outlier_cameras
-from invgraphics.scenes.photos.quality import enough, hopeless
+from invgraphics.scenes.photos.quality import is_usable, registration_obstacle
 from invgraphics.scenes.photos.strategies import Strategy, strategies
 from invgraphics.scenes.process import Progress
 
@@ -42,7 +42,7 @@ class Attempt:
 
     def passes(self, count: int) -> bool:
         """Whether enough of ``count`` photographs are placed and nothing is suspicious."""
-        return self.consistency is not None and not self.consistency["suspicious"] and enough(self.registered, count)
+        return self.consistency is not None and not self.consistency["suspicious"] and is_usable(self.registered, count)
 
     def rank(self, count: int) -> tuple[bool, float]:
         """Sorting key, best last: whether it passes, then the share of all verified matches that the poses explain."""
@@ -88,8 +88,8 @@ def try_strategies(
     count = len(matched.photos)
     attempts: list[Attempt] = []
     for strategy in strategies(matched.job, matched.photos):
-        attempts.append(_attempt(strategy, matched, _share(progress, len(attempts)), place))
-        if attempts[-1].passes(count) or hopeless(matched.photos, matched.evidence) is not None:
+        attempts.append(_attempt(strategy, matched, _attempt_progress(progress, len(attempts)), place))
+        if attempts[-1].passes(count) or registration_obstacle(matched.photos, matched.evidence) is not None:
             break
     best = max(attempts, key=lambda attempt: attempt.rank(count))
     return best, [attempt.row(attempt is best) for attempt in attempts]
@@ -106,7 +106,7 @@ def _attempt(strategy: Strategy, matched: Matched, progress: Progress, place: Re
     return Attempt(strategy, pieces, outliers, consistency, time.perf_counter() - since)
 
 
-def _share(progress: Progress, before: int) -> Progress:
+def _attempt_progress(progress: Progress, before: int) -> Progress:
     """Progress of one of an unknown number of attempts: each gets half of what is left, and never falls back."""
     start, furthest = 1 - 0.5**before, 0.0
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from invgraphics.scenes.photos.pairs import MatchedPair, VerifiedMatches
-from invgraphics.scenes.photos.plausible import implausible, spread
+from invgraphics.scenes.photos.plausible import implausible_parameters, spread
 from invgraphics.scenes.photos.prepare import Prepared
 
 MATCHES = 30
@@ -69,7 +69,7 @@ def check_consistency(model: Any, photos: Sequence[Prepared], evidence: Verified
     for index, pair in enumerate(evidence.pairs):
         first, second = (placed.get(photos[photo].name) for photo in (pair.first, pair.second))
         if first is not None and second is not None:
-            shares[index] = explained(first, second, pair)
+            shares[index] = explained_share(first, second, pair)
     matches = sum(len(pair) for pair in evidence.pairs)
     partners = strongest(evidence.pairs, [index for index in shares if len(evidence.pairs[index]) >= MATCHES])
     counted = sorted({index for indices in partners.values() for index in indices})
@@ -87,7 +87,7 @@ def check_consistency(model: Any, photos: Sequence[Prepared], evidence: Verified
         "threshold": SUSPICIOUS,
         "support": sum(share * len(evidence.pairs[index]) for index, share in shares.items()) / max(matches, 1),
         "spread": spread(model),
-        "implausible": implausible(model),
+        "implausible": implausible_parameters(model),
         "worst": [_row(evidence.pairs[index], shares[index], photos) for index in shown],
     }
     suspicious = bool(broken or found["implausible"]) or 0 < len(doubtful) >= SUSPICIOUS * len(partners)
@@ -129,7 +129,7 @@ def _sentence(found: dict[str, Any], suspicious: bool) -> str:
     )
 
 
-def explained(first: Any, second: Any, pair: MatchedPair) -> float:
+def explained_share(first: Any, second: Any, pair: MatchedPair) -> float:
     """Share of a pair's matches that two posed ``pycolmap.Image`` explain.
 
     A match is explained if it lies within `NEAR` pixels (Sampson's distance, pixels of the first photograph) of the epipolar

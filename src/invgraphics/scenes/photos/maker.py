@@ -70,9 +70,11 @@ def writing(out: Path) -> Iterator[int]:
 
 
 def read_quality(out: Path) -> dict[str, Any] | None:
-    """The report of a finished import; ``None`` where there is none."""
+    """Read the report of a finished import; ``None`` where there is none."""
     quality = _read_json(out / QUALITY)
-    return quality if quality is not None and "key" in quality else None
+    if quality is None or "key" not in quality:
+        return None
+    return {"consistency" if name == "suspicion" else name: value for name, value in quality.items()}  # its first name
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:
@@ -122,7 +124,7 @@ def _make(job: PhotoJob, key: str, out: Path, progress: Progress, lock: int) -> 
         work,
         progress,
         subject=f"The photographs of {job.folder} could not be put together",
-        remedy="If memory ran out, make them smaller (--max-size). What is done is kept: the same command goes on from there.",
+        remedy="If memory ran out, make them smaller (--max-size). Finished steps are kept for the same command.",
         lock=lock,
     )
     for name in reversed(RESULTS):  # an old report goes first, a new one comes last

@@ -8,7 +8,7 @@ from invgraphics.scenes.photos.maker import read_quality
 
 
 def pose_notes(folder: Path) -> dict[str, str]:
-    """Notes of a `Scene`: ``poses`` names the strategy, ``suspicion`` the failed consistency check where there is one.
+    """Notes of a `Scene`: ``poses`` names the strategy, ``inconsistent_poses`` the failed consistency check.
 
     Empty where ``folder`` holds no finished import.
     """
@@ -16,7 +16,7 @@ def pose_notes(folder: Path) -> dict[str, str]:
     if quality is None:
         return {}
     notes = {"poses": str(quality["choice"])} if quality.get("choice") else {}
-    suspicion = quality.get("suspicion")
-    if isinstance(suspicion, dict) and suspicion.get("suspicious"):
-        notes["suspicion"] = str(suspicion.get("sentence") or "the poses contradict the matches")
+    consistency = quality.get("consistency")
+    if isinstance(consistency, dict) and consistency.get("suspicious"):
+        notes["inconsistent_poses"] = str(consistency.get("sentence") or "the poses contradict the matches")
     return notes

@@ -27,7 +27,7 @@ def spread(model: Any) -> float:
     return extent / max(float(np.median(distances)), 1e-12)
 
 
-def implausible(model: Any) -> list[str]:
+def implausible_parameters(model: Any) -> list[str]:
     """Implausible focal lengths, distortions and baselines, in words; empty where there are none."""
     reasons: dict[str, None] = {}
     used = {image.camera_id for image in model.images.values() if image.has_pose}
@@ -35,14 +35,14 @@ def implausible(model: Any) -> list[str]:
         share = camera.mean_focal_length() / max(camera.width, camera.height)
         if not FOCAL_RANGE[0] < share < FOCAL_RANGE[1]:
             reasons[f"the focal length is {share:.2g} times the picture's longest side"] = None
-        elif folds(camera):
+        elif is_folded(camera):
             reasons["the lens distortion folds the picture over"] = None
     if model.num_points3D() and (ratio := spread(model)) < LEAST_SPREAD:
         reasons[f"the cameras stand within {100 * ratio:.1f} % of the scene's distance"] = None
     return list(reasons)
 
 
-def folds(camera: Any) -> bool:
+def is_folded(camera: Any) -> bool:
     """Whether a perspective lens's distorted radius stops growing within the image, so that two directions share a pixel."""
     if "FISHEYE" in camera.model_name:
         return False

@@ -45,7 +45,7 @@ def describe(model: Any, photos: Sequence[Prepared]) -> dict[str, Any]:
     }
 
 
-NOTHING: dict[str, Any] = {
+EMPTY_FIGURES: dict[str, Any] = {
     "registered": 0, "points": 0, "reprojection_error_px": None, "track_length": None, "observations_per_photo": None,
     "lenses": [], "cameras": [],
 }  # fmt: skip
@@ -72,12 +72,12 @@ def unplaced(
     return reasons
 
 
-def enough(registered: int, count: int) -> bool:
+def is_usable(registered: int, count: int) -> bool:
     """Whether a scene with ``registered`` of ``count`` photographs is usable."""
     return registered >= max(LEAST, SHARE * count)
 
 
-def hopeless(photos: Sequence[Prepared], evidence: VerifiedMatches) -> tuple[str, str] | None:
+def registration_obstacle(photos: Sequence[Prepared], evidence: VerifiedMatches) -> tuple[str, str] | None:
     """Why no strategy can register these photographs, and a remedy; ``None`` where one may."""
     longest = max(max(photo.width, photo.height) for photo in photos)
     features = float(np.median(evidence.features))
@@ -95,9 +95,9 @@ def hopeless(photos: Sequence[Prepared], evidence: VerifiedMatches) -> tuple[str
 
 def refusal(photos: Sequence[Prepared], evidence: VerifiedMatches, registered: int) -> tuple[str, str] | None:
     """Why too few photographs were registered, and a remedy; ``None`` where there are enough."""
-    if enough(registered, len(photos)):
+    if is_usable(registered, len(photos)):
         return None
     what = f"Only {registered} of {len(photos)} photographs could be placed" if registered else "No photograph could be placed"
     remedy = "Try --lens fisheye or --matching exhaustive; or take more photographs between those there are."
-    why, remedy = hopeless(photos, evidence) or ("their matches do not fit together.", remedy)
+    why, remedy = registration_obstacle(photos, evidence) or ("their matches do not fit together.", remedy)
     return f"{what}: {why}", remedy

@@ -27,7 +27,7 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
     """
     (result / "images").mkdir(parents=True, exist_ok=True)
     lenses = {camera_id: _lens(camera) for camera_id, camera in model.cameras.items()}
-    bends = {camera_id: bend(lens) for camera_id, lens in lenses.items()}
+    bends = {camera_id: max_distortion(lens) for camera_id, lens in lenses.items()}
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
     kept = [photo for photo in photos if photo.name in by_name]
     for index, photo in enumerate(kept):
@@ -47,7 +47,7 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
     return max(bends.values(), default=0.0)
 
 
-def bend(lens: Lens) -> float:
+def max_distortion(lens: Lens) -> float:
     """Largest displacement in pixels by the lens distortion along the picture's border."""
     if lens.is_pinhole():
         return 0.0

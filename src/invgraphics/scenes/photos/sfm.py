@@ -30,7 +30,7 @@ class Verification:
     guided: bool = False
 
 
-def enter(job: PhotoJob, photos: Sequence[Prepared], work: Path) -> None:
+def write_database(job: PhotoJob, photos: Sequence[Prepared], work: Path) -> None:
     """Write cameras and photographs into a data base, in order: threads that extract features would number them by chance."""
     from invgraphics.scenes.colmap_library import pycolmap
 

@@ -23,7 +23,7 @@ from invgraphics.scenes.photos.mapping import Matched
 from invgraphics.scenes.photos.pairs import read_verified_matches
 from invgraphics.scenes.photos.plot import top_view
 from invgraphics.scenes.photos.prepare import PREPARED, Preparation, prepare
-from invgraphics.scenes.photos.quality import NOTHING, describe, refusal, unplaced
+from invgraphics.scenes.photos.quality import EMPTY_FIGURES, describe, refusal, unplaced
 from invgraphics.scenes.photos.result import write_scene
 from invgraphics.scenes.process import write_error, write_progress
 
@@ -65,7 +65,7 @@ def main(work: Path) -> None:
     clock.start("read")
     preparation = _prepared(job, work, clock)
     clock.start("features")
-    sfm.enter(job, preparation.photos, work)
+    sfm.write_database(job, preparation.photos, work)
     sfm.extract(preparation.photos, work, clock.show)
     clock.start("matches")
     wanted = sfm.pairs(len(preparation.photos), job.matching)
@@ -93,7 +93,7 @@ def _prepared(job: PhotoJob, work: Path, clock: Clock) -> Preparation:
 def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Path, clock: Clock) -> dict[str, Any]:
     """Write the largest piece of the best attempt; returns the report."""
     job, photos = matched.job, matched.photos
-    figures, bend = NOTHING, 0.0
+    figures, bend = EMPTY_FIGURES, 0.0
     if best.pieces:
         figures = describe(best.pieces[0], photos)
         clock.start("pictures")
@@ -109,7 +109,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         **figures,
         "bend_px": bend,
         "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],
-        "suspicion": best.consistency,
+        "consistency": best.consistency,
         "usable": refused is None,
         "refusal": refused,
         "skipped": skipped,

@@ -18,7 +18,7 @@ TRAINED_COPIES = 4
 """Of each parameter of a network: itself, its gradient and Adam's two moments."""
 
 
-def check_request(method: Method, scene: Scene) -> None:
+def check_memory(method: Method, scene: Scene) -> None:
     """Check that a method's field and batches fit into free memory; the estimate is a lower bound.
 
     Raises:

@@ -9,7 +9,7 @@ import torch
 from invgraphics import memory
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
-from invgraphics.experiments.requested import check_request
+from invgraphics.experiments.memory_check import check_memory
 from invgraphics.recipes.recipe import load_method, methods
 from invgraphics.scenes.open import SceneOptions, open_scene
 
@@ -37,15 +37,15 @@ def test_every_method_fits_and_its_parameters_are_counted(toy_folder: Path, monk
     """With next to no memory every method is refused, so that none is left out of the forecast."""
     scene = open_scene(str(toy_folder), SceneOptions())
     for name in methods():
-        check_request(load_method(name), scene)
+        check_memory(load_method(name), scene)
     monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
     for name in methods():
         with pytest.raises(InputError, match="of memory"):
-            check_request(load_method(name), scene)
+            check_memory(load_method(name), scene)
 
 
 def test_counted_parameters_are_those_that_are_built(toy_folder: Path) -> None:
-    from invgraphics.experiments.requested import _parameter_bytes
+    from invgraphics.experiments.memory_check import _parameter_bytes
 
     scene = open_scene(str(toy_folder), SceneOptions())
     for name in ("volumetric/hash", "volumetric/nerf"):
