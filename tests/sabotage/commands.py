@@ -52,7 +52,7 @@ def made(folder: Path) -> list[Case]:
     """The cases, on a scene, a run and photographs that are made in ``folder``."""
     scene = write_blender(toy_scene(), folder / "toy")
     settings = [word for item in SMALL[SPLATS] for word in ("--set", item)]
-    fit = ["fit", SPLATS, str(scene), "--budget", "40steps", "--checkpoint-every", "1steps", "--snapshots", "3", *settings]
+    fit = ["fit", SPLATS, str(scene), "--budget", "20steps", "--checkpoint-every", "1steps", "--snapshots", "3", *settings]
     fit += ["--kernels", "reference"]
     run = folder / "run"
     assert Running([*fit, "--out", str(run)], folder / "log").wait() == 0
@@ -67,7 +67,10 @@ def made(folder: Path) -> list[Case]:
             quick=True,
         ),
         Case(
-            "report", lambda out: ["report", str(run), "--out", str(out)], ("results.csv", "index.md", "table.tex"), quick=True
+            "report",
+            lambda out: ["report", str(run), "--out", str(out)],
+            ("results.csv", "index.md", "index.html", "table.tex"),
+            quick=True,
         ),
         Case(
             "compare",

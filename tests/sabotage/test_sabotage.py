@@ -25,7 +25,7 @@ pytest.importorskip("resource", reason="signals and locks are POSIX's")
 from commands import Case, made, results
 from faults import DONE, faults, small_disk
 
-HANDFUL = 8
+HANDFUL = 6
 COUNT = int(os.environ.get("INVGRAPHICS_SABOTAGE", HANDFUL))
 SEED = int(os.environ.get("INVGRAPHICS_SABOTAGE_SEED", f"{datetime.datetime.now(datetime.UTC):%Y%m%d}"))
 ON_A_DISK_OF_ITS_OWN = "full disk"
