@@ -17,8 +17,17 @@ from invgraphics.scenes.mitsuba.cache import VARIABLE
 from invgraphics.testing import toy_scene
 
 SPLATS, HASH = "splatting/gaussians", "volumetric/hash"
-CLOCKS = {"seconds", "cost", "load_average", "memory_forecast_bytes", "wall_seconds", "forecast_seconds", "disturbed"}
-"""Keys of JSON files that hold times, or what follows from them."""
+CLOCKS = {
+    "seconds",
+    "cost",
+    "load_average",
+    "memory_forecast_bytes",
+    "wall_seconds",
+    "forecast_seconds",
+    "disturbed",
+    "environment",
+}
+"""Keys of JSON files that hold times, what follows from them, or the state of the machine."""
 ASIDE = re.compile(r"(^|/)(jobs/|environment\.json$|\.import/)|lock$")
 """Logs, the machine's description and unfinished work: no results."""
 
