@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
 
-.PHONY: env compare picture bench notebooks test test-notebooks fuzz slow check clean
+.PHONY: env compare picture bench notebooks test test-notebooks fuzz sabotage slow check clean
 
 env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
@@ -35,6 +35,10 @@ test-notebooks: env  ## every notebook at a small size, and the numbers it print
 
 fuzz: env  ## 5000 damaged inputs of every reader; INVGRAPHICS_FUZZ_SEED repeats those of a day
 	INVGRAPHICS_FUZZ=$${INVGRAPHICS_FUZZ:-5000} $(BIN)/python -m pytest -s tests/fuzz
+
+sabotage: env  ## faults at 200 random moments of commands, and with ray a lost node; INVGRAPHICS_SABOTAGE_SEED repeats a day's
+	INVGRAPHICS_SABOTAGE=$${INVGRAPHICS_SABOTAGE:-200} $(BIN)/python -m pytest -s tests/sabotage
+	$(BIN)/python -m pytest -m slow tests/experiments/test_executors_slow.py -k lost_node
 
 slow: env  ## the longer checks
 	$(BIN)/python -m pytest -m slow

@@ -1,4 +1,4 @@
-"""One process writes an output at a time: a second one is refused and told who writes, and nothing finished is erased."""
+"""One process writes an output at a time, a second one is refused and told who writes; what is finished is not erased."""
 
 import json
 import os
@@ -79,8 +79,13 @@ def test_a_killed_process_holds_nothing(toy_folder: Path, tmp_path: Path) -> Non
         assert str(os.getpid()) in (out / locks.INSIDE).read_text()
 
 
-STUDY = 'question = "Why?"\nscenes = ["{scene}"]\nmethods = ["{method}"]\nbudget = "2steps"\n'
-STUDY += '[factors]\n"data.train_views" = [4, 8]\n'
+STUDY = """
+question = "Why?"
+scenes = ["{scene}"]
+methods = ["{method}"]
+budget = "2steps"
+factors = {{ "data.train_views" = [4, 8] }}
+"""
 
 
 def command_words(command: str, run: Path, scene: Path, folder: Path, out: Path) -> list[str]:

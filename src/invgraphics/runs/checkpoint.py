@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 from pathlib import Path
 
 import torch
@@ -33,8 +35,10 @@ def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
             save_file(flat, temporary)
             with temporary.open("rb") as file:
                 os.fsync(file.fileno())
-    except SafetensorError as error:  # safetensors wraps a full disk in its own exception
-        raise OSError(f"{path}: {error}") from error
+    except SafetensorError as error:  # safetensors wraps the system's error in its own
+        number = re.search(r"os error (\d+)", str(error))
+        code = int(number[1]) if number else errno.EIO
+        raise OSError(code, os.strerror(code), str(path)) from error
 
 
 def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, Tensor]]:
