@@ -21,6 +21,7 @@ from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
+from invgraphics.files import write_arrays, write_picture
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
@@ -185,8 +186,8 @@ def _save_view(folder: RunFolder, index: int, picture: Rendering, scene: Scene) 
     }
     if picture.normal is not None:
         arrays["normal"] = picture.normal.numpy().astype(np.float16)
-    np.savez_compressed(folder.arrays(index), **arrays)
-    Image.fromarray(display(picture.over(scene.background), scene).numpy()).save(folder.picture(index))
+    write_arrays(folder.arrays(index), arrays)
+    write_picture(folder.picture(index), Image.fromarray(display(picture.over(scene.background), scene).numpy()))
 
 
 def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
@@ -200,10 +201,11 @@ def save_truth(scene: Scene, root: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for index, view in enumerate(scene.test):
         if not truth_picture(folder, index).is_file():
-            Image.fromarray(display(view.over(scene.background), scene).numpy()).save(truth_picture(folder, index))
+            picture = Image.fromarray(display(view.over(scene.background), scene).numpy())
+            write_picture(truth_picture(folder, index), picture, shared=True)
         arrays = _truth_arrays(view, scene)
         if arrays and not truth_arrays(folder, index).is_file():
-            np.savez_compressed(truth_arrays(folder, index), **arrays)
+            write_arrays(truth_arrays(folder, index), arrays, shared=True)
     return folder
 
 

@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from invgraphics.errors import InputError
+from invgraphics.files import replacing
 
 
 def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
@@ -20,16 +21,10 @@ def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
         for section, part in parts.items()
         for name, value in part.items()
     }
-    temporary = path.with_suffix(".tmp")
-    try:
+    with replacing(path) as temporary:
         save_file(flat, temporary)
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
-        temporary.replace(path)
-    except SafetensorError as error:  # safetensors wraps a full disk in its own exception
-        raise OSError(f"{path}: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, Tensor]]:

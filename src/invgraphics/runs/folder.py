@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.runs import history
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.fit import FitRecord
@@ -182,7 +183,7 @@ class RunFolder:
         """Write the resolved recipe."""
         import tomlkit
 
-        (self.root / RECIPE).write_text(tomlkit.dumps(table))
+        write_text(self.root / RECIPE, tomlkit.dumps(table))
 
     def read_recipe(self) -> dict[str, Any]:
         """Read the resolved recipe.

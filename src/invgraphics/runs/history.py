@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
+from invgraphics.files import append_text, write_text
 from invgraphics.runs.schema import NOT_STORED, from_table, guarded, plain
 
 FILE = "history.jsonl"
@@ -56,15 +57,14 @@ def read_history(path: Path) -> tuple[Moment, ...]:
 
 def append_history(path: Path, moment: Moment) -> None:
     """Append one moment as a line."""
-    with path.open("a") as file:
-        file.write(json.dumps(plain(moment)) + "\n")
+    append_text(path, json.dumps(plain(moment)) + "\n")
 
 
 def cut_history(path: Path, step: int) -> None:
     """Truncate the history after ``step``, from which a resumed fit continues."""
     if path.is_file():
         kept = [table for table in _tables(path) if table["step"] <= step]
-        path.write_text("".join(json.dumps(table) + "\n" for table in kept))
+        write_text(path, "".join(json.dumps(table) + "\n" for table in kept))
 
 
 def _tables(path: Path) -> Iterator[dict[str, Any]]:

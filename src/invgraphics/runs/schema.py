@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.tables import read_json
 
 T = TypeVar("T")
@@ -145,13 +146,8 @@ def guarded(path: Path, read: Callable[[], T]) -> T:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON atomically: to a temporary file beside ``path``, then renamed."""
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Write JSON atomically, see `invgraphics.files`."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def _current(kind: type[Record], table: Mapping[str, Any], source: Path, key: str) -> Mapping[str, Any]:

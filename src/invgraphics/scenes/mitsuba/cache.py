@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
+from invgraphics.files import copy_file
 from invgraphics.tables import read_json
 
 VARIABLE = "INVGRAPHICS_CACHE"
@@ -84,8 +85,11 @@ def copy(source: Path, target: Path) -> Path:
     try:
         shutil.rmtree(partial, ignore_errors=True)
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copytree(source, partial)
+        shutil.copytree(source, partial, copy_function=copy_file)
         partial.replace(target)
+    except InputError:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
         raise InputError(f"{target} cannot be written: {error.strerror or error}.") from error

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, TOP_VIEW, PhotoJob
 from invgraphics.scenes.process import Progress, run_worker
 
@@ -102,7 +103,7 @@ def _make(job: PhotoJob, key: str, out: Path, progress: Progress) -> dict[str, A
         _clear(work, (LOCK,))
     elif left != asked:
         _clear(work, (LOCK, JOB, *MATCHES))
-    request.write_text(json.dumps(asked), encoding="utf-8")
+    write_text(request, json.dumps(asked))
     run_worker(
         "invgraphics.scenes.photos.work",
         work,
