@@ -95,6 +95,7 @@ def check_whole(folder: Path) -> None:
 
 def fails_cleanly(words: list[str], disk: Path, capsys: pytest.CaptureFixture[str]) -> int:
     """Give a command with more and more room, until it is enough; returns how often it was not."""
+    said = ""
     for failures, room in enumerate(ROOMS):
         leave(disk, room)
         capsys.readouterr()

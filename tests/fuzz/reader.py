@@ -100,11 +100,11 @@ def main() -> None:
     warnings.simplefilter("ignore")
     readers = {"scene": read_scene, "gaussians": read_gaussians, "recipe": read_recipe, "study": read_study}
     answers, sys.stdout = sys.stdout, sys.stderr
-    before = 0
     for line in sys.stdin:
         kind, path, good = json.loads(line)
         if good:
             resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY,) * 2)
+        before = status_bytes("VmRSS")
         Path("/proc/self/clear_refs").write_text("5")  # the peak of resident memory starts anew (Linux's proc(5))
         try:
             answer: Any = ["accepted", readers[kind](Path(path))]
@@ -113,7 +113,6 @@ def main() -> None:
         except BaseException:
             answer = ["raised", traceback.format_exc()]
         if good:
-            before = status_bytes("VmRSS")
             resource.setrlimit(resource.RLIMIT_DATA, (status_bytes("VmData") + ENOUGH, resource.RLIM_INFINITY))
         elif (taken := status_bytes("VmHWM") - before) > MEMORY:
             answer = ["greedy", f"{taken >> 20} MiB; {answer}"]

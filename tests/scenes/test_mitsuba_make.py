@@ -161,7 +161,7 @@ def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_
 def test_a_full_disk_is_named_and_rendering_goes_on_when_there_is_room(rendered, scene_file, tmp_path, monkeypatch):
     disk = tmp_path / "disk"
     disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)]
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)]
     if os.geteuid() != 0 or subprocess.run(mount, check=False).returncode:
         pytest.skip("mounting a small tmpfs needs root")
     monkeypatch.setenv(cache.VARIABLE, str(disk))
