@@ -191,7 +191,7 @@ def test_a_full_disk_is_said_and_keeps_the_last_checkpoint(toy_folder: Path, tmp
         process = _spawn(request, tmp_path)
         assert process.wait(timeout=120) == 1
         error = json.loads((tmp_path / "job.error.json").read_text())
-        assert "space" in error["error"]
+        assert "cannot be written: the disk is full" in error["error"] and str(small / "run") in error["error"]
         assert not list((small / "run").glob("*.tmp"))
     finally:
         subprocess.run(["umount", str(small)], check=True)

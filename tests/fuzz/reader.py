@@ -19,7 +19,9 @@ import numpy as np
 from invgraphics.errors import InputError
 
 MEMORY = 1 << 30
-"""Bytes that reading one input may take, beyond what the process holds when it is ready."""
+"""Bytes that reading one input may take at its peak, beyond what the process holds when it is ready."""
+ENOUGH = 2 * MEMORY
+"""Bytes beyond which the process gets no more: it fails there, so that the machine does not."""
 
 
 def read_scene(path: Path) -> str:
@@ -88,29 +90,48 @@ def read_study(path: Path) -> str:
 
 
 def main() -> None:
-    """Answer requests ``[kind, path]`` with ``[outcome, what]`` until there are none."""
+    """Answer requests ``[kind, path, whether it is good]`` with ``[outcome, what]`` until there are none.
+
+    After a good input, all libraries for its like are loaded, and the bounds of memory start from what the process holds then.
+    """
     import torch
 
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     readers = {"scene": read_scene, "gaussians": read_gaussians, "recipe": read_recipe, "study": read_study}
     answers, sys.stdout = sys.stdout, sys.stderr
-    for number, line in enumerate(sys.stdin):
-        kind, path = json.loads(line)
+    for line in sys.stdin:
+        kind, path, good = json.loads(line)
+        if good:
+            resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY,) * 2)
+        before = status_bytes("VmRSS")
+        Path("/proc/self/clear_refs").write_text("5")  # the peak of resident memory starts anew (Linux's proc(5))
         try:
             answer: Any = ["accepted", readers[kind](Path(path))]
         except InputError as error:
-            answer = ["refused", str(error)]
+            answer = ["refused", str(error)] if not lacked_memory(error) else ["raised", traceback.format_exc()]
         except BaseException:
             answer = ["raised", traceback.format_exc()]
+        if good:
+            resource.setrlimit(resource.RLIMIT_DATA, (status_bytes("VmData") + ENOUGH, resource.RLIM_INFINITY))
+        elif (taken := status_bytes("VmHWM") - before) > MEMORY:
+            answer = ["greedy", f"{taken >> 20} MiB; {answer}"]
         print(json.dumps(answer), file=answers, flush=True)
-        if number == 0:  # the first input is a good one, after which all libraries are loaded
-            resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + MEMORY,) * 2)
 
 
-def _data_bytes() -> int:
+def lacked_memory(error: BaseException | None) -> bool:
+    """Whether an exception goes back to an allocation beyond `ENOUGH`; Python's parser says so of nesting as well."""
+    while error is not None:
+        if isinstance(error, MemoryError) and "too complex to parse" not in str(error) and "arser" not in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def status_bytes(entry: str) -> int:
+    """Bytes of an entry of ``/proc/self/status``."""
     lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:"))
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith(f"{entry}:"))
 
 
 if __name__ == "__main__":

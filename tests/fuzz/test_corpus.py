@@ -88,6 +88,14 @@ def numbered(root: Path) -> Path:
     return root
 
 
+def long_names(root: Path) -> Path:
+    """A COLMAP model whose names are longer than a file system takes."""
+    seeds.colmap_text(root)
+    path = root / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text().replace(".png", "9" * 400))
+    return root
+
+
 def points_at(value: float) -> np.ndarray:
     """Points of which one is elsewhere."""
     points = np.zeros((4, 3))
@@ -111,6 +119,7 @@ BAD_SCENES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "file_path = /": (first("file_path", "/"), "no 'file_path'"),
     "file_path with NUL": (first("file_path", "a\0b"), "no 'file_path'"),
     "long file_path": (first("file_path", "x" * 5000), "no 'file_path'"),
+    "file_path of 400 characters": (table(lambda t: [f.update(file_path="9" * 400) for f in t["frames"]]), "None of the 3"),
     "400 digits": (table(lambda t: t.update(w="DIGITS")), "400 digits"),
     "h = 1e300": (table(lambda t: t.update(h=1e300)), "not a size in pixels"),
     "deep JSON": (table(lambda t: t.update(deep=json.loads("[" * 300 + "]" * 300))), "64 deep"),
@@ -125,6 +134,7 @@ BAD_SCENES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "bounds of 1e300": (archive(seeds.npz, bounds=np.array([[-1e300] * 3, [1e300] * 3])), "bounds"),
     "camera far from its box": (archive(seeds.npz, cam_to_world=poses_far), "far away"),
     "0 x 0": (text("cameras.txt", "12 9 11 11", "0 0 11 11"), "0x0 pixels"),
+    "COLMAP name of 400 characters": (long_names, "None of the 3"),
     "COLMAP quaternion of 1e200": (text("images.txt", "1 ", "1 1e200 1e200 "), "."),
     "COLMAP point of NaN": (text("points3D.txt", " 0.0 0.0 0.0 ", " nan 0.0 0.0 "), "cannot be read"),
     "COLMAP point of 1e300": (text("points3D.txt", " 0.0 0.0 0.0 ", " 1e300 0.0 0.0 "), "points|near plane"),

@@ -21,7 +21,7 @@ import mutations
 import seeds
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
-from watched import Reader
+from watched import Process, Reader
 
 COUNT = int(os.environ.get("INVGRAPHICS_FUZZ", "200"))
 SEED = int(os.environ.get("INVGRAPHICS_FUZZ_SEED", f"{datetime.datetime.now(datetime.UTC):%Y%m%d}"))
@@ -52,15 +52,26 @@ def spec_of(root: Path, pattern: str, name: str) -> Path:
     return root if kind_of(name) == "scene" and name != "npz" else root / pattern
 
 
+@pytest.fixture(scope="module")
+def processes() -> Iterator[dict[str, Process]]:
+    """Kind of reader -> its process."""
+    started: dict[str, Process] = {}
+    yield started
+    for process in started.values():
+        process.close()
+
+
 @pytest.fixture(scope="module", params=list(seeds.SEEDS))
-def good(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path, str, Reader]]:
+def good(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, processes: dict[str, Process]
+) -> tuple[str, Path, str, Reader]:
     """Name, folder and pattern of a good input, and the process that has read it."""
     root = tmp_path_factory.mktemp(request.param) / "good"
     root.mkdir()
     pattern = seeds.SEEDS[request.param](root)
-    reader = Reader(kind_of(request.param), spec_of(root, pattern, request.param))
-    yield request.param, root, pattern, reader
-    reader.close()
+    kind = kind_of(request.param)
+    reader = Reader(processes.setdefault(kind, Process(kind)), spec_of(root, pattern, request.param))
+    return request.param, root, pattern, reader
 
 
 def expect_fine(reader: Reader, path: Path, what: str, unchanged: bool) -> str:

@@ -7,36 +7,44 @@ import os
 import select
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 SECONDS = 10.0
 """Longest time for one input."""
+READER = Path(__file__).with_name("reader.py")
+STARTING = 120.0
+"""Longest time for a process that starts and reads its first input."""
 
 
-class Reader:
-    """A process of `reader`, started when it is needed.
+class Process:
+    """A process of `reader`, started when it is needed; the libraries that it loads serve all inputs of one kind.
 
     Args:
         kind: what it reads: ``scene``, ``gaussians``, ``recipe`` or ``study``.
-        good: a good input, which it reads first and whose digest is `digest`.
+        script: what it runs.
     """
 
-    def __init__(self, kind: str, good: Path) -> None:
-        self.kind, self.good = kind, good
+    def __init__(self, kind: str, script: Path = READER) -> None:
+        self.kind, self.script = kind, script
         self._process: subprocess.Popen[bytes] | None = None
-        outcome, self.digest = self.read(good)
-        assert outcome == "accepted", self.digest
+        self._good: Path | None = None
 
-    def read(self, path: Path) -> tuple[str, str]:
-        """The outcome (``accepted``, ``refused``, ``raised``, ``hung``, ``died``) and a digest, a sentence or a traceback."""
+    def read(self, path: Path, good: Path) -> tuple[str, str]:
+        """Read ``path`` after ``good``, see `Reader.read`."""
         if self._process is None:
-            command = [sys.executable, str(Path(__file__).with_name("reader.py"))]
+            command = [sys.executable, str(self.script)]
             environment = os.environ | {"OMP_NUM_THREADS": "1"}
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
             )
-            self._ask(self.good, 60.0)
-        return self._ask(path, SECONDS)
+            self._good = None
+        if self._good != good:
+            answer = self._ask(good, True, STARTING)
+            if answer[0] != "accepted" or path == good:
+                return answer
+            self._good = good
+        return self._ask(path, False, SECONDS)
 
     def close(self) -> None:
         """End the process."""
@@ -45,10 +53,11 @@ class Reader:
             self._process.communicate()
             self._process = None
 
-    def _ask(self, path: Path, seconds: float) -> tuple[str, str]:
+    def _ask(self, path: Path, good: bool, seconds: float) -> tuple[str, str]:
         process = self._process
         assert process is not None and process.stdin is not None and process.stdout is not None
-        process.stdin.write(json.dumps([self.kind, str(path)]).encode() + b"\n")
+        started = time.monotonic()
+        process.stdin.write(json.dumps([self.kind, str(path), good]).encode() + b"\n")
         process.stdin.flush()
         if not select.select([process.stdout], [], [], seconds)[0]:
             self.close()
@@ -57,6 +66,22 @@ class Reader:
         if not line:
             status = process.wait()
             self.close()
-            return "died", f"exit status {status}"
+            return "died", f"exit status {status}, after {time.monotonic() - started:.1f} s"
         outcome, what = json.loads(line)
         return outcome, what
+
+
+class Reader:
+    """A `Process` for the damaged copies of one good input, which it reads first and whose digest is `digest`."""
+
+    def __init__(self, process: Process, good: Path) -> None:
+        self._process, self._good = process, good
+        outcome, self.digest = process.read(good, good)
+        assert outcome == "accepted", self.digest
+
+    def read(self, path: Path) -> tuple[str, str]:
+        """The outcome and a digest, a sentence or a traceback.
+
+        Outcomes: ``accepted``, ``refused``, ``raised``, ``died``; ``hung`` beyond `SECONDS`, ``greedy`` beyond `reader.MEMORY`.
+        """
+        return self._process.read(path, self._good)

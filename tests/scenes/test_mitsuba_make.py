@@ -1,6 +1,7 @@
 """`make`: bitwise reproducible, cached, resumable, and clear about what goes wrong. Renders with the portable variant."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -155,6 +156,28 @@ def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_
     assert _contents(folder) == _contents(rendered)
     assert reports[0] == (0, 4, "train 0000")
     assert reports[-1][:2] == (4, 4)
+
+
+def test_a_full_disk_is_named_and_rendering_goes_on_when_there_is_room(rendered, scene_file, tmp_path, monkeypatch):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)]
+    if os.geteuid() != 0 or subprocess.run(mount, check=False).returncode:
+        pytest.skip("mounting a small tmpfs needs root")
+    monkeypatch.setenv(cache.VARIABLE, str(disk))
+    ballast = disk / "ballast"
+    try:
+        ballast.write_bytes(bytes(shutil.disk_usage(disk).free - 28_000))
+        with pytest.raises(InputError, match=f"'{disk}.*' cannot be written: the disk is full"):
+            make(scene_file)
+        assert len(list(disk.rglob("*.npz"))) in (1, 2, 3) and not list(disk.rglob("*.tmp"))
+        with pytest.raises(InputError, match=f"'{disk}.*' cannot be written: the disk is full"):
+            cache.copy(rendered, disk / "copy")
+        assert not list(disk.glob("*copy*"))
+        ballast.unlink()
+        assert _contents(make(scene_file)) == _contents(rendered)
+    finally:
+        subprocess.run(["umount", "--lazy", str(disk)], check=True)
 
 
 @pytest.mark.usefixtures("forbid_rendering")

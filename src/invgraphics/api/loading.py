@@ -15,6 +15,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.session import FolderRun
+from invgraphics.files import write_text
 from invgraphics.recipes import recipe
 from invgraphics.recipes.recipe import Method
 from invgraphics.scenes.npz import save_npz
@@ -158,7 +159,7 @@ def name_of(method: MethodLike, file: Path | None, budget: str) -> tuple[str, Me
     if file is None:
         return "recipe", recipe.method_from(table, "recipe", budget=Budget.parse(budget))
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(tomlkit.dumps(table))
+    write_text(file, tomlkit.dumps(table))
     return str(file), None
 
 

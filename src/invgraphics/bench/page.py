@@ -13,6 +13,7 @@ from invgraphics.bench.growth import growths
 from invgraphics.bench.plots import PlotStyle
 from invgraphics.bench.results import Results, write_tables
 from invgraphics.bench.tables import Table, kernels_of
+from invgraphics.files import write_text
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def write(results: Results, record: Mapping[str, object], folder: Path, style: P
         "growth": [asdict(growth) for growth in power_laws],
         "skipped": [asdict(skipped) for skipped in results.skipped],
     }
-    (folder / "bench.json").write_text(json.dumps(whole, indent=2) + "\n", encoding="utf-8")
+    write_text(folder / "bench.json", json.dumps(whole, indent=2) + "\n")
     return _write_page(results, record, found, folder, style)
 
 
@@ -77,7 +78,7 @@ def _write_page(results: Results, record: Mapping[str, object], found: list[Gate
         "skipped": results.skipped,
         "url": lambda path: path.relative_to(folder).as_posix(),
     }
-    page.write_text(environment.get_template("bench.html").render(context), encoding="utf-8")
+    write_text(page, environment.get_template("bench.html").render(context))
     return page
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from invgraphics.bench.timing import Timing
+from invgraphics.files import writing_text
 
 FORWARD, BOTH = "forward", "forward+backward"
 """Directions."""
@@ -155,7 +156,7 @@ def write_tables(results: Results, folder: Path) -> None:
 
 
 def _write(path: Path, columns: Iterable[str], rows: Iterable[Mapping[str, object]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with writing_text(path) as file:
         writer = csv.DictWriter(file, list(columns), restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

@@ -16,6 +16,7 @@ from typing import Any
 
 from invgraphics.cli.arguments import parse
 from invgraphics.errors import InputError, NumericalError, did_you_mean
+from invgraphics.files import full_disk
 from invgraphics.interruption import INTERRUPTED, end_on_sigterm
 
 COMMANDS = {
@@ -55,8 +56,6 @@ DONE, FAILED, BAD_INPUT = 0, 1, 2
 MOST_LINES = 4
 
 USER_ERRNOS = {
-    errno.ENOSPC: "the disk is full",
-    errno.EDQUOT: "the disk quota is used up",
     errno.EACCES: "permission denied",
     errno.EPERM: "permission denied",
     errno.EROFS: "the file system is read-only",
@@ -132,11 +131,11 @@ def explain(error: Exception) -> tuple[int, list[str]]:
         return BAD_INPUT, str(error).splitlines()
     if isinstance(error, NumericalError):
         return FAILED, str(error).splitlines()
+    if told := full_disk(getattr(error, "filename", None) or "a file", error):  # from what is not written through `files`
+        return BAD_INPUT, str(told).splitlines()
     if isinstance(error, OSError) and error.errno in USER_ERRNOS:
         where = f"'{error.filename}'" if error.filename else "a file"
         return BAD_INPUT, [f"{where} cannot be used: {USER_ERRNOS[error.errno]}."]
-    if "No space left on device" in str(error) or "StorageFull" in str(error):  # from libraries that wrap the system's error
-        return BAD_INPUT, [f"Writing failed: {USER_ERRNOS[errno.ENOSPC]}."]
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error):
         return FAILED, ["There is not enough memory.", "Try a smaller --size, or smaller settings of the method (--set)."]
     first = (str(error).splitlines() or [""])[0]

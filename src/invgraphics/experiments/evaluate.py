@@ -23,6 +23,7 @@ from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note
 from invgraphics.experiments.progress import Reporter, warn
+from invgraphics.files import write_arrays, write_picture
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import non_finite_pixels, protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
@@ -30,7 +31,6 @@ from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.run import truth_arrays, truth_picture
-from invgraphics.runs.schema import replacing
 from invgraphics.runs.scores import Scores
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
@@ -196,18 +196,8 @@ def _save_view(folder: RunFolder, index: int, picture: Rendering, scene: Scene) 
     }
     if picture.normal is not None:
         arrays["normal"] = picture.normal.numpy().astype(np.float16)
-    _save_arrays(folder.arrays(index), arrays)
-    _save_picture(folder.picture(index), display(picture.over(scene.background), scene))
-
-
-def _save_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
-
-
-def _save_picture(path: Path, colours: torch.Tensor) -> None:
-    with replacing(path) as temporary:
-        Image.fromarray(colours.numpy()).save(temporary, "PNG")
+    write_arrays(folder.arrays(index), arrays)
+    write_picture(folder.picture(index), Image.fromarray(display(picture.over(scene.background), scene).numpy()))
 
 
 def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
@@ -222,10 +212,12 @@ def save_truth(scene: Scene, root: Path) -> Path:
     with locks.locked(folder, folder / locks.INSIDE, waiting=lambda holder: None):  # runs of a study share it
         for index, view in enumerate(scene.test):
             if not truth_picture(folder, index).is_file():
-                _save_picture(truth_picture(folder, index), display(view.over(scene.background), scene))
+                write_picture(
+                    truth_picture(folder, index), Image.fromarray(display(view.over(scene.background), scene).numpy())
+                )
             arrays = _truth_arrays(view, scene)
             if arrays and not truth_arrays(folder, index).is_file():
-                _save_arrays(truth_arrays(folder, index), arrays)
+                write_arrays(truth_arrays(folder, index), arrays)
     return folder
 
 

@@ -22,6 +22,7 @@ from invgraphics.experiments.build import build_model
 from invgraphics.experiments.evaluate import evaluate_saved
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.variants import RendererVariant, with_renderer
+from invgraphics.files import write_text
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.folder import RunFolder
@@ -105,7 +106,7 @@ def _render(
     folder.clear()
     folder.write_recipe(seen.table)
     folder.write(fit.read(Environment))
-    folder.history.write_text("")
+    write_text(folder.history, "")
     provenance = fit.read(Provenance)
     up = Path(*[".."] * len(folder.root.relative_to(fit.root).parts))
     changed = replace(

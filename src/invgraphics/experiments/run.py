@@ -7,6 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -225,7 +226,8 @@ def work(job: Path) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:  # a cell that fails is a result: its sentence goes into the report
-        write_json(job.with_suffix(".error.json"), {"kind": type(error).__name__, "error": str(error)})
+        with suppress(InputError):  # the disk that is full may be this one
+            write_json(job.with_suffix(".error.json"), {"kind": type(error).__name__, "error": str(error)})
         if not isinstance(error, InputError):
             traceback.print_exc()
         return 1

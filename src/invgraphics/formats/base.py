@@ -14,6 +14,7 @@ from invgraphics import plugins
 from invgraphics.core import Gaussians
 from invgraphics.core.believable import check_gaussians
 from invgraphics.errors import InputError
+from invgraphics.files import replacing
 
 HEAD_BYTES = 1 << 16
 """How much of a file `Format.matches` gets to see."""
@@ -95,12 +96,8 @@ def write_gaussians(path: Path, name: str, splats: Splats) -> None:
     if not isinstance(form, WritableFormat):
         raise InputError(f"The format '{name}' can only be read.")
     splats = checked(splats, path)
-    temporary = path.with_name(path.name + ".tmp")
-    try:
+    with replacing(path) as temporary:
         form.write(temporary, splats)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def checked(splats: Splats, path: Path) -> Splats:

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from invgraphics.files import writing
+
 _VERTEX = np.dtype([(axis, "<f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")])
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
@@ -37,11 +39,6 @@ def write_mesh(
     header += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz")]
     header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write("\n".join(header).encode("ascii", errors="replace"))
-            file.write(places.tobytes() + triangles.tobytes())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with writing(path) as file:
+        file.write("\n".join(header).encode("ascii", errors="replace"))
+        file.write(places.tobytes() + triangles.tobytes())

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import os
-import re
 from pathlib import Path
 
 import torch
@@ -14,7 +12,7 @@ from torch import Tensor
 
 from invgraphics.core.finite import non_finite_values
 from invgraphics.errors import InputError, NumericalError
-from invgraphics.runs.schema import replacing
+from invgraphics.files import replacing
 
 
 def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
@@ -30,15 +28,10 @@ def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
         for section, part in parts.items()
         for name, value in part.items()
     }
-    try:
-        with replacing(path) as temporary:
-            save_file(flat, temporary)
-            with temporary.open("rb") as file:
-                os.fsync(file.fileno())
-    except SafetensorError as error:  # safetensors wraps the system's error in its own
-        number = re.search(r"os error (\d+)", str(error))
-        code = int(number[1]) if number else errno.EIO
-        raise OSError(code, os.strerror(code), str(path)) from error
+    with replacing(path) as temporary:
+        save_file(flat, temporary)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
 
 
 def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, Tensor]]:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from invgraphics import locks
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.runs import history
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.fit import FitRecord

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.runs.schema import NOT_STORED, from_table, plain, read_checked, write_text
+from invgraphics.files import append_text, write_text
+from invgraphics.runs.schema import NOT_STORED, from_table, plain, read_checked
 
 FILE = "history.jsonl"
 
@@ -56,8 +57,7 @@ def read_history(path: Path) -> tuple[Moment, ...]:
 
 def append_history(path: Path, moment: Moment) -> None:
     """Append one moment as a line."""
-    with path.open("a") as file:
-        file.write(json.dumps(plain(moment)) + "\n")
+    append_text(path, json.dumps(plain(moment)) + "\n")
 
 
 def cut_history(path: Path, step: int) -> None:

@@ -13,14 +13,14 @@ import json
 import math
 import reprlib
 import types
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.tables import read_json
 
 T = TypeVar("T")
@@ -149,25 +149,8 @@ def read_checked(path: Path, read: Callable[[], T]) -> T:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON atomically."""
+    """Write JSON atomically, see `invgraphics.files`."""
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text (UTF-8) atomically."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Replace ``path`` by the temporary file that is yielded, once it is written; an interruption leaves the old file."""
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        yield temporary
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _current(kind: type[Record], table: Mapping[str, Any], source: Path, key: str) -> Mapping[str, Any]:

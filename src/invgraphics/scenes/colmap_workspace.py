@@ -9,6 +9,7 @@ from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap_sizes import check_sizes
+from invgraphics.scenes.images import file_exists
 from invgraphics.scenes.layout import IMAGE_FOLDERS, is_image_folder
 
 PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse", "colmap/sparse/*", ".", "[0-9]")
@@ -117,7 +118,7 @@ def _read(folder: Path) -> Model:
 
 
 def _present(folder: Path, names: Sequence[str]) -> int:
-    return sum((folder / name).is_file() for name in names) if folder.is_dir() else 0
+    return sum(file_exists(folder / name) for name in names) if folder.is_dir() else 0
 
 
 def _image_folders(model: Path) -> Iterator[Path]:

@@ -14,7 +14,7 @@ from invgraphics.core import Camera
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import focal_from_fov, opengl_to_opencv
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import SUFFIXES, Photo, image_size
+from invgraphics.scenes.images import SUFFIXES, Photo, file_exists, image_size
 from invgraphics.scenes.layout import pose
 from invgraphics.scenes.lens import Lens
 from invgraphics.tables import read_json
@@ -60,7 +60,7 @@ class Frames:
             InputError: a key is missing or a value unusable; the sentence names the file, the frame and the key.
         """
         files = [_find(self.path.parent, self._text(index)) for index in range(len(self.frames))]
-        existing = next((file for file in files if file.is_file()), None)
+        existing = next((file for file in files if file_exists(file)), None)
         return [self._photo(index, file, existing) for index, file in enumerate(files)]
 
     def _where(self, index: int) -> str:
@@ -139,10 +139,10 @@ class Frames:
 def _find(folder: Path, file_path: str) -> Path:
     """Find the file of a frame's photograph, whose suffix may be left out."""
     path = folder / file_path.replace("\\", "/")
-    if path.is_file():
+    if file_exists(path):
         return path
     for suffix in SUFFIXES:
         for candidate in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
-            if candidate.is_file():
+            if file_exists(candidate):
                 return candidate
     return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -52,6 +53,11 @@ def image_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+
+
+def file_exists(path: Path) -> bool:
+    """Whether a file exists; ``False`` for names that the file system does not take, which `Path.is_file` raises about."""
+    return os.path.isfile(path)  # noqa: PTH113
 
 
 def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from invgraphics.core import Bounds, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity, transform_points
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import RESIZE, Photo, load_view, match_sizes, wanted_size
+from invgraphics.scenes.images import RESIZE, Photo, file_exists, load_view, match_sizes, wanted_size
 from invgraphics.scenes.region import near_plane, subject_half
 
 T = TypeVar("T")
@@ -163,8 +163,8 @@ def existing_photos(photos: Sequence[Photo], source: Path) -> tuple[list[Photo],
     Raises:
         InputError: none of them exists.
     """
-    found = [photo for photo in photos if photo.path.is_file()]
-    absent = [photo.name for photo in photos if not photo.path.is_file()]
+    found = [photo for photo in photos if file_exists(photo.path)]
+    absent = [photo.name for photo in photos if not file_exists(photo.path)]
     if not found:
         raise InputError(
             f"None of the {len(photos)} pictures that {source} lists exists.", f"Looked for {photos[0].path} first."

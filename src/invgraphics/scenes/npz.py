@@ -31,6 +31,7 @@ from torch import Tensor
 from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
+from invgraphics.files import write_arrays
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
 from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly_spaced, local_points, pose
 from invgraphics.tables import read_arrays
@@ -213,7 +214,7 @@ def save_npz(scene: Scene, path: Path) -> None:
     if scene.points is not None:
         arrays |= {"points": scene.points.position.cpu().numpy(), "points_rgb": scene.points.rgb.clamp(0, 1).cpu().numpy()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]  # numpy's stub takes keywords for switches
+    write_arrays(path, arrays)
 
 
 def _unsupported_parts(scene: Scene) -> str:

@@ -18,6 +18,7 @@ from torch import Tensor
 from invgraphics.core import Camera, Scene
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.tools.paths import interpolate_poses
 
 SCHEMA = 1
@@ -100,7 +101,7 @@ class CameraPath:
             InputError: the file cannot be written.
         """
         try:
-            file.write_text(self.to_json())
+            write_text(file, self.to_json())
         except OSError as error:
             raise InputError(f"'{file}' cannot be written: {error.strerror}.", "Choose another file.") from error
 

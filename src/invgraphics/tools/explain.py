@@ -15,6 +15,7 @@ from invgraphics.core import Camera, Contributions, Profile, Rendering, Scene, V
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
+from invgraphics.files import write_picture, writing_text
 from invgraphics.runs.explanation import CSV, PICTURE, TRUTH, DeadPrimitives, ExplanationRecord, Pixel, SamplerPass
 from invgraphics.runs.explanation import Contributions as Columns
 from invgraphics.runs.explanation import Profile as ProfileRecord
@@ -229,9 +230,9 @@ def _write(explanation: Explanation, view: View, picture: Rendering, scene: Scen
     """Write the explanation's folder: record, table, picture and photograph."""
     folder = explanation.folder
     for name, colour in ((PICTURE, picture.over(scene.background)), (TRUTH, view.over(scene.background))):
-        Image.fromarray(display(colour, scene).numpy()).save(folder / name)
+        write_picture(folder / name, Image.fromarray(display(colour, scene).numpy()))
     columns = {name: values for name, values in plain(explanation.record.contributions).items() if values is not None}
-    with (folder / CSV).open("w", newline="") as file:
+    with writing_text(folder / CSV) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(zip(*columns.values(), strict=True))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
+from invgraphics.files import replacing
 from invgraphics.renderers.ellipsoids import draw_ellipsoids
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder, output_file
@@ -188,7 +191,7 @@ def _sized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
 
 
 class FilmWriter:
-    """Writer of an H.264 film; a context manager whose file appears at its end, and not if it is left by an exception.
+    """Writer of an H.264 film; a context manager after which the file is there whole, or, after an exception, as it was.
 
     Pictures need even sides: an odd one is continued by its last row or column.
 
@@ -201,6 +204,8 @@ class FilmWriter:
         self._out, self._rate = out, rate
         self._partial = out.with_name(f".{out.stem}.partial{out.suffix}")
         self._writer: Any = None
+        self._file = ExitStack()
+        self._temporary = out
 
     def add(self, picture: np.ndarray) -> None:
         """Append an 8-bit picture (h, w, 3); all have the first one's size."""
@@ -210,16 +215,41 @@ class FilmWriter:
         even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if self._writer is None:
             size = (even.shape[1], even.shape[0])
-            self._writer = imageio_ffmpeg.write_frames(str(self._partial), size, fps=self._rate, quality=8, macro_block_size=2)
+            to = {"quality": 8, "macro_block_size": 2, "output_params": ["-f", "mp4"], "ffmpeg_log_level": "fatal"}
+            self._writer = imageio_ffmpeg.write_frames(str(self._temporary), size, fps=self._rate, **to)
             self._writer.send(None)
         self._writer.send(np.ascontiguousarray(even))
 
     def __enter__(self) -> Self:
+        self._temporary = self._file.enter_context(replacing(self._out))
+        self._file.push(self._close)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._file.__exit__(kind, error, trace)
+
+    def _close(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """End ffmpeg, which does not say so where it could not write all."""
         if self._writer is not None:
             self._writer.close()
-            if kind is None:
-                self._partial.replace(self._out)
-        self._partial.unlink(missing_ok=True)
+        interrupted = error is not None and not isinstance(error, OSError)  # an OSError is ffmpeg's end, seen from here
+        if not interrupted and not _is_whole(self._temporary):
+            sentence = f"'{self._out}' cannot be written: ffmpeg did not finish it."
+            raise InputError(sentence, "The disk may be full: free some space there.") from error
+
+
+def _is_whole(film: Path) -> bool:
+    """Whether an MP4 file's boxes reach exactly to its end, and its index, which is written last, is among them."""
+    if not film.is_file():
+        return False
+    place, names, end = 0, set(), film.stat().st_size
+    with film.open("rb") as file:
+        while place < end:
+            file.seek(place)
+            size, name = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
+            size = struct.unpack(">Q", file.read(8).ljust(8, b"\0"))[0] if size == 1 else size
+            if size < 8:
+                return False
+            names.add(name)
+            place += size
+    return place == end and b"moov" in names

@@ -18,6 +18,7 @@ from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
+from invgraphics.files import write_picture
 from invgraphics.metrics.poses import Similarity, rotation_angle
 from invgraphics.runs.folder import output_file
 from invgraphics.runs.location import Location, PoseError, Start
@@ -207,4 +208,4 @@ def _draw(path: Path, fitted: Fitted, found: View) -> None:
     photo, shown = (display(colour, scene) for colour in (found.over(scene.background), picture.over(scene.background)))
     gap = ((photo.float() - shown.float()).abs() * 4).clamp(0, 255).to(torch.uint8)
     edge = torch.full((photo.shape[0], 4, 3), 255, dtype=torch.uint8)
-    Image.fromarray(torch.cat([photo, edge, shown, edge, gap], dim=1).numpy()).save(path)
+    write_picture(path, Image.fromarray(torch.cat([photo, edge, shown, edge, gap], dim=1).numpy()))

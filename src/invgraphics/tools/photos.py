@@ -13,6 +13,7 @@ from torch import Tensor
 from invgraphics.core import Scene
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.metrics.poses import pose_errors
 from invgraphics.scenes.open import SceneOptions, find_loader
 from invgraphics.scenes.photos import PhotoJob, reconstruct
@@ -48,9 +49,7 @@ def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress:
             quality["truth"] = compare(job.path, quality, truth)
         else:
             quality |= _found_truth(job.path, quality)
-        partial = out / f"{QUALITY}.partial"
-        partial.write_text(json.dumps(quality, indent=1), encoding="utf-8")
-        partial.replace(out / QUALITY)
+        write_text(out / QUALITY, json.dumps(quality, indent=1))
     return quality
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from invgraphics.files import write_text, writing_text
 from invgraphics.metrics.conventions import PROTOCOLS, Colour, Protocol
 from invgraphics.runs.folder import RunFolder, output_folder
 from invgraphics.runs.scores import Score, Scores
@@ -160,12 +161,12 @@ def write_tables(results: Sequence[Rescored], out: Path) -> list[Path]:
     ]
     page = out / "rescore.md"
     with output_folder(out):
-        page.write_text("\n".join(line for line in lines).strip() + "\n", encoding="utf-8")
+        write_text(page, "\n".join(line for line in lines).strip() + "\n")
         return [page, _write_csv(results, out / "rescore.csv")]
 
 
 def _write_csv(results: Sequence[Rescored], path: Path) -> Path:
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with writing_text(path) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["pictures", "protocol", "metric", "mean", "unit", "background", "prediction", "truth", "skipped"])
         for one in results:

@@ -17,6 +17,7 @@ import viser
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.viewer.cameras import LetterboxedView
+from invgraphics.viewer.host_check import HostCheck
 from invgraphics.viewer.loaded_run import POLL, LoadedRun
 from invgraphics.viewer.overlays import CameraFrustums
 from invgraphics.viewer.progressive import ProgressiveRenderer
@@ -59,6 +60,9 @@ class Viewer:
         address: of the server.
         view: initial test view.
         max_size: initial limit of the longer side, pixels.
+
+    Raises:
+        InputError: the port is in use, or this version of viser cannot be made to check the Host header.
     """
 
     def __init__(self, runs: Sequence[LoadedRun], address: Address, view: int, max_size: int) -> None:
@@ -67,11 +71,18 @@ class Viewer:
         self._worker = RenderThread(self._report_error)
         self._shared = SharedState(ProgressiveRenderer(runs), self._worker, views, CameraFrustums(views, scene), view, max_size)
         self._sessions: dict[int, Session] = {}
-        with redirect_stdout(io.StringIO()):  # the command prints the address itself
+        check = HostCheck(address.host)
+        with redirect_stdout(io.StringIO()), check.applied():  # the command prints the address itself
             self._server = LocalServer(address.host, address.port, label=" | ".join(s.name for s in runs), verbose=False)
         if address.port and self._server.get_port() != address.port:  # viser falls back to the next port
             self.stop()
             raise port_in_use(address)
+        if not check.active:
+            self.stop()
+            raise InputError(
+                f"viser {viser.__version__} starts its server so that invgraphics cannot guard it against other sites' pages.",
+                "`pip install 'viser==1.1.*'`",
+            )
         self._configure_scene(scene)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from numpy import ndarray
 
 from invgraphics import locks
 from invgraphics.errors import InputError
+from invgraphics.files import copy_file, write_picture
 from invgraphics.report.data.redact import Redactor
 
 LOCK = ".report.lock"
@@ -64,7 +64,7 @@ class Folder:
             self.redactor.copy(path, copy)
         else:
             copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, copy)
+            copy_file(path, copy)
         return self.url(copy)
 
 
@@ -108,7 +108,7 @@ def save_normals(path: Path, normals: Float[ndarray, "h w 3"], mask: Bool[ndarra
 
 def _write(image: Any, path: Path, **options: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    image.save(path, optimize=True, **options)
+    write_picture(path, image, optimize=True, **options)
 
 
 def gradient(colours: str, stops: int = 9) -> str:

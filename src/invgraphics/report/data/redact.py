@@ -13,6 +13,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
 
 from invgraphics.errors import InputError
+from invgraphics.files import write_picture, write_text
 from invgraphics.report.data.pictures import read_picture
 
 T = TypeVar("T")
@@ -92,11 +93,11 @@ class Redactor:
         if source.suffix == ".png":
             from PIL import Image
 
-            Image.fromarray(read_picture(source)).save(target, optimize=True)
+            write_picture(target, Image.fromarray(read_picture(source)), optimize=True)
         elif source.suffix == ".json":
-            target.write_text(json.dumps(self.value(json.loads(source.read_text())), indent=1) + "\n", encoding="utf-8")
+            write_text(target, json.dumps(self.value(json.loads(source.read_text())), indent=1) + "\n")
         else:
-            target.write_text(self.text(source.read_text()), encoding="utf-8")
+            write_text(target, self.text(source.read_text()))
 
     def _last(self, path: str) -> str:
         """The last component of an absolute path, unless it is a home or a private word."""

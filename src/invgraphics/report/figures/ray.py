@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from invgraphics.files import replacing
 from invgraphics.report.data.pictures import read_picture
 from invgraphics.report.data.ray import Ray, close_up, curve_of, read_ray, whole_ray
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, POINTS, SERIES, canvas, save, spread_labels
@@ -69,7 +70,8 @@ def draw_ray(folder: Path) -> Path:
         _pictures(figure, grid[:, 1].subgridspec(2, 1), ray, folder)
         figure.suptitle(_title(ray), x=0.01, ha="left", fontsize=14, fontweight="bold")
         png = folder / f"{FIGURE}.png"
-        figure.savefig(png, dpi=POINTS * SHARPNESS, facecolor=PAGE.light)
+        with replacing(png) as temporary:
+            figure.savefig(temporary, format="png", dpi=POINTS * SHARPNESS, facecolor=PAGE.light)
         save(figure, folder / FIGURE)
     return png
 

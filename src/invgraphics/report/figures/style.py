@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from invgraphics.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -126,8 +129,9 @@ def save(figure: Canvas, stem: Path) -> Path:
     """Write ``stem.svg``, which follows the reader's light or dark setting, and return its path."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     svg = stem.with_suffix(".svg")
-    figure.savefig(svg, metadata={"Date": None}, transparent=True)
-    svg.write_text(adaptive(svg.read_text(encoding="utf-8")), encoding="utf-8")
+    drawn = io.StringIO()
+    figure.savefig(drawn, format="svg", metadata={"Date": None}, transparent=True)
+    write_text(svg, adaptive(drawn.getvalue()))
     return svg
 
 

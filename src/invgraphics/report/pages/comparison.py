@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from invgraphics.files import write_text
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.figures.style import SERIES, Figure
 from invgraphics.report.figures.views import has_flip
@@ -28,7 +29,7 @@ def render(template: str, context: Mapping[str, Any], folder: Folder) -> None:
     )
     shared = {"url": folder.url, "palette": SERIES, "has_flip": has_flip(), "public": folder.redactor is not None}
     html = environment.get_template(template).render({**shared, **context})
-    (folder.root / "index.html").write_text(html, encoding="utf-8")
+    write_text(folder.root / "index.html", html)
 
 
 def write_html(part: Part, contrasts: Contrasts, folder: Folder) -> None:
@@ -72,7 +73,7 @@ def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
     parts += markdown_figures([*([contrasts.figure] if contrasts.figure else []), *part.drawn.figures], folder)
     parts += ["", "## Provenance", "", *(f"- {text(name)}: {text(value)}" for name, value in facts.shared_facts(comparison))]
     parts += markdown_commands([comparison.command, *(cell.command for cell in facts.reproduction(comparison, folder))])
-    (folder.root / "index.md").write_text("\n".join(parts) + "\n", encoding="utf-8")
+    write_text(folder.root / "index.md", "\n".join(parts) + "\n")
 
 
 def markdown_part(part: Part) -> list[str]:

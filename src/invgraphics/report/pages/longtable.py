@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from invgraphics.files import replacing, writing_text
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD
 from invgraphics.report.data.studies import Study
@@ -60,14 +61,15 @@ def write_table(columns: Columns, rows: Sequence[Row], stem: Path) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    with stem.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
+    with writing_text(stem.with_suffix(".csv")) as file:
         writer = csv.DictWriter(file, list(columns), restval="")
         writer.writeheader()
         writer.writerows({name: _plain(value) for name, value in row.items()} for row in rows)
     types = {"text": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": pa.bool_()}
     schema = pa.schema([(name, types[kind]) for name, kind in columns.items()])
     table = pa.Table.from_pylist([{name: row.get(name) for name in columns} for row in rows], schema)
-    parquet.write_table(table, stem.with_suffix(".parquet"))
+    with replacing(stem.with_suffix(".parquet")) as temporary:
+        parquet.write_table(table, temporary)
 
 
 def write_comparison_table(comparison: Comparison, stem: Path, base: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from invgraphics.files import write_text
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.factors import METHOD, StudyCell
 from invgraphics.report.data.studies import Study
@@ -184,7 +185,7 @@ def write_study_markdown(page: StudyPage, folder: Folder) -> None:
     figures += [part.figure for part in page.analyses]
     lines += markdown_figures(figures + [figure for part in page.parts for figure in part.drawn.figures], folder)
     lines += markdown_commands([study.command])
-    (folder.root / "index.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(folder.root / "index.md", "\n".join(lines) + "\n")
 
 
 def _factor_word(path: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from invgraphics.files import write_text
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.summary import Cell, Row, Summary
@@ -92,7 +93,7 @@ def write_latex(comparison: Comparison, summary: Summary, path: Path) -> None:
         lines += ["    \\midrule", *(_latex_row(row, summary.columns) for row in summary.baselines)]
     lines += ["    \\bottomrule", "  \\end{tabular}", "\\end{table}"]
     notes = [f"% ({number}) {' '.join(note.split())}" for number, note in enumerate(summary.notes, 1)]
-    path.write_text("\n".join([*lines, *notes]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([*lines, *notes]) + "\n")
 
 
 def _latex_line(cells: list[str]) -> str:
@@ -160,4 +161,4 @@ def write_latex_effects(effects: list[Effect], caption: str, path: Path) -> None
         cells[2] = f"\\textbf{{{cells[2]}}}" if effect.found else cells[2]
         lines.append(_latex_line(cells))
     lines += ["    \\bottomrule", "  \\end{tabular}", "\\end{table}"]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from invgraphics.files import write_text
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.factors import StudyCell
 from invgraphics.report.data.studies import Study
@@ -245,4 +246,4 @@ def _write_markdown(page: VerdictPage, folder: Folder) -> None:
         cells = " | ".join("" if field is None else f"{field.text} {field.sign}" for field in fields)
         lines.append(f"| {text(scene)} | {text(rest)} | {cells} |")
     lines += markdown_figures(page.figures, folder) + markdown_commands([page.study.command])
-    (folder.root / "index.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(folder.root / "index.md", "\n".join(lines) + "\n")

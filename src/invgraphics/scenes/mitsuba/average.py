@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.images import area_resize
 from invgraphics.scenes.mitsuba import cache, render, stage
@@ -79,9 +80,7 @@ def _declare(folder: Path, source: Source) -> None:
     samples = {split: getattr(source.samples, split) for split in SPLITS}
     content = json.loads(path.read_text(encoding="utf-8"))
     content[cache.AVERAGED_FROM] = {"size": list(source.size), "samples_per_pixel": samples}
-    partial = folder / f"{cache.TRUTH}.partial"
-    partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    partial.replace(path)
+    write_text(path, json.dumps(content, indent=1))
 
 
 if __name__ == "__main__":

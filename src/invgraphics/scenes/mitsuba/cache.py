@@ -11,6 +11,7 @@ from typing import Any
 
 from invgraphics import locks
 from invgraphics.errors import InputError
+from invgraphics.files import copy_file
 from invgraphics.tables import read_json
 
 VARIABLE = "INVGRAPHICS_CACHE"
@@ -88,7 +89,8 @@ def _copy(source: Path, target: Path) -> Path:
     partial = target.with_name(f".{target.name}.partial")
     try:
         shutil.rmtree(partial, ignore_errors=True)
-        shutil.copytree(source, partial)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copytree(source, partial, copy_function=copy_file)
         partial.replace(target)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from invgraphics.core import Camera
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.core.transforms import opencv_to_opengl
+from invgraphics.files import write_arrays, write_picture, write_text
 from invgraphics.scenes.mitsuba.cache import REQUEST, SCHEMA, TRUTH
 from invgraphics.scenes.mitsuba.gbuffer import GBuffer
 from invgraphics.scenes.mitsuba.job import Job
@@ -49,18 +50,9 @@ def write_view(
 
     picture, arrays = view_paths(folder, split, index)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(quantise(straight_srgb(linear)).numpy(), "RGBA").save(picture)
-    partial = arrays.with_suffix(".partial")
-    with partial.open("wb") as file:
-        np.savez_compressed(
-            file,
-            linear=linear,
-            depth=gbuffer.depth,
-            normal=gbuffer.normal,
-            alpha=gbuffer.alpha,
-            half_psnr=np.float64(half_psnr),
-        )
-    partial.replace(arrays)
+    write_picture(picture, Image.fromarray(quantise(straight_srgb(linear)).numpy(), "RGBA"))
+    content = {"linear": linear, "depth": gbuffer.depth, "normal": gbuffer.normal, "alpha": gbuffer.alpha}
+    write_arrays(arrays, content | {"half_psnr": np.float64(half_psnr)})
 
 
 def write_transforms(folder: Path, split: Split, cameras: tuple[Camera, ...]) -> None:
@@ -72,7 +64,7 @@ def write_transforms(folder: Path, split: Split, cameras: tuple[Camera, ...]) ->
         for i, camera in enumerate(cameras)
     ]
     text = json.dumps({"camera_angle_x": angle, "frames": frames}, indent=1)
-    (folder / f"transforms_{split}.json").write_text(text, encoding="utf-8")
+    write_text(folder / f"transforms_{split}.json", text)
 
 
 def write_truth(folder: Path, job: Job, cameras: dict[Split, tuple[Camera, ...]], half_psnr: list[float]) -> None:
@@ -101,9 +93,7 @@ def write_truth(folder: Path, job: Job, cameras: dict[Split, tuple[Camera, ...]]
         "cameras": {split: [_camera_table(camera) for camera in views] for split, views in cameras.items()},
         "files": files,
     }
-    partial = folder / f"{TRUTH}.partial"
-    partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    partial.replace(folder / TRUTH)
+    write_text(folder / TRUTH, json.dumps(content, indent=1))
 
 
 def _camera_table(camera: Camera) -> dict[str, Any]:

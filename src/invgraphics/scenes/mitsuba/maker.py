@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.scenes.mitsuba import cache, llvm
 from invgraphics.scenes.mitsuba.forecast import RenderingForecast
 from invgraphics.scenes.mitsuba.job import Job
@@ -85,7 +86,7 @@ def _make(job: Job, folder: Path, progress: Progress, lock: int) -> None:
     try:
         shutil.rmtree(folder, ignore_errors=True)  # a broken one, see `cache.read_truth`
         partial.mkdir(exist_ok=True)
-        request.write_text(json.dumps(job.table()), encoding="utf-8")
+        write_text(request, json.dumps(job.table()))
         _run(job, partial, progress, lock)
         request.unlink()
         partial.replace(folder)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from invgraphics.errors import InputError
+from invgraphics.files import write_bytes
 
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
@@ -31,7 +32,7 @@ def write(
     records = np.empty(len(faces), _FACE)
     records["count"], records["corners"] = 3, faces
     body = np.concatenate(columns, axis=1).astype("<f4").tobytes() + records.tobytes()
-    path.write_bytes("\n".join(header).encode() + body)
+    write_bytes(path, "\n".join(header).encode() + body)
 
 
 def read(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
+from invgraphics.files import write_arrays
 from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.mitsuba import folder as folders
 from invgraphics.scenes.mitsuba import ply, stage
@@ -116,8 +117,7 @@ def _write_points(job: Job, folder: Path, train: tuple[Camera, ...]) -> None:
         positions.append((rays.origins.numpy() + np.where(hit, depth, 0)[:, None] * rays.directions.numpy())[hit])
         colours.append(folders.straight_srgb(linear)[..., :3].numpy().reshape(-1, 3)[hit])
     position, rgb = sample_points(positions, colours, POINTS, job.seed)
-    with (folder / "points.npz").open("wb") as file:
-        np.savez_compressed(file, position=position.astype(np.float32), rgb=rgb.astype(np.float32))
+    write_arrays(folder / "points.npz", {"position": position.astype(np.float32), "rgb": rgb.astype(np.float32)})
 
 
 def _report(done: int, total: int, what: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from invgraphics import locks
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, TOP_VIEW, PhotoJob
 from invgraphics.scenes.process import Progress, run_worker
 
@@ -117,8 +118,7 @@ def _make(job: PhotoJob, key: str, out: Path, progress: Progress, lock: int) -> 
         _clear(work, ())
     elif left != asked:
         _clear(work, (JOB, *MATCHES))
-    request.with_suffix(".partial").write_text(json.dumps(asked), encoding="utf-8")
-    request.with_suffix(".partial").replace(request)
+    write_text(request, json.dumps(asked))
     run_worker(
         "invgraphics.scenes.photos.work",
         work,

@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
+from invgraphics.files import write_picture, write_text
 from invgraphics.scenes.images import SUFFIXES, image_files, make_view, read_pixels
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
@@ -67,7 +68,7 @@ class Preparation:
 
     def write(self, path: Path) -> None:
         """As JSON."""
-        path.write_text(json.dumps(asdict(self)), encoding="utf-8")
+        write_text(path, json.dumps(asdict(self)))
 
     @staticmethod
     def read(path: Path) -> Preparation:
@@ -228,9 +229,9 @@ def _write(work: Path, name: str, source: _Source, pixels: UInt8[np.ndarray, "h 
 
     height, width = pixels.shape[:2]
     masked = pixels.shape[2] == 4 and int(pixels[..., 3].min()) < _OPAQUE
-    Image.fromarray(pixels).save(work / PHOTOS / name, compress_level=1)
+    write_picture(work / PHOTOS / name, Image.fromarray(pixels), compress_level=1)
     opaque = pixels[..., 3] >= _OPAQUE if masked else np.ones((height, width), dtype=bool)
-    Image.fromarray(255 * opaque.astype(np.uint8)).save(work / MASKS / f"{name}.png", compress_level=1)
+    write_picture(work / MASKS / f"{name}.png", Image.fromarray(255 * opaque.astype(np.uint8)), compress_level=1)
     focal = None if source.focal_share is None else source.focal_share * max(width, height)
     centre = None
     group = {"auto": f"{source.group} {width}x{height}", "single": f"{width}x{height}", "per-photo": name}[job.cameras]

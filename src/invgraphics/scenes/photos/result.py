@@ -10,6 +10,9 @@ import numpy as np
 import torch
 
 from invgraphics.core import Camera
+from invgraphics.errors import InputError
+from invgraphics.files import copy_file, write_picture
+from invgraphics.scenes.colmap_sizes import check_sizes
 from invgraphics.scenes.images import make_view, read_pixels
 from invgraphics.scenes.lens import Lens, Straight, straighten
 from invgraphics.scenes.photos.prepare import PHOTOS, Prepared
@@ -43,8 +46,17 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
                     _move_points(image, camera, straight)
         _make_pinhole(camera, straight)
     (result / "sparse" / "0").mkdir(parents=True, exist_ok=True)
-    model.write(str(result / "sparse" / "0"))
+    _write_model(model, result / "sparse" / "0")
     return max(bends.values(), default=0.0)
+
+
+def _write_model(model: Any, folder: Path) -> None:
+    """Write a COLMAP model; the library does not say where it could not write all."""
+    model.write(str(folder))
+    try:
+        check_sizes(folder)
+    except InputError as error:
+        raise InputError(f"'{folder}' was not written whole.", "The disk may be full: free some space there.") from error
 
 
 def max_distortion(lens: Lens) -> float:
@@ -67,14 +79,14 @@ def _write_picture(source: Path, target: Path, lens: Lens | None) -> None:
     from PIL import Image
 
     if lens is None:
-        target.write_bytes(source.read_bytes())
+        copy_file(source, target)
         return
     pixels = read_pixels(source)
     unit = torch.ones(2, dtype=torch.float64)  # replaced by the lens's own
     camera = Camera(torch.eye(4, dtype=torch.float64), unit, unit, lens.width, lens.height)
     view = make_view(camera, pixels, source.name, lens=lens)
     alpha = [] if view.alpha is None else [view.alpha[..., None].numpy()]
-    Image.fromarray(np.concatenate([view.image.numpy(), *alpha], axis=-1)).save(target, compress_level=1)
+    write_picture(target, Image.fromarray(np.concatenate([view.image.numpy(), *alpha], axis=-1)), compress_level=1)
 
 
 def _move_points(image: Any, camera: Any, straight: Straight) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from invgraphics.files import write_text
 from invgraphics.scenes.photos.job import DATABASE, EXHAUSTIVE, MODELS, PhotoJob
 from invgraphics.scenes.photos.prepare import MASKS, PHOTOS, Prepared
 from invgraphics.scenes.process import Progress
@@ -139,5 +140,5 @@ def match(
     for start in range(0, len(wanted), _PAIRS):
         progress(start, len(wanted), f"matching {len(wanted)} pairs")
         lines = [f"{photos[i].name} {photos[j].name}" for i, j in wanted[start : start + _PAIRS]]
-        pairing.match_list_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_text(Path(pairing.match_list_path), "\n".join(lines) + "\n")
         pycolmap.match_image_pairs(path, matching, pairing, geometry)

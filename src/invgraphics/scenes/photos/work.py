@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
+from invgraphics.files import write_text
 from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.photos import sfm
 from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
@@ -75,9 +76,7 @@ def main(work: Path) -> None:
     matched = Matched(job, preparation.photos, evidence, work)
     best, attempts = try_strategies(matched, clock.show)
     quality = _finish(matched, preparation.skipped, best, result, clock) | {"choice": choice(attempts), "attempts": attempts}
-    partial = result / f"{QUALITY}.partial"
-    partial.write_text(json.dumps({"schema": SCHEMA, "key": asked["key"], **quality}, indent=1), encoding="utf-8")
-    partial.replace(result / QUALITY)
+    write_text(result / QUALITY, json.dumps({"schema": SCHEMA, "key": asked["key"], **quality}, indent=1))
 
 
 def _prepared(job: PhotoJob, work: Path, clock: Clock) -> Preparation:
@@ -85,8 +84,7 @@ def _prepared(job: PhotoJob, work: Path, clock: Clock) -> Preparation:
     if path.is_file():
         return Preparation.read(path)
     preparation = prepare(job, work, clock.show)
-    preparation.write(path.with_suffix(".partial"))
-    path.with_suffix(".partial").replace(path)
+    preparation.write(path)
     return preparation
 
 

@@ -1,0 +1,160 @@
+"""Atomic writing of files: whole or not at all, and a full disk is named together with the file and the remedy.
+
+Every result is written through this module: the content goes to a temporary file beside its place and is renamed at the end, so
+that an interruption or a full disk leaves either the old file or the new one.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from invgraphics.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+_AGAIN = "Free some space there, and give the command again (a fit: with --resume)."
+FULL = {
+    errno.ENOSPC: ("the disk is full", _AGAIN),
+    errno.EDQUOT: ("the disk quota is used up", _AGAIN),
+    errno.EFBIG: ("a file may not become as large there", "Raise the limit (`ulimit -f unlimited`), or write to another disk."),
+}
+"""Errors of a disk that takes no more -> what it is, and the remedy."""
+_SYSTEM_ERROR = re.compile(r"(?i)\(os error (\d+)\)|\[errno (\d+)\]")  # how Rust and Arrow spell errors of the system in words
+
+
+def full_disk(path: Path | str, error: BaseException) -> InputError | None:
+    """The error with which a user is told that ``path`` could not be written to a full disk.
+
+    Args:
+        path: the file or folder that was being written.
+        error: what was raised, by the system or by a library that quotes it.
+
+    Returns:
+        ``None`` if ``error`` says nothing of a full disk.
+    """
+    number = getattr(error, "errno", None)
+    if number is None and (quoted := _SYSTEM_ERROR.search(str(error))):
+        number = int(quoted.group(1) or quoted.group(2))
+    if number is None and "No space left on device" in str(error):
+        number = errno.ENOSPC
+    if number not in FULL:
+        return None
+    what, remedy = FULL[number]
+    return InputError(f"'{path}' cannot be written: {what}.", remedy)
+
+
+@contextmanager
+def naming_full_disk(path: Path) -> Iterator[None]:
+    """Turn errors of a full disk within the context into an `InputError` that names ``path``.
+
+    Raises:
+        InputError: the disk is full, a quota is used up, or files may not become as large.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        told = full_disk(path, error)
+        if told is None:
+            raise
+        raise told from error
+
+
+@contextmanager
+def replacing(path: Path, shared: bool = False) -> Iterator[Path]:
+    """Yield a temporary path beside ``path`` to be written, which replaces it at the end; an exception removes it.
+
+    Args:
+        path: the file.
+        shared: whether other processes may write the same file at the same time; each then has a temporary file of its own.
+
+    Raises:
+        InputError: as `naming_full_disk`.
+    """
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp" if shared else f"{path.name}.tmp")
+    try:
+        with naming_full_disk(path):
+            yield temporary
+            temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(path: Path, shared: bool = False) -> Iterator[IO[bytes]]:
+    """Yield a binary file that replaces ``path`` at the end; an exception removes it. Arguments and errors as `replacing`."""
+    with replacing(path, shared) as temporary, temporary.open("wb") as file:
+        yield file
+
+
+@contextmanager
+def writing_text(path: Path) -> Iterator[IO[str]]:
+    """Yield a UTF-8 text file, for ``csv``, that replaces ``path`` at the end; line ends are written as they are given."""
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        yield file
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically."""
+    with writing(path) as file:
+        file.write(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file atomically."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def append_text(path: Path, text: str) -> None:
+    """Append to a UTF-8 text file: all of ``text``, or nothing where the disk is full.
+
+    Raises:
+        InputError: as `naming_full_disk`.
+    """
+    with naming_full_disk(path), path.open("ab", buffering=0) as file:
+        size, rest = file.tell(), text.encode("utf-8")
+        try:
+            while rest:
+                rest = rest[file.write(rest) :]
+        except OSError:
+            file.truncate(size)
+            raise
+
+
+def write_arrays(path: Path, arrays: Mapping[str, ArrayLike], shared: bool = False) -> None:
+    """Write a compressed ``.npz`` archive atomically; ``shared`` as in `replacing`."""
+    import numpy as np
+
+    with writing(path, shared) as file:
+        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]  # numpy's stub takes keywords for switches
+
+
+def write_picture(path: Path, image: Any, shared: bool = False, **options: Any) -> None:
+    """Write a Pillow image as PNG atomically.
+
+    Args:
+        path: the file.
+        image: a ``PIL.Image.Image``.
+        shared: as in `replacing`.
+        options: of Pillow's PNG writer.
+    """
+    content = io.BytesIO()  # Pillow's encoder hides the system's error behind one of its own
+    image.save(content, format="PNG", **options)
+    with writing(path, shared) as file:
+        file.write(content.getvalue())
+
+
+def copy_file(source: Path | str, target: Path | str) -> None:
+    """Copy a file's content atomically."""
+    with replacing(Path(target)) as temporary:
+        shutil.copyfile(source, temporary)

@@ -1,0 +1,67 @@
+"""The bounds of time and memory that the fuzzer holds readers to, with a reader that breaks each of them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("resource", reason="limits of memory are POSIX's")
+
+import watched
+
+SCRIPT = """
+import sys, time
+sys.path.insert(0, {folder!r})
+import numpy as np, reader
+from invgraphics.errors import InputError
+
+def read(path):
+    match path.name:
+        case "takes":
+            np.ones({much}, np.uint8)
+        case "asks":  # for what is not there, and hides it in a sentence
+            try:
+                np.ones({too_much}, np.uint8)
+            except MemoryError as error:
+                raise InputError("It cannot be read.") from error
+        case "takes-less":
+            np.ones({less}, np.uint8)
+        case "sleeps":
+            time.sleep(60)
+        case "ends":
+            sys.stdout.flush()
+            import os
+            os._exit(3)
+    return "fine"
+
+reader.read_recipe = read
+reader.main()
+"""
+
+
+@pytest.fixture(scope="module")
+def process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[watched.Process]:
+    script = tmp_path_factory.mktemp("script") / "misbehaving.py"
+    sizes = {"less": 3 << 28, "much": 3 << 29, "too_much": 3 << 30}
+    script.write_text(SCRIPT.format(folder=str(Path(watched.__file__).parent), **sizes))
+    started = watched.Process("recipe", script)
+    yield started
+    started.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "outcome"),
+    [
+        ("good", "accepted"),
+        ("takes-less", "accepted"),
+        ("takes", "greedy"),
+        ("asks", "raised"),
+        ("sleeps", "hung"),
+        ("ends", "died"),
+    ],
+)
+def test_every_bound_is_noticed(process: watched.Process, name: str, outcome: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if name == "sleeps":
+        monkeypatch.setattr(watched, "SECONDS", 1.0)
+    reader = watched.Reader(process, Path("good"))
+    assert reader.read(Path(name))[0] == outcome
