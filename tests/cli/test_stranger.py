@@ -101,7 +101,8 @@ def environment(tmp_path: Path) -> dict[str, str]:
     (info.parent / "stranger_fog.py").write_text(MODULE)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger-fog\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
-    return os.environ | {"PYTHONPATH": str(info.parent), "COLUMNS": "200"}
+    paths = [str(info.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "200"}
 
 
 def _invgraphics(environment: dict[str, str], *arguments: str) -> str:

@@ -12,7 +12,7 @@ from invgraphics import plugins
 from invgraphics.core import Bounds, Camera, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.scenes import mitsuba
-from invgraphics.scenes.layout import contracted_frame, evenly_spaced
+from invgraphics.scenes.layout import contracted_frame, evenly
 from invgraphics.scenes.open import SceneOptions, find_loader, open_scene, validate
 
 
@@ -133,10 +133,10 @@ def test_samples_are_for_what_is_rendered(tmp_path: Path) -> None:
 
 
 def test_evenly_spaced_choice() -> None:
-    assert evenly_spaced(list(range(200)), 4) == [25, 75, 125, 175]
-    assert evenly_spaced(list(range(3)), 16) == [0, 1, 2]
-    assert evenly_spaced(list(range(3)), None) == [0, 1, 2]
-    assert len(set(evenly_spaced(list(range(17)), 16))) == 16
+    assert evenly(list(range(200)), 4) == [25, 75, 125, 175]
+    assert evenly(list(range(3)), 16) == [0, 1, 2]
+    assert evenly(list(range(3)), None) == [0, 1, 2]
+    assert len(set(evenly(list(range(17)), 16))) == 16
 
 
 @pytest.mark.parametrize("bad", [{"size": 0}, {"size": (4, -1)}, {"test_views": 0}, {"train_views": -2}, {"spp": 0}])

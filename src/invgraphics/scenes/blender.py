@@ -9,7 +9,7 @@ import torch
 from invgraphics.core import Bounds, Scene
 from invgraphics.scenes.frames import Frames
 from invgraphics.scenes.images import Photo
-from invgraphics.scenes.layout import Frame, SceneOptions, Split, compose, evenly_spaced, existing_photos
+from invgraphics.scenes.layout import Frame, SceneOptions, Split, compose, evenly, existing_photos
 
 HALF_EXTENT = 1.5
 """The objects of NeRF-synthetic lie within ±1.5 world units (instant-ngp and TensoRF use the same box)."""
@@ -33,7 +33,7 @@ class Blender:
         notes: dict[str, str] = {"loader": "blender"}
         train, test = self._photos(path, "train", notes), self._photos(path, "test", notes)
         val = self._photos(path, "val", notes) if (path / "transforms_val.json").is_file() else []
-        split = Split(train, test, evenly_spaced(val, _VAL_VIEWS), "the data set's own")
+        split = Split(train, test, evenly(val, _VAL_VIEWS), "the data set's own")
         box = torch.full((3,), HALF_EXTENT)
         return compose(path.resolve().name, split, Frame(Bounds(-box, box)), options, notes)
 

@@ -150,7 +150,7 @@ def every_eighth(photos: Sequence[Photo]) -> Split:
     return Split(train, test, rule=f"every {HOLD_OUT}th photograph by name")
 
 
-def evenly_spaced(items: Sequence[T], count: int | None) -> list[T]:
+def evenly(items: Sequence[T], count: int | None) -> list[T]:
     """Select ``count`` evenly spaced items, in the middle of equal parts; all of them if there are no more."""
     if count is None or count >= len(items):
         return list(items)
@@ -238,9 +238,7 @@ def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes:
     """
     if not split.test:
         raise InputError(f"{name} has no photographs to score.")
-    chosen = replace(
-        split, train=evenly_spaced(split.train, options.train_views), test=evenly_spaced(split.test, options.test_views)
-    )
+    chosen = replace(split, train=evenly(split.train, options.train_views), test=evenly(split.test, options.test_views))
     notes = notes | {
         "split": split.rule,
         "train_views": f"{len(chosen.train)} of {len(split.train)}, evenly spaced",

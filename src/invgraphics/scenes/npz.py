@@ -33,7 +33,7 @@ from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.files import write_arrays
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
-from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly_spaced, local_points, pose
+from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
 from invgraphics.tables import read_arrays
 
 Arrays = Mapping[str, np.ndarray]
@@ -63,7 +63,7 @@ class Npz:
         if not train or not test:
             raise InputError(f"{path} has {len(train)} views to fit and {len(test)} to score; it needs at least one of each.")
         final = wanted_size(width, height, options.size)
-        chosen = (evenly_spaced(train, options.train_views), evenly_spaced(test, options.test_views))
+        chosen = (evenly(train, options.train_views), evenly(test, options.test_views))
         notes = {
             "loader": "npz",
             "train_views": f"{len(chosen[0])} of {len(train)}, evenly spaced",

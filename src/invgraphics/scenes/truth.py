@@ -12,7 +12,7 @@ import torch
 from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, Photo, load_view
-from invgraphics.scenes.layout import SceneOptions, evenly_spaced, pose
+from invgraphics.scenes.layout import SceneOptions, evenly, pose
 from invgraphics.scenes.mitsuba import cache, ply
 from invgraphics.tables import read_arrays
 
@@ -50,7 +50,7 @@ class Truth:
         views = {
             split: tuple(
                 _view(path, split, index, truth["cameras"][split][index], options)
-                for index in evenly_spaced(range(len(truth["cameras"][split])), count)
+                for index in evenly(range(len(truth["cameras"][split])), count)
             )
             for split, count in wanted.items()
         }
