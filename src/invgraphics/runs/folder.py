@@ -17,7 +17,7 @@ from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.history import Moment
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.renderings import Renderings
-from invgraphics.runs.schema import Record, write_text
+from invgraphics.runs.schema import Record
 from invgraphics.runs.scores import DEFAULT, Scores, read_scores, scores_file
 from invgraphics.tables import read_toml
 

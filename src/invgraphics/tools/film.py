@@ -202,7 +202,6 @@ class FilmWriter:
 
     def __init__(self, out: Path, rate: int) -> None:
         self._out, self._rate = out, rate
-        self._partial = out.with_name(f".{out.stem}.partial{out.suffix}")
         self._writer: Any = None
         self._file = ExitStack()
         self._temporary = out
