@@ -57,7 +57,7 @@ class Running:
         if self.alive():
             os.kill(self.pid, number)
 
-    def wait(self, seconds: float = 120) -> int:
+    def wait(self, seconds: float = 300) -> int:
         """Exit status, negative for a signal."""
         self._process.join(seconds)
         status = self._process.exitcode

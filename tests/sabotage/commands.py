@@ -16,7 +16,7 @@ from training_fixtures import SMALL, write_blender
 from invgraphics.scenes.mitsuba.cache import VARIABLE
 from invgraphics.testing import toy_scene
 
-SPLATS, HASH = "splatting/gaussians", "volumetric/hash"
+SPLATS = "splatting/gaussians"
 CLOCKS = {
     "seconds",
     "cost",
@@ -65,8 +65,8 @@ def made(folder: Path) -> list[Case]:
     fit += ["--kernels", "reference"]
     run = folder / "run"
     assert Running([*fit, "--out", str(run)], folder / "log").wait() == 0
-    small = ":".join([HASH, *(item for item in SMALL[HASH])])
-    compare = ["compare", str(scene), "--methods", f"{SPLATS},{small}", "--budget", "20steps", "--kernels", "reference"]
+    methods = f"{SPLATS},{SPLATS}:batches.views=31"
+    compare = ["compare", str(scene), "--methods", methods, "--budget", "10steps", "--kernels", "reference", *settings]
     return [
         Case(
             "fit",
