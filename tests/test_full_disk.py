@@ -1,5 +1,6 @@
 """A full disk, on a real small file system: every command names the file and the remedy, and leaves nothing half-written."""
 
+import ast
 import json
 import os
 import shutil
@@ -191,3 +192,24 @@ def test_appending_is_all_or_nothing(disk: Path) -> None:
     with pytest.raises(InputError, match="the disk is full"):
         files.append_text(path, "x" * 10_000)
     assert path.read_text() == "first\n"
+
+
+DIRECT = {
+    "files.py",
+    "bench/memory.py",  # of the kernel, in /proc
+    "runs/folder.py",  # the empty probe of a folder
+    "formats/splat.py",  # into the temporary file of `formats.base.write_gaussians`
+    "formats/spz.py",
+}
+"""Modules that write without `invgraphics.files`."""
+
+
+def test_every_other_module_writes_through_files() -> None:
+    root = Path(files.__file__).parent
+    direct = {"write_text", "write_bytes", "savez", "savez_compressed", "copyfile"}
+    found = set()
+    for path in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in direct:
+                found.add(path.relative_to(root).as_posix())
+    assert found == DIRECT

@@ -122,7 +122,7 @@ def main() -> None:
 def lacked_memory(error: BaseException | None) -> bool:
     """Whether an exception goes back to an allocation beyond `ENOUGH`; Python's parser says so of nesting as well."""
     while error is not None:
-        if isinstance(error, MemoryError) and "too complex to parse" not in str(error) and "arser" not in str(error):
+        if "can't allocate memory" in str(error) or (isinstance(error, MemoryError) and "arser" not in str(error)):
             return True
         error = error.__cause__ or error.__context__
     return False

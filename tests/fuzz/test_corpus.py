@@ -107,6 +107,24 @@ poses = np.stack([eye.cam_to_world for eye in seeds.eyes()])
 poses_far = poses.copy()
 poses_far[0, 0, 3] = 1e30
 
+
+def no_utf8(root: Path) -> Path:
+    """A COLMAP model with a name that is no UTF-8."""
+    seeds.colmap_binary(root)
+    path = root / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"0.png", b"\x80.png"))
+    return root
+
+
+def long_chunk(root: Path) -> Path:
+    """A PNG file whose pixels claim 4 GB, which Pillow once reserved."""
+    seeds.images(root)
+    path = root / "images" / "0.png"
+    data = path.read_bytes()
+    path.write_bytes(data[:33] + b"\xff\xff\xff\x7f" + data[37:])
+    return root
+
+
 BAD_SCENES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "k1 = 1e30": (table(lambda t: t.update(k1=1e30)), "smear its picture"),
     "k1 = -9": (table(lambda t: t.update(k1=-900.0)), "fold its picture"),
@@ -135,6 +153,8 @@ BAD_SCENES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "camera far from its box": (archive(seeds.npz, cam_to_world=poses_far), "far away"),
     "0 x 0": (text("cameras.txt", "12 9 11 11", "0 0 11 11"), "0x0 pixels"),
     "COLMAP name of 400 characters": (long_names, "None of the 3"),
+    "COLMAP name that is no UTF-8": (no_utf8, "name is no text in UTF-8"),
+    "PNG chunk of 4 GB": (long_chunk, "is damaged: the chunk at byte 33 is cut off"),
     "COLMAP quaternion of 1e200": (text("images.txt", "1 ", "1 1e200 1e200 "), "."),
     "COLMAP point of NaN": (text("points3D.txt", " 0.0 0.0 0.0 ", " nan 0.0 0.0 "), "cannot be read"),
     "COLMAP point of 1e300": (text("points3D.txt", " 0.0 0.0 0.0 ", " 1e300 0.0 0.0 "), "points|near plane"),

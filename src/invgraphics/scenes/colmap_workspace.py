@@ -109,7 +109,10 @@ def _read(folder: Path) -> Model:
     except (ValueError, IndexError, RuntimeError, MemoryError) as error:
         raise InputError(f"The COLMAP model {folder} cannot be read: {str(error).splitlines()[0]}.") from error
     bare = Model(folder, reconstruction, None, 0)
-    names = [image.name for image in bare.registered]
+    try:
+        names = [image.name for image in bare.registered]
+    except UnicodeDecodeError as error:
+        raise InputError(f"The COLMAP model {folder} has an image whose name is no text in UTF-8.", "Rename it.") from error
     for images in _image_folders(folder):
         present = _present(images, names)
         if present:

@@ -113,6 +113,8 @@ def _open(path: Path) -> Any:
     from PIL import Image, UnidentifiedImageError
 
     try:
+        if wrong := png.cut_off(path):
+            raise InputError(f"{path} is damaged: {wrong}.", "Copy the file again.")
         return Image.open(path)
     except FileNotFoundError:
         raise InputError(f"{path} does not exist.") from None

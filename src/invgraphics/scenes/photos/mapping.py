@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from invgraphics.files import copy_file
 from invgraphics.scenes.photos.job import DATABASE, PhotoJob
 from invgraphics.scenes.photos.pairs import VerifiedMatches
 from invgraphics.scenes.photos.prepare import PHOTOS, Prepared
@@ -74,7 +75,7 @@ def _database(strategy: Strategy, matched: Matched, progress: Progress) -> Path:
     if not (strategy.calibrated or strategy.guided):
         return path
     copy = matched.work / COPY
-    shutil.copyfile(path, copy)
+    copy_file(path, copy)
     if strategy.guided:
         with pycolmap.Database.open(copy) as database:
             database.clear_matches()

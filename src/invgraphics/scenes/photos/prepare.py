@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_picture, write_text
+from invgraphics.scenes import png
 from invgraphics.scenes.images import SUFFIXES, image_files, make_view, read_pixels
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
@@ -154,6 +155,8 @@ def _exif(path: Path) -> dict[int, Any]:
     from PIL import Image
 
     try:
+        if png.cut_off(path):
+            return {}
         with Image.open(path) as image:
             exif = image.getexif()
             return dict(exif) | dict(exif.get_ifd(0x8769))
