@@ -85,10 +85,9 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     method = replace(_method(folder, provenance), preset_choice=provenance.preset_choice)
     device = device_of("cuda" if provenance.device.startswith("cuda") and torch.cuda.is_available() else "cpu")
     model = build_model(method, scene, provenance.seed, device)
-    shown = provenance.fitted_run
-    if shown is not None:
+    if provenance.fitted_run is not None:
         model = replace(model, renderer=model.renderer.untrained())
-    source = folder if shown is None else RunFolder(folder.root / shown)
+    source = folder.fit(provenance)
     state = checkpoint.load(source.checkpoint, device)
     config = refined_poses(method)
     fitted = Fitted(folder, method, scene, model, source)

@@ -25,12 +25,10 @@ from invgraphics.experiments.variants import RendererVariant, with_renderer
 from invgraphics.files import write_text
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.environment import Environment
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import RENDERED, RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.renderings import OWN, Difference, Rendering, Renderings
 from invgraphics.text import sha256_of
-
-FOLDER = "rendered"
 
 
 def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method], scene: Scene) -> None:
@@ -80,8 +78,8 @@ def render_missing(job: Job, scene: Scene) -> None:
         if variant.table == method.table["renderer"]:
             shown[variant.name] = OWN
         else:
-            shown[variant.name] = f"{FOLDER}/{variant.folder}"
-            _render(RunFolder(folder.root / FOLDER / variant.folder), folder, (method, variant), scene, job.protocols)
+            shown[variant.name] = f"{RENDERED}/{variant.folder}"
+            _render(RunFolder(folder.root / RENDERED / variant.folder), folder, (method, variant), scene, job.protocols)
     pictures = {name: _pictures(folder.root / place, scene) for name, place in shown.items()}
     record = Renderings(
         identity=_identity(folder, job.variants, method),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from invgraphics.runs.inside import inside
 from invgraphics.runs.schema import Record
 
 FOLDER = "analyses"
@@ -46,5 +47,9 @@ class Analysis(Record):
 
 
 def analysis_path(study: Path, name: str) -> Path:
-    """The file of an analysis."""
-    return study / FOLDER / f"{name}.json"
+    """The file of an analysis.
+
+    Raises:
+        InputError: the name or a link leads outside the study.
+    """
+    return inside(study, FOLDER, f"{name}.json")

@@ -15,10 +15,11 @@ from invgraphics.runs import history
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.history import Moment
+from invgraphics.runs.inside import inside
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.renderings import Renderings
 from invgraphics.runs.schema import Record
-from invgraphics.runs.scores import DEFAULT, Scores, read_scores, scores_file
+from invgraphics.runs.scores import DEFAULT, Scores, scores_file
 from invgraphics.tables import read_toml
 
 R = TypeVar("R", bound=Record)
@@ -31,6 +32,10 @@ RUNS = "runs"
 """Folder of the runs, in a comparison or study."""
 TRUTH = "truth"
 """Folder of the true pictures, once per content; in a comparison or study they are shared by its runs."""
+RENDERED = "rendered"
+"""Folder of a fit's renderings by other renderers, each a run."""
+SHARED_ABOVE = 5
+"""Levels above a run at which the folder of runs of its comparison or study is looked for: of METHOD/seed-N/rendered/NAME."""
 PUBLISHED = (RECIPE, scores_file(), history.FILE, Provenance.FILE, Environment.FILE)
 """Files of a run that a report links."""
 
@@ -72,12 +77,15 @@ def check_run(folder: Path) -> None:
         InputError: it lacks a recipe or its provenance.
     """
     for name in (RECIPE, Provenance.FILE):
-        if not (folder / name).is_file():
+        if not inside(folder, name).is_file():
             raise InputError(f"{folder} is not a run: it has no {name}.", "Give a folder that `invgraphics fit` wrote.")
 
 
 class RunFolder:
-    """A run's folder. All files but the history are replaced atomically, so that an interruption leaves valid files."""
+    """A run's folder. All files but the history are replaced atomically, so that an interruption leaves valid files.
+
+    Paths are checked by `inside`: where a link leads outside the folder, all that uses the path raises `InputError`.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -113,9 +121,17 @@ class RunFolder:
         with locks.locked(self.root, self.root / locks.INSIDE, waiting if wait else None):
             yield
 
+    def path(self, *names: str) -> Path:
+        """Path of a file or folder in this folder.
+
+        Raises:
+            InputError: it leads outside.
+        """
+        return inside(self.root, *names)
+
     def has(self, kind: type[Record]) -> bool:
         """Whether the file of a record exists."""
-        return (self.root / kind.FILE).is_file()
+        return self.path(kind.FILE).is_file()
 
     def read(self, kind: type[R]) -> R:
         """Read a record from its file.
@@ -123,11 +139,11 @@ class RunFolder:
         Raises:
             InputError: the file is missing or broken; the sentence names file and key.
         """
-        return kind.read(self.root / kind.FILE)
+        return kind.read(self.path(kind.FILE))
 
     def write(self, record: Record) -> None:
         """Write a record to its file, atomically."""
-        record.write(self.root / record.file)
+        record.write(self.path(record.file))
 
     def remove(self, kind: type[Record]) -> None:
         """Remove the file of a record, if it exists."""
@@ -141,34 +157,70 @@ class RunFolder:
     @property
     def checkpoint(self) -> Path:
         """Path of the fit's checkpoint."""
-        return self.root / CHECKPOINT
+        return self.path(CHECKPOINT)
 
     def snapshot(self, index: int) -> Path:
         """Path of a snapshot of the model during the fit, for time-lapses."""
-        return self.root / "snapshots" / f"{index:04d}.safetensors"
+        return self.path("snapshots", f"{index:04d}.safetensors")
 
     @property
     def snapshots(self) -> list[Path]:
         """Paths of all snapshots of the model, first to last."""
-        return sorted((self.root / "snapshots").glob("*.safetensors"))
+        return self._matching("snapshots", "*.safetensors")
 
     def picture(self, index: int) -> Path:
         """Path of the prediction of a test view, 8 bits, over the scene's background."""
-        return self.root / "test" / f"{index:04d}.png"
+        return self.path("test", f"{index:04d}.png")
 
     def arrays(self, index: int) -> Path:
         """Path of the unrounded prediction of a test view: colour, alpha, depth and normals."""
-        return self.root / "test" / f"{index:04d}.npz"
+        return self.path("test", f"{index:04d}.npz")
 
     @property
     def predictions(self) -> list[Path]:
         """Paths of all unrounded predictions that exist."""
-        return sorted((self.root / "test").glob("*.npz"))
+        return self._matching("test", "*.npz")
+
+    def _matching(self, folder: str, pattern: str) -> list[Path]:
+        """Sorted paths of the files of a folder in this one that match a pattern."""
+        return [self.path(folder, path.name) for path in sorted(self.path(folder).glob(pattern))]
+
+    def truth(self, provenance: Provenance) -> Path:
+        """Folder of the run's true pictures: in the run, or in the folder of truth that its comparison or study shares.
+
+        Raises:
+            InputError: its provenance names another place.
+        """
+        real = self.root.resolve()
+        sets = [above.parent / TRUTH for above in real.parents[:SHARED_ABOVE] if above.name in (RUNS, RENDERED)]
+        path = (real / provenance.truth).resolve()
+        if any(path.is_relative_to(place) for place in (real, *sets)):
+            return path
+        raise InputError(
+            f"'{self.root / Provenance.FILE}': 'truth' cannot be '{provenance.truth}', outside the run and its comparison.",
+            "Nothing outside them is used: move the run together with its comparison or study.",
+        )
+
+    def fit(self, provenance: Provenance) -> RunFolder:
+        """Folder of the fit that a rendering shows; the run itself where it is a fit.
+
+        Raises:
+            InputError: its provenance names a folder that the rendering does not lie in.
+        """
+        if provenance.fitted_run is None:
+            return self
+        fit = (self.root / provenance.fitted_run).resolve()
+        if fit not in self.root.resolve().parents:
+            raise InputError(
+                f"'{self.root / Provenance.FILE}': 'fitted_run' cannot be '{provenance.fitted_run}'.",
+                "Expected: the folder that the rendering lies in, for instance '../..'.",
+            )
+        return RunFolder(fit)
 
     @property
     def history(self) -> Path:
         """Path of the history, one JSON line for each recorded moment of the fit."""
-        return self.root / history.FILE
+        return self.path(history.FILE)
 
     @property
     def finished(self) -> bool:
@@ -182,7 +234,7 @@ class RunFolder:
 
     def scores_path(self, protocol: str = DEFAULT) -> Path:
         """Path of a protocol's scores."""
-        return self.root / scores_file(protocol)
+        return self.path(scores_file(protocol))
 
     def read_scores(self, protocol: str = DEFAULT) -> Scores:
         """Read the scores under a protocol.
@@ -190,7 +242,7 @@ class RunFolder:
         Raises:
             InputError: they are missing or broken.
         """
-        return read_scores(self.root, protocol)
+        return Scores.read(self.scores_path(protocol))
 
     def clear(self) -> None:
         """Remove the files of an unfinished or replaced run, and no others.
@@ -200,6 +252,8 @@ class RunFolder:
         Raises:
             InputError: there are files in their places, and no provenance of a run that wrote them.
         """
+        for folder in ("test", "snapshots"):
+            self.path(folder)
         kinds = (FitRecord, Renderings, Environment, Provenance)
         patterns = (Scores.FILES, "test/*", "snapshots/*")
         found = [path for pattern in patterns for path in self.root.glob(pattern)]
@@ -215,7 +269,7 @@ class RunFolder:
         """Write the resolved recipe, atomically."""
         import tomlkit
 
-        write_text(self.root / RECIPE, tomlkit.dumps(table))
+        write_text(self.path(RECIPE), tomlkit.dumps(table))
 
     def read_recipe(self) -> dict[str, Any]:
         """Read the resolved recipe.
@@ -223,9 +277,10 @@ class RunFolder:
         Raises:
             InputError: it is missing or is not TOML.
         """
-        if not (self.root / RECIPE).is_file():
+        recipe = self.path(RECIPE)
+        if not recipe.is_file():
             raise InputError(f"{self.root} is not a run: it has no {RECIPE}.")
-        return read_toml(self.root / RECIPE)
+        return read_toml(recipe)
 
     def append_history(self, moment: Moment) -> None:
         """Append one moment to the history."""

@@ -9,6 +9,7 @@ from invgraphics.errors import InputError
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import Moment, read_history
+from invgraphics.runs.inside import inside
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.scores import DEFAULT, Scores
 
@@ -38,7 +39,7 @@ class Run:
     @property
     def truth(self) -> Path:
         """Folder of the true test pictures."""
-        return (self.folder / self.provenance.truth).resolve()
+        return self.files.truth(self.provenance)
 
     @property
     def files(self) -> RunFolder:
@@ -48,12 +49,12 @@ class Run:
 
 def truth_picture(truth: Path, index: int) -> Path:
     """Path of a test view's true picture, 8 bits, over the scene's background."""
-    return truth / f"{index:04d}.png"
+    return inside(truth, f"{index:04d}.png")
 
 
 def truth_arrays(truth: Path, index: int) -> Path:
     """Path of a test view's true arrays, where they exist: depth, normals, alpha, straight colour, mask."""
-    return truth / f"{index:04d}.npz"
+    return inside(truth, f"{index:04d}.npz")
 
 
 def read_run(folder: Path, protocol: str = DEFAULT) -> Run:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from invgraphics.runs.schema import Record
@@ -124,12 +123,3 @@ class Scores(Record):
 def scores_file(protocol: str = DEFAULT) -> str:
     """Name of the file of a protocol's scores."""
     return "scores.json" if protocol == DEFAULT else f"scores.{protocol}.json"
-
-
-def read_scores(run: Path, protocol: str = DEFAULT) -> Scores:
-    """Read a protocol's scores from a folder.
-
-    Raises:
-        InputError: the file is missing or broken.
-    """
-    return Scores.read(run / scores_file(protocol))

@@ -16,6 +16,7 @@ from invgraphics.core import Bounds, Rendering, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.metrics.conventions import BLACK, Colour
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.inside import inside
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.images import image_files, read_pixels
 from invgraphics.tools.saved_pictures import has_transparency, is_baked, read_picture, read_saved, read_truth
@@ -80,7 +81,11 @@ def _open_run(folder: Path, truth: Path | None) -> PictureSet:
     provenance, predictions = run.read(Provenance), run.predictions
     if not predictions:
         raise InputError(f"The run '{folder}' has no saved predictions (test/*.npz).", "Let it finish: fit --resume.")
-    matched, notes = _match(predictions, _pictures_in(truth or folder / provenance.truth))
+    true = run.truth(provenance) if truth is None else truth
+    matched, notes = _match(predictions, _pictures_in(true))
+    _check_inside(run.path("test"), predictions)
+    if truth is None:
+        _check_inside(true, [path for _, path in matched])
     names = run.read_scores().views if run.finished else ()
     scene = _scene(provenance.background, provenance.colour)
 
@@ -165,6 +170,16 @@ def _pictures_in(folder: Path) -> list[Path]:
     if not files:
         raise InputError(f"There is no picture in '{folder}'." if folder.is_dir() else f"There is no folder '{folder}'.")
     return files
+
+
+def _check_inside(folder: Path, files: Sequence[Path]) -> None:
+    """Refuse links that lead outside ``folder``, of ``files`` and of the picture or the arrays beside each.
+
+    Raises:
+        InputError: there is such a link.
+    """
+    for name in {name for path in files for name in (path.name, f"{path.stem}.png", f"{path.stem}.npz")}:
+        inside(folder, name)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

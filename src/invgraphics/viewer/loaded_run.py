@@ -197,7 +197,6 @@ def missing_file(run: Path) -> tuple[str, str] | None:
 def _source(run: Path) -> RunFolder:
     """Folder of a run's checkpoint: its own, or that of the fit it is a rendering of."""
     try:
-        fitted = RunFolder(run).read(Provenance).fitted_run
+        return RunFolder(run).fit(RunFolder(run).read(Provenance))
     except InputError:
-        fitted = None  # opening the run reports the error
-    return RunFolder(run if fitted is None else run / fitted)
+        return RunFolder(run)  # opening the run reports the error

@@ -18,6 +18,7 @@ from invgraphics import locks
 from invgraphics.errors import InputError
 from invgraphics.files import copy_file, write_picture
 from invgraphics.report.data.redact import Redactor
+from invgraphics.runs.inside import inside
 
 LOCK = ".report.lock"
 """Lock file of a report's folder; a study's folder has another one, as its report may be written while it runs."""
@@ -48,18 +49,23 @@ class Folder:
         """The relative, quoted link to a file inside the folder."""
         return quote(Path(os.path.relpath(path.resolve(), self.root.resolve())).as_posix())
 
-    def publish(self, path: Path, place: str) -> str:
-        """A relative link to ``path``, which is copied to ``place`` when it lies outside the folder or must be cleaned.
+    def publish(self, source: Path, name: str, place: str) -> str:
+        """A relative link to a file, which is copied when it lies outside the report's folder or must be cleaned.
+
+        Args:
+            source: folder of a run, of a truth or of a study.
+            name: of the file in it.
+            place: of the copy, in this part of the report.
 
         Raises:
-            InputError: there is no such file.
+            InputError: there is no such file, or it or its place lies outside its folder.
         """
+        path = inside(source, name)
         if not path.is_file():
             raise InputError(f"'{path}' is missing.", "Fit the run again, or leave it out of the report.")
-        inside = path.resolve().is_relative_to(self.root.resolve())
-        if inside and self.redactor is None:
+        if self.redactor is None and path.resolve().is_relative_to(self.root.resolve()):
             return self.url(path)
-        copy = self.root / self.part / place
+        copy = inside(self.root, self.part, place)
         if self.redactor is not None:
             self.redactor.copy(path, copy)
         else:

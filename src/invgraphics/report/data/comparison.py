@@ -9,6 +9,8 @@ from typing import Any
 from invgraphics.errors import InputError
 from invgraphics.runs.comparison import ComparisonRecord, Failure, SceneFacts
 from invgraphics.runs.environment import Environment
+from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.inside import inside
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.scores import DEFAULT, Score
 
@@ -76,9 +78,9 @@ def read_comparison(folder: Path) -> Comparison:
         InputError: a file is missing or broken (it is named), or the runs do not share their ground truth.
     """
     source = folder / ComparisonRecord.FILE
-    record = ComparisonRecord.read(source)
+    record = RunFolder(folder).read(ComparisonRecord)
     protocol = str(record.protocol.get("name", DEFAULT))
-    runs = tuple(read_run(folder / run, protocol) for run in record.runs)
+    runs = tuple(read_run(inside(folder, run), protocol) for run in record.runs)
     if not runs and not record.failures:
         raise InputError(f"'{source}' lists no runs.", "Run `invgraphics compare` again.")
     check_comparable(runs)

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.runs.explanation import Contributions, ExplanationRecord, Profile
+from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.schema import plain
 
 DEPTHS = ("true_depth", "expected", "median")
@@ -55,7 +56,7 @@ def read_ray(folder: Path) -> Ray:
     Raises:
         InputError: a file is missing or broken.
     """
-    record = ExplanationRecord.read(folder / ExplanationRecord.FILE)
+    record = RunFolder(folder).read(ExplanationRecord)
     columns = curve_of(record.contributions)
     rgb = np.stack([columns[key] for key in ("red", "green", "blue")], axis=1)
     return Ray(record, columns, rgb, np.array(record.background, float))

@@ -13,6 +13,8 @@ from invgraphics.report.data.factors import METHOD, Factor, Observation, StudyCe
 from invgraphics.report.data.variants import find_factors, variant_name
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.environment import Environment
+from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.inside import inside
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.scores import DEFAULT
 from invgraphics.runs.study import Approximation, CellRecord, KnownDeviation, StudyRecord
@@ -95,7 +97,7 @@ def read_study(folder: Path) -> Study:
         InputError: a file is missing or broken; the sentence names it.
     """
     source = folder / StudyRecord.FILE
-    record = StudyRecord.read(source)
+    record = RunFolder(folder).read(StudyRecord)
     if not record.cells:
         raise InputError(f"'{source}' lists no cells.", "Give a study with at least one scene, method and seed.")
     base = {key: level_text(value) for key, value in record.base.items()}
@@ -175,7 +177,7 @@ def _cell(record: CellRecord, base: Mapping[str, str], folder: Path, protocol: s
         status=record.status,
         error=record.error or ("no message" if record.status == "failed" else ""),
         seconds=record.seconds,
-        run=read_run(folder / record.run, protocol) if record.status == "done" else None,
+        run=read_run(inside(folder, record.run), protocol) if record.status == "done" else None,
         label=record.label or f"{record.method} {record.scene}",
         size=_size_text(record.size),
         budget=record.budget,

@@ -9,6 +9,7 @@ from typing import Any
 
 from invgraphics.report.figures.style import Figure, canvas, save, series_style
 from invgraphics.runs.analysis import Analysis, analysis_path
+from invgraphics.text import file_name
 
 SIZE = (460.0, 380.0)
 MARKED = 40
@@ -34,7 +35,7 @@ def draw_analyses(root: Path, names: Sequence[str], figures: Path) -> list[Analy
     for name in names:
         source = analysis_path(root, name)
         if source.is_file():
-            parts.append(_draw(Analysis.read(source), figures / f"analysis-{name}"))
+            parts.append(_draw(Analysis.read(source), figures / f"analysis-{file_name(name)}"))
     return parts
 
 

@@ -14,6 +14,7 @@ from invgraphics.report.data.pictures import read_picture
 from invgraphics.report.data.ray import Ray, close_up, curve_of, read_ray, whole_ray
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, POINTS, SERIES, canvas, save, spread_labels
 from invgraphics.runs.explanation import FIGURE, PICTURE, TRUTH
+from invgraphics.runs.inside import inside
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -244,7 +245,7 @@ def _pictures(figure: Canvas, places: Any, ray: Ray, folder: Path) -> None:
     shown = ((PICTURE, pixel.rendered, "rendered"), (TRUTH, pixel.true, "truth"))
     for place, (name, values, title) in zip(places, shown, strict=True):
         axes = figure.add_subplot(place)
-        _cross_hair(axes, read_picture(folder / name), ray)
+        _cross_hair(axes, read_picture(inside(folder, name)), ray)
         axes.set_title(title)
         colour = np.array(values, float)
         tone = ray.shown(colour)

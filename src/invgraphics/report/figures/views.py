@@ -19,7 +19,7 @@ from invgraphics.report.data.assets import Folder, gradient, save_normals, save_
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.pictures import Arrays, read_arrays, read_picture
 from invgraphics.report.wording import Quantity, quality_quantity
-from invgraphics.runs.run import Run, truth_picture
+from invgraphics.runs.run import Run, truth_arrays, truth_picture
 
 ERROR_COLOURS, DEPTH_COLOURS = "magma", "viridis_r"
 EVENLY_SPACED = 4
@@ -121,7 +121,7 @@ def draw_views(comparison: Comparison, folder: Folder) -> tuple[ViewPage, ...]:
 
 def publish_truth(run: Run, index: int, folder: Folder) -> str:
     """Link to the truth's picture of a test view."""
-    return folder.publish(truth_picture(run.truth, index), f"pictures/truth-{index:04d}.png")
+    return folder.publish(run.truth, truth_picture(run.truth, index).name, f"pictures/truth-{index:04d}.png")
 
 
 def _mean_over(runs: Sequence[Run], key: str, view: int, quantity: Quantity) -> float:
@@ -133,17 +133,17 @@ def _mean_over(runs: Sequence[Run], key: str, view: int, quantity: Quantity) -> 
 
 
 def _draw_view(firsts: Sequence[tuple[Run, int]], index: int, why: str, folder: Folder) -> ViewPage:
-    truth_png = firsts[0][0].truth / f"{index:04d}.png"
+    truth_png = truth_picture(firsts[0][0].truth, index)
     truth = read_picture(truth_png)
-    geometry_file = truth_png.with_suffix(".npz")
+    geometry_file = truth_arrays(firsts[0][0].truth, index)
     geometry = read_arrays(geometry_file) if geometry_file.is_file() else {}
     shown = []
     for run, series in firsts:
-        stem = run.folder / "test" / f"{index:04d}"
-        colour = read_picture(stem.with_suffix(".png"))
+        picture = run.files.picture(index)
+        colour = read_picture(picture)
         if colour.shape != truth.shape:
-            raise InputError(f"'{stem.with_suffix('.png')}' and '{truth_png}' differ in size.", "Score the run again.")
-        shown.append(_Shown(run, series, colour, read_arrays(stem.with_suffix(".npz"))))
+            raise InputError(f"'{picture}' and '{truth_png}' differ in size.", "Score the run again.")
+        shown.append(_Shown(run, series, colour, read_arrays(run.files.arrays(index))))
     target = folder.figures / "views" / f"{index:04d}"
     layers = (
         _colour_layer(shown, index, folder),
@@ -199,7 +199,7 @@ def _colour_layer(shown: Sequence[_Shown], index: int, folder: Folder) -> Layer:
     pictures = []
     for one in shown:
         place = f"pictures/method-{one.series}-{index:04d}.png"
-        pictures.append(Picture(folder.publish(one.run.files.picture(index), place)))
+        pictures.append(Picture(folder.publish(one.run.folder, f"test/{index:04d}.png", place)))
     captioned = _captioned(shown, pictures, ("psnr", "ssim"), index)
     truth = Picture(publish_truth(shown[0].run, index, folder))
     return Layer("colour", "Picture", "", "", "", "", truth, _with_methods(shown, captioned))

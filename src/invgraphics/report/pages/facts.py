@@ -142,8 +142,8 @@ def reproduction(comparison: Comparison, folder: Folder) -> tuple[Cell, ...]:
             command = run.provenance.command
             files = []
             for name in PUBLISHED:
-                if (run.folder / name).is_file():
-                    files.append((name, folder.publish(run.folder / name, f"runs/{series}-seed-{run.seed}/{name}")))
+                if run.files.path(name).is_file():
+                    files.append((name, folder.publish(run.folder, name, f"runs/{series}-seed-{run.seed}/{name}")))
             cells.append(Cell(method, series, run.seed, command, tuple(own.items()), tuple(files)))
     return tuple(cells)
 

@@ -159,9 +159,10 @@ def _field(cell: StudyCell, index: int, quantity: Quantity | None, folder: Folde
     if cell.run is None:
         return MatrixCell("missing", "–", "", f"{where}: has not run")
     value = value_of(cell.run, quantity) if quantity is not None else None
-    scores = cell.run.folder / cell.run.scores.file
     text = "done" if value is None or quantity is None else quantity.text(value)
-    return MatrixCell("done", text, folder.publish(scores, f"cells/{index:04d}.json"), f"{where}: done{took}")
+    return MatrixCell(
+        "done", text, folder.publish(cell.run.folder, cell.run.scores.file, f"cells/{index:04d}.json"), f"{where}: done{took}"
+    )
 
 
 def write_study_markdown(page: StudyPage, folder: Folder) -> None:

@@ -137,7 +137,7 @@ def write_verdict_report(study: Study, folder: Folder, source: Path) -> None:
         panels.setdefault(_place(one.cell), []).append(one)
     figures = draw_curve_panels(panels, study.methods, folder.figures)
     page = VerdictPage(study, fields, _matrix(study, fields), figures, unused(judged, study.known))
-    folder.publish(source / StudyRecord.FILE, StudyRecord.FILE)
+    folder.publish(source, StudyRecord.FILE, StudyRecord.FILE)
     _write_verdicts(page, folder.root / "verdicts")
     _write_markdown(page, folder)
     machine = facts.plain_facts(study.environment.facts())
@@ -184,8 +184,8 @@ def _field(one: JudgedCell, name: str, anchor: str, folder: Folder) -> Field:
         ABSENT if worst is None else f"{worst[1]:.2f} ({worst[0]})",
         run.provenance.code_version.rpartition("+")[2] or ABSENT,
     )
-    names = [name for name in PUBLISHED if (run.folder / name).is_file()]
-    files = tuple((name, folder.publish(run.folder / name, f"runs/{cell.id}/{name}")) for name in names)
+    names = [name for name in PUBLISHED if run.files.path(name).is_file()]
+    files = tuple((name, folder.publish(run.folder, name, f"runs/{cell.id}/{name}")) for name in names)
     return Field(one, name, anchor, text, numbers, files)
 
 

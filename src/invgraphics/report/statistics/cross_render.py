@@ -11,6 +11,7 @@ from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.summary import quality_columns, value_of
 from invgraphics.report.wording import Quantity
+from invgraphics.runs.inside import inside
 from invgraphics.runs.renderings import OWN, Renderings
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.study import Approximation
@@ -108,7 +109,7 @@ def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendere
         return None
     record = run.files.read(Renderings)
     seen = {
-        clean(one.renderer): run if one.run == OWN else read_run(run.folder / one.run, run.scores.protocol)
+        clean(one.renderer): run if one.run == OWN else read_run(inside(run.folder, one.run), run.scores.protocol)
         for one in record.renderings
     }
     differences = {frozenset(clean(name) for name in one.renderers): one.rmse for one in record.differences}
@@ -152,7 +153,7 @@ def _cell(fits: Sequence[CrossRendered], name: str, quantity: Quantity, folder: 
     difference = "" if own else _decibels(fits, None, name)
     path = first.seen[name].files.picture(SHOWN_VIEW)
     place = f"crossed/{file_name(first.fit.method)}-{file_name(name)}.png"
-    picture = folder.publish(path, place) if path.is_file() else ""
+    picture = folder.publish(path.parent, path.name, place) if path.is_file() else ""
     return CrossCell(quantity.text(score), difference, own, best=False, picture=picture)
 
 
