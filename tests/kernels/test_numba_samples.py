@@ -91,11 +91,6 @@ def test_jacobian_comes_from_the_reference():
         assert torch.equal(ours, theirs)
 
 
-@pytest.mark.parametrize("shape", [(5, 6, 7, 3), (2, 2, 2, 1), (1, 4, 1, 2), (9, 1, 3, 12)])
-def test_grid_sampling(shape):
-    assert_equal(numba.grid_sample, reference.grid_sample, [torch.cat([POINTS, CORNERS]), torch.randn(shape)])
-
-
 def packed(n):
     """Sorted ray indices, with rays of no sample, of one and of many."""
     counts = torch.randint(0, 60, (n,))
