@@ -5,7 +5,7 @@ import csv
 import pytest
 from bench_made_up import measured
 
-from invgraphics.bench import iterations, sample_cases, splat_cases
+from invgraphics.bench import iterations, lattice_cases, sample_cases, splat_cases
 from invgraphics.bench.gates import gates
 from invgraphics.bench.growth import growths
 from invgraphics.bench.results import BOTH, COLUMNS, FORWARD, SIZE_KEYS, PeakMemory, Results, write_tables
@@ -35,7 +35,7 @@ def test_tables_on_disk(tmp_path) -> None:
 
 
 def test_every_size_of_every_case_has_a_column() -> None:
-    makers = (splat_cases.splats, splat_cases.ssim, sample_cases.hash_encode, sample_cases.grid_sample)
+    makers = (splat_cases.splats, splat_cases.ssim, sample_cases.hash_encode, lattice_cases.lattice_encode)
     for make in (*makers, sample_cases.ray_march, sample_cases.composite):
         for case in make(False):
             assert case.sizes and set(case.sizes) <= set(SIZE_KEYS)

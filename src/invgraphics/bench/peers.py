@@ -1,4 +1,4 @@
-"""Third-party implementations on the same machine, in the same run: nerfstudio, Dr.Jit and Mitsuba; reported, never gated.
+"""Third-party implementations on the same machine, in the same run: nerfstudio, Dr.Jit, Mitsuba and torch's grid sampler.
 
 The torch-only tile rasteriser is our own reference, which every run measures anyway.
 """
@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from invgraphics import kernels
+from invgraphics.bench import lattice_cases
 from invgraphics.bench.case import Run
+from invgraphics.bench.lattice_cases import GATE_POINTS, LAYOUTS, TORCH, torch_sampler
 from invgraphics.bench.results import BOTH, FORWARD, PEERS, Measurement, Results, Skipped
 from invgraphics.bench.sample_cases import BASE, FINEST, ray_ordered
 from invgraphics.bench.sample_cases import GATE as HASH_GATE
@@ -48,6 +50,14 @@ def peers(effort: Effort, results: Results) -> None:
             _row(f"{PEERS}: hash encoding", name, direction, HASH_GATE, timing, passes * look_ups, "look-ups")
             for name, timing in timings.items()
         ]
+    for name, layout in LAYOUTS.items():
+        samplers = {ours: lattice_cases.ours(layout, GATE_POINTS), TORCH: torch_sampler(layout, GATE_POINTS)}
+        for direction in (FORWARD, BOTH):
+            timings = alternate({who: runs[direction] for who, runs in samplers.items()}, effort)
+            results.measurements += [
+                _row(f"{PEERS}: {name}", who, direction, layout.sizes(GATE_POINTS), timing, float(GATE_POINTS), "points")
+                for who, timing in timings.items()
+            ]
     pictures: dict[str, dict[str, Run]] = {ours: _our_splats()}
     _add(pictures, "Mitsuba's volprim_rf_basic", "Mitsuba (ray traced)", _mitsuba, results)
     timings = alternate({name: runs[FORWARD] for name, runs in pictures.items()}, effort)

@@ -16,7 +16,8 @@ FORWARD_ONLY = ("ray_march", "ngp_render")
 """Operations without a gradient."""
 
 SIZE_KEYS = (
-    "gaussians", "width", "points", "levels", "log2_size", "hidden", "resolution", "channels", "rays", "samples", "bytes",
+    "gaussians", "width", "points", "levels", "log2_size", "hidden", "resolution", "vertices", "channels", "rays", "samples",
+    "bytes",
 )  # fmt: skip
 """Columns of problem sizes, in order."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from invgraphics import kernels
-from invgraphics.bench import PARTS, iterations, limits, sample_cases, splat_cases
+from invgraphics.bench import PARTS, iterations, lattice_cases, limits, sample_cases, splat_cases
 from invgraphics.bench.case import Case
 from invgraphics.bench.memory import measure_memory
 from invgraphics.bench.peers import peers
@@ -25,7 +25,7 @@ STEPS_QUICK, STEPS_FULL = Effort(2.0, 2, 9), Effort(4.0, 3, 15)
 _CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
     "splats": splat_cases.splats,
     "hash": sample_cases.hash_encode,
-    "grid": sample_cases.grid_sample,
+    "lattice": lattice_cases.lattice_encode,
     "march": sample_cases.ray_march,
     "composite": sample_cases.composite,
     "picture": sample_cases.ngp_render,

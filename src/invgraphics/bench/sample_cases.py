@@ -31,9 +31,6 @@ LEVELS, BASE, FINEST = 16, 16, 4096
 MOST_FOR_REFERENCE = 1 << 16
 """Points beyond which the reference is skipped: its autograd graph holds every corner of every level."""
 
-GRID, GRID_CHANNELS = 128, 4
-GRID_POINTS, QUICK_GRID_POINTS = (1 << 14, 1 << 16, 1 << 18), (1 << 14, 1 << 16)
-
 OCCUPANCY, STEPS_PER_DIAGONAL = 128, 1024
 MARCH_RAYS, QUICK_MARCH_RAYS = (1 << 10, 1 << 12, 1 << 14), (1 << 10, 1 << 12)
 IMAGE_WIDTH = 400
@@ -59,13 +56,6 @@ def hash_encode(quick: bool) -> Iterator[Case]:
         sizes = {"levels": LEVELS, "log2_size": log2_size, "points": points}
         why = LARGE if points > MOST_FOR_REFERENCE else ""
         yield Case("hash_encode", sizes, lambda size=log2_size, points=points: _hash(size, points), why)
-
-
-def grid_sample(quick: bool) -> Iterator[Case]:
-    """Trilinear look-ups in a dense grid over points."""
-    for points in QUICK_GRID_POINTS if quick else GRID_POINTS:
-        sizes = {"resolution": GRID, "channels": GRID_CHANNELS, "points": points}
-        yield Case("grid_sample", sizes, lambda points=points: _grid(points))
 
 
 def ray_march(quick: bool) -> Iterator[Case]:
@@ -106,18 +96,6 @@ def _hash(log2_size: int, points: int) -> dict[str, KernelPass]:
     return {
         FORWARD: KernelPass(without_gradient(encode), amount, limit, "look-ups"),
         BOTH: KernelPass(forward_backward(encode, [table]), 2 * amount, limit, "look-ups"),
-    }
-
-
-def _grid(points: int) -> dict[str, KernelPass]:
-    shape = (GRID, GRID, GRID, GRID_CHANNELS)
-    values = torch.rand(shape, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    unit = ray_ordered(points)
-    sample = lambda: kernels.grid_sample(unit, values)  # noqa: E731
-    limit = limits.gather(4 * values.numel())
-    return {
-        FORWARD: KernelPass(without_gradient(sample), 8.0 * points, limit, "look-ups"),
-        BOTH: KernelPass(forward_backward(sample, [values]), 16.0 * points, limit, "look-ups"),
     }
 
 

@@ -7,12 +7,15 @@ deterministic for a given number of threads, ``cuda`` accumulates some gradients
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.lattice import Combination, Lattice, check_lattices
 from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.dispatch import choose
@@ -42,9 +45,28 @@ def hash_encode(
     return choose("hash_encode", unit)(unit, table, grid, jacobian)
 
 
-def grid_sample(unit: Float[Tensor, "m 3"], grid: Float[Tensor, "x y z c"]) -> Float[Tensor, "m c"]:
-    """Trilinear interpolation in a dense grid whose corner vertices lie at 0 and 1; differentiable in both."""
-    return choose("grid_sample", unit)(unit, grid)
+def lattice_encode(
+    unit: Float[Tensor, "m 3"], lattices: Sequence[Lattice], combine: Combination = "concat"
+) -> Float[Tensor, "m width"]:
+    """Linear, bilinear and trilinear interpolation of features on lines, planes and voxel grids, combined per point.
+
+    Compiled for float32 on the CPU; elsewhere, CUDA included, the reference runs.
+
+    Args:
+        unit: positions in [0, 1]; those outside are clamped, NaN counts as 0.
+        lattices: dense or linked lattices, features of ``unit``'s dtype and device.
+        combine: concatenation, sum, VM or CP product (see `core.lattice.Combination`).
+
+    Returns:
+        Features, differentiable twice in ``unit`` and in every lattice's features; the gradient along axes on which a position
+        was clamped is zero. Widths: ``concat`` the sum of all channels, ``vm`` that of its pairs, ``sum`` and ``cp`` one
+        lattice's channels. Gradients of features are the same bits for any number of threads.
+
+    Raises:
+        InputError: lattices that do not fit together or do not fit the positions.
+    """
+    check_lattices(unit, lattices, combine)
+    return choose("lattice_encode", unit)(unit, lattices, combine)
 
 
 def ray_march(

@@ -2,11 +2,11 @@
 
 `runtime` holds the compiler settings; the operations are those of `invgraphics.kernels`. Cases without a compiled kernel fall
 back to the reference: discs, optimised intrinsics, gradients through `Footprints.depth_planes`, the Jacobian of the hash
-encoding, fused rendering of hash grids with other than two features per entry.
+encoding, second derivatives of the lattice encoding, fused rendering of hash grids with other than two features per entry.
 """
 
 from invgraphics.kernels.numba.hash.encode import hash_encode as hash_encode
-from invgraphics.kernels.numba.hash.grid import grid_sample as grid_sample
+from invgraphics.kernels.numba.lattice.encode import lattice_encode as lattice_encode
 from invgraphics.kernels.numba.ngp.march import ngp_march as ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render as ngp_render
 from invgraphics.kernels.numba.rays.composite import composite as composite

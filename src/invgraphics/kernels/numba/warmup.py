@@ -10,10 +10,11 @@ import torch
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.lattice import Lattice
 from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.hash.encode import hash_encode
-from invgraphics.kernels.numba.hash.grid import grid_sample
+from invgraphics.kernels.numba.lattice.encode import lattice_encode
 from invgraphics.kernels.numba.ngp.march import ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.rays.composite import composite
@@ -57,7 +58,8 @@ def samples() -> None:
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)
     (gradient,) = torch.autograd.grad(features.sum(), unit, create_graph=True)
-    values = grid_sample(unit, torch.zeros(2, 2, 2, 1).requires_grad_())
+    factors = [Lattice(torch.zeros(2, 1).requires_grad_(), axis) for axis in "xy"]
+    values = lattice_encode(unit, factors, "cp")
     ray = torch.zeros(2, dtype=torch.int64)
     _, sums, alpha = composite(values[:, 0], features, ray, 1)
     (sums.sum() + alpha.sum() + gradient.sum()).backward()

@@ -1,8 +1,8 @@
 """Every kernel in plain torch, meant to be read; the oracle of the fast ones."""
 
 from invgraphics.kernels.reference.composite import composite as composite
-from invgraphics.kernels.reference.grid import grid_sample as grid_sample
 from invgraphics.kernels.reference.hash import hash_encode as hash_encode
+from invgraphics.kernels.reference.lattice import lattice_encode as lattice_encode
 from invgraphics.kernels.reference.march import ray_march as ray_march
 from invgraphics.kernels.reference.ngp import ngp_march as ngp_march
 from invgraphics.kernels.reference.ngp import ngp_render as ngp_render

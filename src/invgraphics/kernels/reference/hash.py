@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import embedding
 
 from invgraphics.core.ngp import HashGrid
-from invgraphics.kernels.reference.grid import locate
+from invgraphics.kernels.reference.lattice import locate
 
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the spatial hash, one per axis (Instant-NGP, equation 4)."""

@@ -1,1 +1,1 @@
-"""Multi-resolution hash encoding and dense grids."""
+"""Multi-resolution hash encoding."""

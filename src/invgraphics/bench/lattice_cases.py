@@ -1,0 +1,125 @@
+"""Benchmark cases of lattices: voxels, tri-planes and VM factors, each with the same work by torch's own grid sampler."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from invgraphics import kernels
+from invgraphics.bench import limits
+from invgraphics.bench.case import Case, KernelPass, Run
+from invgraphics.bench.results import BOTH, FORWARD
+from invgraphics.bench.sample_cases import ray_ordered
+from invgraphics.bench.splat_cases import forward_backward, without_gradient
+from invgraphics.core.lattice import Combination, Lattice
+
+POINTS, QUICK_POINTS = (1 << 14, 1 << 16, 1 << 18), (1 << 14, 1 << 16)
+GATE_POINTS = 1 << 16
+"""Points of the gates."""
+TORCH = "torch grid_sample"
+"""Name of torch's sampler in results."""
+LINE = 64
+"""Bytes in a cache line."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Lattices of a method.
+
+    Attributes:
+        axes: of each lattice.
+        combine: their combination.
+        vertices: along each axis.
+        channels: of each lattice.
+    """
+
+    axes: tuple[str, ...]
+    combine: Combination
+    vertices: int
+    channels: int
+
+    def sizes(self, points: int) -> dict[str, int]:
+        """Problem size, by `results.SIZE_KEYS`."""
+        return {"vertices": self.vertices, "channels": self.channels, "points": points}
+
+    def lattices(self) -> list[Lattice]:
+        """Random features that require gradients."""
+        generator = torch.Generator().manual_seed(0)
+        shapes = [(*[self.vertices] * len(axes), self.channels) for axes in self.axes]
+        values = [torch.rand(shape, generator=generator).requires_grad_() for shape in shapes]
+        return [Lattice(features, axes) for features, axes in zip(values, self.axes, strict=True)]
+
+    @property
+    def lines(self) -> int:
+        """Cache lines that one point reads at least: neighbours along a lattice's last axis lie side by side."""
+        pairs = sum(2 ** (len(axes) - 1) for axes in self.axes)
+        return pairs * math.ceil(2 * 4 * self.channels / LINE)
+
+
+LAYOUTS = {
+    "lattice_encode, voxels": Layout(("xyz",), "concat", 128, 28),
+    "lattice_encode, tri-plane": Layout(("xy", "xz", "yz"), "sum", 256, 32),
+    "lattice_encode, VM": Layout(("xy", "z", "xz", "y", "yz", "x"), "vm", 300, 16),
+}
+"""By name: a density and spherical harmonics of degree 2 (Plenoxels), EG3D's planes, TensoRF's density."""
+
+
+def lattice_encode(quick: bool) -> Iterator[Case]:
+    """Every layout over points."""
+    for name, layout in LAYOUTS.items():
+        for points in QUICK_POINTS if quick else POINTS:
+            yield Case(name, layout.sizes(points), lambda layout=layout, points=points: _passes(layout, points))
+
+
+def _passes(layout: Layout, points: int) -> dict[str, KernelPass]:
+    runs, amount = ours(layout, points), float(layout.lines * points)
+    limit = limits.gather(sum(4 * layout.channels * layout.vertices ** len(axes) for axes in layout.axes))
+    return {
+        FORWARD: KernelPass(runs[FORWARD], amount, limit, "look-ups"),
+        BOTH: KernelPass(runs[BOTH], 2 * amount, limit, "look-ups"),
+    }
+
+
+def ours(layout: Layout, points: int) -> dict[str, Run]:
+    """Our encoding of a layout, by direction."""
+    unit, lattices = ray_ordered(points), layout.lattices()
+    encode = lambda: kernels.lattice_encode(unit, lattices, layout.combine)  # noqa: E731
+    return _runs(encode, [lattice.features for lattice in lattices])
+
+
+def torch_sampler(layout: Layout, points: int) -> dict[str, Run]:
+    """The same work by `torch.nn.functional.grid_sample`, lattices of a dimension as one batch, by direction."""
+    unit, lattices = ray_ordered(points), layout.lattices()
+    groups = [lattices] if layout.combine != "vm" else [lattices[::2], lattices[1::2]]
+    volumes = [_volume(group) for group in groups]
+    places = [_places(unit, group) for group in groups]
+
+    def sample() -> Tensor:
+        found = [grid_sample(v, p, align_corners=True, padding_mode="border") for v, p in zip(volumes, places, strict=True)]
+        return found[0].sum(0) if layout.combine == "sum" else math.prod(found[1:], start=found[0])
+
+    return _runs(sample, volumes)
+
+
+def _volume(group: list[Lattice]) -> Tensor:
+    """Features of lattices with as many axes in torch's layout: batch, channels, axes reversed; a line has width 1."""
+    volume = torch.stack([x.features.detach().permute(*reversed(range(x.features.ndim))) for x in group]).contiguous()
+    return (volume[..., None] if len(group[0].axes) == 1 else volume).requires_grad_()
+
+
+def _places(unit: Float[Tensor, "m 3"], group: list[Lattice]) -> Tensor:
+    """Positions in torch's layout and range [-1, 1]."""
+    found = torch.stack([2 * unit[:, list(x.columns)] - 1 for x in group])
+    if len(group[0].axes) == 1:
+        found = torch.cat([torch.zeros_like(found), found], dim=-1)
+    return found.reshape(len(group), *[1] * (found.shape[-1] - 1), *found.shape[1:])
+
+
+def _runs(encode: Callable[[], Tensor], inputs: list[Tensor]) -> dict[str, Run]:
+    return {FORWARD: without_gradient(encode), BOTH: forward_backward(encode, inputs)}

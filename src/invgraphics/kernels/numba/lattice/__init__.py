@@ -1,0 +1,1 @@
+"""Interpolation on voxel grids, planes and lines, and products of them."""

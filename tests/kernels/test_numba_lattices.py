@@ -1,0 +1,118 @@
+"""Numba's lattice encoding against the plain reference in float64: features, gradients, and gradients of gradients."""
+
+import pytest
+import torch
+from lattice_cases import VM_AXES, derivatives, lattice, linked
+
+from invgraphics.core.lattice import Lattice
+from invgraphics.kernels import numba, reference
+from invgraphics.kernels.numba.lattice.backward import split_rows
+from invgraphics.kernels.numba.lattice.cells import records
+
+# More than one block, and no whole number of them.
+POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(5)) * 1.2 - 0.1
+CORNERS = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 1.0, 0.0], [-3.0, 0.5, 2.0]])
+UNIT = torch.cat([POINTS, CORNERS])
+
+
+def assert_equal(lattices, combine):
+    """Within fp32 rounding of the truth, relative to the largest entry; the same bits again and with another thread count."""
+    before, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 1, 2):
+            torch.set_num_threads(count)
+            found.append(derivatives(numba, UNIT, lattices, combine, torch.float32))
+    finally:
+        torch.set_num_threads(before)
+    truth = derivatives(reference, UNIT, lattices, combine, torch.float64)
+    first_order = 2 + len(lattices)
+    assert len(truth) > first_order
+    for k, (number, again, threaded, true) in enumerate(zip(*found, truth, strict=True)):
+        assert torch.equal(number, again)
+        assert torch.equal(number, threaded) or k >= first_order
+        assert (number - true).abs().max() <= 1e-5 * true.abs().max()
+
+
+@pytest.mark.parametrize("channels", [1, 2, 4, 5, 12, 16, 28, 48])
+def test_channels(channels):
+    assert_equal([lattice("xyz", channels), lattice("zx", channels), lattice("y", channels)], "concat")
+
+
+@pytest.mark.parametrize("combine", ["sum", "vm", "cp"])
+@pytest.mark.parametrize("channels", [3, 16, 20])
+def test_combinations(combine, channels):
+    axes = {"sum": ("xy", "xz", "yz"), "vm": VM_AXES, "cp": "xyz"}[combine]
+    assert_equal([lattice(name, channels) for name in axes], combine)
+
+
+def test_a_product_of_planes_and_voxels_of_unequal_widths():
+    assert_equal([lattice("xy", 3), lattice("yz", 3), lattice("zyx", 17), lattice("x", 17)], "vm")
+
+
+@pytest.mark.parametrize("sizes", [(2, 2, 2), (1, 4, 1), (9, 1, 3), (40, 30, 20)])
+def test_sizes(sizes):
+    assert_equal([lattice("xyz", 4, sizes), lattice("xz", 4, sizes)], "sum")
+
+
+def test_links():
+    assert_equal([linked(5), linked(3, rows=200)], "concat")
+
+
+def test_links_that_share_a_row_or_are_none():
+    links = torch.randint(-3, 30, (5, 6, 7), dtype=torch.int32)
+    assert (links >= 20).any()
+    assert_equal([Lattice(torch.randn(20, 3), "xyz", links)], "concat")
+    nothing = numba.lattice_encode(UNIT, [Lattice(torch.zeros(0, 2), "xyz", links)])
+    assert torch.equal(nothing, torch.zeros(len(UNIT), 2))
+
+
+def test_an_empty_vertex_reads_no_row():
+    links = torch.full((2, 2, 2), -1, dtype=torch.int32)
+    features = torch.full((1, 3), torch.nan)
+    assert torch.equal(numba.lattice_encode(POINTS, [Lattice(features, "xyz", links)]), torch.zeros(len(POINTS), 3))
+
+
+def test_tensors_that_are_not_contiguous():
+    features, links = torch.randn(7, 5, 6, 4).permute(1, 2, 0, 3), linked(3).links
+    assert links is not None
+    assert_equal([Lattice(features, "xyz")], "concat")
+    wide = torch.full((*links.shape, 2), 10**6, dtype=torch.int32)
+    wide[..., 0] = links
+    assert_equal([Lattice(torch.randn(40, 3), "xyz", wide[..., 0])], "concat")
+
+
+def test_bad_numbers_read_nothing_outside():
+    bad = torch.tensor([[torch.nan, 0.5, 0.5], [torch.inf, -torch.inf, 0.5], [1e30, -1e30, 0.0]])
+    planes = [lattice(axes, 3) for axes in VM_AXES]
+    found, truth = (
+        derivatives(k, bad, planes, "vm", dtype) for k, dtype in ((numba, torch.float32), (reference, torch.float64))
+    )
+    for number, true in zip(found, truth, strict=True):
+        torch.testing.assert_close(number.double(), true, atol=1e-4, rtol=1e-4)
+
+
+def test_no_points():
+    found = derivatives(numba, torch.zeros(0, 3), [lattice(axes, 3) for axes in VM_AXES], "vm", torch.float32)
+    assert found[0].shape == (0, 9)
+    assert not any(x.any() for x in found)
+
+
+def test_gradients_that_nobody_wants_are_left_out():
+    plane, line = lattice("xy", 3), lattice("z", 3)
+    line.features.requires_grad_()
+    numba.lattice_encode(UNIT, [plane, line], "vm").sum().backward()
+    truth = lattice("z", 3).features.clone().copy_(line.features.detach()).requires_grad_()
+    reference.lattice_encode(UNIT, [plane, Lattice(truth, "z")], "vm").sum().backward()
+    torch.testing.assert_close(line.features.grad, truth.grad, atol=1e-4, rtol=1e-4)
+
+
+def test_rows_are_shared_out_by_work():
+    """Points crowd in one corner: each job still gets about as many of their rows' visits."""
+    crowd = (torch.rand(20_000, 3) ** 4).T.contiguous().numpy()
+    starts = split_rows(crowd, records([lattice("xyz", 1, (32, 32, 32))], "concat"), 4)[0]
+    assert starts[0] == 0
+    assert starts[-1] == 32**3
+    cell = (crowd * 31).astype(int)
+    visits, _ = torch.tensor((cell[0] * 32 + cell[1]) * 32 + cell[2]).sort()
+    shares = torch.searchsorted(visits, torch.from_numpy(starts)).diff() / len(visits)
+    assert (shares - 0.25).abs().max() < 0.1
