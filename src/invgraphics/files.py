@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import io
-import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping
@@ -71,17 +70,16 @@ def naming_full_disk(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def replacing(path: Path, shared: bool = False) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` to be written, which replaces it at the end; an exception removes it.
 
     Args:
         path: the file.
-        shared: whether other processes may write the same file at the same time; each then has a temporary file of its own.
 
     Raises:
         InputError: as `naming_full_disk`.
     """
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp" if shared else f"{path.name}.tmp")
+    temporary = path.with_name(f"{path.name}.tmp")
     try:
         with naming_full_disk(path):
             yield temporary
@@ -91,9 +89,9 @@ def replacing(path: Path, shared: bool = False) -> Iterator[Path]:
 
 
 @contextmanager
-def writing(path: Path, shared: bool = False) -> Iterator[IO[bytes]]:
+def writing(path: Path) -> Iterator[IO[bytes]]:
     """Yield a binary file that replaces ``path`` at the end; an exception removes it. Arguments and errors as `replacing`."""
-    with replacing(path, shared) as temporary, temporary.open("wb") as file:
+    with replacing(path) as temporary, temporary.open("wb") as file:
         yield file
 
 
@@ -131,26 +129,25 @@ def append_text(path: Path, text: str) -> None:
             raise
 
 
-def write_arrays(path: Path, arrays: Mapping[str, ArrayLike], shared: bool = False) -> None:
-    """Write a compressed ``.npz`` archive atomically; ``shared`` as in `replacing`."""
+def write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
+    """Write a compressed ``.npz`` archive atomically."""
     import numpy as np
 
-    with writing(path, shared) as file:
+    with writing(path) as file:
         np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]  # numpy's stub takes keywords for switches
 
 
-def write_picture(path: Path, image: Any, shared: bool = False, **options: Any) -> None:
+def write_picture(path: Path, image: Any, **options: Any) -> None:
     """Write a Pillow image as PNG atomically.
 
     Args:
         path: the file.
         image: a ``PIL.Image.Image``.
-        shared: as in `replacing`.
         options: of Pillow's PNG writer.
     """
     content = io.BytesIO()  # Pillow's encoder hides the system's error behind one of its own
     image.save(content, format="PNG", **options)
-    with writing(path, shared) as file:
+    with writing(path) as file:
         file.write(content.getvalue())
 
 

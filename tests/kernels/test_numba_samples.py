@@ -5,13 +5,13 @@ import time
 import numpy as np
 import pytest
 import torch
-from invgraphics.kernels.reference.grid import locate
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.ngp import HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
 from invgraphics.kernels.reference.hash import entry_index
+from invgraphics.kernels.reference.lattice import locate
 from invgraphics.kernels.types import MarchSteps
 
 
