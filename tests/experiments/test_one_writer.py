@@ -40,7 +40,11 @@ def fit_words(scene: Path, out: Path, seed: int = 0, budget: str = "40steps") ->
 @pytest.fixture(scope="module")
 def run(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = str(tmp_path_factory.mktemp("runs") / "a")
-    return fit_run(FitRequest(method=METHOD, scene=str(toy_folder), out=out, budget="2steps", overrides=tuple(SMALL[METHOD])))
+    return fit_run(
+        FitRequest(
+            method=METHOD, scene=str(toy_folder), out=out, budget="2steps", overrides=tuple(SMALL[METHOD]), kernels="reference"
+        )
+    )
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -173,7 +177,14 @@ def test_files_of_others_are_not_cleared(toy_folder: Path, tmp_path: Path) -> No
     shutil.copytree(toy_folder, scene)
     with pytest.raises(InputError, match="which no run here has written"):
         fit_run(
-            FitRequest(method=METHOD, scene=str(toy_folder), out=str(scene), budget="2steps", overrides=tuple(SMALL[METHOD]))
+            FitRequest(
+                method=METHOD,
+                scene=str(toy_folder),
+                out=str(scene),
+                budget="2steps",
+                overrides=tuple(SMALL[METHOD]),
+                kernels="reference",
+            )
         )
     assert contents(scene) == contents(toy_folder)
 
