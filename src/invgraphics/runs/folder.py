@@ -31,6 +31,8 @@ RUNS = "runs"
 """Folder of the runs, in a comparison or study."""
 TRUTH = "truth"
 """Folder of the true pictures, once per content; in a comparison or study they are shared by its runs."""
+TEMPORARY = ("*.tmp", ".tmp??????", "test/*.tmp", "snapshots/*.tmp", "snapshots/.tmp??????")
+"""Files that are being written: ours, and those of safetensors."""
 PUBLISHED = (RECIPE, scores_file(), history.FILE, Provenance.FILE, Environment.FILE)
 """Files of a run that a report links."""
 
@@ -111,6 +113,9 @@ class RunFolder:
             print(f"Waiting for {holder}, which writes {self.root}.", file=sys.stderr, flush=True)
 
         with locks.locked(self.root, self.root / locks.INSIDE, waiting if wait else None):
+            for pattern in TEMPORARY:
+                for left in self.root.glob(pattern):  # by a process that was killed; nobody else writes here now
+                    left.unlink(missing_ok=True)
             yield
 
     def has(self, kind: type[Record]) -> bool:
