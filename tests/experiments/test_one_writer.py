@@ -40,7 +40,11 @@ def fit_words(scene: Path, out: Path, seed: int = 0, budget: str = "40steps") ->
 @pytest.fixture(scope="module")
 def run(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = str(tmp_path_factory.mktemp("runs") / "a")
-    return fit_run(FitRequest(method=METHOD, scene=str(toy_folder), out=out, budget="2steps", overrides=tuple(SMALL[METHOD])))
+    return fit_run(
+        FitRequest(
+            method=METHOD, scene=str(toy_folder), out=out, budget="2steps", overrides=tuple(SMALL[METHOD]), kernels="reference"
+        )
+    )
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -77,6 +81,17 @@ def test_a_killed_process_holds_nothing(toy_folder: Path, tmp_path: Path) -> Non
     fit.wait()
     with RunFolder(out).held():
         assert str(os.getpid()) in (out / locks.INSIDE).read_text()
+
+
+def test_what_a_killed_process_was_writing_is_removed(tmp_path: Path) -> None:
+    """A checkpoint of gigabytes, for instance."""
+    left = [tmp_path / name for name in ("checkpoint.safetensors.tmp", ".tmpAb3xYz", "test/0000.png.tmp")]
+    kept = [tmp_path / name for name in ("checkpoint.safetensors", "test/0000.png")]
+    (tmp_path / "test").mkdir()
+    for path in (*left, *kept):
+        path.touch()
+    with RunFolder(tmp_path).held():
+        assert not any(path.exists() for path in left) and all(path.exists() for path in kept)
 
 
 STUDY = """
@@ -173,7 +188,14 @@ def test_files_of_others_are_not_cleared(toy_folder: Path, tmp_path: Path) -> No
     shutil.copytree(toy_folder, scene)
     with pytest.raises(InputError, match="which no run here has written"):
         fit_run(
-            FitRequest(method=METHOD, scene=str(toy_folder), out=str(scene), budget="2steps", overrides=tuple(SMALL[METHOD]))
+            FitRequest(
+                method=METHOD,
+                scene=str(toy_folder),
+                out=str(scene),
+                budget="2steps",
+                overrides=tuple(SMALL[METHOD]),
+                kernels="reference",
+            )
         )
     assert contents(scene) == contents(toy_folder)
 

@@ -24,7 +24,7 @@ from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
-from invgraphics.runs.checkpoint import load
+from invgraphics.runs.checkpoint import load, save
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.runs.schema import plain
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -203,3 +203,11 @@ def test_a_damaged_run_gets_a_sentence(run: Path, tmp_path: Path) -> None:
     (tmp_path / "provenance.json").write_text("{")
     with pytest.raises(InputError, match="is not valid JSON"):
         evaluate_run(tmp_path)
+
+
+def test_a_checkpoint_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    """The library that writes it tells the system's error in words, without number and path."""
+    path = tmp_path / "gone" / CHECKPOINT
+    with pytest.raises(FileNotFoundError) as caught:
+        save(path, {"fit": {"steps": torch.zeros(1)}})
+    assert caught.value.filename == str(path)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 from pathlib import Path
 
 import torch
@@ -29,7 +31,12 @@ def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
         for name, value in part.items()
     }
     with replacing(path) as temporary:
-        save_file(flat, temporary)
+        try:
+            save_file(flat, temporary)
+        except SafetensorError as error:  # the system's error in words
+            number = re.search(r"os error (\d+)", str(error))
+            code = int(number[1]) if number else errno.EIO
+            raise OSError(code, os.strerror(code), str(path)) from error
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
 

@@ -36,6 +36,8 @@ RENDERED = "rendered"
 """Folder of a fit's renderings by other renderers, each a run."""
 SHARED_ABOVE = 5
 """Levels above a run at which the folder of runs of its comparison or study is looked for: of METHOD/seed-N/rendered/NAME."""
+TEMPORARY = ("*.tmp", ".tmp??????", "test/*.tmp", "snapshots/*.tmp", "snapshots/.tmp??????")
+"""Files that are being written: ours, and those of safetensors."""
 PUBLISHED = (RECIPE, scores_file(), history.FILE, Provenance.FILE, Environment.FILE)
 """Files of a run that a report links."""
 
@@ -119,6 +121,9 @@ class RunFolder:
             print(f"Waiting for {holder}, which writes {self.root}.", file=sys.stderr, flush=True)
 
         with locks.locked(self.root, self.root / locks.INSIDE, waiting if wait else None):
+            for pattern in TEMPORARY:
+                for left in self.root.glob(pattern):  # by a process that was killed; nobody else writes here now
+                    left.unlink(missing_ok=True)
             yield
 
     def path(self, *names: str) -> Path:
