@@ -12,7 +12,7 @@ import json
 import math
 import reprlib
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -128,20 +128,6 @@ def read_table(path: Path) -> dict[str, Any]:
     if not isinstance(table, dict):
         raise InputError(f"'{path}' must hold a table, not a {type(table).__name__}.")
     return table
-
-
-def guarded(path: Path, read: Callable[[], T]) -> T:
-    """Call ``read`` on ``path``, with system errors turned into `InputError`.
-
-    Raises:
-        InputError: the file is missing or cannot be read.
-    """
-    try:
-        return read()
-    except FileNotFoundError:
-        raise InputError(f"'{path}' is missing.", _KILLED) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"'{path}' cannot be read: {error}.") from None
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import INTERRUPTED, Outcome, Resources
 from invgraphics.experiments.request import FitRequest
 from invgraphics.runs.schema import write_json
+from invgraphics.tables import read_json
 
 WITH_PARENT = "--while-stdin-is-open"
 """Argument of `invgraphics.experiments.run` as a program that ties its life to that of the process that started it."""
@@ -72,8 +72,8 @@ class FitProcess:
 
     def _error(self, status: int) -> str:
         try:
-            return str(json.loads(self._report.read_text())["error"])
-        except (OSError, json.JSONDecodeError, KeyError):
+            return str(read_json(self._report)["error"])
+        except (InputError, KeyError, TypeError):
             return f"The process ended with status {status} and left no message."
 
 

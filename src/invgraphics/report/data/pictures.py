@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from invgraphics.errors import InputError
+from invgraphics.tables import read_numbers
 
 Arrays = dict[str, Float[ndarray, "..."]]
 """What an ``.npz`` holds: alpha, depth, normal and so on."""
@@ -33,15 +33,9 @@ def read_picture(path: Path) -> UInt8[ndarray, "h w 3"]:
 
 
 def read_arrays(path: Path) -> Arrays:
-    """Read all arrays of an ``.npz`` as float32; pickled objects are refused.
+    """Read all arrays of an ``.npz`` as float32, within the limits of `invgraphics.tables`.
 
     Raises:
-        InputError: it is missing or broken.
+        InputError: it is missing or broken, or an array holds no real numbers.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name].astype(np.float32) for name in archive.files}
-    except FileNotFoundError:
-        raise InputError(f"'{path}' is missing.") from None
-    except (OSError, ValueError, EOFError, BadZipFile, AttributeError) as error:
-        raise InputError(f"'{path}' is not a readable .npz archive: {error}.") from None
+    return {name: array.astype(np.float32) for name, array in read_numbers(path).items()}

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from invgraphics.errors import InputError
 from invgraphics.report.data.pictures import read_picture
+from invgraphics.tables import LIMITS, read_json, read_text
 
 T = TypeVar("T")
 
@@ -81,9 +82,9 @@ class Redactor:
 
             Image.fromarray(read_picture(source)).save(target, optimize=True)
         elif source.suffix == ".json":
-            target.write_text(json.dumps(self.value(json.loads(source.read_text())), indent=1) + "\n", encoding="utf-8")
+            target.write_text(json.dumps(self.value(read_json(source)), indent=1) + "\n", encoding="utf-8")
         else:
-            target.write_text(self.text(source.read_text()), encoding="utf-8")
+            target.write_text(self.text(read_text(source, LIMITS.json_bytes)), encoding="utf-8")
 
     def _last(self, path: str) -> str:
         """The last component of an absolute path, unless it is a home or a private word."""
