@@ -17,7 +17,7 @@ class Reader:
     """A process of `reader`, started when it is needed.
 
     Args:
-        kind: what it reads: ``scene``, ``gaussians``, ``recipe`` or ``study``.
+        kind: what it reads, a key of `reader.READERS`.
         good: a good input, which it reads first and whose digest is `digest`.
     """
 
