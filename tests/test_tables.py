@@ -28,6 +28,7 @@ SOURCES = Path(invgraphics.__file__).parent
         ('{"w": ' + "1" * 6000 + "}", "6000 digits"),
         ('{"w": ' + "-" + "1" * 400 + "}", "401 digits"),
         ('{"w": }', "line 1, column 7"),
+        ('["\\ud83d", 1]', "surrogates not allowed"),
         ("", "line 1, column 1"),
     ],
 )

@@ -65,6 +65,8 @@ _DAMAGED = (
 """What zipfile and NumPy raise about damaged archives and headers."""
 _KEY_PARTS = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{LIMITS.depth}}}")
 """A dotted key of too many parts, for which tomllib takes quadratic time and memory."""
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+"""An escape of half a character beyond the basic plane, in JSON."""
 _HEADERS = {1: ("<H", np.lib.format.read_array_header_1_0), 2: ("<I", np.lib.format.read_array_header_2_0)}
 """Version of NumPy's format -> how the header's length is stored, and how the header is parsed."""
 _LONGEST_HEADER = 10_000
@@ -88,6 +90,8 @@ def parse_json(text: str, where: str) -> Any:
     try:
         value = json.loads(text, parse_int=_whole)
         _check_depth(value)
+        if _SURROGATE.search(text):
+            json.dumps(value, ensure_ascii=False).encode()  # half a pair of surrogates could never be written again
     except json.JSONDecodeError as error:
         raise InputError(f"{where} is not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.") from error
     except ValueError as error:

@@ -219,9 +219,8 @@ def test_saved_arrays_are_refused(tmp_path: Path, name: str) -> None:
     np.savez(path, **(arrays | change))  # type: ignore[arg-type]
     with pytest.raises(InputError, match=sentence):
         open_pictures(tmp_path / "run").prediction(0, True)
-    if "size" not in name:
-        with pytest.raises(InputError, match=sentence):
-            read_arrays(path)
+    with pytest.raises(InputError, match="has the shape" if "size" in name else sentence):
+        read_arrays(path, (9, 12))
 
 
 @pytest.mark.parametrize("step", ['"3"', "null", "true", "[1]", "9" * 400])

@@ -177,7 +177,7 @@ def _converted(hint: Any, value: Any, source: Path, key: str) -> Any:
         return from_table(hint, value, source, key)
     elif hint is float and _is_number(value) and not math.isnan(value):
         return float(value)
-    elif hint is int and _is_number(value) and float(value).is_integer():
+    elif hint is int and _is_number(value) and float(value).is_integer() and abs(value) < 2**63:
         return int(value)
     elif hint in (str, bool) and type(value) is hint:
         return value

@@ -32,10 +32,21 @@ def read_picture(path: Path) -> UInt8[ndarray, "h w 3"]:
         raise InputError(f"'{path}' is not a readable picture: {error}.") from None
 
 
-def read_arrays(path: Path) -> Arrays:
+def read_arrays(path: Path, size: tuple[int, int]) -> Arrays:
     """Read all arrays of an ``.npz`` as float32, within the limits of `invgraphics.tables`.
 
+    Args:
+        path: of the archive.
+        size: height and width of the picture beside it.
+
     Raises:
-        InputError: it is missing or broken, or an array holds no real numbers.
+        InputError: it is missing or broken, or an array holds no real numbers or has another size.
     """
-    return {name: array.astype(np.float32) for name, array in read_numbers(path).items()}
+    arrays = read_numbers(path)
+    for name, array in arrays.items():
+        expected = (*size, 3) if name in ("rgb", "normal") else size
+        if array.shape != expected:
+            raise InputError(
+                f"'{name}' of '{path}' has the shape {array.shape}, its picture {expected}.", "Score the run again."
+            )
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
