@@ -1,6 +1,8 @@
 """Limits of what is read from files: size, depth, digits, and headers that claim more than there is."""
 
+import ast
 import io
+import re
 import struct
 import time
 import zipfile
@@ -10,9 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from invgraphics import memory
+import invgraphics
+from invgraphics import memory, tables
 from invgraphics.errors import InputError
 from invgraphics.tables import parse_toml, read_array, read_arrays, read_json, read_toml
+
+SOURCES = Path(invgraphics.__file__).parent
 
 
 @pytest.mark.parametrize(
@@ -23,6 +28,7 @@ from invgraphics.tables import parse_toml, read_array, read_arrays, read_json, r
         ('{"w": ' + "1" * 6000 + "}", "6000 digits"),
         ('{"w": ' + "-" + "1" * 400 + "}", "401 digits"),
         ('{"w": }', "line 1, column 7"),
+        ('["\\ud83d", 1]', "surrogates not allowed"),
         ("", "line 1, column 1"),
     ],
 )
@@ -147,3 +153,19 @@ def test_an_archive_that_unpacks_beyond_memory_is_refused(tmp_path: Path, monkey
     monkeypatch.setattr(memory, "available_bytes", lambda: 40_000_000)
     with pytest.raises(InputError, match="needs about 50 MB of memory, and 40 MB are free"):
         read_arrays(tmp_path / "a.npz")
+
+
+UNBOUNDED = re.compile(
+    r"(json|tomllib|pickle|marshal|shelve|yaml)\.loads?|(np|numpy|torch|joblib)\.load|tomllib\.\w+|pickle\.\w+"
+)
+"""Readers without limits on size, depth and digits, or that execute what they read."""
+
+
+@pytest.mark.parametrize("path", sorted(SOURCES.rglob("*.py")), ids=lambda path: path.relative_to(SOURCES).as_posix())
+def test_no_other_module_parses_json_toml_or_arrays(path: Path) -> None:
+    if path == Path(tables.__file__):
+        return
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    uses = {ast.unparse(node) for node in nodes if isinstance(node, ast.Attribute)}
+    uses |= {f"{node.module}.{name.name}" for node in nodes if isinstance(node, ast.ImportFrom) for name in node.names}
+    assert not [use for use in uses if UNBOUNDED.fullmatch(use)]

@@ -65,6 +65,8 @@ _DAMAGED = (
 """What zipfile and NumPy raise about damaged archives and headers."""
 _KEY_PARTS = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{LIMITS.depth}}}")
 """A dotted key of too many parts, for which tomllib takes quadratic time and memory."""
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+"""An escape of half a character beyond the basic plane, in JSON."""
 _HEADERS = {1: ("<H", np.lib.format.read_array_header_1_0), 2: ("<I", np.lib.format.read_array_header_2_0)}
 """Version of NumPy's format -> how the header's length is stored, and how the header is parsed."""
 _LONGEST_HEADER = 10_000
@@ -76,16 +78,26 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: it is missing, unreadable, no JSON (line and column are given), or beyond `LIMITS`.
     """
-    text = read_text(path, LIMITS.json_bytes)
+    return parse_json(read_text(path, LIMITS.json_bytes), str(path))
+
+
+def parse_json(text: str, where: str) -> Any:
+    """Parse JSON to plain values; ``where`` names its origin in messages.
+
+    Raises:
+        InputError: it is no JSON (line and column are given), or beyond `LIMITS`.
+    """
     try:
         value = json.loads(text, parse_int=_whole)
         _check_depth(value)
+        if _SURROGATE.search(text):
+            json.dumps(value, ensure_ascii=False).encode()  # half a pair of surrogates could never be written again
     except json.JSONDecodeError as error:
-        raise InputError(f"{path} is not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.") from error
+        raise InputError(f"{where} is not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}.") from error
     except ValueError as error:
-        raise InputError(f"{path} is not JSON that can be used: {error}.") from error
+        raise InputError(f"{where} is not JSON that can be used: {error}.") from error
     except RecursionError:
-        raise InputError(f"{path} is not JSON that can be used: {_TOO_DEEP}.") from None
+        raise InputError(f"{where} is not JSON that can be used: {_TOO_DEEP}.") from None
     return value
 
 
@@ -162,6 +174,19 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise InputError(f"{path} does not exist.") from None
     except _DAMAGED as error:
         raise _unreadable(path, error) from error
+    return arrays
+
+
+def read_numbers(path: Path) -> dict[str, np.ndarray]:
+    """Read all arrays of an ``.npz`` archive, which must hold real numbers or truth values.
+
+    Raises:
+        InputError: as `read_arrays`, or an array holds something else.
+    """
+    arrays = read_arrays(path)
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiub":
+            raise InputError(f"'{name}' of {path} holds {array.dtype}, not real numbers.", _AGAIN)
     return arrays
 
 

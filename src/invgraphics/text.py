@@ -19,7 +19,7 @@ def file_name(key: str) -> str:
 
 def duration(seconds: float) -> str:
     """Format a duration: ``12 s``, ``6 min 52 s``, ``10 min``, ``2 h 1 min``."""
-    if seconds < 90:
+    if seconds < 90 or seconds == float("inf"):
         return f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)

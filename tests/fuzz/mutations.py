@@ -182,7 +182,7 @@ BYTES: tuple[Callable[[bytes, Choose], bytes], ...] = (flip, cut, drop, repeat, 
 TEXT = (*BYTES[:4], token, token, token, nest)
 JSON = (flip, cut, token, nest, json_value, json_value, json_number, json_number, json_number)
 ARRAYS = (flip, cut, word, array_value, array_value, array_value)
-KINDS = {".json": JSON, ".npz": ARRAYS, ".npy": ARRAYS, ".txt": TEXT, ".toml": TEXT}
+KINDS = {".json": JSON, ".npz": ARRAYS, ".npy": ARRAYS, ".txt": TEXT, ".toml": TEXT, ".jsonl": TEXT}
 
 
 def mutate(path: Path, choose: Choose) -> str:

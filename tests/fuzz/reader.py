@@ -9,8 +9,11 @@ import hashlib
 import json
 import resource
 import sys
+import tempfile
 import traceback
 import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +92,93 @@ def read_study(path: Path) -> str:
     return hashlib.sha256(repr(cells).encode()).hexdigest()
 
 
+def _digest(*records: Any) -> str:
+    from invgraphics.runs.schema import plain
+
+    return hashlib.sha256(json.dumps(plain(records), sort_keys=True).encode()).hexdigest()
+
+
+def read_run(path: Path) -> str:
+    """Read a run's records; returns a digest of them."""
+    from invgraphics.runs.run import read_run as read
+
+    run = read(path)
+    assert all(isinstance(moment.step, int) and np.isfinite(moment.seconds) for moment in run.history), "no history"
+    return _digest(run.scores, run.provenance, run.environment, run.history, run.seed)
+
+
+def read_comparison(path: Path) -> str:
+    """Read a comparison and its runs; returns a digest."""
+    from invgraphics.report.data.comparison import read_comparison as read
+
+    comparison = read(path)
+    assert all(run.folder.resolve().is_relative_to(path.resolve()) for run in comparison.runs), "a run elsewhere"
+    runs = [(run.scores, run.provenance, run.environment, run.history) for run in comparison.runs]
+    return _digest(runs, comparison.methods, comparison.question, comparison.protocol, comparison.environment)
+
+
+def read_study_cells(path: Path) -> str:
+    """Read a study's folder, as its report does; returns a digest."""
+    from invgraphics.report.data.studies import read_study as read
+    from invgraphics.report.data.studies import scene_comparisons
+
+    study = read(path)
+    return _digest(study.question, [cell.label for cell in study.cells], len(scene_comparisons(study)), study.methods)
+
+
+def read_pictures(path: Path) -> str:
+    """Read all saved predictions and their truth; returns a digest."""
+    from invgraphics.tools.predictions import open_pictures
+
+    pictures, sha = open_pictures(path), hashlib.sha256()
+    for index in range(len(pictures.names)):
+        predicted, truth = pictures.prediction(index, True), pictures.truth(index)
+        height, width = predicted.alpha.shape
+        assert predicted.rgb.shape == (height, width, 3) and truth.image.shape[2] == 3, "no picture"
+        sha.update(predicted.rgb.numpy().tobytes() + truth.image.numpy().tobytes())
+    return sha.hexdigest()
+
+
+def read_checkpoint(path: Path) -> str:
+    """Read a checkpoint; returns a digest of its tensors."""
+    from invgraphics.runs.checkpoint import load
+
+    sha = hashlib.sha256()
+    for section, part in sorted(load(path).items()):
+        for name, value in sorted(part.items()):
+            numbers = value.float().numpy()
+            assert bool(value.isfinite().all()), f"{section}.{name} is not finite"
+            sha.update(f"{section}|{name}{tuple(value.shape)}".encode() + numbers.tobytes())
+    return sha.hexdigest()
+
+
+def make_page(kind: str, path: Path) -> str:
+    """Write a report into a folder of its own; returns nothing of it, whose order follows the records."""
+    from invgraphics.report.build import build_from_runs, build_report
+    from invgraphics.report.study import build_study_report
+
+    with tempfile.TemporaryDirectory() as out:
+        if kind == "study_page":
+            page = build_study_report(path, Path(out))
+        else:
+            page = build_report(path, Path(out)) if kind == "page" else build_from_runs([path], Path(out))
+        assert "</html>" in page.read_text(encoding="utf-8"), "no page"
+    return kind
+
+
+READERS: dict[str, Callable[[Path], str]] = {
+    "scene": read_scene,
+    "gaussians": read_gaussians,
+    "recipe": read_recipe,
+    "study": read_study,
+    "run": read_run,
+    "comparison": read_comparison,
+    "study_cells": read_study_cells,
+    "pictures": read_pictures,
+    "checkpoint": read_checkpoint,
+} | {kind: partial(make_page, kind) for kind in ("page", "run_page", "study_page")}
+
+
 def main() -> None:
     """Answer requests ``[kind, path, whether it is good]`` with ``[outcome, what]`` until there are none.
 
@@ -98,7 +188,6 @@ def main() -> None:
 
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    readers = {"scene": read_scene, "gaussians": read_gaussians, "recipe": read_recipe, "study": read_study}
     answers, sys.stdout = sys.stdout, sys.stderr
     for line in sys.stdin:
         kind, path, good = json.loads(line)
@@ -107,7 +196,7 @@ def main() -> None:
         before = status_bytes("VmRSS")
         Path("/proc/self/clear_refs").write_text("5")  # the peak of resident memory starts anew (Linux's proc(5))
         try:
-            answer: Any = ["accepted", readers[kind](Path(path))]
+            answer: Any = ["accepted", READERS[kind](Path(path))]
         except InputError as error:
             answer = ["refused", str(error)] if not lacked_memory(error) else ["raised", traceback.format_exc()]
         except BaseException:

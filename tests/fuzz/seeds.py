@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import folders
 import numpy as np
 from dots import GL, POINTS, Eye, ring, save
 from gaussian_files import cloud
@@ -192,5 +193,16 @@ def study(root: Path) -> str:
 SCENES: tuple[Callable[[Path], str], ...] = (nerfstudio, blender, llff, idr, npz, colmap_text, colmap_binary, images)
 GAUSSIANS: tuple[Callable[[Path], str], ...] = (ply, compressed_ply, splat, spz, old_spz)
 TABLES: tuple[Callable[[Path], str], ...] = (recipe, study)
-SEEDS = {make.__name__: make for make in (*SCENES, *GAUSSIANS, *TABLES)}
+FOLDERS: dict[str, tuple[str, Callable[[Path], str]]] = {
+    "run": ("run", folders.run_folder),
+    "comparison": ("comparison", folders.comparison_folder),
+    "study_cells": ("study_cells", folders.study_folder),
+    "pictures": ("pictures", folders.run_pictures),
+    "checkpoint": ("checkpoint", folders.checkpoint),
+    "report_of_runs": ("page", folders.comparison_folder),
+    "report_of_pictures": ("run_page", folders.run_pictures),
+    "report_of_a_study": ("study_page", folders.study_folder),
+}
+"""Folders that invgraphics writes: seed -> which reader reads it, and what writes it."""
+SEEDS = {make.__name__: make for make in (*SCENES, *GAUSSIANS, *TABLES)} | {name: make for name, (_, make) in FOLDERS.items()}
 """Reader -> writes a good input into a folder and names, as a pattern, the files that are mutated."""

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import folders
 import numpy as np
 import pytest
 import seeds
@@ -13,8 +14,11 @@ import seeds
 from invgraphics.config import InputError
 from invgraphics.formats.base import read_gaussians
 from invgraphics.recipes.recipe import load_method
+from invgraphics.report.data.pictures import read_arrays
+from invgraphics.runs.history import cut_history
 from invgraphics.scenes.open import open_scene
 from invgraphics.studies.reading import read_study
+from invgraphics.tools.predictions import open_pictures
 
 
 def table(change: Callable[[dict], object]) -> Callable[[Path], Path]:
@@ -225,3 +229,33 @@ def test_a_study_of_too_many_cells_is_refused_before_it_is_expanded(tmp_path: Pa
     path.write_text(path.read_text() + f'"a.b" = [{levels}]\n"a.c" = [{levels}]\n"a.d" = [{levels}]\n')
     with pytest.raises(InputError, match="16,000,000,000 cells"):
         read_study(path)
+
+
+SAVED = {
+    "text": ({"rgb": np.full((9, 12, 3), "a")}, "<U1, not real numbers"),
+    "complex": ({"depth": np.ones((9, 12), np.complex64)}, "complex64, not real numbers"),
+    "sizes that differ": ({"rgb": np.ones((4, 4, 3))}, "differ in size"),
+}
+
+
+@pytest.mark.parametrize("name", SAVED)
+def test_saved_arrays_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "run").mkdir()
+    folders.run_pictures(tmp_path / "run")
+    change, sentence = SAVED[name]
+    path = tmp_path / "run" / "test" / "0000.npz"
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **(arrays | change))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=sentence):
+        open_pictures(tmp_path / "run").prediction(0, True)
+    with pytest.raises(InputError, match="has the shape" if "size" in name else sentence):
+        read_arrays(path, (9, 12))
+
+
+@pytest.mark.parametrize("step", ['"3"', "null", "true", "[1]", "9" * 400])
+def test_a_history_without_steps_is_not_resumed(tmp_path: Path, step: str) -> None:
+    path = tmp_path / "history.jsonl"
+    path.write_text(f'{{"step": {step}, "seconds": 1.0}}\n{{"step": 9, "seconds": 2.0}}\n')
+    with pytest.raises(InputError, match="line 1, is"):
+        cut_history(path, 5)

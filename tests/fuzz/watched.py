@@ -21,7 +21,7 @@ class Process:
     """A process of `reader`, started when it is needed; the libraries that it loads serve all inputs of one kind.
 
     Args:
-        kind: what it reads: ``scene``, ``gaussians``, ``recipe`` or ``study``.
+        kind: what it reads, a key of `reader.READERS`.
         script: what it runs.
     """
 

@@ -129,7 +129,7 @@ def test_no_file_and_no_json(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_camera_path(tmp_path / "none.json")
     (tmp_path / "path.json").write_text("{")
-    with pytest.raises(InputError, match="is not JSON"):
+    with pytest.raises(InputError, match="is not valid JSON"):
         read_camera_path(tmp_path / "path.json")
 
 

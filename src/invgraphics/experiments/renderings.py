@@ -28,6 +28,7 @@ from invgraphics.runs.environment import Environment
 from invgraphics.runs.folder import RENDERED, RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.renderings import OWN, Difference, Rendering, Renderings
+from invgraphics.tables import read_arrays
 from invgraphics.text import sha256_of
 
 
@@ -140,9 +141,9 @@ def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:
     background = scene.background.numpy()
     pictures = []
     for index in range(len(scene.test)):
-        with np.load(RunFolder(run).arrays(index), allow_pickle=False) as arrays:
-            clear = 1 - arrays["alpha"].astype(np.float64)[..., None]
-            pictures.append((arrays["rgb"].astype(np.float64) + clear * background).clip(0, 1))
+        arrays = read_arrays(RunFolder(run).arrays(index))
+        clear = 1 - arrays["alpha"].astype(np.float64)[..., None]
+        pictures.append((arrays["rgb"].astype(np.float64) + clear * background).clip(0, 1))
     return pictures
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import traceback
@@ -45,6 +44,7 @@ from invgraphics.runs.provenance import LoadAverage, Options, Provenance
 from invgraphics.runs.schema import write_json
 from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import selection_notes
+from invgraphics.tables import read_json
 from invgraphics.training.fit import Fit
 
 
@@ -222,7 +222,7 @@ def _relative(target: Path, start: Path) -> tuple[str, ...]:
 def work(job: Path) -> int:
     """Run the fit of a JSON job file in this process; returns its exit status (see `executors.local`)."""
     try:
-        fit_run(FitRequest.from_json(json.loads(job.read_text())))
+        fit_run(FitRequest.from_json(read_json(job)))
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:  # a cell that fails is a result: its sentence goes into the report

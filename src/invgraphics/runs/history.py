@@ -11,7 +11,8 @@ from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.files import append_text, write_text
-from invgraphics.runs.schema import NOT_STORED, from_table, plain, read_checked
+from invgraphics.runs.schema import NOT_STORED, from_table, plain
+from invgraphics.tables import LIMITS, parse_json, read_text
 
 FILE = "history.jsonl"
 
@@ -68,14 +69,17 @@ def cut_history(path: Path, step: int) -> None:
 
 
 def _tables(path: Path) -> Iterator[dict[str, Any]]:
-    lines = read_checked(path, lambda: path.read_text(encoding="utf-8")).splitlines()
+    if not path.exists():
+        raise InputError(f"'{path}' is missing.", "The run may have been killed before it was written.")
+    lines = read_text(path, LIMITS.json_bytes).splitlines()
     for number, line in enumerate(lines, 1):
         try:
-            table = json.loads(line)
-        except ValueError as error:
+            table = parse_json(line, f"'{path}', line {number},")
+        except InputError:
             if number == len(lines):
                 return
-            raise InputError(f"'{path}', line {number}, is not valid JSON: {error}.") from None
-        if not isinstance(table, dict) or "step" not in table:
-            raise InputError(f"'{path}', line {number}, is no table with the key 'step'.")
+            raise
+        step = table.get("step") if isinstance(table, dict) else None
+        if isinstance(step, bool) or not isinstance(step, int | float):
+            raise InputError(f"'{path}', line {number}, is no table with the key 'step', a number.")
         yield table

@@ -13,7 +13,7 @@ import json
 import math
 import reprlib
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -134,20 +134,6 @@ def read_table(path: Path) -> dict[str, Any]:
     return table
 
 
-def read_checked(path: Path, read: Callable[[], T]) -> T:
-    """Call ``read`` on ``path`` and return its result, with system errors turned into `InputError`.
-
-    Raises:
-        InputError: the file is missing or cannot be read.
-    """
-    try:
-        return read()
-    except FileNotFoundError:
-        raise InputError(f"'{path}' is missing.", _KILLED) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"'{path}' cannot be read: {error}.") from None
-
-
 def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically, see `invgraphics.files`."""
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
@@ -203,7 +189,7 @@ def _converted(hint: Any, value: Any, source: Path, key: str) -> Any:
         return from_table(hint, value, source, key)
     elif hint is float and _is_number(value) and not math.isnan(value):
         return float(value)
-    elif hint is int and _is_number(value) and float(value).is_integer():
+    elif hint is int and _is_number(value) and float(value).is_integer() and abs(value) < 2**63:
         return int(value)
     elif hint in (str, bool) and type(value) is hint:
         return value

@@ -17,6 +17,7 @@ from typing import IO
 
 from invgraphics.errors import InputError
 from invgraphics.interruption import WITH_PARENT
+from invgraphics.tables import parse_json
 
 Progress = Callable[[int, int, str], None]
 
@@ -84,7 +85,7 @@ def _follow(process: subprocess.Popen[str], progress: Progress) -> InputError | 
             done, total, what = rest.split(" ", 2)
             progress(int(done), int(total), what)
         elif word == "error":
-            failure = InputError(*json.loads(rest))
+            failure = InputError(*parse_json(rest, "the error of a process"))
     return failure
 
 

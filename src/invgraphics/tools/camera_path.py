@@ -19,6 +19,7 @@ from invgraphics.core import Camera, Scene
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
+from invgraphics.tables import read_json
 from invgraphics.tools.paths import interpolate_poses
 
 SCHEMA = 1
@@ -136,11 +137,9 @@ def read_camera_path(file: Path) -> CameraPath:
         InputError: the file cannot be read or holds no valid camera path.
     """
     try:
-        table = json.loads(file.read_text())
-    except OSError as error:
-        raise InputError(f"The camera path '{file}' cannot be read: {error.strerror}.", "Save one in the viewer.") from error
-    except ValueError as error:
-        raise _invalid(file, f"is not JSON ({error})") from error
+        table = read_json(file)
+    except InputError as error:
+        raise InputError(f"The camera path '{file}' cannot be read: {error.sentence}", "Save one in the viewer.") from error
     if not isinstance(table, dict) or table.get("kind") != KIND:
         raise _invalid(file, f'has no "kind": "{KIND}"')
     if table.get("schema") != SCHEMA:

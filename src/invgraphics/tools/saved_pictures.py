@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,13 @@ from invgraphics.core import Camera, Rendering, Scene, View
 from invgraphics.core.colour import srgb_to_linear
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import read_pixels
+from invgraphics.tables import read_numbers
 
 
 def read_truth(path: Path, scene: Scene) -> View:
     """Read a true view from its picture and the arrays that `save_truth` wrote beside it; depth in world units."""
     pixels = read_pixels(path)
-    arrays = _arrays(path.with_suffix(".npz")) if path.with_suffix(".npz").is_file() else {}
+    arrays = read_numbers(path.with_suffix(".npz")) if path.with_suffix(".npz").is_file() else {}
     image, alpha = torch.from_numpy(pixels[..., :3].copy()), None
     if "rgb" in arrays:
         image = torch.from_numpy(arrays["rgb"])
@@ -39,7 +39,7 @@ def read_truth(path: Path, scene: Scene) -> View:
 def is_baked(truth: Path) -> bool:
     """Whether a saved truth's transparency is lost: it is stored only as composited over the scene's background."""
     path = truth.with_suffix(".npz")
-    arrays = _arrays(path) if path.is_file() else {}
+    arrays = read_numbers(path) if path.is_file() else {}
     return "alpha" in arrays and "rgb" not in arrays and bool((arrays["alpha"] < 1).any())
 
 
@@ -69,21 +69,15 @@ def read_saved(path: Path, scene: Scene, exact: bool) -> Rendering:
         exact: take the colours from the 8-bit picture beside it, so that over the scene's background they are the very bytes
             that were scored, free of half precision.
     """
-    arrays = _arrays(path)
+    arrays = read_numbers(path)
     if not {"rgb", "alpha", "depth"} <= set(arrays):
         raise InputError(f"'{path}' lacks colour, alpha or depth.", "Score the run again: invgraphics evaluate.")
     rgb, alpha, depth = (torch.from_numpy(arrays[key]).float() for key in ("rgb", "alpha", "depth"))
+    if alpha.ndim != 2 or rgb.shape != (*alpha.shape, 3) or depth.shape != alpha.shape:
+        raise InputError(f"Colour, alpha and depth of '{path}' differ in size.", "Score the run again: invgraphics evaluate.")
     if exact and bool(rgb.isfinite().all()):
         shown = torch.from_numpy(read_pixels(path.with_suffix(".png"))[..., :3].copy()).float() / 255
         shown = srgb_to_linear(shown) if scene.colour == "linear" else shown
         rgb = shown - (1 - alpha[..., None]) * scene.background
     normal = torch.from_numpy(arrays["normal"]).float() if "normal" in arrays else None
     return Rendering(rgb, alpha, depth, normal)
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"'{path}' cannot be read: {error}.", "Copy the file again, or score the run again.") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -17,6 +16,7 @@ from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.request import FitRequest
 from invgraphics.interruption import INTERRUPTED, WITH_PARENT
 from invgraphics.runs.schema import write_json
+from invgraphics.tables import read_json
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables from which libraries take their number of threads."""
@@ -70,8 +70,8 @@ class FitProcess:
 
     def _error(self, status: int) -> str:
         try:
-            return str(json.loads(self._report.read_text())["error"])
-        except (OSError, json.JSONDecodeError, KeyError):
+            return str(read_json(self._report)["error"])
+        except (InputError, KeyError, TypeError):
             return f"The process ended with status {status} and left no message."
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from invgraphics.errors import InputError
+from invgraphics.tables import read_numbers
 
 Arrays = dict[str, Float[ndarray, "..."]]
 """What an ``.npz`` holds: alpha, depth, normal and so on."""
@@ -32,16 +32,21 @@ def read_picture(path: Path) -> UInt8[ndarray, "h w 3"]:
         raise InputError(f"'{path}' is not a readable picture: {error}.") from None
 
 
-def read_arrays(path: Path) -> Arrays:
-    """Read all arrays of an ``.npz`` as float32; pickled objects are refused.
+def read_arrays(path: Path, size: tuple[int, int]) -> Arrays:
+    """Read all arrays of an ``.npz`` as float32, within the limits of `invgraphics.tables`.
+
+    Args:
+        path: of the archive.
+        size: height and width of the picture beside it.
 
     Raises:
-        InputError: it is missing or broken.
+        InputError: it is missing or broken, or an array holds no real numbers or has another size.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name].astype(np.float32) for name in archive.files}
-    except FileNotFoundError:
-        raise InputError(f"'{path}' is missing.") from None
-    except (OSError, ValueError, EOFError, BadZipFile, AttributeError) as error:
-        raise InputError(f"'{path}' is not a readable .npz archive: {error}.") from None
+    arrays = read_numbers(path)
+    for name, array in arrays.items():
+        expected = (*size, 3) if name in ("rgb", "normal") else size
+        if array.shape != expected:
+            raise InputError(
+                f"'{name}' of '{path}' has the shape {array.shape}, its picture {expected}.", "Score the run again."
+            )
+    return {name: array.astype(np.float32) for name, array in arrays.items()}

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from invgraphics.errors import InputError
 from invgraphics.files import write_picture, write_text
 from invgraphics.report.data.pictures import read_picture
+from invgraphics.tables import LIMITS, read_json, read_text
 
 T = TypeVar("T")
 
@@ -95,9 +96,9 @@ class Redactor:
 
             write_picture(target, Image.fromarray(read_picture(source)), optimize=True)
         elif source.suffix == ".json":
-            write_text(target, json.dumps(self.value(json.loads(source.read_text())), indent=1) + "\n")
+            write_text(target, json.dumps(self.value(read_json(source)), indent=1) + "\n")
         else:
-            write_text(target, self.text(source.read_text()))
+            write_text(target, self.text(read_text(source, LIMITS.json_bytes)))
 
     def _last(self, path: str) -> str:
         """The last component of an absolute path, unless it is a home or a private word."""

@@ -136,14 +136,14 @@ def _draw_view(firsts: Sequence[tuple[Run, int]], index: int, why: str, folder: 
     truth_png = truth_picture(firsts[0][0].truth, index)
     truth = read_picture(truth_png)
     geometry_file = truth_arrays(firsts[0][0].truth, index)
-    geometry = read_arrays(geometry_file) if geometry_file.is_file() else {}
+    geometry = read_arrays(geometry_file, truth.shape[:2]) if geometry_file.is_file() else {}
     shown = []
     for run, series in firsts:
         picture = run.files.picture(index)
         colour = read_picture(picture)
         if colour.shape != truth.shape:
             raise InputError(f"'{picture}' and '{truth_png}' differ in size.", "Score the run again.")
-        shown.append(_Shown(run, series, colour, read_arrays(run.files.arrays(index))))
+        shown.append(_Shown(run, series, colour, read_arrays(run.files.arrays(index), truth.shape[:2])))
     target = folder.figures / "views" / f"{index:04d}"
     layers = (
         _colour_layer(shown, index, folder),

@@ -31,6 +31,7 @@ from invgraphics.scenes.mitsuba.gbuffer import trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job, Source
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
 from invgraphics.scenes.process import write_error, write_progress
+from invgraphics.tables import read_arrays, read_json
 
 
 def main(folder: Path) -> None:
@@ -68,8 +69,8 @@ def _views(job: Job) -> Iterator[tuple[Split, int, Camera]]:
 def mean_picture(arrays: Path, job: Job) -> tuple[Float[np.ndarray, "h w 4"], float]:
     """Average a view's linear RGBA to the job's size; also the PSNR in dB between halves of its samples, first order."""
     assert job.source is not None
-    with np.load(arrays, allow_pickle=False) as table:
-        linear, half_psnr = table["linear"].astype(np.float64), float(table["half_psnr"])
+    table = read_arrays(arrays)
+    linear, half_psnr = table["linear"].astype(np.float64), float(table["half_psnr"])
     gain = 10 * math.log10(math.prod(job.source.size) / math.prod(job.size))  # noise of pixels is independent: variances divide
     return area_resize(linear, *job.size).astype(np.float32), half_psnr + gain
 
@@ -78,7 +79,7 @@ def _declare(folder: Path, source: Source) -> None:
     """Record the averaged source in ``truth.json``."""
     path = folder / cache.TRUTH
     samples = {split: getattr(source.samples, split) for split in SPLITS}
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path)
     content[cache.AVERAGED_FROM] = {"size": list(source.size), "samples_per_pixel": samples}
     write_text(path, json.dumps(content, indent=1))
 

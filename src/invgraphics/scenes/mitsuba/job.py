@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from invgraphics.config import fill, to_table
 from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel, SceneSpec
+from invgraphics.tables import parse_json
 from invgraphics.text import sha256_of
 
 # The sources that decide pixels, relative to the package; the rest (caching, messages) does not.
@@ -64,7 +64,7 @@ class Job:
     @staticmethod
     def from_json(text: str) -> Job:
         """Parse a job (inverse of ``json.dumps(job.table())``)."""
-        return fill(Job, json.loads(text))
+        return fill(Job, parse_json(text, "the job"))
 
     @property
     def folder_name(self) -> str:

@@ -29,6 +29,7 @@ from invgraphics.scenes.mitsuba.cache import REQUEST, unwritable
 from invgraphics.scenes.mitsuba.gbuffer import GBuffer, sample_points, trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
+from invgraphics.tables import read_arrays
 
 POINTS = 20_000
 
@@ -102,16 +103,15 @@ def _finish(job: Job, model: Model, folder: Path, views: dict[Split, tuple[Camer
         if views[split]:
             folders.write_transforms(folder, split, views[split])
     for index in range(job.views.test):
-        with np.load(folders.view_paths(folder, "test", index)[1], allow_pickle=False) as arrays:
-            half_psnr.append(float(arrays["half_psnr"]))
+        half_psnr.append(float(read_arrays(folders.view_paths(folder, "test", index)[1])["half_psnr"]))
     folders.write_truth(folder, job, views, half_psnr)
 
 
 def _write_points(job: Job, folder: Path, train: tuple[Camera, ...]) -> None:
     positions, colours = [], []
     for index, camera in enumerate(train):
-        with np.load(folders.view_paths(folder, "train", index)[1], allow_pickle=False) as arrays:
-            depth, linear = arrays["depth"].reshape(-1), arrays["linear"]
+        arrays = read_arrays(folders.view_paths(folder, "train", index)[1])
+        depth, linear = arrays["depth"].reshape(-1), arrays["linear"]
         rays = camera.rays()
         hit = np.isfinite(depth)
         positions.append((rays.origins.numpy() + np.where(hit, depth, 0)[:, None] * rays.directions.numpy())[hit])

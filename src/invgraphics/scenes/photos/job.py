@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 from invgraphics.config import fill
 from invgraphics.errors import InputError
+from invgraphics.tables import parse_json
 from invgraphics.text import sha256_of
 
 SCHEMA = 2
@@ -79,7 +80,7 @@ class PhotoJob:
     @staticmethod
     def parse(text: str) -> PhotoJob:
         """Inverse of `text`."""
-        return fill(PhotoJob, json.loads(text))
+        return fill(PhotoJob, parse_json(text, "the job"))
 
     def key(self) -> str:
         """Hash of the settings, the photographs' names, sizes and dates, and the library's version."""

@@ -14,6 +14,7 @@ from invgraphics.errors import InputError
 from invgraphics.files import write_text
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, TOP_VIEW, PhotoJob
 from invgraphics.scenes.process import Progress, run_worker
+from invgraphics.tables import parse_json, read_json
 
 WORK = ".import"
 """Where unfinished work lies inside the folder of the result; features and matches stay there for another try."""
@@ -80,8 +81,8 @@ def read_quality(out: Path) -> dict[str, Any] | None:
 
 def _read_json(path: Path) -> dict[str, Any] | None:
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        table = read_json(path)
+    except InputError:
         return None
     return table if isinstance(table, dict) else None
 
@@ -112,7 +113,7 @@ def _check_target(job: PhotoJob, out: Path) -> None:
 def _make(job: PhotoJob, key: str, out: Path, progress: Progress, lock: int) -> dict[str, Any]:
     work = out / WORK
     request = work / JOB
-    asked = {"key": key, "matches": job.matches_key(), "job": json.loads(job.text())}
+    asked = {"key": key, "matches": job.matches_key(), "job": parse_json(job.text(), "the job")}
     left = _read_json(request)
     if left is None or left.get("matches") != asked["matches"]:  # of no use
         _clear(work, ())

@@ -20,6 +20,7 @@ from invgraphics.scenes.images import SUFFIXES, image_files, make_view, read_pix
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
 from invgraphics.scenes.process import Progress
+from invgraphics.tables import read_json
 
 PHOTOS, MASKS, PREPARED = "photos", "masks", "prepared.json"
 
@@ -74,7 +75,7 @@ class Preparation:
     @staticmethod
     def read(path: Path) -> Preparation:
         """Inverse of `write`."""
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = read_json(path)
         photos = [Prepared(**row | {"centre": row["centre"] and tuple(row["centre"])}) for row in table["photos"]]
         return Preparation(tuple(photos), table["skipped"])
 

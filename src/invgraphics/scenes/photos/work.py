@@ -27,6 +27,7 @@ from invgraphics.scenes.photos.prepare import PREPARED, Preparation, prepare
 from invgraphics.scenes.photos.quality import EMPTY_FIGURES, describe, refusal, unplaced
 from invgraphics.scenes.photos.result import write_scene
 from invgraphics.scenes.process import write_error, write_progress
+from invgraphics.tables import parse_json, read_json
 
 STEPS = {"read": 10, "features": 20, "matches": 35, "poses": 27, "pictures": 8}
 """Stages in their order, and about how many per cent of the time each takes."""
@@ -57,7 +58,7 @@ def main(work: Path) -> None:
     from invgraphics.scenes.colmap_library import pycolmap
 
     pycolmap.logging.minloglevel = 2
-    asked = json.loads((work / JOB).read_text(encoding="utf-8"))
+    asked = read_json(work / JOB)
     job = PhotoJob.parse(json.dumps(asked["job"]))
     result = work / RESULT
     shutil.rmtree(result, ignore_errors=True)
@@ -101,7 +102,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
     clock.start("")
     refused = refusal(photos, matched.evidence, figures["registered"])
     return {
-        "job": json.loads(job.text()),
+        "job": parse_json(job.text(), "the job"),
         "given": len(photos) + len(skipped),
         "used": len(photos),
         **figures,
