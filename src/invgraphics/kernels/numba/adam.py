@@ -8,7 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.runtime import array, index, inlined, job_start, parallel, prange, threads
+from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, job_start, parallel, prange, threads
+from invgraphics.kernels.numba.simd.lanes import where
+from invgraphics.kernels.numba.simd.partial import load_first, store_first
 from invgraphics.kernels.types import AdamStep
 
 GROUP = 64
@@ -18,11 +20,11 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)
 
 @inlined
 def _any_touched(gradient, first, end):
-    """Whether an entry is not 0; NaN is not."""
-    touched = False
+    """Whether an entry is not 0; NaN is not. A sum, because LLVM vectorises it."""
+    total = ZERO
     for number in range(first, end):
-        touched |= gradient[index(number)] != ZERO
-    return touched
+        total += abs(gradient[index(number)])
+    return total != ZERO
 
 
 @inlined
@@ -30,15 +32,17 @@ def _update(arrays, first, end, factor, numbers, skip):
     """Step of consecutive entries; ``numbers`` are the decays, their complements and eps."""
     values, gradient, mean, square = arrays
     beta1, beta2, rest1, rest2, eps = numbers
-    for number in range(first, end):
-        i = index(number)
-        g = gradient[i]
-        touched = not skip or g != ZERO
-        m, v = beta1 * mean[i] + rest1 * g, beta2 * square[i] + rest2 * g * g
-        new = values[i] - factor * m / (np.sqrt(v) + eps)
-        mean[i] = m if touched else mean[i]
-        square[i] = v if touched else square[i]
-        values[i] = new if touched else values[i]
+    largest = ZERO if skip else -ONE
+    for start in range(first, end, LANES):
+        i, part = index(start), min(index(end - start), LANES)
+        g, m, v = load_first(gradient, i, part), load_first(mean, i, part), load_first(square, i, part)
+        value = load_first(values, i, part)
+        new_m, new_v = beta1 * m + rest1 * g, beta2 * v + rest2 * g * g
+        # Not where the gradient is NaN: comparisons with it are false.
+        untouched = abs(g) <= largest
+        store_first(mean, i, part, where(untouched, m, new_m))
+        store_first(square, i, part, where(untouched, v, new_v))
+        store_first(values, i, part, where(untouched, value, value - factor * new_m / (np.sqrt(new_v) + eps)))
 
 
 @parallel
