@@ -8,7 +8,7 @@ from bench_made_up import measured
 from invgraphics.bench import iterations, lattice_cases, sample_cases, splat_cases
 from invgraphics.bench.gates import gates
 from invgraphics.bench.growth import growths
-from invgraphics.bench.results import BOTH, COLUMNS, FORWARD, SIZE_KEYS, PeakMemory, Results, write_tables
+from invgraphics.bench.results import BOTH, COLUMNS, FORWARD, PEERS, SIZE_KEYS, PeakMemory, Results, write_tables
 from invgraphics.bench.run import thread_counts
 from invgraphics.bench.tables import number, quantity
 
@@ -62,9 +62,14 @@ def test_measurements_that_differ_in_more_than_one_size_are_not_compared() -> No
     assert growths([measured("splats", "numba", BOTH, size, 1.0) for size in sizes]) == []
 
 
-def promised(speed_up: float, splat_share: float, step: float, hash_share: float, rate_share: float) -> Results:
+def promised(speed_up: float, splat_share: float, step: float, hash_share: float, rate_share: float, lattice: float) -> Results:
     """A run in which the promises come out as asked."""
     limit = {"amount": 1.0, "limit": "x"}
+    samplers = [
+        measured(f"{PEERS}: {name}", who, BOTH, layout.sizes(lattice_cases.GATE_POINTS), seconds)
+        for k, (name, layout) in enumerate(lattice_cases.LAYOUTS.items())
+        for who, seconds in (("numba", 0.1), (lattice_cases.TORCH, 0.1 * (lattice + k)))
+    ]
     return Results(
         [
             measured("splats", "reference", BOTH, splat_cases.GATE, 0.1 * speed_up),
@@ -75,16 +80,17 @@ def promised(speed_up: float, splat_share: float, step: float, hash_share: float
             measured(iterations.SPLAT_STEP, "numba", BOTH, splat_cases.GATE, 0.1 * step),
             measured(iterations.NERF_SHARE, "torch", BOTH, iterations.NERF_GATE, 0.1, amount=100.0),
             measured(iterations.NERF_STEP, "numba", BOTH, iterations.NERF_GATE, 0.2, amount=200.0 * rate_share),
+            *samplers,
         ]
     )
 
 
 def test_promises_kept_and_missed() -> None:
-    kept = gates(promised(26, 0.07, 1.6, 0.5, 0.45))
-    assert [gate.verdict for gate in kept] == ["PASS"] * 6
-    assert [gate.measured for gate in kept] == pytest.approx([26, 0.07, 0.07, 1.6, 0.5, 0.45])
-    assert [gate.verdict for gate in gates(promised(24, 0.05, 1.8, 0.3, 0.35))] == ["MISS"] * 6
-    assert [gate.verdict for gate in gates(Results())] == ["-"] * 6
+    kept = gates(promised(26, 0.07, 1.6, 0.5, 0.45, 11))
+    assert [gate.verdict for gate in kept] == ["PASS"] * 7
+    assert [gate.measured for gate in kept] == pytest.approx([26, 0.07, 0.07, 1.6, 0.5, 0.45, 11])
+    assert [gate.verdict for gate in gates(promised(24, 0.05, 1.8, 0.3, 0.35, 9))] == ["MISS"] * 7
+    assert [gate.verdict for gate in gates(Results())] == ["-"] * 7
 
 
 def test_numbers_in_words() -> None:

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import KDTree
 
 from invgraphics import kernels
-from invgraphics.bench import iterations, limits, memory, peers, run, sample_cases, splat_cases, workload
+from invgraphics.bench import iterations, lattice_cases, limits, memory, peers, run, sample_cases, splat_cases, workload
 from invgraphics.bench.results import BOTH, FORWARD, Results
 from invgraphics.bench.run import BenchRequest, bench, measure_case
 from invgraphics.bench.timing import Effort
@@ -183,4 +183,4 @@ def test_peers_that_are_missing_or_broken_are_named(monkeypatch) -> None:
         ("Dr.Jit (LLVM) hash encoding", "it failed: ZeroDivisionError: division by zero"),
         ("Mitsuba's volprim_rf_basic", "not installed"),
     ]
-    assert {m.implementation for m in results.measurements} == {"numba"}
+    assert {m.implementation for m in results.measurements} == {"numba", lattice_cases.TORCH}

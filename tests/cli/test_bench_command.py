@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from bench_made_up import measured
 
-from invgraphics.bench import PARTS, QUICK, iterations, sample_cases, splat_cases
+from invgraphics.bench import PARTS, QUICK, iterations, lattice_cases, sample_cases, splat_cases
 from invgraphics.bench import run as bench_run
 from invgraphics.bench.results import BOTH, FORWARD, PEERS, THREADS, PeakMemory, Results, Skipped
 from invgraphics.cli import main
@@ -38,6 +38,12 @@ def made_up_run(request) -> Results:
         *(measured(f"{THREADS}: ssim", "numba", BOTH, {"width": 400}, 1 / n, threads=n) for n in (1, 2)),
         *(measured(f"gather {n} KB", "machine", "", {"bytes": 1024 * n}, 0.1, amount=10 / n) for n in (1, 4)),
     ]
+    for name, layout in lattice_cases.LAYOUTS.items():
+        sizes = layout.sizes(lattice_cases.GATE_POINTS)
+        results.measurements += [
+            measured(f"{PEERS}: {name}", "numba", BOTH, sizes, 0.1),
+            measured(f"{PEERS}: {name}", lattice_cases.TORCH, BOTH, sizes, 1.2),
+        ]
     results.skipped.append(Skipped("a peer", "it is not installed"))
     return results
 
@@ -65,7 +71,7 @@ def test_unknown_kernels_are_refused(capsys) -> None:
 def test_a_missed_promise_fails_only_a_check(tmp_path: Path, capsys) -> None:
     assert main.run(["bench", "--out", str(tmp_path)]) == main.DONE
     shown = capsys.readouterr().out
-    assert "5 of 6 promises kept, 1 missed." in shown and "left out: a peer (it is not installed)" in shown
+    assert "6 of 7 promises kept, 1 missed." in shown and "left out: a peer (it is not installed)" in shown
     assert main.run(["bench", "--out", str(tmp_path), "--check"]) == main.FAILED
 
 
@@ -73,8 +79,8 @@ def test_a_missed_promise_fails_only_a_check(tmp_path: Path, capsys) -> None:
 def test_the_page_is_whole_and_works_offline(tmp_path: Path) -> None:
     main.run(["bench", "--out", str(tmp_path)])
     html = (tmp_path / "index.html").read_text()
-    assert html.count(">PASS<") == 5 and html.count(">MISS<") == 1
-    assert "another&#39;s &lt;code&gt;" in html and "5 of 6 promises kept" in html
+    assert html.count(">PASS<") == 6 and html.count(">MISS<") == 1
+    assert "another&#39;s &lt;code&gt;" in html and "6 of 7 promises kept" in html
     sections = ("kernels", "steps", "growth", "threads", "memory", "peers", "limits", "machine")
     assert all(f'<section id="{name}">' in html and f'href="#{name}"' in html for name in sections)
     links = re.findall(r'(?:src|href)="([^"#]+)"', html)

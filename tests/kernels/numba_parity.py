@@ -12,6 +12,7 @@ from torch import Tensor
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.lattice import Lattice
 from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import numba, reference
@@ -45,6 +46,12 @@ def samples() -> list[str]:
     unit = torch.rand(200, 3) * 1.2 - 0.1
     ours, theirs = (lambda t, k=k: k.hash_encode(unit.to(t.dtype), t, grid) for k in (numba, reference))
     assert_equal(ours, theirs, [torch.randn(grid.entries, 2)])
+    plane, line = [torch.randn(5, 6, 21), torch.randn(7, 21)]
+    ours, theirs = (
+        lambda p, q, k=k: k.lattice_encode(unit.to(p.dtype), [Lattice(p, "xy"), Lattice(q, "z")], "vm")
+        for k in (numba, reference)
+    )
+    assert_equal(ours, theirs, [plane, line])
     ray = torch.repeat_interleave(torch.arange(30), torch.randint(0, 40, (30,)))
     inputs = [torch.rand(len(ray)) ** 6 * 2, torch.randn(len(ray), 4)]
     assert_equal(lambda d, c: numba.composite(d, c, ray, 30), lambda d, c: reference.composite(d, c, ray, 30), inputs)
@@ -57,6 +64,8 @@ def samples() -> list[str]:
         assert true.abs().max() > 0.1
         assert (number - true).abs().max() <= 1e-4 * true.abs().max()
     parts = (
+        "lattice.encode.encode",
+        "lattice.backward.feature_gradients",
         "hash.encode.encode",
         "hash.encode.encode_backward",
         "rays.composite.accumulate",

@@ -45,7 +45,9 @@ def test_a_trilinear_function_is_reproduced():
 def test_equals_scipy(axes):
     one, where = lattice(axes, 2), points().clamp(0, 1)
     grid = RegularGridInterpolator([vertices(size).numpy() for size in one.resolution], one.features.numpy())
-    np.testing.assert_allclose(lattice_encode(where, [one]), grid(where[:, list(one.columns)].numpy()), atol=1e-12)
+    np.testing.assert_allclose(
+        lattice_encode(where, [one]), grid(where[:, ["xyz".index(axis) for axis in axes]].numpy()), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("axes", ["xy", "yz", "xyz"])
@@ -53,7 +55,7 @@ def test_equals_torch_with_corners_aligned_and_border_padding(axes):
     one, where = lattice(axes, 3), points()
     # torch wants channels first, the axes reversed and coordinates in [-1, 1].
     volume = one.features.permute(*reversed(range(len(axes) + 1)))[None]
-    places = (2 * where[:, list(one.columns)] - 1).reshape(1, *[1] * (len(axes) - 1), -1, len(axes))
+    places = (2 * where[:, ["xyz".index(axis) for axis in axes]] - 1).reshape(1, *[1] * (len(axes) - 1), -1, len(axes))
     expected = torch.nn.functional.grid_sample(volume, places, align_corners=True, padding_mode="border")
     torch.testing.assert_close(lattice_encode(where, [one]), expected.reshape(3, -1).T)
 

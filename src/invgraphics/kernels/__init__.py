@@ -24,7 +24,7 @@ from invgraphics.kernels.dispatch import in_use as in_use
 from invgraphics.kernels.dispatch import use as use
 from invgraphics.kernels.dispatch import using as using
 from invgraphics.kernels.dispatch import warm_up as warm_up
-from invgraphics.kernels.types import Bins, Footprints, March, MarchSteps
+from invgraphics.kernels.types import AdamStep, Bins, Footprints, March, MarchSteps
 
 
 def hash_encode(
@@ -67,6 +67,30 @@ def lattice_encode(
     """
     check_lattices(unit, lattices, combine)
     return choose("lattice_encode", unit)(unit, lattices, combine)
+
+
+def adam_rows(
+    values: Float[Tensor, "*rows c"],
+    gradient: Float[Tensor, "*rows c"],
+    moments: tuple[Float[Tensor, "*rows c"], Float[Tensor, "*rows c"]],
+    step: AdamStep,
+    rates: Float[Tensor, "*rows"] | None = None,
+) -> None:
+    """Adam step in place, on the entries with a gradient only (masked Adam of DVGO, Sun et al. 2022, `lib/cuda/adam_upd`).
+
+    With m and v the moments after their update, values -= lr sqrt(1 - beta2^k) / (1 - beta1^k) m / (sqrt(v) + eps). Entries
+    whose gradient is exactly 0 keep value and moments, which are not decayed later either; k counts all steps, not the entry's
+    own. Unlike torch's Adam, eps is not divided by sqrt(1 - beta2^k).
+
+    Args:
+        values: what is updated; rows of c.
+        gradient: of the same shape.
+        moments: first and second moment, updated too.
+        step: settings, number of the step, and whether zeros are skipped.
+        rates: factor of the learning rate of each row, for instance its share of the most views that see a voxel (DVGO,
+            §4.2); ``None`` for 1.
+    """
+    choose("adam_rows", values)(values, gradient, moments, step, rates)
 
 
 def ray_march(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from jaxtyping import Float, Int
@@ -109,3 +110,29 @@ COMPENSATION_MIN = 0.005
 """Lower bound of the low-pass filter's opacity compensation (Mip-Splatting; 3DGS, anti-aliased rasteriser)."""
 TRANSMITTANCE_MIN = 1e-4
 """Compositing of a pixel stops before transmittance falls below this (3DGS, appendix C)."""
+
+
+@dataclass(frozen=True)
+class AdamStep:
+    """Settings of one Adam step (Kingma and Ba 2015).
+
+    Attributes:
+        lr: learning rate.
+        beta1: decay of the first moment.
+        beta2: decay of the second moment.
+        eps: added to the root of the second moment.
+        number: steps so far, this one included; the bias correction's exponent.
+        skip_zero: leave entries whose gradient is exactly 0 as they are, moments included.
+    """
+
+    lr: float
+    beta1: float
+    beta2: float
+    eps: float
+    number: int
+    skip_zero: bool = True
+
+    @property
+    def size(self) -> float:
+        """Learning rate times both bias corrections."""
+        return self.lr * math.sqrt(1 - self.beta2**self.number) / (1 - self.beta1**self.number)

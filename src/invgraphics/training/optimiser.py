@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from invgraphics.errors import InputError
+from invgraphics.training.masked_adam import MOMENTS, ROW_RATES, MaskedAdam
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class GroupConfig:
         schedule: how to get there: ``exponential`` (log-linear) or ``cosine``.
         warmup: part of the fit over which the rate rises from 1% to its value.
         per_extent: whether rates are per scene extent (3DGS multiplies position rates by it).
+        skip_zero: leave entries whose gradient is exactly 0 as they are, moments included (DVGO's masked Adam), where a step
+            touches few rows of a large grid.
     """
 
     match: str
@@ -32,6 +35,7 @@ class GroupConfig:
     schedule: Literal["exponential", "cosine"] = "exponential"
     warmup: float = 0.0
     per_extent: bool = False
+    skip_zero: bool = False
 
     def __post_init__(self) -> None:
         if self.lr < 0 or (self.final is not None and self.final <= 0):
@@ -83,7 +87,15 @@ class Optimiser:
             first = config.groups[unused[0]].match
             known = ", ".join(sorted(parameters))
             raise InputError(f"'optimiser.groups.{unused[0]}' matches no parameter ('{first}').", f"Parameters: {known}.")
-        self._adam = torch.optim.Adam(groups, lr=0.0, betas=(config.beta1, config.beta2), eps=config.eps, fused=True)
+        betas = (config.beta1, config.beta2)
+        dense, masked = (
+            [group for group in groups if config.groups[str(group["name"])].skip_zero == skip] for skip in (False, True)
+        )
+        self._adams: list[torch.optim.Optimizer] = []
+        if dense:
+            self._adams.append(torch.optim.Adam(dense, lr=0.0, betas=betas, eps=config.eps, fused=True))
+        if masked:
+            self._adams.append(MaskedAdam(masked, betas, config.eps))
         self.set_progress(0.0)
 
     def _group_of(self, name: str) -> str:
@@ -92,15 +104,23 @@ class Optimiser:
             raise InputError(f"No optimiser group matches the parameter '{name}'.", "Add it under [optimiser.groups].")
         return max(fits, key=lambda key: len(self._config.groups[key].match))
 
+    def _groups(self) -> list[dict[str, Any]]:
+        return [group for adam in self._adams for group in adam.param_groups]
+
+    def _adam_of(self, name: str) -> torch.optim.Optimizer:
+        """The optimiser that holds a parameter."""
+        key = self._group_of(name)
+        return next(adam for adam in self._adams if any(group["name"] == key for group in adam.param_groups))
+
     def set_progress(self, progress: float) -> None:
         """Set every group's learning rate for this point of the fit."""
-        for group in self._adam.param_groups:
+        for group in self._groups():
             config = self._config.groups[group["name"]]
             group["lr"] = config.rate(progress) * (self._extent if config.per_extent else 1.0)
 
     def rates(self) -> dict[str, float]:
         """Current learning rate of each group."""
-        return {group["name"]: group["lr"] for group in self._adam.param_groups}
+        return {group["name"]: group["lr"] for group in self._groups()}
 
     def rate_of(self, name: str) -> float:
         """Current learning rate of one parameter."""
@@ -108,41 +128,60 @@ class Optimiser:
 
     def zero_grad(self) -> None:
         """Drop all gradients."""
-        self._adam.zero_grad(set_to_none=True)
+        for adam in self._adams:
+            adam.zero_grad(set_to_none=True)
 
     def step(self) -> None:
         """One Adam step."""
-        self._adam.step()
+        for adam in self._adams:
+            adam.step()
+
+    def set_row_rates(self, name: str, rates: Float[Tensor, "*rows"]) -> None:
+        """Set a factor of the learning rate for every row of a parameter of shape (*rows, c), in place of earlier ones.
+
+        Raises:
+            InputError: the parameter's group does not have ``skip_zero``, or the shapes do not fit.
+        """
+        adam, parameter = self._adam_of(name), self._names[name]
+        if not isinstance(adam, MaskedAdam):
+            group = self._group_of(name)
+            raise InputError(f"Rates per row of '{name}' need 'skip_zero = true' in 'optimiser.groups.{group}'.")
+        if rates.shape != parameter.shape[:-1]:
+            raise InputError(f"'{name}' has rows {tuple(parameter.shape[:-1])}, but the rates have {tuple(rates.shape)}.")
+        adam.state[parameter][ROW_RATES] = rates.to(parameter)
 
     def reindex_rows(self, name: str, parameter: nn.Parameter, rows: Int[Tensor, " k"], new: int) -> None:
-        """Replace a parameter by one of other rows: moments of the old one's ``rows``, then zeros for ``new`` rows."""
-        old = self._names[name]
-        for group in self._adam.param_groups:
+        """Replace a parameter by one of other rows: moments of the old one's ``rows``, then zeros for ``new`` rows.
+
+        Rates per row follow; those of new rows are 1.
+        """
+        old, adam = self._names[name], self._adam_of(name)
+        for group in adam.param_groups:
             group["params"] = [parameter if other is old else other for other in group["params"]]
-        state = self._adam.state.pop(old, None)
+        state = adam.state.pop(old, None)
         self._names[name] = parameter
         if state:
-            for key in ("exp_avg", "exp_avg_sq"):
+            for key in {*MOMENTS, ROW_RATES} & set(state):
                 kept = state[key][rows]
-                state[key] = torch.cat([kept, kept.new_zeros(new, *kept.shape[1:])])
-            self._adam.state[parameter] = state
+                state[key] = torch.cat([kept, kept.new_full((new, *kept.shape[1:]), float(key == ROW_RATES))])
+            adam.state[parameter] = state
 
     def reset_moments(self, name: str, rows: Int[Tensor, " k"] | None = None) -> None:
         """Zero the moments of a parameter (after an opacity reset), or of some of its rows."""
-        for key, value in self._adam.state.get(self._names[name], {}).items():
-            if key != "step":
+        for key, value in self._adam_of(name).state.get(self._names[name], {}).items():
+            if key in MOMENTS:
                 value[slice(None) if rows is None else rows] = 0.0
 
     def state(self) -> dict[str, Tensor]:
-        """Moments and step counts by parameter name."""
+        """Moments, step counts and rates per row by parameter name."""
         return {
             f"{name}/{key}": value
             for name, parameter in self._names.items()
-            for key, value in self._adam.state.get(parameter, {}).items()
+            for key, value in self._adam_of(name).state.get(parameter, {}).items()
         }
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state`."""
         for path, value in state.items():
             name, _, key = path.rpartition("/")
-            self._adam.state[self._names[name]][key] = value.clone()
+            self._adam_of(name).state[self._names[name]][key] = value.clone()

@@ -5,6 +5,7 @@ back to the reference: discs, optimised intrinsics, gradients through `Footprint
 encoding, second derivatives of the lattice encoding, fused rendering of hash grids with other than two features per entry.
 """
 
+from invgraphics.kernels.numba.adam import adam_rows as adam_rows
 from invgraphics.kernels.numba.hash.encode import hash_encode as hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode as lattice_encode
 from invgraphics.kernels.numba.ngp.march import ngp_march as ngp_march

@@ -13,6 +13,7 @@ from invgraphics.core.field import Gaussians
 from invgraphics.core.lattice import Lattice
 from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
+from invgraphics.kernels.numba.adam import adam_rows
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
 from invgraphics.kernels.numba.ngp.march import ngp_march
@@ -23,7 +24,7 @@ from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
-from invgraphics.kernels.types import MarchSteps
+from invgraphics.kernels.types import AdamStep, MarchSteps
 
 
 def warm_up() -> float:
@@ -60,6 +61,8 @@ def samples() -> None:
     (gradient,) = torch.autograd.grad(features.sum(), unit, create_graph=True)
     factors = [Lattice(torch.zeros(2, 1).requires_grad_(), axis) for axis in "xy"]
     values = lattice_encode(unit, factors, "cp")
+    rows = [torch.ones(2, 1) for _ in range(4)]
+    adam_rows(rows[0], rows[1], (rows[2], rows[3]), AdamStep(0.1, 0.9, 0.99, 1e-15, 1), torch.ones(2))
     ray = torch.zeros(2, dtype=torch.int64)
     _, sums, alpha = composite(values[:, 0], features, ray, 1)
     (sums.sum() + alpha.sum() + gradient.sum()).backward()

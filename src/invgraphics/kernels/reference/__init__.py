@@ -1,5 +1,6 @@
 """Every kernel in plain torch, meant to be read; the oracle of the fast ones."""
 
+from invgraphics.kernels.reference.adam import adam_rows as adam_rows
 from invgraphics.kernels.reference.composite import composite as composite
 from invgraphics.kernels.reference.hash import hash_encode as hash_encode
 from invgraphics.kernels.reference.lattice import lattice_encode as lattice_encode

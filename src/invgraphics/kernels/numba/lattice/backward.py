@@ -20,15 +20,17 @@ SAMPLE = 61
 
 
 @inlined
-def _multiply_others(values, n, lattice, separate, row):
-    """Multiply a row by the values of the other lattices of a product."""
-    column, channels = index(separate[lattice].column), separate[lattice].channels
-    for other in range(separate[lattice].group, separate[lattice].group_end):
-        if other != lattice:
-            place = index(separate[other].column)
-            for channel in range(channels):
-                k = index(channel)
-                row[column + k] *= values[n, place + k]
+def _factor_gradient(gradient, place, values, n, number, separate, out, at):
+    """Gradient of one factor at one point: that of the product times the values of its other factors."""
+    channels, width = index(separate[number].channels), index(values.shape[1])
+    for start in range(0, channels, LANES):
+        k = index(start)
+        part = min(channels - k, LANES)
+        total = load_first(gradient, place + k, part)
+        for other in range(separate[number].group, separate[number].group_end):
+            if other != number:
+                total = total * load_first(values, n * width + index(separate[other].column) + k, part)
+        store_first(out, at + k, part, total)
 
 
 @parallel
@@ -50,11 +52,9 @@ def factor_gradients(positions, gradient, combined, separate, jobs, out):
                 n = index(point)
                 i = index(first) + n
                 for number in range(len(separate)):
-                    column, received = index(separate[number].column), index(combined[number].column)
-                    for channel in range(separate[number].channels):
-                        k = index(channel)
-                        out[i, column + k] = gradient[i, received + k]
-                    _multiply_others(values, n, number, separate, out[i])
+                    place = i * index(gradient.shape[1]) + index(combined[number].column)
+                    at = i * index(width) + index(separate[number].column)
+                    _factor_gradient(gradient, place, values, n, number, separate, out, at)
 
 
 @serial

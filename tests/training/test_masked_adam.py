@@ -1,0 +1,96 @@
+"""Groups with ``skip_zero``: what they leave alone, rates per row, changes of rows, and resumption to the bit."""
+
+import pytest
+import torch
+
+from invgraphics.errors import InputError
+from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
+
+CONFIG = OptimiserConfig({"grid": GroupConfig("field.grid", 0.1, skip_zero=True), "net": GroupConfig("field.net", 0.1)})
+
+
+def made(values=None):
+    """A grid and a network, and their optimiser."""
+    values = torch.ones(4, 3, 2) if values is None else values
+    parameters = {"field.grid": torch.nn.Parameter(values.clone()), "field.net": torch.nn.Parameter(torch.ones(5))}
+    return parameters, Optimiser(CONFIG, parameters, 1.0)
+
+
+def step(parameters, optimiser, seed, touched=slice(0, 2)):
+    """One step in which only some rows of the grid have a gradient."""
+    generator = torch.Generator().manual_seed(seed)
+    gradient = torch.zeros(parameters["field.grid"].shape)
+    gradient[touched] = torch.randn(gradient[touched].shape, generator=generator)
+    parameters["field.grid"].grad = gradient
+    parameters["field.net"].grad = torch.randn(5, generator=generator)
+    optimiser.step()
+
+
+def test_rows_without_gradient_stay_while_torch_moves_them_by_momentum():
+    parameters, optimiser = made()
+    step(parameters, optimiser, 0, slice(0, 3))
+    before = parameters["field.grid"].detach().clone()
+    step(parameters, optimiser, 1, slice(0, 2))
+    moved = (parameters["field.grid"].detach() != before).flatten(1).all(1)
+    assert moved.tolist() == [True, True, False, False]
+    assert (parameters["field.net"] != 1).all()
+
+
+def test_touched_entries_move_as_in_torch():
+    parameters, optimiser = made()
+    plain, dense = made()
+    dense = Optimiser(OptimiserConfig({"all": GroupConfig("field", 0.1)}), plain, 1.0)
+    for seed in range(4):
+        step(parameters, optimiser, seed)
+        step(plain, dense, seed)
+    for name in parameters:
+        torch.testing.assert_close(parameters[name].detach(), plain[name].detach(), atol=1e-5, rtol=1e-5)
+
+
+def test_rates_per_row_scale_the_step():
+    (slow, slowly), (fast, quickly) = made(), made()
+    rates = torch.rand(4, 3)
+    slowly.set_row_rates("field.grid", rates)
+    for parameters, optimiser in ((slow, slowly), (fast, quickly)):
+        step(parameters, optimiser, 0, slice(0, 4))
+    ratio = (slow["field.grid"] - 1) / (fast["field.grid"] - 1)
+    torch.testing.assert_close(ratio.detach(), rates[..., None].expand(4, 3, 2), atol=1e-4, rtol=1e-4)
+
+
+def test_resumes_to_the_bit():
+    parameters, optimiser = made()
+    optimiser.set_row_rates("field.grid", torch.rand(4, 3))
+    step(parameters, optimiser, 0)
+    stored = {name: value.clone() for name, value in optimiser.state().items()}
+    again, resumed = made(parameters["field.grid"].detach())
+    again["field.net"].data.copy_(parameters["field.net"].detach())
+    resumed.load(stored)
+    step(parameters, optimiser, 1)
+    step(again, resumed, 1)
+    assert set(stored) >= {"field.grid/row_rates", "field.grid/step", "field.grid/exp_avg", "field.net/exp_avg"}
+    assert all(torch.equal(parameters[name], again[name]) for name in parameters)
+
+
+def test_moments_and_rates_follow_the_rows():
+    parameters, optimiser = made(torch.ones(4, 3))
+    optimiser.set_row_rates("field.grid", torch.tensor([0.1, 0.2, 0.3, 0.4]))
+    step(parameters, optimiser, 0, slice(0, 4))
+    old = optimiser.state()["field.grid/exp_avg"].clone()
+    replaced = torch.nn.Parameter(torch.ones(3, 3))
+    optimiser.reindex_rows("field.grid", replaced, torch.tensor([3, 1]), 1)
+    state = optimiser.state()
+    torch.testing.assert_close(state["field.grid/row_rates"], torch.tensor([0.4, 0.2, 1.0]))
+    torch.testing.assert_close(state["field.grid/exp_avg"], torch.cat([old[[3, 1]], torch.zeros(1, 3)]))
+    optimiser.reset_moments("field.grid")
+    assert not optimiser.state()["field.grid/exp_avg"].any()
+    assert optimiser.state()["field.grid/row_rates"].all()
+    step({"field.grid": replaced, "field.net": parameters["field.net"]}, optimiser, 1, slice(0, 3))
+    assert (replaced != 1).all()
+
+
+def test_rates_that_do_not_fit_are_refused():
+    _, optimiser = made()
+    with pytest.raises(InputError, match=r"has rows \(4, 3\), but the rates have \(4,\)"):
+        optimiser.set_row_rates("field.grid", torch.ones(4))
+    with pytest.raises(InputError, match=r"'skip_zero = true' in 'optimiser\.groups\.net'"):
+        optimiser.set_row_rates("field.net", torch.ones(()))
