@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from invgraphics.errors import InputError
+from invgraphics.scenes import png
 from invgraphics.tables import read_numbers
 
 Arrays = dict[str, Float[ndarray, "..."]]
@@ -24,6 +25,8 @@ def read_picture(path: Path) -> UInt8[ndarray, "h w 3"]:
     from PIL import Image, UnidentifiedImageError
 
     try:
+        if wrong := png.cut_off(path):  # Pillow would reserve what it claims
+            raise InputError(f"'{path}' is damaged: {wrong}.")
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
     except FileNotFoundError:
