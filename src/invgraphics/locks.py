@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import datetime
 import fcntl
-import json
 import os
 import socket
 import threading
@@ -98,7 +97,7 @@ def locked(what: Path, file: Path | None = None, waiting: Callable[[Holder], Non
 
 def _acquire(what: Path, file: Path, waiting: Callable[[Holder], None] | None) -> int:
     """Open and lock ``file``; returns its descriptor."""
-    began, told = time.monotonic(), False
+    began, notified = time.monotonic(), False
     while True:
         descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         if _is_free(descriptor, what):
@@ -109,9 +108,9 @@ def _acquire(what: Path, file: Path, waiting: Callable[[Holder], None] | None) -
             continue
         holder = _holder(descriptor)
         os.close(descriptor)
-        if waiting is not None and not told:
+        if waiting is not None and not notified:
             waiting(holder)
-            told = True
+            notified = True
         if waiting is None and not (holder.dead and time.monotonic() < began + ORPHAN_SECONDS):
             raise InputError(f"{what} is being written by {holder}.", "Wait for its end, or choose another --out.")
         time.sleep(POLL_SECONDS)
@@ -143,12 +142,12 @@ def _sign(descriptor: int) -> None:
     holder = Holder.here()
     with contextlib.suppress(OSError):
         os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, json.dumps([holder.pid, holder.host, holder.since]).encode(), 0)
+        os.pwrite(descriptor, f"{holder.pid}\n{holder.host}\n{holder.since}".encode(), 0)
 
 
 def _holder(descriptor: int) -> Holder:
     try:
-        pid, host, since = json.loads(os.pread(descriptor, 1000, 0))
-        return Holder(int(pid), str(host), str(since))
-    except (OSError, ValueError, TypeError):
+        pid, host, since = os.pread(descriptor, 1000, 0).decode().split("\n")
+        return Holder(int(pid), host, since)
+    except (OSError, ValueError):
         return Holder()

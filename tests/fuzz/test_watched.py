@@ -34,7 +34,7 @@ def read(path):
             os._exit(3)
     return "fine"
 
-reader.read_recipe = read
+reader.READERS["recipe"] = read
 reader.main()
 """
 
