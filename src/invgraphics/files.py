@@ -30,11 +30,11 @@ FULL = {
 _SYSTEM_ERROR = re.compile(r"(?i)\(os error (\d+)\)|\[errno (\d+)\]")  # how Rust and Arrow spell errors of the system in words
 
 
-def full_disk(path: Path | str, error: BaseException) -> InputError | None:
-    """The error with which a user is told that ``path`` could not be written to a full disk.
+def full_disk(path: Path | str | None, error: BaseException) -> InputError | None:
+    """Convert an error of writing to a full disk to one that names the file and the remedy.
 
     Args:
-        path: the file or folder that was being written.
+        path: the file or folder that was being written; ``None`` if it is not known.
         error: what was raised, by the system or by a library that quotes it.
 
     Returns:
@@ -48,7 +48,8 @@ def full_disk(path: Path | str, error: BaseException) -> InputError | None:
     if number not in FULL:
         return None
     what, remedy = FULL[number]
-    return InputError(f"'{path}' cannot be written: {what}.", remedy)
+    subject = "A file" if path is None else f"'{path}'"
+    return InputError(f"{subject} cannot be written: {what}.", remedy)
 
 
 @contextmanager
@@ -63,10 +64,10 @@ def naming_full_disk(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        told = full_disk(path, error)
-        if told is None:
+        full = full_disk(path, error)
+        if full is None:
             raise
-        raise told from error
+        raise full from error
 
 
 @contextmanager

@@ -14,6 +14,9 @@ from invgraphics.cli.output import not_scored
 from invgraphics.errors import InputError, NumericalError
 
 
+AGAIN = "Free some space there, and give the command again (a fit: with --resume).\n"
+
+
 class Failing:
     """A command that raises what it is given."""
 
@@ -30,10 +33,14 @@ class Failing:
         (InputError("1\n2\n3", "4\n5"), 2, "1\n2\n3\n4\n"),
         (NumericalError("step 7: density is not finite"), 1, "step 7: density is not finite\n"),
         (KeyboardInterrupt(), 130, "Interrupted.\n"),
-        (OSError(errno.ENOSPC, "No space left on device", "/x/y"), 2, "'/x/y' cannot be used: the disk is full.\n"),
+        (OSError(errno.ENOSPC, "No space left on device", "/x/y"), 2, "'/x/y' cannot be written: the disk is full.\n" + AGAIN),
         (PermissionError(errno.EACCES, "Permission denied", "/x"), 2, "'/x' cannot be used: permission denied.\n"),
         (OSError(errno.EROFS, "Read-only", "/x"), 2, "'/x' cannot be used: the file system is read-only.\n"),
-        (RuntimeError("I/O error: No space left on device (os error 28)"), 2, "Writing failed: the disk is full.\n"),
+        (
+            RuntimeError("I/O error: No space left on device (os error 28)"),
+            2,
+            f"A file cannot be written: the disk is full.\n{AGAIN}",
+        ),
         (MemoryError(), 1, "There is not enough memory.\nTry a smaller --size, or smaller settings of the method (--set).\n"),
     ],
 )

@@ -91,7 +91,7 @@ def test_an_unfinished_run_is_refused(tmp_path: Path, capsys) -> None:
     assert "no folder" in refused(capsys, str(tmp_path))
     (tmp_path / "truth" / "0").mkdir(parents=True)
     Image.new("RGB", (16, 16)).save(tmp_path / "truth" / "0" / "0000.png")
-    assert "0000.npz' cannot be read" in refused(capsys, str(tmp_path))
+    assert "0000.npz cannot be read" in refused(capsys, str(tmp_path))
 
 
 def test_protocols_are_listed_with_their_sources(capsys) -> None:

@@ -131,8 +131,8 @@ def explain(error: Exception) -> tuple[int, list[str]]:
         return BAD_INPUT, str(error).splitlines()
     if isinstance(error, NumericalError):
         return FAILED, str(error).splitlines()
-    if told := full_disk(getattr(error, "filename", None) or "a file", error):  # from what is not written through `files`
-        return BAD_INPUT, str(told).splitlines()
+    if full := full_disk(getattr(error, "filename", None), error):  # from what is not written through `files`
+        return BAD_INPUT, str(full).splitlines()
     if isinstance(error, OSError) and error.errno in USER_ERRNOS:
         where = f"'{error.filename}'" if error.filename else "a file"
         return BAD_INPUT, [f"{where} cannot be used: {USER_ERRNOS[error.errno]}."]

@@ -77,10 +77,11 @@ def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
         raise InputError("--methods is empty.", "Example: --methods volumetric/hash,splatting/gaussians.")
     if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
         raise InputError("A method or a seed is named twice.")
-    every = [Job.of(fit) for fit in request.fits()]
-    for job in every:
-        check_replaceable(job)
-    jobs = [job for job in every if job.request.seed == request.seeds[0]]
+    fits = request.fits()
+    jobs = [Job.of(fit) for fit in fits if fit.seed == request.seeds[0]]
+    methods = {job.request.method: job.method for job in jobs}
+    for fit in fits:
+        check_replaceable(Job.of(fit, methods[fit.method]))
     scene = open_with_progress(request.scene, jobs[0].options)
     check_variants(jobs[0].variants, [job.method for job in jobs], scene)
     return jobs, degrade(scene, jobs[0].data, request.seeds[0])
