@@ -13,7 +13,6 @@ from invgraphics.cli.fit import Fit
 from invgraphics.cli.output import not_scored
 from invgraphics.errors import InputError, NumericalError
 
-
 AGAIN = "Free some space there, and give the command again (a fit: with --resume).\n"
 
 
