@@ -214,7 +214,7 @@ def test_scenes_are_saved_where_they_can_be() -> None:
 
 
 def test_a_study_shows_its_figures() -> None:
-    head = 'question = "?"\nscenes = ["toy.npz"]\nmethods = ["splatting/gaussians"]\nseeds = [0, 1]\nbudget = "3steps"\n'
+    head = 'question = "?"\nscenes = ["toy.npz"]\nmethods = ["splatting/gaussians"]\nseeds = [0]\nbudget = "2steps"\n'
     Path("views.toml").write_text(head + "[factors]\ndata.train_views = [4, 8]\n")
     result = ig.ablate("views.toml", out="views")
     assert ElementTree.fromstring(result.figure("effects-psnr")._repr_svg_()).tag.endswith("svg")

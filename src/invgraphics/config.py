@@ -19,6 +19,9 @@ from invgraphics.errors import InputError, did_you_mean
 
 T = TypeVar("T")
 
+OMIT_EMPTY = {"omit_empty": True}
+"""Metadata of a field that is left out of tables where it is empty, so that tables without it stay as they were."""
+
 
 @dataclass(frozen=True)
 class Slot:
@@ -64,12 +67,13 @@ def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
 
 
 def to_table(config: Any) -> dict[str, Any]:
-    """Convert a config to its complete table (inverse of `fill`), with defaults, without ``None``."""
+    """Convert a config to its complete table (inverse of `fill`), with defaults, without ``None`` (see `OMIT_EMPTY`)."""
     hints = get_type_hints(type(config), include_extras=True)
     table = {}
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if value is not None and field.init:
+        omitted = field.metadata.get("omit_empty", False) and not value
+        if value is not None and field.init and not omitted:
             table[field.name] = _plain(hints[field.name], value)
     return table
 

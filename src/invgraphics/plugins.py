@@ -22,6 +22,7 @@ REGISTRIES = {
     "renderers": ("invgraphics.renderers", "RENDERERS"),
     "samplers": ("invgraphics.renderers", "SAMPLERS"),
     "losses": ("invgraphics.training", "LOSSES"),
+    "penalties": ("invgraphics.training", "PENALTIES"),
     "hooks": ("invgraphics.training", "HOOKS"),
     "scenes": ("invgraphics.scenes", "LOADERS"),
     "metrics": ("invgraphics.metrics", "METRICS"),

@@ -10,8 +10,11 @@ from invgraphics.config import fill, to_table
 from invgraphics.core import Bounds, Quantity, Samples
 from invgraphics.errors import InputError
 from invgraphics.fields import neural
+from invgraphics.fields.encodings.factors import CpConfig, VmConfig
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies
 from invgraphics.fields.encodings.hash import HashConfig
+from invgraphics.fields.encodings.triplane import TriplaneConfig
+from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig, unit_covariance
 
@@ -23,11 +26,36 @@ SMALL = NeuralFieldConfig(
 HASH = replace(
     SMALL, encoding=HashConfig(levels=2, features=2, log2_size=6, base=2, finest=6), direction="sh", density_activation="exp"
 )
+TENSORF = replace(
+    SMALL,
+    encoding=VmConfig(5, 2),
+    geometry_head="none",
+    appearance=VmConfig(5, 3),
+    appearance_basis=4,
+    feature_octaves=1,
+    density_scale=3.0,
+)
+GRID = replace(SMALL, encoding=VoxelsConfig(4, features=1 + 12), geometry_head="none", head="sh")
 KINDS = {
     "frequency": SMALL,
     "hash": HASH,
     "sdf": replace(SMALL, geometry="sdf"),
     "hash sdf": replace(HASH, geometry="sdf", direction="none"),
+    "vm": TENSORF,
+    "cp": replace(TENSORF, encoding=CpConfig(5, 2), appearance=CpConfig(5, 3), appearance_basis=0),
+    "triplane": replace(
+        SMALL,
+        encoding=TriplaneConfig(5, 4),
+        geometry_features=3,
+        head="none",
+        hidden_activation="softplus",
+        colour_padding=0.01,
+    ),
+    "grid": GRID,
+    "grid, activated inside": replace(GRID, density_interpolation="in"),
+    "grid of opacities": replace(GRID, density_interpolation="pre"),
+    "two encodings and handed features": replace(SMALL, appearance=VoxelsConfig(4, features=2)),
+    "dense sdf": replace(SMALL, encoding=VoxelsConfig(6, features=2, levels=2, coarsest=3), geometry="sdf"),
 }
 
 
@@ -116,7 +144,7 @@ def test_normals_can_be_trained(make_scene):
 
 
 @pytest.mark.parametrize("grad", [True, False])
-@pytest.mark.parametrize("kind", ["hash", "sdf"])
+@pytest.mark.parametrize("kind", ["hash", "sdf", "vm", "two encodings and handed features"])
 def test_chunks_change_nothing(make_scene, monkeypatch, kind, grad):
     scene = make_scene()
     field = _field(KINDS[kind], scene)

@@ -117,6 +117,27 @@ def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
         resolve(method.name, "", table | {"hooks": [table["hooks"][0], {"type": "density_control", "pace": 1, "cap_ramp": 1}]})
 
 
+@pytest.mark.parametrize("preset", ["laptop", "paper"])
+def test_keys_that_came_later_leave_the_digest_alone(preset: str) -> None:
+    """While they have the values that change nothing; neural fields and the volumetric renderer had these keys first."""
+    fields = "type encoding geometry layers width skip geometry_features colour_layers colour_width direction direction_degree"
+    known = {*fields.split(), "density_activation", "density_bias", "density_per"}
+    method = load_method("volumetric/nerf", preset)
+    table = copy.deepcopy(method.table)
+    parts = [table["field"], *([table["renderer"]["sampler"]["proposal"]] if preset == "paper" else [])]
+    for part in parts:
+        assert part.keys() > known
+        for key in part.keys() - known:
+            del part[key]
+    for key in table["renderer"].keys() - {"type", "sampler", "gradient_reach"}:
+        del table["renderer"][key]
+    assert resolve(method.name, preset, table).digest == method.digest
+    text = json.dumps(table, sort_keys=True)
+    assert method.digest == hashlib.sha256(text.encode()).hexdigest()
+    assert load_method(method.name, preset, ["field.density_scale=2.0"]).digest != method.digest
+    assert load_method(method.name, preset, ["renderer.colour_threshold=0.1"]).digest != method.digest
+
+
 def test_renderers_of_older_runs_still_resolve() -> None:
     now = load_method("splatting/gaussians-mip", None, ["renderer.max_grad_splats=10"])
     renderer = {key: value for key, value in now.table["renderer"].items() if key not in ("antialiased", "max_grad_splats")}

@@ -64,12 +64,12 @@ def gauntlet(toy_folder: Path, tmp_path: Path, monkeypatch) -> AblateRequest:
     head += f"methods = {json.dumps(METHODS)}\ntest_views = 2\n"
     keys = [(method, *item.split("=")) for method in METHODS for item in SMALL[method]]
     base = "[base]\n" + "".join(f'"{method}:{key}" = {value}\n' for method, key, value in keys)
-    cells = f'[[cells]]\nscenes = ["{scene}"]\nsize = 24\nbudget = "12steps"\n'
-    cells += '[[cells]]\nscenes = ["$TOY_DATA/gone"]\nmethods = ["volumetric/hash"]\nsize = 24\nbudget = "3steps"\n'
-    cells += f'[[cells]]\nscenes = ["{scene}"]\nmethods = ["splatting/gaussians"]\nsize = 16\nbudget = "3steps"\n'
-    cells += f'[[cells]]\nscenes = ["{scene}"]\nsize = 24\nbudget = "3steps"\n'
+    cells = f'[[cells]]\nscenes = ["{scene}"]\nsize = 24\nbudget = "4steps"\n'
+    cells += '[[cells]]\nscenes = ["$TOY_DATA/gone"]\nmethods = ["volumetric/hash"]\nsize = 24\nbudget = "2steps"\n'
+    cells += f'[[cells]]\nscenes = ["{scene}"]\nmethods = ["splatting/gaussians"]\nsize = 16\nbudget = "2steps"\n'
+    cells += f'[[cells]]\nscenes = ["{scene}"]\nsize = 24\nbudget = "2steps"\n'
     (tmp_path / "small.toml").write_text(head + base + cells)
-    return AblateRequest(study=str(tmp_path / "small.toml"), out=str(tmp_path / "out"), kernels="reference")
+    return AblateRequest(study=str(tmp_path / "small.toml"), out=str(tmp_path / "out"))
 
 
 def _yes(forecast: Forecast) -> None:
@@ -89,22 +89,22 @@ def test_a_small_gauntlet_from_its_file_to_its_verdicts(executor, gauntlet, toy_
     executor.fails = staticmethod(lambda fit: "Step 3: not finite." if fit.size == 16 else "")
     folder, failed = ablate(gauntlet, _yes)
     name = toy_folder.name
-    assert [cell.label for cell in failed] == [f"splatting/gaussians {name}@16 3steps seed=0"]
+    assert [cell.label for cell in failed] == [f"splatting/gaussians {name}@16 2steps seed=0"]
     cells = _cells(gauntlet)
-    gone = cells["volumetric/hash gone@24 3steps seed=0"]
+    gone = cells["volumetric/hash gone@24 2steps seed=0"]
     assert (gone["status"], gone["error"]) == ("skipped", "gone is not in $TOY_DATA")
     for method in METHODS:
-        provenance = json.loads((folder / cells[f"{method} {name}@24 12steps seed=0"]["run"] / "provenance.json").read_text())
+        provenance = json.loads((folder / cells[f"{method} {name}@24 4steps seed=0"]["run"] / "provenance.json").read_text())
         assert provenance["scene"] == f"$TOY_DATA/{name}" and provenance["options"] == {"size": 24, "test_views": 2}
         assert provenance["memory_forecast_bytes"] > 0
-        assert cells[f"{method} {name}@24 12steps seed=0"]["forecast_seconds"] > 0
+        assert cells[f"{method} {name}@24 4steps seed=0"]["forecast_seconds"] > 0
     build_study_report(folder)
     found = _verdicts(folder)
     for method in METHODS:
-        outcomes = {rule: found[f"{method} {name}@24 12steps seed=0", rule]["outcome"] for rule in ("budget", "finite", "late")}
+        outcomes = {rule: found[f"{method} {name}@24 4steps seed=0", rule]["outcome"] for rule in ("budget", "finite", "late")}
         assert outcomes == dict.fromkeys(outcomes, "ok"), method
         # Fits that share a process share what it has freed: only a fit in its own can be held to its forecast.
-        assert found[f"{method} {name}@24 12steps seed=0", "memory"]["outcome"] in ("ok", "red")
+        assert found[f"{method} {name}@24 4steps seed=0", "memory"]["outcome"] in ("ok", "red")
     assert found[failed[0].label, "finite"]["outcome"] == "red"
     text = (folder / "index.html").read_text() + (folder / "index.md").read_text() + (folder / "results.csv").read_text()
     assert "1 skipped" in text and "Skipped: gone is not in $TOY_DATA." in text
@@ -141,7 +141,7 @@ def test_cells_that_are_left_out_stay_what_they_were(executor, gauntlet, toy_fol
     seen: list[Forecast] = []
     ablate(replace(request, cells=f"splatting/* {toy_folder.name}@16 *"), seen.append)
     assert (seen[0].runs, seen[0].missing, seen[0].later) == (8, 1, 7) and "7 left out" in str(seen[0])
-    ablate(replace(request, cells="splatting/* 3steps *"), _yes)
+    ablate(replace(request, cells="splatting/* 2steps *"), _yes)
     assert len(executor.made) == 2
     statuses = [cell["status"] for cell in _cells(request).values()]
     assert sorted(statuses) == ["done"] * 2 + ["missing"] * 5 + ["skipped"]
@@ -154,7 +154,7 @@ def test_cheap_cells_come_first(executor, gauntlet) -> None:
     ablate(replace(gauntlet, cells="splatting/* *"), _yes)
     plan = {planned.fit.out: planned for planned in make_plan(read_study(Path(gauntlet.study)), gauntlet)}
     made = [(plan[out].fit.budget, plan[out].fit.size) for out in executor.made]
-    assert made[-1] == ("12steps", 24) and sorted(made[:2]) == [("3steps", 16), ("3steps", 24)]
+    assert made[-1] == ("4steps", 24) and sorted(made[:2]) == [("2steps", 16), ("2steps", 24)]
 
 
 @pytest.fixture

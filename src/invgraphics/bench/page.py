@@ -116,8 +116,9 @@ _KERNELS = (
     "Median time and quartiles of one call. The reference (plain torch), Numba and the limit take turns, call by call, so a "
     "disturbance meets all of them. Splats count the alphas that the rasteriser evaluates (16 for every visit of a footprint "
     "to a block of 4 x 4 pixels; the backward pass visits again) against exponentials per second; hash encoding counts 8 "
-    "look-ups per level and point and pass against random reads in a table of one level's size; what streams through memory "
-    "is compared with the triad, SSIM's filters with the matrix product."
+    "look-ups per level and point and pass against random reads in a table of one level's size, lattices the cache lines that "
+    "a point reads against random reads among all their features; what streams through memory is compared with the triad, "
+    "SSIM's filters with the matrix product."
 )
 _STEPS = (
     "A whole step of a fit (draw, render, compare, differentiate, Adam; for the hash grid also its share of a style at the "
@@ -131,8 +132,11 @@ _MEMORY = (
     "loaded; whole steps include parameters, gradients and Adam's moments."
 )
 _PEERS = (
-    "Other people's code, in alternation with ours, reported and not gated. A torch-only tile rasteriser is our own "
-    "reference, above. Mitsuba traces one ray per pixel through the same Gaussians."
+    "Other people's code, in alternation with ours. A torch-only tile rasteriser is our own reference, above. Mitsuba traces "
+    "one ray per pixel through the same Gaussians. torch's grid_sample gets TensoRF's own layout: lattices with as many axes "
+    "are one batch, channels first, lines of width 1, and their products are torch's. It shares out a batch, not the points, "
+    "so voxels keep one core busy and factors three at most. Only its ratio is gated, by layout: products of factors promise "
+    "less, because a factor's gradient needs the values of the others, which are looked up again."
 )
 _LIMITS = (
     "sgemm: torch.mm of 2048 x 2048 float32. triad: a = b + s c on arrays larger than the caches. exp2: the kernels' own "

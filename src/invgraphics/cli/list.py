@@ -19,6 +19,7 @@ COMPONENTS = {
     "renderers": "renderers",
     "samplers": "samplers",
     "losses": "losses",
+    "penalties": "penalties",
     "hooks": "hooks",
     "metrics": "metrics",
     "formats": "scenes",

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.fused import FusedLattice
 from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.rendering import Context
 from invgraphics.core.samples import FieldValues, Samples
@@ -85,7 +86,7 @@ class Field(nn.Module, ABC):
         assert density is not None
         return density
 
-    def fused(self, bounds: Bounds) -> FusedNGP | None:
+    def fused(self, bounds: Bounds) -> FusedNGP | FusedLattice | None:
         """Detached parameters over ``bounds`` for fused inference, where a kernel supports such fields; else ``None``."""
         return None
 

@@ -88,7 +88,12 @@ def colour(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Floa
     Where a channel is cut off, a gradient that would raise it passes unchanged and one that would lower it further is zero, so
     that gradient descent can bring a black primitive back.
     """
-    return _NonNegative.apply(evaluate(sh, directions) + 0.5)  # type: ignore[no-any-return]
+    return non_negative(evaluate(sh, directions) + 0.5)
+
+
+def non_negative(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """``max(0, x)`` with the gradient of a projection: below zero only what would raise x passes."""
+    return _NonNegative.apply(x)  # type: ignore[no-any-return]
 
 
 class _NonNegative(torch.autograd.Function):

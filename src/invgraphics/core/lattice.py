@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from invgraphics.core.bounds import Bounds
 from invgraphics.errors import InputError, did_you_mean
 
 Combination = Literal["concat", "sum", "vm", "cp"]
@@ -23,7 +24,13 @@ Combination = Literal["concat", "sum", "vm", "cp"]
 - ``cp``: the product of all: x, y, z is the CANDECOMP/PARAFAC decomposition (equation 4 there), its components not yet summed.
 """
 
+ORIGIN, CORNER = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+"""Lowest and highest corner of the unit cube."""
+
 COMBINATIONS: tuple[str, ...] = get_args(Combination)
+
+Role = Literal["geometry", "appearance"]
+"""What a field reads from lattices: density or signed distance, or colour; shared lattices count as geometry."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +93,47 @@ class Lattice:
         return self.features.reshape(-1, self.channels)
 
 
+def vertices_along(resolution: float, edges: Sequence[float]) -> tuple[int, int, int]:
+    """Vertices along x, y and z of about cubic voxels in a box, as many in all as in a cube (TensoRF, `utils.N_to_reso`).
+
+    Args:
+        resolution: vertices along an edge of that cube.
+        edges: lengths of the box's edges, in any unit.
+    """
+    mean = (edges[0] * edges[1] * edges[2]) ** (1 / 3)
+    x, y, z = (max(2, round(resolution * edge / mean)) for edge in edges)
+    return x, y, z
+
+
+def resampled(
+    features: Float[Tensor, "*vertices c"], size: Sequence[int], lo: Sequence[float] = (), hi: Sequence[float] = ()
+) -> Float[Tensor, "*resized c"]:
+    """Linear interpolation, axis by axis, of features at ``size`` vertices spread evenly from ``lo`` to ``hi``, ends included.
+
+    Args:
+        features: of a dense lattice.
+        size: new vertices along each axis.
+        lo: where the first lies on each axis, in units of the old lattice's length; empty for 0.
+        hi: where the last lies; empty for 1. What reaches beyond the old lattice continues its border.
+    """
+    for axis, count in enumerate(size):
+        first, last = lo[axis] if lo else 0.0, hi[axis] if hi else 1.0
+        old = features.shape[axis]
+        if (first, last, count) == (0.0, 1.0, old):
+            continue
+        # In double precision: where new vertices lie on old ones they have their features, to float32.
+        place = torch.arange(count, dtype=torch.float64) / max(count - 1, 1) * (last - first) + first
+        place = (place * (old - 1)).clamp(0, old - 1)
+        below = place.floor().clamp_max(max(old - 2, 0)).long()
+        weight = (place - below).to(features.dtype).to(features.device)
+        weight = weight.reshape(-1, *[1] * (features.ndim - axis - 1))
+        above = (below + 1).clamp_max(old - 1).to(features.device)
+        features = torch.lerp(
+            features.index_select(axis, below.to(features.device)), features.index_select(axis, above), weight
+        )
+    return features
+
+
 def check_lattices(unit: Tensor, lattices: Sequence[Lattice], combine: Combination) -> None:
     """Check that lattices can be encoded together at positions ``unit``.
 
@@ -106,3 +154,62 @@ def check_lattices(unit: Tensor, lattices: Sequence[Lattice], combine: Combinati
     groups = {"concat": [], "vm": [channels[k : k + 2] for k in range(0, len(channels), 2)]}.get(combine, [channels])
     if any(len(set(group)) > 1 for group in groups):
         raise InputError(f"'{combine}' needs lattices of as many channels, not {channels}.")
+
+
+@runtime_checkable
+class LatticeEncoding(Protocol):
+    """Protocol of encodings made of lattices, beside `core.field.Encoding`.
+
+    Attributes:
+        combine: how the lattices' features become one vector.
+    """
+
+    combine: Combination
+
+    @property
+    def resolution(self) -> tuple[int, int, int]:
+        """Vertices of the finest lattice along x, y and z."""
+        ...
+
+    def lattices(self) -> tuple[Lattice, ...]:
+        """Lattices over the encoding's parameters, whose gradients reach them."""
+        ...
+
+    def resize(self, resolution: tuple[int, int, int], lo: Sequence[float] = ORIGIN, hi: Sequence[float] = CORNER) -> None:
+        """Replace the parameters, under their names, by interpolated ones of ``resolution`` vertices along x, y and z.
+
+        Corners are aligned (see `Lattice`), so R -> 2R - 1 vertices leave the features unchanged everywhere.
+
+        Args:
+            resolution: vertices of the finest lattice.
+            lo: lowest corner of the part of the unit cube that the new lattices span.
+            hi: its highest corner.
+        """
+        ...
+
+
+@runtime_checkable
+class LatticeField(Protocol):
+    """Protocol of fields with encodings made of lattices."""
+
+    @property
+    def bounds(self) -> Bounds:
+        """The region that the lattices' unit cube covers."""
+        ...
+
+    def lattice_encodings(self) -> dict[Role, LatticeEncoding]:
+        """Encodings made of lattices by what is read from them; empty where there is none."""
+        ...
+
+    def crop(self, lo: Float[Tensor, 3], hi: Float[Tensor, 3], resolution: float) -> None:
+        """Move the region to the box [lo, hi] and interpolate the lattices there; nothing is left outside.
+
+        Args:
+            lo: lowest corner, local frame.
+            hi: highest corner.
+            resolution: vertices of the finest lattices along the edges of a cube of as many voxels.
+
+        Raises:
+            InputError: the region is no box, or an encoding is not made of lattices.
+        """
+        ...

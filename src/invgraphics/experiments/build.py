@@ -63,6 +63,7 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
         model=model,
         scene=scene,
         losses=recipe.losses,
+        penalties=recipe.penalties,
         hooks=[hook.build() for hook in recipe.hooks],
         optimiser=recipe.optimiser
         if poses is None

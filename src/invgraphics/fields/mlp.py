@@ -27,14 +27,16 @@ class Mlp(nn.Module):
         width: features of each hidden layer.
         outputs: features out.
         skip: index of the hidden layer after which the inputs are concatenated once more, -1 for none.
-        smooth: softplus with sharpness 100 (twice differentiable, as IDR and NeuS use it) instead of ReLU.
+        sharpness: of a softplus in place of ReLU: 100 is IDR's and NeuS's, twice differentiable, 1 is EG3D's.
     """
 
-    def __init__(self, *, inputs: int, layers: int, width: int, outputs: int, skip: int = -1, smooth: bool = False) -> None:
+    def __init__(
+        self, *, inputs: int, layers: int, width: int, outputs: int, skip: int = -1, sharpness: float | None = None
+    ) -> None:
         super().__init__()
         self.inputs = inputs
         self.skip = skip
-        self.smooth = smooth
+        self.sharpness = sharpness
         widths = [inputs] + [width + (inputs if index == skip else 0) for index in range(layers)]
         self.hidden = nn.ModuleList(nn.Linear(before, width) for before in widths[:-1])
         self.output = nn.Linear(widths[-1], outputs)
@@ -51,7 +53,7 @@ class Mlp(nn.Module):
     def _last_hidden(self, x: Float[Tensor, "m inputs"]) -> Float[Tensor, "m width"]:
         h = x
         for index, layer in enumerate(self.hidden):
-            h = softplus(layer(h), beta=100) if self.smooth else relu(layer(h), inplace=True)
+            h = relu(layer(h), inplace=True) if self.sharpness is None else softplus(layer(h), beta=self.sharpness)
             if index == self.skip:
                 h = torch.cat([h, x], dim=1)
         return h

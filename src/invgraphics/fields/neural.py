@@ -1,9 +1,10 @@
-"""Networks over an encoding of position: NeRF, Instant-NGP, and signed distance functions.
+"""Networks over an encoding of position: NeRF, Instant-NGP, signed distance functions; and grids, factors and planes.
 
 A position goes through `Bounds.to_unit` and the encoding into ``geometry_net``, which says what is there (a density or a signed
 distance) and hands a feature vector to ``colour_net``, which also sees the direction. A method is a choice of settings:
 NeRF is 8 layers of 256 with a skip at 4 over 10 octaves, 256 geometry features and one colour layer of 128; Instant-NGP is one
-layer of 64 over a hash encoding, 15 geometry features, two colour layers of 64, ``exp`` density and SH directions.
+layer of 64 over a hash encoding, 15 geometry features, two colour layers of 64, ``exp`` density and SH directions. A grid can
+be the density itself; colour can have an encoding of its own, and a network, spherical harmonics or nothing above it (DVGO).
 
 Densities are per local length unit, signed distances in local length units, whatever the size of the box.
 """
@@ -11,25 +12,30 @@ Densities are per local length unit, signed distances in local length units, wha
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
-from torch.nn.functional import normalize, relu, softplus
+from torch import Tensor, nn
+from torch.nn.functional import normalize
 from typing_extensions import override
 
-from invgraphics.config import Slot
-from invgraphics.core import harmonics
+from invgraphics import kernels
 from invgraphics.core.bounds import Bounds, Space
 from invgraphics.core.field import Encoding, Field, Quantity
+from invgraphics.core.fused import FusedLattice
+from invgraphics.core.lattice import Lattice, LatticeEncoding, Role
 from invgraphics.core.ngp import FusedNGP
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
-from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies, frequency_width
-from invgraphics.fields.encodings.hash import HashEncoding
-from invgraphics.fields.mlp import Mlp, truncated_exp
+from invgraphics.fields import heads
+from invgraphics.fields.covariance import unit_covariance
+from invgraphics.fields.density import DensityActivation
+from invgraphics.fields.encodings.lattices import LatticeConfig, LatticeFeatures, crop_lattices
+from invgraphics.fields.fused import fused_parts
+from invgraphics.fields.mlp import Mlp
+from invgraphics.fields.settings import NeuralSettings
 
 CPU_CHUNK = 8192
 """Samples that go through the networks at once on a CPU: larger activations cost more in page faults than in arithmetic."""
@@ -44,61 +50,10 @@ _POINTWISE = {
 
 
 @dataclass(frozen=True)
-class NeuralFieldConfig:
-    """An encoding and two networks.
-
-    Attributes:
-        encoding: position to features.
-        geometry: what the first network says: volume density, or signed distance (started as a sphere).
-        layers: hidden layers of the geometry network.
-        width: features of each.
-        skip: hidden layer after which the encoding is concatenated once more, counted from 0; -1 for none.
-        geometry_features: features that the geometry network hands to the colour network.
-        colour_layers: hidden layers of the colour network.
-        colour_width: features of each.
-        direction: how the colour network sees the viewing direction; ``none`` makes colour independent of it.
-        direction_degree: octaves for ``frequency``; bands for ``sh``, 1 to 4.
-        density_activation: ``exp`` stops growing at exp(15); not used for ``sdf``.
-        density_bias: added before that activation (mip-NeRF: softplus and -1).
-        density_per: unit of length of the network's density. ``contracted``: in a contracted space, the box's half-extent after
-            contraction along the radius, so that a new field is as thin a fog all the way to infinity as in a box.
-    """
+class NeuralFieldConfig(NeuralSettings):
+    """A neural field's settings, from which it is built (`NeuralSettings`)."""
 
     title: ClassVar[str] = "network"
-
-    encoding: Annotated[Any, Slot("encodings")] = field(default_factory=FrequencyConfig)
-    geometry: Literal["density", "sdf"] = "density"
-    layers: int = 8
-    width: int = 256
-    skip: int = 4
-    geometry_features: int = 256
-    colour_layers: int = 1
-    colour_width: int = 128
-    direction: Literal["frequency", "sh", "none"] = "frequency"
-    direction_degree: int = 4
-    density_activation: Literal["softplus", "exp", "relu"] = "softplus"
-    density_bias: float = -1.0
-    density_per: Literal["local", "contracted"] = "local"
-
-    def __post_init__(self) -> None:
-        if self.layers < 0 or self.colour_layers < 0:
-            raise ValueError("layers and colour_layers cannot be negative.")
-        if min(self.width, self.colour_width) < 1 or self.geometry_features < 0:
-            raise ValueError("width and colour_width must be at least 1, geometry_features at least 0.")
-        if not -1 <= self.skip < self.layers:
-            raise ValueError(f"skip must name one of the {self.layers} hidden layers (from 0) or be -1, not {self.skip}.")
-        if self.direction == "sh" and not 1 <= self.direction_degree <= harmonics.MAX_DEGREE + 1:
-            raise ValueError(f"direction_degree must be 1 to {harmonics.MAX_DEGREE + 1} for 'sh', not {self.direction_degree}.")
-        if self.direction_degree < 0:
-            raise ValueError("direction_degree cannot be negative.")
-        if self.geometry_features == 0 and self.direction == "none":
-            raise ValueError("with geometry_features = 0 and direction = 'none' colour would be the same everywhere.")
-
-    @property
-    def direction_width(self) -> int:
-        """Number of features of a direction."""
-        widths = {"frequency": frequency_width(self.direction_degree), "sh": self.direction_degree**2, "none": 0}
-        return widths[self.direction]
 
     def build(self, scene: Scene) -> NeuralField:
         """Build the field for ``scene``'s bounds and colour space, its weights drawn from torch's global generator."""
@@ -107,13 +62,13 @@ class NeuralFieldConfig:
 
 @dataclass(frozen=True, eq=False)
 class _NetworkOutputs:
-    """Outputs of both networks on one chunk.
+    """Raw geometry and colour of one chunk.
 
     Attributes:
         raw: density before its activation, or signed distance.
         radiance: colour; ``None`` where it is not wanted.
         feature_grad: gradient of ``raw`` in the encoding's features; ``None`` without normals.
-        geometry_features: outputs of the geometry network that the colour network takes; ``None`` where they are not wanted.
+        geometry_features: features that geometry hands on to colour; ``None`` where they are not wanted.
     """
 
     raw: Float[Tensor, " m"]
@@ -123,45 +78,55 @@ class _NetworkOutputs:
 
 
 class NeuralField(Field):
-    """Density or signed distance, radiance and normal by two networks over an encoding.
+    """Density or signed distance, radiance and normal of an encoding, by two networks or simpler heads.
 
     Args:
         config: sizes and kinds.
         bounds: the region; density is zero outside it.
         colour: radiance is in [0, 1] for ``srgb``, in [0, inf) for ``linear``.
+
+    Attributes:
+        encoding: of positions, for geometry.
+        geometry_net: its network; there is none with ``geometry_head = "none"``.
+        appearance: encoding of positions for colour; ``None`` where colour sees geometry's features.
+        basis: linear map of that encoding's features; ``None`` without.
+        colour_net: colour's network; there is none with other heads.
     """
 
     lo: Tensor
     hi: Tensor
+    geometry_net: Mlp
+    colour_net: Mlp
 
     def __init__(self, config: NeuralFieldConfig, bounds: Bounds, colour: Literal["srgb", "linear"] = "srgb") -> None:
         super().__init__()
         self.config = config
-        self.provides = _POINTWISE[config.geometry]
         self.colour: Literal["srgb", "linear"] = colour
         self._space: Space = bounds.space
         self._near = bounds.near
         self.register_buffer("lo", bounds.lo.clone())
         self.register_buffer("hi", bounds.hi.clone())
-        self.encoding: Encoding = config.encoding.build()
-        signed = config.geometry == "sdf"
-        self.geometry_net = Mlp(
-            # A distance function also sees the plain coordinates, which its start as a sphere is made of.
-            inputs=self.encoding.width + (3 if signed else 0),
-            layers=config.layers,
-            width=config.width,
-            outputs=1 + config.geometry_features,
-            skip=config.skip,
-            smooth=signed,
+        self._half = float(bounds.half.mean())  # at the start: no crop changes densities
+        self.encoding = _build_encoding(config.encoding, bounds)
+        self.appearance = None if config.appearance is None else _build_encoding(config.appearance, bounds)
+        self.density_activation = DensityActivation(
+            config.density_activation, config.density_bias, config.density_interpolation
         )
-        self.colour_net = Mlp(
-            inputs=config.geometry_features + config.direction_width,
-            layers=config.colour_layers,
-            width=config.colour_width,
-            outputs=3,
-            smooth=signed,
-        )
-        if signed:
+        if config.geometry_head == "mlp":
+            self.geometry_net = heads.geometry_net(config, self.encoding.width)
+        handed = heads.features_handed_on(config, self.encoding)
+        own = 0 if self.appearance is None else config.appearance_basis or self.appearance.width
+        heads.check_colour_features(config.head, handed + own)
+        if config.head == "mlp":
+            self.colour_net = heads.colour_net(config, handed + own)
+        self.basis: nn.Linear | None = None
+        if self.appearance is not None and config.appearance_basis:
+            self.basis = nn.Linear(self.appearance.width, own, bias=False)
+        # Colour with an encoding of its own is looked up where it is asked, not wherever a sampler asks for densities.
+        without = Quantity.NONE if self.appearance is None else Quantity.FEATURES
+        self.provides = _POINTWISE[config.geometry] & ~without
+        self._needs_geometry_for_colour = handed > 0 or self.appearance is None
+        if config.geometry == "sdf":
             self.geometry_net.initialise_as_sphere(INITIAL_RADIUS)
 
     @property
@@ -169,17 +134,32 @@ class NeuralField(Field):
         """The region this field describes."""
         return Bounds(self.lo, self.hi, self._space, self._near)
 
+    def lattice_encodings(self) -> dict[Role, LatticeEncoding]:
+        """Its encodings that are lattices, by role; one that colour shares is geometry's."""
+        encodings: dict[Role, Encoding | None] = {"geometry": self.encoding, "appearance": self.appearance}
+        return {role: encoding for role, encoding in encodings.items() if isinstance(encoding, LatticeEncoding)}
+
+    @torch.no_grad()
+    def crop(self, lo: Float[Tensor, 3], hi: Float[Tensor, 3], resolution: float) -> None:
+        """See `core.lattice.LatticeField`; densities inside the new box stay what they are."""
+        encodings = [self.encoding] if self.appearance is None else [self.encoding, self.appearance]
+        crop_lattices(encodings, self.bounds, (lo, hi), resolution)
+        self.lo.copy_(lo)
+        self.hi.copy_(hi)
+
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
         """See `Field.query`.
 
         Normals are the normalised gradient: of the signed distance, or of minus the density (taken before its activation,
         which is monotone, so that they are defined where the density saturates). They can be had inside ``no_grad``.
-        Features are what the geometry network hands to the colour network; samples that bring them along are not looked at
-        again where only their radiance is wanted.
+        Features are what geometry hands on to colour; samples that bring them along are not looked at again where only their
+        radiance is wanted.
         """
         training = torch.is_grad_enabled()
-        if want == Quantity.RADIANCE and samples.features is not None:
-            chunks = self._chunks(samples.features, samples.direction)
+        appearance = self._appearance(samples) if Quantity.RADIANCE in want else None
+        known = samples.features if self._needs_geometry_for_colour else samples.position[:, :0]
+        if want == Quantity.RADIANCE and known is not None:
+            chunks = self._chunks(known, appearance, samples.direction)
             return FieldValues(radiance=torch.cat([self._radiance(*chunk) for chunk in chunks]))
         with_normal = Quantity.NORMAL in want
         with torch.set_grad_enabled(training or with_normal):
@@ -187,7 +167,8 @@ class NeuralField(Field):
             if with_normal and not (training and position.requires_grad):
                 position = position.detach().requires_grad_()
             features = self._encode(samples, position)
-            parts = [self._evaluate(*chunk, want, training) for chunk in self._chunks(features, samples.direction)]
+            chunks = self._chunks(features, appearance, samples.direction)
+            parts = [self._evaluate(*chunk, want, training) for chunk in chunks]
             raw = torch.cat([part.raw for part in parts])
             normal = None
             if with_normal:
@@ -205,54 +186,68 @@ class NeuralField(Field):
         )
 
     @override
-    def fused(self, bounds: Bounds) -> FusedNGP | None:
-        """Detached hash grid and networks over ``bounds``.
-
-        ``None`` for other encodings, networks or bounds, for other than two features per entry, and with a coarse-to-fine
-        window.
-        """
-        config, encoding = self.config, self.encoding
-        plain = config.geometry == "density" and config.skip < 0 and config.direction in ("sh", "none")
+    def fused(self, bounds: Bounds) -> FusedNGP | FusedLattice | None:
+        """Detached parameters over ``bounds``, the field's own: of a hash grid or of lattices (see `fused_parts`)."""
         here = bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)
-        if not plain or not here or not isinstance(encoding, HashEncoding):
-            return None
-        # Entries of other widths have no compiled kernel, and the plain one keeps every sample of a picture.
-        if encoding.window_alpha is not None or encoding.grid.features != 2:
-            return None
-        geometry, colour = (net.layers() for net in (self.geometry_net, self.colour_net))
-        bands = config.direction_degree if config.direction == "sh" else 0
-        density = config.density_activation, config.density_bias, bands, self.colour, self._contracted_density
-        return FusedNGP(encoding.table.detach(), encoding.grid, geometry, colour, *density)
+        return fused_parts(self, self._density_scale, self._contracted_density) if here else None
 
     @property
     def _contracted_density(self) -> float:
         """Half-extents per local unit, which scale densities given per contracted half-extent; 0 for other densities."""
-        contracted = self._space == "contracted" and self.config.density_per == "contracted"
-        return 1 / float(self.bounds.half.mean()) if contracted else 0.0
+        contracted = self._space == "contracted" and self.config.density_per != "local"
+        return 1 / self._half if contracted else 0.0
+
+    @property
+    def _density_scale(self) -> float:
+        """Factor of densities besides that of contracted space."""
+        per_half = self._space == "box" and self.config.density_per == "half"
+        return self.config.density_scale / (self._half if per_half else 1.0)
 
     def _encode(self, samples: Samples, position: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
+        """Features for geometry; of a grid whose density is activated before interpolation, the first is that density."""
         unit = self.bounds.to_unit(position)
-        covariance = None
-        if self.encoding.needs_covariance:
-            covariance = unit_covariance(self.bounds, position, samples.covariance)
-        features = self.encoding(unit, covariance)
+        if self.density_activation.interpolation != "post":
+            return self._encode_activated(unit)
+        features = self._features(self.encoding, samples, position, unit)
         if self.config.geometry == "density":
             return features
         # In half-extents of the box, which is half as long as the unit cube in a contracted space.
         reach = 2 if self._space == "contracted" else 1
         return torch.cat([reach * (2 * unit - 1), features], dim=1)
 
-    def _chunks(self, features: Tensor, direction: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        size = CPU_CHUNK if features.device.type == "cpu" else max(len(features), 1)
-        return zip(features.split(size), direction.split(size), strict=True)
+    def _encode_activated(self, unit: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
+        assert isinstance(self.encoding, LatticeFeatures)
+        (grid,) = self.encoding.lattices()
+        first = self.density_activation.at_vertices(grid.features[..., :1])
+        features = torch.cat([first, grid.features[..., 1:]], dim=-1)
+        return kernels.lattice_encode(unit, [Lattice(features, grid.axes, grid.links)], self.encoding.combine)
 
-    def _evaluate(self, features: Tensor, direction: Tensor, want: Quantity, training: bool) -> _NetworkOutputs:
-        """Evaluate both networks on one chunk; detached unless ``training``."""
+    def _appearance(self, samples: Samples) -> Float[Tensor, "m f"] | None:
+        if self.appearance is None:
+            return None
+        return self._features(self.appearance, samples, samples.position, self.bounds.to_unit(samples.position))
+
+    def _features(self, encoding: Encoding, samples: Samples, position: Tensor, unit: Tensor) -> Float[Tensor, "m f"]:
+        covariance = unit_covariance(self.bounds, position, samples.covariance) if encoding.needs_covariance else None
+        return encoding(unit, covariance)
+
+    def _chunks(
+        self, features: Tensor, appearance: Tensor | None, direction: Tensor
+    ) -> Iterator[tuple[Tensor, Tensor | None, Tensor]]:
+        size = CPU_CHUNK if direction.device.type == "cpu" else max(len(direction), 1)
+        parts = features.split(size), direction.split(size)
+        own = [None] * len(parts[0]) if appearance is None else appearance.split(size)
+        return zip(parts[0], own, parts[1], strict=True)
+
+    def _evaluate(
+        self, features: Tensor, appearance: Tensor | None, direction: Tensor, want: Quantity, training: bool
+    ) -> _NetworkOutputs:
+        """Evaluate geometry and colour on one chunk; detached unless ``training``."""
         with_colour = Quantity.RADIANCE in want
         if Quantity.NORMAL in want and not training:
             # Starting the chunk's graph here keeps it from growing over all chunks.
             features = features.detach().requires_grad_()
-        outputs = self.geometry_net(features, None if with_colour or Quantity.FEATURES in want else 1)
+        outputs = self._geometry(features, with_colour or Quantity.FEATURES in want)
         raw, feature_grad = outputs[:, 0], None
         if Quantity.NORMAL in want:
             (feature_grad,) = torch.autograd.grad(raw.sum(), features, create_graph=training)
@@ -260,37 +255,33 @@ class NeuralField(Field):
             raw, outputs = raw.detach(), outputs.detach()
         with torch.set_grad_enabled(training):
             geometry_features = outputs[:, 1:]
-            radiance = self._radiance(geometry_features, direction) if with_colour else None
+            radiance = self._radiance(geometry_features, appearance, direction) if with_colour else None
             return _NetworkOutputs(raw, radiance, feature_grad, geometry_features if Quantity.FEATURES in want else None)
 
-    def _radiance(self, geometry: Tensor, direction: Tensor) -> Float[Tensor, "m 3"]:
-        degree = self.config.direction_degree
-        if self.config.direction == "frequency":
-            geometry = torch.cat([geometry, frequencies(direction, degree)], dim=1)
-        elif self.config.direction == "sh":
-            geometry = torch.cat([geometry, harmonics.basis(direction, degree - 1)], dim=1)
-        raw = self.colour_net(geometry)
-        return raw.sigmoid() if self.colour == "srgb" else softplus(raw)
+    def _geometry(self, features: Float[Tensor, "m f"], with_features: bool) -> Float[Tensor, "m o"]:
+        """Raw geometry, and behind it the features that are handed on."""
+        if self.config.geometry_head == "mlp":
+            return self.geometry_net(features, None if with_features else 1)
+        return features.sum(dim=1, keepdim=True) if heads.sums_components(self.encoding) else features
+
+    def _radiance(
+        self, geometry: Float[Tensor, "m g"], appearance: Float[Tensor, "m a"] | None, direction: Float[Tensor, "m 3"]
+    ) -> Float[Tensor, "m 3"]:
+        features = geometry
+        if appearance is not None:
+            own = appearance if self.basis is None else self.basis(appearance)
+            features = torch.cat([geometry, own], dim=1) if self._needs_geometry_for_colour else own
+        raw = heads.raw_colour(self.colour_net if self.config.head == "mlp" else None, features, direction, self.config)
+        return heads.activated_colour(raw, self.config, self.colour)
 
     def _density(self, raw: Float[Tensor, " m"], position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-        activation = {"softplus": softplus, "exp": truncated_exp, "relu": relu}[self.config.density_activation]
-        density = activation(raw + self.config.density_bias)
+        density = self.density_activation.at_points(raw)
         if self._contracted_density > 0:
             density = density * (self._contracted_density * self.bounds.radial_scale(position))
+        if self._density_scale != 1:
+            density = density * self._density_scale
         return torch.where(self.bounds.contains(position), density, torch.zeros_like(density))
 
 
-def unit_covariance(
-    bounds: Bounds, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]
-) -> Float[Tensor, "m 3 3"]:
-    """Transform covariances to the unit cube by the linearised map J Σ J^T (mip-NeRF 360, equation 9)."""
-    differentiable = torch.is_grad_enabled()
-    with torch.enable_grad():
-        if not (differentiable and position.requires_grad):
-            position = position.detach().requires_grad_()
-        unit = bounds.to_unit(position)
-        rows = [
-            torch.autograd.grad(u.sum(), position, create_graph=differentiable, retain_graph=True)[0] for u in unit.unbind(1)
-        ]
-    jacobian = torch.stack(rows, dim=1)
-    return jacobian @ covariance @ jacobian.mT
+def _build_encoding(config: Any, bounds: Bounds) -> Encoding:
+    return config.build(bounds.half.tolist()) if isinstance(config, LatticeConfig) else config.build()

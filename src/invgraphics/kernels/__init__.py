@@ -12,11 +12,10 @@ from collections.abc import Sequence
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from invgraphics.core import fused, lattice, ngp
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
-from invgraphics.core.lattice import Combination, Lattice, check_lattices
-from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.dispatch import choose
 from invgraphics.kernels.dispatch import compiled as compiled
@@ -28,7 +27,7 @@ from invgraphics.kernels.types import AdamStep, Bins, Footprints, March, MarchSt
 
 
 def hash_encode(
-    unit: Float[Tensor, "m 3"], table: Float[Tensor, "entries f"], grid: HashGrid, jacobian: bool = False
+    unit: Float[Tensor, "m 3"], table: Float[Tensor, "entries f"], grid: ngp.HashGrid, jacobian: bool = False
 ) -> tuple[Float[Tensor, "m width"], Float[Tensor, "m width 3"] | None]:
     """Multi-resolution hash encoding (Instant-NGP, §3): trilinear look-ups on every level, concatenated coarse to fine.
 
@@ -46,7 +45,7 @@ def hash_encode(
 
 
 def lattice_encode(
-    unit: Float[Tensor, "m 3"], lattices: Sequence[Lattice], combine: Combination = "concat"
+    unit: Float[Tensor, "m 3"], lattices: Sequence[lattice.Lattice], combine: lattice.Combination = "concat"
 ) -> Float[Tensor, "m width"]:
     """Linear, bilinear and trilinear interpolation of features on lines, planes and voxel grids, combined per point.
 
@@ -60,12 +59,12 @@ def lattice_encode(
     Returns:
         Features, differentiable twice in ``unit`` and in every lattice's features; the gradient along axes on which a position
         was clamped is zero. Widths: ``concat`` the sum of all channels, ``vm`` that of its pairs, ``sum`` and ``cp`` one
-        lattice's channels. Gradients of features are the same bits for any number of threads.
+        lattice's channels.
 
     Raises:
         InputError: lattices that do not fit together or do not fit the positions.
     """
-    check_lattices(unit, lattices, combine)
+    lattice.check_lattices(unit, lattices, combine)
     return choose("lattice_encode", unit)(unit, lattices, combine)
 
 
@@ -116,7 +115,7 @@ def ngp_march(
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
     steps: MarchSteps,
-    field: FusedNGP,
+    field: ngp.FusedNGP,
     start: Float[Tensor, " n"],
     min_transmittance: float,
 ) -> March:
@@ -142,7 +141,7 @@ def ngp_render(
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
     steps: MarchSteps,
-    field: FusedNGP,
+    field: ngp.FusedNGP,
     min_transmittance: float = 0.0,
     max_error: float = 0.0,
     width: int = 0,
@@ -164,6 +163,39 @@ def ngp_render(
         Sums of w * (radiance, distance), and of w, per ray (see `composite`).
     """
     return choose("ngp_render", rays.origins)(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
+
+
+def lattice_march(
+    rays: Rays,
+    occupied: Bool[Tensor, "r r r"],
+    bounds: Bounds,
+    steps: MarchSteps,
+    field: fused.FusedLattice,
+    start: Float[Tensor, " n"],
+    min_transmittance: float,
+) -> March:
+    """`ngp_march` for a field over lattices.
+
+    Arguments and result as there; appearance and networks of colour are not looked at.
+    """
+    return choose("lattice_march", rays.origins)(rays, occupied, bounds, steps, field, start, min_transmittance)
+
+
+def lattice_render(
+    rays: Rays,
+    occupied: Bool[Tensor, "r r r"],
+    bounds: Bounds,
+    steps: MarchSteps,
+    field: fused.FusedLattice,
+    min_transmittance: float = 0.0,
+    max_error: float = 0.0,
+    width: int = 0,
+) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
+    """`ngp_render` for a field over lattices: voxels, tri-planes, VM and CP factors, with networks or without.
+
+    Arguments and results as there. Not differentiable.
+    """
+    return choose("lattice_render", rays.origins)(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
 
 
 def composite(

@@ -1,4 +1,4 @@
-"""Renamed recipe keys, with which recipes and runs of earlier versions still load."""
+"""Renamed and added recipe keys, with which recipes and runs of earlier versions still load under the digests they had."""
 
 from __future__ import annotations
 
@@ -20,27 +20,59 @@ RENAMED_KEYS: dict[str, dict[str, str]] = {
 A part is its dotted path, followed by its ``type`` where it has one: ``hooks.density_control``, ``renderer.splatting``."""
 
 
+_ADDED_TO_NEURAL = {
+    "density_scale": 1.0,
+    "density_interpolation": "post",
+    "appearance_basis": 0,
+    "feature_octaves": 0,
+    "geometry_head": "mlp",
+    "head": "mlp",
+    "hidden_activation": "relu",
+    "colour_activation": "sigmoid",
+    "colour_padding": 0.0,
+}
+ADDED_KEYS: dict[str, dict[str, Any]] = {
+    "field.neural": _ADDED_TO_NEURAL,
+    "renderer.sampler.proposal.neural": _ADDED_TO_NEURAL,
+    "renderer.volumetric": {"colour_threshold": 0.0},
+}
+"""Part of a recipe -> keys that later versions added, with the values that change nothing."""
+
+
 def with_current_names(table: Mapping[str, Any]) -> dict[str, Any]:
     """Rename a recipe table's old keys to their current names."""
     return _renamed(table, RENAMED_KEYS)
 
 
 def with_first_names(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Rename a recipe table's keys to their original names, for hashes that are invariant under renaming."""
-    return _renamed(table, {part: {new: old for old, new in keys.items()} for part, keys in RENAMED_KEYS.items()})
+    """Rename a recipe table's keys to their original names and drop added ones that change nothing, for lasting hashes."""
+    first = {part: {new: old for old, new in keys.items()} for part, keys in RENAMED_KEYS.items()}
+    return _renamed(table, first, ADDED_KEYS)
 
 
-def _renamed(table: Mapping[str, Any], names: Mapping[str, Mapping[str, str]], path: str = "") -> dict[str, Any]:
+def _renamed(
+    table: Mapping[str, Any],
+    names: Mapping[str, Mapping[str, str]],
+    dropped: Mapping[str, Mapping[str, Any]] | None = None,
+    path: str = "",
+) -> dict[str, Any]:
+    dropped = dropped or {}
     kind = table.get("type")
-    keys = names.get(f"{path}.{kind}" if isinstance(kind, str) else path, {})
+    part = f"{path}.{kind}" if isinstance(kind, str) else path
+    keys, without = names.get(part, {}), dropped.get(part, {})
     # A table with both keys keeps both, and is refused for the one that is unknown.
     return {
-        keys[key] if key in keys and keys[key] not in table else key: _value(value, names, f"{path}.{key}" if path else key)
+        keys[key] if key in keys and keys[key] not in table else key: _value(value, names, dropped, _join(path, key))
         for key, value in table.items()
+        if not (key in without and value == without[key])
     }
 
 
-def _value(value: Any, names: Mapping[str, Mapping[str, str]], path: str) -> Any:
+def _join(path: str, key: str) -> str:
+    return f"{path}.{key}" if path else key
+
+
+def _value(value: Any, names: Mapping[str, Mapping[str, str]], dropped: Mapping[str, Mapping[str, Any]], path: str) -> Any:
     if isinstance(value, Mapping):
-        return _renamed(value, names, path)
-    return [_value(item, names, path) for item in value] if isinstance(value, list | tuple) else value
+        return _renamed(value, names, dropped, path)
+    return [_value(item, names, dropped, path) for item in value] if isinstance(value, list | tuple) else value

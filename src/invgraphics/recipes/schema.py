@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Annotated, Any, Protocol, Self, get_type_hints, runtime_checkable
 
-from invgraphics.config import Slot
+from invgraphics.config import OMIT_EMPTY, Slot
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.hooks import Hook
 from invgraphics.training.optimiser import OptimiserConfig
+from invgraphics.training.penalties import check_penalty
 from invgraphics.training.poses import TrainingConfig
 
 
@@ -31,7 +32,8 @@ class Recipe:
         paper: where the method comes from.
         field: parameterisation of the scene.
         renderer: how it is rendered.
-        losses: their sum is minimised.
+        losses: their sum, and that of the penalties, is minimised.
+        penalties: terms that depend on the model alone, such as total variation.
         hooks: callbacks between steps, such as density control.
         optimiser: Adam's settings and parameter groups.
         batches: size of a step.
@@ -45,6 +47,7 @@ class Recipe:
     optimiser: OptimiserConfig
     summary: str = ""
     paper: str = ""
+    penalties: tuple[Annotated[Any, Slot("penalties")], ...] = default(default=(), metadata=OMIT_EMPTY)
     hooks: tuple[Annotated[Any, Slot("hooks")], ...] = ()
     batches: BatchConfig = default(default_factory=BatchConfig)
     training: TrainingConfig | None = None
@@ -63,17 +66,20 @@ class Recipe:
         return replace(self, field=field, hooks=tuple(hooks))
 
     def check_hooks(self) -> None:
-        """Check before building that the field provides what each hook needs.
+        """Check before building that the field provides what each hook and penalty needs.
 
         Classes are those with which ``build`` of the configs is annotated; where there is no annotation, the fit checks.
 
         Raises:
-            InputError: names the hook, what it needs, and the field.
+            InputError: names the part, what it needs, and the field.
         """
         field = _build_type(self.field)
         for hook in map(_build_type, self.hooks):
             if field is not None and hook is not None and issubclass(hook, Hook):
                 hook.check(field)
+        for penalty in self.penalties:
+            if field is not None:
+                check_penalty(penalty, field)
 
 
 def _build_type(config: Any) -> type | None:

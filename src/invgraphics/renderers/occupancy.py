@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,6 +15,8 @@ from typing_extensions import override
 
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.fused import FusedLattice
+from invgraphics.core.ngp import FusedNGP
 from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.samplers import uniform
@@ -175,22 +178,24 @@ class Occupancy(Sampler):
         """March with early termination by a fused kernel, where it supports the field and these steps; else ``None``."""
         parts, steps = field.fused(ctx.bounds), self.steps(ctx)
         even = ctx.bounds.space == "box" or steps.contracted
-        if parts is None or not even or steps.cone > 0 or not kernels.compiled("ngp_march", parts.table):
+        march = _compiled("march", parts) if even and steps.cone == 0 else None
+        if march is None:
             return None
         start = self._start(rays, steps, ctx)
-        return kernels.ngp_march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
+        return march(rays, self.occupied, ctx.bounds, steps, parts, start, self.config.transmittance)
 
     @override
     @torch.no_grad()
     def composite_fused(
         self, rays: Rays, width: int, field: Field, ctx: Context, max_error: float
     ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]] | None:
-        """See `Sampler.composite_fused`; fields that hand out the parameters of a hash grid have a kernel."""
+        """See `Sampler.composite_fused`; fields that hand out the parameters of a hash grid or of lattices have a kernel."""
         parts = field.fused(ctx.bounds)
-        if parts is None or self.config.stop == "never" or not kernels.compiled("ngp_render", parts.table):
+        render = None if self.config.stop == "never" else _compiled("render", parts)
+        if render is None:
             return None
         limits = self.config.transmittance, max_error
-        return kernels.ngp_render(rays, self.occupied, ctx.bounds, self.steps(ctx), parts, *limits, width)
+        return render(rays, self.occupied, ctx.bounds, self.steps(ctx), parts, *limits, width)
 
     def steps(self, ctx: Context) -> MarchSteps:
         """Current step lengths of the march."""
@@ -270,6 +275,16 @@ class Occupancy(Sampler):
             return field.density_no_grad(Samples.at(position)) * steps.step / ctx.bounds.radial_scale(position)
         distance = (position - ctx.bounds.centre).norm(dim=1)
         return field.density_no_grad(Samples.at(position)) * (steps.cone * distance).clamp_min(steps.step)
+
+
+def _compiled(operation: Literal["march", "render"], parts: FusedNGP | FusedLattice | None) -> Callable[..., Any] | None:
+    """The fused kernel for a field's parameters; ``None`` where only the reference supports them."""
+    if parts is None:
+        return None
+    lattices = isinstance(parts, FusedLattice)
+    name = f"{'lattice' if lattices else 'ngp'}_{operation}"
+    like = parts.geometry.lattices[0].features if lattices else parts.table
+    return getattr(kernels, name) if kernels.compiled(name, like) else None
 
 
 def _joined(parts: list[March]) -> March:

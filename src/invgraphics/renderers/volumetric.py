@@ -45,20 +45,25 @@ class VolumetricConfig:
         gradient_reach: in endless space, gradients of samples nearer to a camera than this are scaled by the square of their
             distance over it, local units; 0 leaves them alone. Few pixels see what is near a camera, and each sees it large
             (Philip and Deschaintre 2023, Floaters no more).
+        colour_threshold: in training, samples that contribute no more than this to their ray are not asked for their colour,
+            which counts as black (DVGO, TensoRF: 1e-4); 0 asks all.
     """
 
     title: ClassVar[str] = "volume rendering"
 
     sampler: Annotated[Any, Slot("samplers")] = field(default_factory=StratifiedConfig)
     gradient_reach: float = 0.0
+    colour_threshold: float = 0.0
 
     def __post_init__(self) -> None:
         if self.gradient_reach < 0:
             raise ValueError(f"gradient_reach must not be negative, not {self.gradient_reach}")
+        if not 0 <= self.colour_threshold < 1:
+            raise ValueError(f"colour_threshold must be in [0, 1), not {self.colour_threshold}")
 
     def build(self, scene: Scene) -> Volumetric:
         """The renderer with its sampler."""
-        return Volumetric(self.sampler.build(scene), self.gradient_reach)
+        return Volumetric(self.sampler.build(scene), self.gradient_reach, self.colour_threshold)
 
 
 class Volumetric(RayRenderer):
@@ -66,10 +71,11 @@ class Volumetric(RayRenderer):
 
     requires: ClassVar[Quantity] = Quantity.DENSITY | Quantity.RADIANCE
 
-    def __init__(self, sampler: Sampler, gradient_reach: float = 0.0) -> None:
+    def __init__(self, sampler: Sampler, gradient_reach: float = 0.0, colour_threshold: float = 0.0) -> None:
         super().__init__()
         self.sampler = sampler
         self.gradient_reach = gradient_reach
+        self.colour_threshold = colour_threshold
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; with normals if ``ctx.geometry`` is set and the field provides them."""
@@ -80,6 +86,8 @@ class Volumetric(RayRenderer):
             samples = replace(samples, density=query(field, samples, Quantity.DENSITY, ctx.chunk).density)
         if samples.density is not None and not torch.is_grad_enabled():
             values = _query_contributing(field, samples, len(rays), want, ctx.chunk)
+        elif self.colour_threshold > 0 and ctx.training:
+            values = _query_above(self.colour_threshold, field, samples, len(rays), want, ctx.chunk)
         else:
             values = query(field, samples, want, ctx.chunk)
         assert values.density is not None
@@ -114,7 +122,7 @@ class Volumetric(RayRenderer):
     @override
     def untrained(self) -> Volumetric:
         """Copy of the renderer with the sampler's constants in place of its learnt state."""
-        return Volumetric(self.sampler.untrained(), self.gradient_reach)
+        return Volumetric(self.sampler.untrained(), self.gradient_reach, self.colour_threshold)
 
 
 def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldValues:
@@ -138,6 +146,22 @@ def _query_contributing(field: Field, samples: Samples, rays: int, want: Quantit
         if value is not None
     }
     return FieldValues(**spread | {"density": samples.density})
+
+
+def _query_above(threshold: float, field: Field, samples: Samples, rays: int, want: Quantity, chunk: int) -> FieldValues:
+    """Query samples in the graph; radiance of those that weigh no more than ``threshold`` is skipped and stays zero."""
+    features = field.provides & Quantity.FEATURES
+    values = query(field, samples, (want & ~Quantity.RADIANCE) | features, chunk)
+    assert values.density is not None
+    with torch.no_grad():
+        depth = values.density.detach() * samples.delta
+        weights, _, _ = kernels.composite(depth, depth[:, None], samples.ray, rays)
+        seen = torch.nonzero(weights > threshold)[:, 0]
+    asked = replace(samples[seen], features=None if values.features is None else values.features[seen])
+    found = query(field, asked, Quantity.RADIANCE, chunk).radiance
+    assert found is not None
+    radiance = found.new_zeros(len(samples), 3).index_copy(0, seen, found)
+    return replace(values, radiance=radiance, features=None)
 
 
 def query(field: Field, samples: Samples, want: Quantity, chunk: int) -> FieldValues:

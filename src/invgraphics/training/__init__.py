@@ -1,4 +1,4 @@
-"""Fitting a field by gradient descent through a renderer; losses are callable frozen configs, hooks have a ``build()``."""
+"""Fitting a field by gradient descent through a renderer; losses and penalties are called, hooks have a ``build()``."""
 
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,14 @@ LOSSES = {
     "opacity": "invgraphics.training.splat_losses:OpacityLoss",
     "scale": "invgraphics.training.splat_losses:ScaleLoss",
     "distortion": "invgraphics.training.losses:DistortionLoss",
+    "background_entropy": "invgraphics.training.losses:BackgroundEntropyLoss",
+    "point_colour": "invgraphics.training.losses:PointColourLoss",
+}
+
+PENALTIES = {
+    "total_variation": "invgraphics.training.penalties:TotalVariationPenalty",
+    "l1": "invgraphics.training.penalties:L1Penalty",
+    "sparsity": "invgraphics.training.penalties:SparsityPenalty",
 }
 
 HOOKS = {
@@ -18,6 +26,10 @@ HOOKS = {
     "relocation": "invgraphics.training.relocation:RelocationConfig",
     "smoothing": "invgraphics.training.smoothing:SmoothingConfig",
     "limits": "invgraphics.training.limits:LimitsConfig",
+    "upsample": "invgraphics.training.upsample:UpsampleConfig",
+    "tight_box": "invgraphics.training.tight_box:TightBoxConfig",
+    "prune": "invgraphics.training.prune:PruneConfig",
+    "view_rates": "invgraphics.training.view_rates:ViewRatesConfig",
     "sh_degree": "invgraphics.training.hooks:ShDegreeConfig",
 }
 

@@ -23,6 +23,7 @@ from invgraphics.training.clock import SchedulerTimes
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
 from invgraphics.training.losses import Loss
 from invgraphics.training.optimiser import Optimiser, OptimiserConfig
+from invgraphics.training.penalties import Penalty, check_penalty
 from invgraphics.training.poses import Poses, coarse_to_fine_encodings
 
 
@@ -33,7 +34,7 @@ class Plan:
     Attributes:
         model: field and renderer that are fitted.
         scene: training views, bounds and background.
-        losses: their sum is minimised.
+        losses: their sum, and that of the penalties, is minimised.
         hooks: called around each step, in order.
         optimiser: parameter groups and Adam's settings.
         batches: size of a step.
@@ -41,6 +42,7 @@ class Plan:
         seed: of all randomness during the fit.
         device: where tensors live.
         poses: of the training cameras, where they are fitted too.
+        penalties: of field and renderer alone.
     """
 
     model: Model
@@ -53,6 +55,7 @@ class Plan:
     seed: int = 0
     device: torch.device = default(default_factory=lambda: torch.device("cpu"))
     poses: Poses | None = None
+    penalties: Sequence[Penalty] = ()
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -66,6 +69,8 @@ class Fit:
     def __init__(self, plan: Plan) -> None:
         for hook in plan.hooks:
             hook.check(plan.model.field)
+        for penalty in plan.penalties:
+            check_penalty(penalty, plan.model.field)
         keep_freed_memory()
         limit_spinning()
         self.plan = plan
@@ -102,7 +107,7 @@ class Fit:
         return Context(self._bounds, training=True, progress=self.progress, generator=self._generator)
 
     def step(self) -> float:
-        """One optimisation step: draw a batch, render, composite, sum the losses, backpropagate, update. Returns the loss.
+        """One optimisation step: draw a batch, render, composite, sum all terms, backpropagate, update. Returns the loss.
 
         Raises:
             NumericalError: the loss is not finite; names the step and the first tensor, rendering or loss that is not.
@@ -116,7 +121,10 @@ class Fit:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
         composited = replace(rendering, rgb=rendering.over(batch.background))
-        terms = torch.stack([loss(composited, trace, batch, ctx) for loss in plan.losses])
+        terms = torch.stack(
+            [loss(composited, trace, batch, ctx) for loss in plan.losses]
+            + [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties]
+        )
         loss = terms.sum()
         value = loss.item()
         if not torch.isfinite(loss):
@@ -159,7 +167,7 @@ class Fit:
         modules = self.plan.modules.items()
         parts: dict[str, dict[str, Tensor]] = {owner: dict(module.named_parameters()) for owner, module in modules}
         parts["rendering"] = {"rgb": rendering.rgb, "alpha": rendering.alpha}
-        names = [type(loss).__name__ for loss in self.plan.losses]
+        names = [type(term).__name__ for term in (*self.plan.losses, *self.plan.penalties)]
         broken = [name for name, term in zip(names, terms.tolist(), strict=True) if not math.isfinite(term)]
         where = non_finite_values(parts) or f"the loss is not finite ({', '.join(broken) or 'the sum of ' + ', '.join(names)})"
         return f"Step {self.steps}: {where}; the fit stops here."

@@ -64,7 +64,7 @@ class Hook:
             InputError: names the hook, what it needs, and the field.
         """
         if cls.requires is not None:
-            cls.requires.check(cls.name or cls.__name__, field)
+            cls.requires.check(f"hook '{cls.name or cls.__name__}'", field)
 
     def before_step(self, state: FitState) -> None:
         """Called before the step's rays are drawn."""

@@ -114,6 +114,43 @@ class DistortionLoss:
         return self.weight * (pairs + within).sum() / max(trace.rays, 1)
 
 
+@dataclass(frozen=True)
+class BackgroundEntropyLoss:
+    """Entropy of the light that a ray lets through (DVGO, Sun et al. 2022, equation 12): 0 for rays that meet all or nothing.
+
+    Attributes:
+        weight: factor; DVGO uses 0.01 in its coarse stage and 0.001 in the fine one.
+    """
+
+    weight: float = 0.001
+
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean over pixels, in nats."""
+        through = (1 - rendering.alpha).clamp(1e-6, 1 - 1e-6)
+        return self.weight * -(through * through.log() + (1 - through) * (1 - through).log()).mean()
+
+
+@dataclass(frozen=True)
+class PointColourLoss:
+    """Squared colour difference of every sample to its pixel, weighed as the sample is (DVGO, equation 11).
+
+    Gradients reach the samples' colours, not their weights.
+
+    Attributes:
+        weight: factor; DVGO uses 0.1 in its coarse stage and 0.01 in the fine one.
+    """
+
+    weight: float = 0.01
+
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean over rays of sums over channels; 0 for renderers without samples."""
+        samples, values, weights = trace.samples, trace.values, trace.weights
+        if samples is None or values is None or values.radiance is None or weights is None:
+            return batch.target.new_zeros(())
+        squared = (values.radiance - batch.target[samples.ray]).square().sum(dim=1)
+        return self.weight * (weights.detach() * squared).sum() / max(trace.rays, 1)
+
+
 def normalised_distance(t: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:
     """Distance along a ray in the spacing of the samplers' strata, in units of the longest interval that a ray can have.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -12,6 +13,10 @@ from torch import Tensor, nn
 
 from invgraphics.errors import InputError
 from invgraphics.training.masked_adam import MOMENTS, ROW_RATES, MaskedAdam
+
+RESTARTED = "restarted"
+"""Name in an optimiser's state of the progress at which rates were restarted last."""
+LATEST_RESTART = 0.999
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class OptimiserConfig:
 
 
 class Optimiser:
-    """Adam over the parameters of a field, a renderer and poses; follows changes of a parameter's rows (density control)."""
+    """Adam over the parameters of a field, a renderer and poses; follows changes of a parameter's shape."""
 
     def __init__(self, config: OptimiserConfig, parameters: dict[str, nn.Parameter], extent: float) -> None:
         self._config = config
@@ -96,6 +101,7 @@ class Optimiser:
             self._adams.append(torch.optim.Adam(dense, lr=0.0, betas=betas, eps=config.eps, fused=True))
         if masked:
             self._adams.append(MaskedAdam(masked, betas, config.eps))
+        self._since = 0.0
         self.set_progress(0.0)
 
     def _group_of(self, name: str) -> str:
@@ -113,10 +119,16 @@ class Optimiser:
         return next(adam for adam in self._adams if any(group["name"] == key for group in adam.param_groups))
 
     def set_progress(self, progress: float) -> None:
-        """Set every group's learning rate for this point of the fit."""
+        """Set every group's learning rate for this point of the fit, of whose rest after `restart` a schedule makes all."""
+        progress = (progress - self._since) / (1 - self._since) if self._since else progress
         for group in self._groups():
             config = self._config.groups[group["name"]]
             group["lr"] = config.rate(progress) * (self._extent if config.per_extent else 1.0)
+
+    def restart(self, progress: float) -> None:
+        """Begin all learning rates' schedules anew at this point of the fit, from which they take as long as is left."""
+        self._since = min(progress, LATEST_RESTART)
+        self.set_progress(progress)
 
     def rates(self) -> dict[str, float]:
         """Current learning rate of each group."""
@@ -136,13 +148,24 @@ class Optimiser:
         for adam in self._adams:
             adam.step()
 
-    def set_row_rates(self, name: str, rates: Float[Tensor, "*rows"]) -> None:
+    def row_rates(self, name: str) -> Float[Tensor, "*rows"] | None:
+        """Factors of the learning rate of a parameter's rows; ``None`` for 1."""
+        return self._adam_of(name).state.get(self._names[name], {}).get(ROW_RATES)
+
+    def set_row_rates(self, name: str, rates: Float[Tensor, "*rows"] | None) -> None:
         """Set a factor of the learning rate for every row of a parameter of shape (*rows, c), in place of earlier ones.
+
+        Args:
+            name: of the parameter.
+            rates: the factors; ``None`` for 1.
 
         Raises:
             InputError: the parameter's group does not have ``skip_zero``, or the shapes do not fit.
         """
         adam, parameter = self._adam_of(name), self._names[name]
+        if rates is None:
+            adam.state.get(parameter, {}).pop(ROW_RATES, None)
+            return
         if not isinstance(adam, MaskedAdam):
             group = self._group_of(name)
             raise InputError(f"Rates per row of '{name}' need 'skip_zero = true' in 'optimiser.groups.{group}'.")
@@ -155,16 +178,39 @@ class Optimiser:
 
         Rates per row follow; those of new rows are 1.
         """
-        old, adam = self._names[name], self._adam_of(name)
-        for group in adam.param_groups:
-            group["params"] = [parameter if other is old else other for other in group["params"]]
-        state = adam.state.pop(old, None)
-        self._names[name] = parameter
+        state = self._exchange(name, parameter)
         if state:
             for key in {*MOMENTS, ROW_RATES} & set(state):
                 kept = state[key][rows]
                 state[key] = torch.cat([kept, kept.new_full((new, *kept.shape[1:]), float(key == ROW_RATES))])
-            adam.state[parameter] = state
+            self._adam_of(name).state[parameter] = state
+
+    def replace(self, name: str, parameter: nn.Parameter, moments: Callable[[Tensor], Tensor] | None = None) -> None:
+        """Replace a parameter by one of another shape.
+
+        Args:
+            name: of the parameter.
+            parameter: the new one.
+            moments: makes moments of the new shape of the old ones; ``None``: the new parameter begins without any. Rates per
+                row are dropped.
+        """
+        state = self._exchange(name, parameter)
+        if state and moments is not None:
+            kept = {key: moments(value) if key in MOMENTS else value for key, value in state.items() if key != ROW_RATES}
+            self._adam_of(name).state[parameter] = kept
+
+    def _exchange(self, name: str, parameter: nn.Parameter) -> dict[str, Any] | None:
+        """Put a parameter in another's place; returns the other's state."""
+        old, adam = self._names[name], self._adam_of(name)
+        for group in adam.param_groups:
+            group["params"] = [parameter if other is old else other for other in group["params"]]
+        self._names[name] = parameter
+        return adam.state.pop(old, None)
+
+    def drop_moments(self) -> None:
+        """Forget all parameters' moments, step counts and rates per row, as a new optimiser has none."""
+        for adam in self._adams:
+            adam.state.clear()
 
     def reset_moments(self, name: str, rows: Int[Tensor, " k"] | None = None) -> None:
         """Zero the moments of a parameter (after an opacity reset), or of some of its rows."""
@@ -173,8 +219,9 @@ class Optimiser:
                 value[slice(None) if rows is None else rows] = 0.0
 
     def state(self) -> dict[str, Tensor]:
-        """Moments, step counts and rates per row by parameter name."""
-        return {
+        """Moments, step counts and rates per row by parameter name, and when rates were restarted, if they were."""
+        restarted = {RESTARTED: torch.tensor(self._since, dtype=torch.float64)} if self._since else {}
+        return restarted | {
             f"{name}/{key}": value
             for name, parameter in self._names.items()
             for key, value in self._adam_of(name).state.get(parameter, {}).items()
@@ -183,5 +230,8 @@ class Optimiser:
     def load(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state`."""
         for path, value in state.items():
+            if path == RESTARTED:
+                self._since = float(value)
+                continue
             name, _, key = path.rpartition("/")
             self._adam_of(name).state[self._names[name]][key] = value.clone()

@@ -1,4 +1,4 @@
-"""What a hook needs of the field that is fitted, declared so that a recipe can be refused before anything is built."""
+"""What hooks and penalties need of the field, declared so that a recipe can be refused before anything is built."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Requirement:
         declared = {name for base in cls.__mro__ for name in get_annotations(base)}
         return all(hasattr(field, name) or name in declared for name in get_protocol_members(self.protocol))
 
-    def check(self, hook: str, field: object) -> None:
+    def check(self, part: str, field: object) -> None:
         """Refuse a field, or a class of fields, that lacks a member.
 
         Raises:
-            InputError: names the hook, what it needs, and the field.
+            InputError: names the part of the recipe, what it needs, and the field.
         """
         if not self.met_by(field):
             name = (field if isinstance(field, type) else type(field)).__name__
-            raise InputError(f"The hook '{hook}' needs {self.words}, which {name} does not have.")
+            raise InputError(f"The {part} needs {self.words}, which {name} does not have.")

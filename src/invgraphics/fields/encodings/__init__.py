@@ -7,6 +7,11 @@ from invgraphics.lazy import submodules
 ENCODINGS = {
     "frequency": "invgraphics.fields.encodings.frequency:FrequencyConfig",
     "hash": "invgraphics.fields.encodings.hash:HashConfig",
+    "voxels": "invgraphics.fields.encodings.voxels:VoxelsConfig",
+    "sparse_voxels": "invgraphics.fields.encodings.sparse:SparseVoxelsConfig",
+    "vm": "invgraphics.fields.encodings.factors:VmConfig",
+    "cp": "invgraphics.fields.encodings.factors:CpConfig",
+    "triplane": "invgraphics.fields.encodings.triplane:TriplaneConfig",
 }
 
 if not TYPE_CHECKING:

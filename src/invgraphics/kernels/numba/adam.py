@@ -8,8 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, job_start, parallel, prange, threads
-from invgraphics.kernels.numba.simd.lanes import where
+from invgraphics.kernels.numba.runtime import GROUP as REGISTER
+from invgraphics.kernels.numba.runtime import array, index, inlined, job_start, parallel, prange, threads
+from invgraphics.kernels.numba.simd.lanes import load, store, where
 from invgraphics.kernels.numba.simd.partial import load_first, store_first
 from invgraphics.kernels.types import AdamStep
 
@@ -28,21 +29,41 @@ def _any_touched(gradient, first, end):
 
 
 @inlined
+def _stepped(found, factor, numbers, skip):
+    """Values and moments after a step, of values, gradient and moments before it."""
+    value, g, m, v = found
+    beta1, beta2, rest1, rest2, eps = numbers
+    new_m, new_v = beta1 * m + rest1 * g, beta2 * v + rest2 * g * g
+    # Not where the gradient is NaN: comparisons with it are false.
+    untouched = abs(g) <= (ZERO if skip else -ONE)
+    step = factor * new_m / (np.sqrt(new_v) + eps)
+    return where(untouched, value, value - step), where(untouched, m, new_m), where(untouched, v, new_v)
+
+
+@inlined
 def _update(arrays, first, end, factor, numbers, skip):
     """Step of consecutive entries; ``numbers`` are the decays, their complements and eps."""
     values, gradient, mean, square = arrays
-    beta1, beta2, rest1, rest2, eps = numbers
-    largest = ZERO if skip else -ONE
-    for start in range(first, end, LANES):
-        i, part = index(start), min(index(end - start), LANES)
-        g, m, v = load_first(gradient, i, part), load_first(mean, i, part), load_first(square, i, part)
-        value = load_first(values, i, part)
-        new_m, new_v = beta1 * m + rest1 * g, beta2 * v + rest2 * g * g
-        # Not where the gradient is NaN: comparisons with it are false.
-        untouched = abs(g) <= largest
-        store_first(mean, i, part, where(untouched, m, new_m))
-        store_first(square, i, part, where(untouched, v, new_v))
-        store_first(values, i, part, where(untouched, value, value - factor * new_m / (np.sqrt(new_v) + eps)))
+    whole = first + (end - first) // REGISTER * REGISTER
+    for start in range(first, whole, REGISTER):
+        i = index(start)
+        found = load(values, i), load(gradient, i), load(mean, i), load(square, i)
+        value, m, v = _stepped(found, factor, numbers, skip)
+        store(values, i, value)
+        store(mean, i, m)
+        store(square, i, v)
+    if whole < end:
+        i, part = index(whole), index(end - whole)
+        found = (
+            load_first(values, i, part),
+            load_first(gradient, i, part),
+            load_first(mean, i, part),
+            load_first(square, i, part),
+        )
+        value, m, v = _stepped(found, factor, numbers, skip)
+        store_first(values, i, part, value)
+        store_first(mean, i, part, m)
+        store_first(square, i, part, v)
 
 
 @parallel

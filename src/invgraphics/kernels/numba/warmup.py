@@ -10,10 +10,13 @@ import torch
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
+from invgraphics.core.fused import ColourHead, CombinedLattices, DensityHead, FusedLattice
 from invgraphics.core.lattice import Lattice
 from invgraphics.core.ngp import FusedNGP, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.adam import adam_rows
+from invgraphics.kernels.numba.fused.march import lattice_march
+from invgraphics.kernels.numba.fused.render import lattice_render
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
 from invgraphics.kernels.numba.ngp.march import ngp_march
@@ -76,3 +79,7 @@ def samples() -> None:
     )
     ngp_march(rays, everywhere, bounds, MarchSteps(0.1), field, rays.near, 0.5)
     ngp_render(rays, everywhere, bounds, MarchSteps(0.1), field)
+    planes = CombinedLattices(tuple(Lattice(torch.zeros(2, 2, 4), axes) for axes in ("xy", "xz", "yz")), "sum")
+    dense = FusedLattice(planes, (), DensityHead("exp"), None, (), ColourHead("none"))
+    lattice_march(rays, everywhere, bounds, MarchSteps(0.1), dense, rays.near, 0.5)
+    lattice_render(rays, everywhere, bounds, MarchSteps(0.1), dense)

@@ -124,12 +124,18 @@ def estimate(nested: Nested, confidence: float = CONFIDENCE, seed: int = 0) -> E
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's step-down adjusted p-values of one family; entries without a p-value stay ``None`` and do not count."""
-    from statsmodels.stats.multitest import multipletests
+    """Holm's step-down adjusted p-values of one family; entries without a p-value stay ``None`` and do not count.
 
-    known = [p for p in p_values if p is not None]
-    corrected = iter(np.asarray(multipletests(known, method="holm")[1]).tolist() if known else [])
-    return [None if p is None else next(corrected) for p in p_values]
+    Written out because statsmodels' ``multipletests``, which the tests compare it with, collects garbage at every call: half of
+    the time of a study's page.
+    """
+    order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
+    adjusted: list[float | None] = [None] * len(p_values)
+    highest = 0.0
+    for rank, (p, index) in enumerate(order):
+        highest = max(highest, min(1.0, (len(order) - rank) * p))
+        adjusted[index] = highest
+    return adjusted
 
 
 def mean_half_width(deviation: float, count: int, confidence: float = CONFIDENCE) -> float:

@@ -1,60 +1,43 @@
-"""Gradients of the lattice encoding: of the factors of a product, of features, and of positions.
+"""Gradient of the lattice encoding in the features; through products, without an array of their factors' gradients.
 
-``gradient`` is always contiguous float32 (m, total), in which the gradient of a lattice's own interpolated features begins at
-its record's ``column``.
+``gradient`` is always contiguous float32 (m, width), in which the gradient of a lattice, or of the product that it is a factor
+of, begins at its record's ``column``.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.hash.cells import ONE, ZERO, axis_cell
-from invgraphics.kernels.numba.hash.jacobian import trilinear_gradient
-from invgraphics.kernels.numba.lattice.cells import BLOCK, CORNERS, EMPTY, encode_block, locate_block
+from invgraphics.kernels.numba.hash.cells import ZERO
+from invgraphics.kernels.numba.lattice.cells import BLOCK, CORNERS, EMPTY, WRITE, corners_of, job_scratch, locate_block
+from invgraphics.kernels.numba.lattice.rows import interpolate_block, load_part, scatter_block
 from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined, job_start, parallel, prange, serial
-from invgraphics.kernels.numba.simd.lanes import broadcast, load, reduce_sums, store
-from invgraphics.kernels.numba.simd.partial import floats_at, load_first, store_first
+from invgraphics.kernels.numba.simd.lanes import load, store
+from invgraphics.kernels.numba.simd.partial import floats_at, unowned
 
 SAMPLE = 61
 """Every so many-th point tells where on a lattice the work lies: a prime, so that it keeps step with no number of samples."""
+TARGET = np.dtype([(name, np.int64) for name in ("gradient", "copy")])
+"""Per lattice: address of its features' gradient, 0 where nobody wants it; first float in a job's copy, -1 for no copy."""
+PASS = np.dtype([(name, np.int64) for name in ("first", "end", "pivot", "copied")])
+"""A pass over a group of lattices (see `passes_over`)."""
+_FLOAT = 4
 
 
-@inlined
-def _factor_gradient(gradient, place, values, n, number, separate, out, at):
-    """Gradient of one factor at one point: that of the product times the values of its other factors."""
-    channels, width = index(separate[number].channels), index(values.shape[1])
-    for start in range(0, channels, LANES):
-        k = index(start)
-        part = min(channels - k, LANES)
-        total = load_first(gradient, place + k, part)
-        for other in range(separate[number].group, separate[number].group_end):
-            if other != number:
-                total = total * load_first(values, n * width + index(separate[other].column) + k, part)
-        store_first(out, at + k, part, total)
+def passes_over(lattices: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Passes over the points that write all wanted gradients.
 
-
-@parallel
-def factor_gradients(positions, gradient, combined, separate, jobs, out):
-    """Gradients of every lattice's interpolated features through the products that ``combined`` describes.
-
-    ``separate`` holds the same lattices, their features one after the other; the result is laid out as it says.
+    A pass shares out the points. Those of a pass with a pivot, a lattice too large for copies, go to the jobs that own rows
+    around them; without one, every job gets equally many. Lattices with copies are written in the group's first pass.
     """
-    points, width = positions.shape[1], out.shape[1]
-    for job in prange(jobs):
-        entries, weights = np.empty(CORNERS * BLOCK, np.uint32), np.empty(CORNERS * BLOCK, np.float32)
-        values = np.empty((BLOCK, width), np.float32)
-        begin, end = job_start(points, jobs, job), job_start(points, jobs, job + 1)
-        for first in range(begin, end, BLOCK):
-            count = min(BLOCK, end - first)
-            for number in range(len(separate)):
-                encode_block(positions, (index(first), count), separate[number], entries, weights, values, index(0))
-            for point in range(count):
-                n = index(point)
-                i = index(first) + n
-                for number in range(len(separate)):
-                    place = i * index(gradient.shape[1]) + index(combined[number].column)
-                    at = i * index(width) + index(separate[number].column)
-                    _factor_gradient(gradient, place, values, n, number, separate, out, at)
+    passes = []
+    for first in np.unique(lattices["group"]):
+        members = range(first, lattices["group_end"][first])
+        wanted = [k for k in members if targets["gradient"][k]]
+        pivots = [k for k in wanted if targets["copy"][k] < 0]
+        if wanted:
+            passes += [(first, members.stop, pivot, turn == 0) for turn, pivot in enumerate(pivots or [-1])]
+    return np.array(passes, PASS)
 
 
 @serial
@@ -72,7 +55,7 @@ def split_rows(positions: np.ndarray, lattices: np.ndarray, jobs: int) -> np.nda
     samples = -(-positions.shape[1] // SAMPLE)
     starts = np.zeros((len(lattices), jobs + 1), np.int64)
     starts[:, -1] = lattices["rows"]
-    if samples:
+    if samples and jobs > 1:
         rows = np.empty((len(lattices), samples), np.uint32)
         sample_rows(positions, lattices, rows)
         rows.sort(axis=1)
@@ -81,113 +64,193 @@ def split_rows(positions: np.ndarray, lattices: np.ndarray, jobs: int) -> np.nda
 
 
 @inlined
-def _add_to_row(grad_rows, at, weight, gradient, place, channels):
-    """Add a weighted gradient to a row of features."""
-    whole, rest = channels // LANES * LANES, channels % LANES
-    for start in range(0, whole, LANES):
-        k = index(start)
-        store(grad_rows, at + k, load(grad_rows, at + k) + weight * load(gradient, place + k))
-    if rest > 0:
-        old, new = load_first(grad_rows, at + whole, rest), load_first(gradient, place + whole, rest)
-        store_first(grad_rows, at + whole, rest, old + weight * new)
+def list_points(count, chosen):
+    """All points of a block."""
+    for number in range(count):
+        chosen[number] = number
+    return count
 
 
 @inlined
-def _scatter_block(gradient, block, lattice, entries, weights, owned, grad_rows):
-    """Add the gradients of a block's points to the ``owned`` rows among those of their corners."""
+def _select_points(lattice, entries, count, owned, touched, led):
+    """Points around which an owned row may lie, and those among them whose first row is owned: of those, no two jobs share one.
+
+    Rows of a dense cell lie between those of its first and last corner.
+    """
     start, end = owned
-    channels, width, column = index(lattice.channels), index(gradient.shape[1]), index(lattice.column)
-    corners, dense = lattice.corners, lattice.links == 0
-    last = index((corners - 1) * BLOCK)
-    for number in range(block[1]):
+    found, first, last = 0, 0, index((lattice.corners - 1) * BLOCK)
+    for number in range(count):
         n = index(number)
-        # Rows of a dense cell lie between those of its first and last corner.
-        if not (dense and (entries[n] >= end or entries[last + n] < start)):
-            place = (block[0] + n) * width + column
-            for corner in range(corners):
-                at = index(corner * BLOCK) + n
-                row = entries[at]
-                if row >= start and row < end:
-                    _add_to_row(grad_rows, index(row) * channels, weights[at], gradient, place, channels)
+        near, leads, leading = entries[n] < end and entries[n + last] >= start, entries[n] >= start and entries[n] < end, True
+        if lattice.links != 0:
+            near, leads = False, False
+            for corner in range(lattice.corners):
+                row = entries[index(corner * BLOCK) + n]
+                mine = row >= start and row < end
+                near |= mine
+                if leading and row != EMPTY:
+                    leads, leading = mine, False
+        touched[found], led[first] = number, number
+        found, first = found + near, first + leads
+    return found, first
+
+
+@inlined
+def _multiply(lattice, points, gradient, place, width, values, slot, factors):
+    """Gradient of a product at a block's points times the values of one factor, into ``factors``."""
+    chosen, count = points
+    stride, part = index(lattice.stride), min(index(lattice.channels), LANES)
+    last = max(lattice.channels - GROUP, 0)
+    for point in range(count):
+        n = index(chosen[point])
+        for start in range(0, lattice.channels, GROUP):
+            k = index(min(start, last))
+            product = load_part(gradient, place + n * width + k, part) * load(values, slot + n * stride + k)
+            store(factors, n * stride + k, product)
+
+
+@inlined
+def _multiply_in_place(lattice, points, values, slot, factors):
+    """Multiply ``factors`` by the values of one more factor; registers do not overlap here, or some would count twice."""
+    chosen, count = points
+    stride = index(lattice.stride)
+    for point in range(count):
+        n = index(chosen[point])
+        for start in range(0, lattice.channels, GROUP):
+            at = n * stride + index(start)
+            store(factors, at, load(factors, at) * load(values, slot + at))
+
+
+@inlined
+def _factor_gradients(gradient, place, width, lattices, number, points, values, factors):
+    """Gradient of one factor at a block's points: that of the product, times the values of the other factors.
+
+    ``values`` holds what `interpolate_block` found for each lattice of the group, at its ``slot``.
+    """
+    lattice = lattices[number]
+    begun = lattice.group + (1 if number == lattice.group else 0)
+    _multiply(lattice, points, gradient, place, width, values, index(lattices[begun].slot), factors)
+    for other in range(begun + 1, lattice.group_end):
+        if other != number:
+            _multiply_in_place(lattice, points, values, index(lattices[other].slot), factors)
+
+
+@inlined
+def _rows_of(lattice, target, one, number, job, starts, copies):
+    """Which rows a job may write of a lattice in a pass (none: an empty range), and the address of the first row of all."""
+    if target.gradient == 0 or (number != one.pivot and (target.copy < 0 or one.copied == 0)):
+        return np.int64(0), np.int64(0), np.int64(0)
+    if number == one.pivot:
+        return starts[number, job], starts[number, job + 1], target.gradient
+    return np.int64(0), lattice.rows, target.gradient if job == 0 else copies + _FLOAT * target.copy
+
+
+@inlined
+def _clear(lattices, targets, starts, job, copies):
+    """Fill what a job owns of every gradient with zeros."""
+    for number in range(len(lattices)):
+        lattice, target = lattices[number], targets[number]
+        channels = lattice.channels
+        if target.gradient != 0:
+            if target.copy < 0:
+                owned = floats_at(target.gradient, lattice.rows * channels)
+                owned[starts[number, job] * channels : starts[number, job + 1] * channels] = ZERO
+            else:
+                copy = floats_at(target.gradient if job == 0 else copies + _FLOAT * target.copy, lattice.rows * channels)
+                copy[:] = ZERO
+
+
+@inlined
+def _points_of(positions, block, lattices, one, starts, job, scratch):
+    """Indices of a job's points in a block, and those whose copies it writes; corners of the pivot are found on the way."""
+    _, _, _, touched, led = scratch
+    if one.pivot < 0:
+        list_points(block[1], touched)
+        return list_points(block[1], led), block[1]
+    pivot, (entries, weights) = lattices[one.pivot], corners_of(scratch, one.pivot - one.first)
+    locate_block(positions, block, pivot, entries, weights)
+    owned = starts[one.pivot, job], starts[one.pivot, job + 1]
+    return _select_points(pivot, entries, block[1], owned, touched, led)
+
+
+@inlined
+def interpolate_group(lattices, first, end, points, scratch):
+    """Values of every factor of a product at a block's points."""
+    for number in range(first, end):
+        lattice, (entries, weights) = lattices[number], corners_of(scratch, number - first)
+        slot, stride = index(lattice.slot), index(lattice.stride)
+        interpolate_block(lattice, entries, weights, points, WRITE, scratch[1], slot, stride)
+
+
+@inlined
+def gradient_of(gradient, block, lattices, number, points, scratch):
+    """Where the gradient of a lattice's own values is found: flat array, place of the block's first point, and stride.
+
+    ``gradient`` is that of all features, flat, and their number.
+    """
+    flat, width = gradient
+    lattice = lattices[number]
+    place = block[0] * width + index(lattice.column)
+    if lattice.group_end - lattice.group == 1:
+        return flat, place, width
+    _factor_gradients(flat, place, width, lattices, number, points, scratch[1], scratch[2])
+    return scratch[2], index(0), index(lattice.stride)
+
+
+@inlined
+def _visit_block(positions, gradient, block, lattices, targets, one, starts, job, copies, scratch):
+    """Add the gradients of a job's points in a block to the rows that it may write in this pass."""
+    _, _, _, touched, led = scratch
+    count, leaders = _points_of(positions, block, lattices, one, starts, job, scratch)
+    if count > 0:
+        for number in range(one.first, one.end):
+            if number != one.pivot:
+                entries, weights = corners_of(scratch, number - one.first)
+                locate_block(positions, block, lattices[number], entries, weights)
+        if one.end - one.first > 1:
+            interpolate_group(lattices, one.first, one.end, (touched, count), scratch)
+        for number in range(one.first, one.end):
+            lattice, (entries, weights) = lattices[number], corners_of(scratch, number - one.first)
+            start, end, address = _rows_of(lattice, targets[number], one, number, job, starts, copies)
+            if start < end:
+                some = (touched, count) if number == one.pivot else (led, leaders)
+                source = gradient_of(gradient, block, lattices, number, some, scratch)
+                grad_rows = floats_at(address, lattice.rows * lattice.channels)
+                scatter_block(lattice, entries, weights, some, (start, end), source, grad_rows)
 
 
 @parallel
-def feature_gradients(positions, gradient, lattices, starts, targets, jobs):
-    """Gradients of all lattices' features, at the addresses ``targets``.
+def feature_gradients(positions, gradient, lattices, targets, passes, starts, copies, memory, sizes, jobs):
+    """Gradients of all lattices' features, at the addresses in ``targets``.
 
-    Each job owns a range of each lattice's rows, ``starts``, and adds to them in the order of the points: no row is written by
-    two jobs, and sums are the same for any number of them.
+    No row is written by two jobs. Of a large lattice, each job owns a range of rows, ``starts``; of a small one, a copy of its
+    own (the first job the gradient itself), to be added up by `add_copies`: ``copies`` are the address of the second job's and
+    the bytes of each job's. Either is written in the order of the points.
     """
     points = positions.shape[1]
     for job in prange(jobs):
-        entries, weights = np.empty(CORNERS * BLOCK, np.uint32), np.empty(CORNERS * BLOCK, np.float32)
-        for number in range(len(lattices)):
-            lattice = lattices[number]
-            grad_rows = floats_at(targets[number], lattice.rows * lattice.channels)
-            start, end = starts[number, job], starts[number, job + 1]
-            grad_rows[start * lattice.channels : end * lattice.channels] = ZERO
-            if start < end:
-                for first in range(0, points, BLOCK):
-                    block = index(first), min(BLOCK, points - first)
-                    locate_block(positions, block, lattice, entries, weights)
-                    _scatter_block(gradient, block, lattice, entries, weights, (start, end), grad_rows)
-
-
-@inlined
-def _dot_products(features, gradient, place, entries, n, lattice, sums):
-    """Products of a gradient with the features of the 8 corners, in the first values of ``sums``."""
-    channels = index(lattice.channels)
-    whole, rest = channels // LANES * LANES, channels % LANES
-    for corner in range(lattice.corners):
-        row, total = entries[index(corner * BLOCK) + n], broadcast(ZERO)
-        if row != EMPTY:
-            at = index(row) * channels
-            for start in range(0, whole, LANES):
-                k = index(start)
-                total = total + load(features, at + k) * load(gradient, place + k)
-            if rest > 0:
-                total = total + load_first(features, at + whole, rest) * load_first(gradient, place + whole, rest)
-        store(sums, index(corner) * LANES, total)
-    parts = (
-        load(sums, index(0)), load(sums, LANES), load(sums, index(2) * LANES), load(sums, index(3) * LANES),
-        load(sums, index(4) * LANES), load(sums, index(5) * LANES), load(sums, index(6) * LANES), load(sums, index(7) * LANES),
-    )  # fmt: skip
-    store(sums, index(0), reduce_sums(parts))
-
-
-@inlined
-def _axis(coordinate, size):
-    """Fraction within a cell, and cells along the axis, 0 where the position was clamped."""
-    _, fraction = axis_cell(coordinate, size - 1)
-    return fraction, np.float32(size - 1) if coordinate >= ZERO and coordinate <= ONE else ZERO
+        scratch, own = job_scratch(memory, sizes, job), copies[0] + copies[1] * (np.int64(job) - 1)
+        received = unowned(gradient), index(gradient.shape[1])
+        _clear(lattices, targets, starts, job, own)
+        for turn in range(len(passes)):
+            one = passes[turn]
+            alone = one.pivot >= 0
+            begin, end = (0, points) if alone else (job_start(points, jobs, job), job_start(points, jobs, job + 1))
+            for first in range(begin, end, BLOCK):
+                block = index(first), min(BLOCK, end - first)
+                _visit_block(positions, received, block, lattices, targets, one, starts, job, own, scratch)
 
 
 @parallel
-def position_gradient(positions, gradient, lattices, jobs, grad_unit):
-    """Gradient of the positions (3, m); zero on axes on which a position was clamped."""
-    points, width = positions.shape[1], index(gradient.shape[1])
+def add_copies(lattices, targets, copies, jobs):
+    """Add the other jobs' copies of small lattices' gradients to the first one's, in the order of the jobs."""
     for job in prange(jobs):
-        entries, weights = np.empty(CORNERS * BLOCK, np.uint32), np.empty(CORNERS * BLOCK, np.float32)
-        sums = np.empty(CORNERS * GROUP, np.float32)
-        begin, end = job_start(points, jobs, job), job_start(points, jobs, job + 1)
-        grad_unit[:, begin:end] = ZERO
-        for first in range(begin, end, BLOCK):
-            block = index(first), min(BLOCK, end - first)
-            for number in range(len(lattices)):
-                lattice = lattices[number]
-                locate_block(positions, block, lattice, entries, weights)
-                features = floats_at(lattice.features, lattice.rows * lattice.channels)
-                sums[:] = ZERO
-                for point in range(block[1]):
-                    n = index(point)
-                    i = block[0] + n
-                    _dot_products(features, gradient, i * width + index(lattice.column), entries, n, lattice, sums)
-                    x, y, z = index(lattice.axis0), index(lattice.axis1), index(lattice.axis2)
-                    f, a = _axis(positions[x, i], lattice.size0)
-                    g, b = _axis(positions[y, i], lattice.size1)
-                    h, c = _axis(positions[z, i], lattice.size2)
-                    v = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]
-                    along_x, along_y, along_z = trilinear_gradient(v, (f, g, h))
-                    grad_unit[x, i] += a * along_x
-                    grad_unit[y, i] += b * along_y
-                    grad_unit[z, i] += c * along_z
+        for number in range(len(lattices)):
+            lattice, target = lattices[number], targets[number]
+            size = lattice.rows * lattice.channels
+            if target.gradient != 0 and target.copy >= 0:
+                total = floats_at(target.gradient, size)
+                for other in range(jobs - 1):
+                    copy = floats_at(copies[0] + copies[1] * other + _FLOAT * target.copy, size)
+                    for at in range(job_start(size, jobs, job), job_start(size, jobs, job + 1)):
+                        total[index(at)] += copy[index(at)]

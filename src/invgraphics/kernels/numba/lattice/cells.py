@@ -1,4 +1,4 @@
-"""Corners of lattice cells and interpolation at them, for a block of points at a time; inlined into the kernels."""
+"""Lattices as kernels read them, and the corners of their cells around a block of points; inlined into the kernels."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from invgraphics.core.lattice import Combination, Lattice
-from invgraphics.kernels.numba.hash.cells import ONE, ZERO, axis_cell, trilinear_weights
-from invgraphics.kernels.numba.runtime import LANES, index, inlined
-from invgraphics.kernels.numba.simd.lanes import broadcast, load, store
-from invgraphics.kernels.numba.simd.partial import floats_at, load_first, store_first, words_at
+from invgraphics.kernels.numba.hash.cells import ONE, axis_cell, trilinear_weights
+from invgraphics.kernels.numba.runtime import GROUP, index, inlined
+from invgraphics.kernels.numba.simd.partial import floats_at, unsigned_at, words_at
 
 BLOCK = 128
 """Points whose corners are found together, vectorised, before features are read."""
@@ -34,12 +33,20 @@ RECORD = np.dtype(
             "column",  # first feature in the output
             "mode",
             *("group", "group_end"),  # lattices whose product an output is
+            *("slot", "stride"),  # first value, and values per point, in a block's scratch of the group's features
         )
     ]
 )
 """One lattice, as kernels read it."""
 
-_u32, _UNIT = np.uint32, index(1)
+_u32 = np.uint32
+_WORD = 4
+"""Bytes of all numbers in a job's scratch."""
+
+
+def padded(channels: int) -> int:
+    """Channels, rounded up to whole registers."""
+    return -(-channels // GROUP) * GROUP
 
 
 def records(lattices: Sequence[Lattice], combine: Combination) -> np.ndarray:
@@ -58,6 +65,8 @@ def records(lattices: Sequence[Lattice], combine: Combination) -> np.ndarray:
         before = 0 if combine in ("sum", "cp") else sum(lattices[k].channels for k in range(0, first, group))
         place["column"], place["group"], place["group_end"] = before, first, first + group
         place["mode"] = MULTIPLY if number > first else ADD if combine == "sum" and number else WRITE
+        place["stride"] = padded(lattice.channels)
+        place["slot"] = BLOCK * sum(padded(lattices[k].channels) for k in range(first, number))
     return table
 
 
@@ -140,55 +149,34 @@ def locate_block(positions, block, lattice, entries, weights):
                 entries[n] = _u32(row) if 0 <= row < most else EMPTY
 
 
-@inlined
-def _interpolate(features, corners, entries, weights, n, channels, k, part):
-    """Interpolate features k, k + 1, ... of the n-th point; ``part`` of them, if that is less than `LANES`."""
-    total = broadcast(ZERO)
-    for corner in range(corners):
-        at = index(corner * BLOCK) + n
-        if entries[at] != EMPTY:
-            place = index(entries[at]) * channels + k
-            values = load(features, place) if part == LANES else load_first(features, place, part)
-            total = total + weights[at] * values
-    return total
+def scratch_words(lattices: np.ndarray) -> tuple[int, int, int]:
+    """Sizes of a job's scratch: most lattices of a group, most values of a group in a block, and most of a lattice."""
+    groups = [lattices[first:end] for first, end in zip(lattices["group"], lattices["group_end"], strict=True)]
+    values = max(int(group["stride"].sum()) for group in groups)
+    return max(map(len, groups)), BLOCK * values, BLOCK * int(lattices["stride"].max())
+
+
+def job_words(sizes: tuple[int, int, int]) -> int:
+    """Words of each job's scratch (see `job_scratch`), in whole cache lines."""
+    members, group_values, lattice_values = sizes
+    return 2 * members * CORNERS * BLOCK + group_values + lattice_values + 2 * BLOCK
 
 
 @inlined
-def combine_into(out, at, part, mode, value):
-    """Write, add or multiply the first lanes to the output."""
-    if mode == ADD:
-        value = value + (load(out, at) if part == LANES else load_first(out, at, part))
-    elif mode == MULTIPLY:
-        value = value * (load(out, at) if part == LANES else load_first(out, at, part))
-    if part == LANES:
-        store(out, at, value)
-    else:
-        store_first(out, at, part, value)
+def job_scratch(memory, sizes, job):
+    """Scratch of a job, at an address: of corners, of a group's values, of a factor's gradient, and two lists of points."""
+    members, group_values, lattice_values = sizes
+    corners = 2 * members * CORNERS * BLOCK
+    first = memory + _WORD * np.int64(job) * (corners + group_values + lattice_values + 2 * BLOCK)
+    values = first + _WORD * corners
+    factors = values + _WORD * group_values
+    chosen = factors + _WORD * lattice_values
+    lists = unsigned_at(chosen, BLOCK), unsigned_at(chosen + _WORD * BLOCK, BLOCK)
+    return first, floats_at(values, group_values), floats_at(factors, lattice_values), lists[0], lists[1]
 
 
 @inlined
-def encode_block(positions, block, lattice, entries, weights, out, target):
-    """Interpolate one lattice at the points of a block, into ``out`` from row ``target`` on.
-
-    Args:
-        positions: float32 (3, m) in the unit cube; clamped, NaN counts as 0.
-        block: first point and number of points, at most `BLOCK`.
-        lattice: a `RECORD`, whose ``column`` and ``mode`` say where the features go.
-        entries: uint32 scratch of `CORNERS` x `BLOCK`.
-        weights: float32 scratch of that size.
-        out: contiguous float32 (points, width).
-        target: row of ``out`` of the block's first point (uint64).
-    """
-    locate_block(positions, block, lattice, entries, weights)
-    channels, corners, mode = index(lattice.channels), lattice.corners, lattice.mode
-    features, width, column = floats_at(lattice.features, lattice.rows * lattice.channels), index(out.shape[1]), lattice.column
-    whole, rest = channels // LANES * LANES, channels % LANES
-    for number in range(block[1]):
-        n = index(number)
-        at = (target + n) * width + index(column)
-        for start in range(0, whole, LANES):
-            k = index(start)
-            combine_into(out, at + k, LANES, mode, _interpolate(features, corners, entries, weights, n, channels, k, LANES))
-        if rest > 0:
-            value = _interpolate(features, corners, entries, weights, n, channels, whole, rest)
-            combine_into(out, at + whole, rest, mode, value)
+def corners_of(scratch, member):
+    """Rows and weights of the corners (see `locate_block`) of a group's ``member``."""
+    first = scratch[0] + 2 * _WORD * CORNERS * BLOCK * member
+    return unsigned_at(first, CORNERS * BLOCK), floats_at(first + _WORD * CORNERS * BLOCK, CORNERS * BLOCK)

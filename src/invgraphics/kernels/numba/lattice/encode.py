@@ -14,25 +14,58 @@ from torch import Tensor
 
 from invgraphics.core.lattice import Combination, Lattice
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.lattice.backward import factor_gradients, feature_gradients, position_gradient, split_rows
-from invgraphics.kernels.numba.lattice.cells import BLOCK, CORNERS, encode_block, records
+from invgraphics.kernels.numba.lattice.backward import (
+    TARGET,
+    add_copies,
+    feature_gradients,
+    list_points,
+    passes_over,
+    split_rows,
+)
+from invgraphics.kernels.numba.lattice.cells import (
+    BLOCK,
+    corners_of,
+    job_scratch,
+    job_words,
+    locate_block,
+    padded,
+    records,
+    scratch_words,
+)
+from invgraphics.kernels.numba.lattice.positions import position_gradient
+from invgraphics.kernels.numba.lattice.rows import interpolate_block
 from invgraphics.kernels.numba.runtime import array, index, job_start, once_differentiable, parallel, prange, scratch, threads
+from invgraphics.kernels.numba.simd.partial import unowned
 
 MOST_ROWS = 2**32 - 1
 """Vertices and rows that 32 bits can number, one number aside for empty vertices."""
 
 
+ALONE = (1, 0, 0)
+"""Sizes of the forward pass's scratch: the corners of one lattice at a time."""
+
+
+def memory_of(sizes: tuple[int, int, int], jobs: int) -> int:
+    """Address of the scratch of all jobs, until the next call."""
+    return scratch("lattice", jobs * job_words(sizes)).ctypes.data
+
+
 @parallel
-def encode(positions, lattices, jobs, out):
-    """Combined features of all lattices at each point; ``positions`` is (3, m)."""
-    points = positions.shape[1]
+def encode(positions, lattices, memory, jobs, out):
+    """Combined features of all lattices at each point; ``positions`` is (3, m), ``memory`` the address of the jobs' scratch."""
+    points, width = positions.shape[1], index(out.shape[1])
     for job in prange(jobs):
-        entries, weights = np.empty(CORNERS * BLOCK, np.uint32), np.empty(CORNERS * BLOCK, np.float32)
+        scratch, flat = job_scratch(memory, ALONE, job), unowned(out)
+        (entries, weights), chosen = corners_of(scratch, 0), scratch[3]
         begin, end = job_start(points, jobs, job), job_start(points, jobs, job + 1)
-        for first in range(begin, end, BLOCK):
-            block = index(first), min(BLOCK, end - first)
+        for start in range(begin, end, BLOCK):
+            block = index(start), min(BLOCK, end - start)
+            some = chosen, list_points(block[1], chosen)
             for number in range(len(lattices)):
-                encode_block(positions, block, lattices[number], entries, weights, out, block[0])
+                lattice = lattices[number]
+                locate_block(positions, block, lattice, entries, weights)
+                place = block[0] * width + index(lattice.column)
+                interpolate_block(lattice, entries, weights, some, lattice.mode, flat, place, width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +90,8 @@ class _Encode(torch.autograd.Function):
     def forward(ctx: Any, unit: Tensor, shape: _Shape, *features: Tensor) -> Tensor:
         table = shape.records_of(features)
         out = unit.new_empty(len(unit), int((table["column"] + table["channels"]).max()))
-        encode(array(unit.T), table, threads(), out.numpy())
+        jobs = threads()
+        encode(array(unit.T), table, memory_of(ALONE, jobs), jobs, out.numpy())
         ctx.save_for_backward(unit, *features)
         ctx.shape = shape
         return out
@@ -81,25 +115,15 @@ class _Gradient(torch.autograd.Function):
         ctx.save_for_backward(unit, gradient, *features)
         ctx.shape, ctx.wanted = shape, wanted
         table, positions, received = shape.records_of(features), array(unit.T), array(gradient)
-        if shape.combine in ("vm", "cp"):
-            separate = shape.records_of(features, "concat")
-            total = int(separate["channels"].sum())
-            products = scratch("lattice.factors", len(unit) * total).reshape(len(unit), total)
-            separate["group"], separate["group_end"] = table["group"], table["group_end"]
-            factor_gradients(positions, received, table, separate, threads(), products)
-            table, received = separate, products
-        found = []
+        found, sizes, jobs = [], scratch_words(table), threads()
         if wanted[0]:
             grad_unit = torch.empty(3, len(unit))
-            position_gradient(positions, received, table, threads(), grad_unit.numpy())
+            position_gradient(positions, received, table, memory_of(sizes, jobs), sizes, jobs, grad_unit.numpy())
             found.append(grad_unit.T)
-        chosen = np.array(wanted[1:])
-        if chosen.any():
-            grad_features = [torch.empty(values.shape) for values, want in zip(features, chosen, strict=True) if want]
-            addresses = np.array([values.data_ptr() for values in grad_features], np.int64)
-            jobs, table = threads(), table[chosen]
-            feature_gradients(positions, received, table, split_rows(positions, table, jobs), addresses, jobs)
-            found += grad_features
+        if any(wanted[1:]):
+            grad_features = [torch.empty(x.shape) if want else None for x, want in zip(features, wanted[1:], strict=True)]
+            _feature_gradients(positions, received, table, grad_features)
+            found += [x for x in grad_features if x is not None]
         return tuple(found)
 
     @staticmethod
@@ -116,6 +140,23 @@ class _Gradient(torch.autograd.Function):
             found = iter(torch.autograd.grad(first, asked, grad_outputs, allow_unused=True))
         grad_unit, grad_gradient, *grad_features = [next(found) if need else None for need in needed]
         return grad_unit, grad_gradient, None, None, *grad_features
+
+
+def _feature_gradients(positions: np.ndarray, gradient: np.ndarray, table: np.ndarray, out: Sequence[Tensor | None]) -> None:
+    """Fill ``out``; lattices without a tensor there are left out."""
+    jobs, targets, size = threads(), np.zeros(len(table), TARGET), 0
+    for k, tensor in enumerate(out):
+        rows, channels = int(table["rows"][k]), int(table["channels"][k])
+        targets["gradient"][k], targets["copy"][k] = 0 if tensor is None else tensor.data_ptr(), -1
+        # A copy is filled and added up once, which must cost less than what it saves at every point.
+        if tensor is not None and (jobs == 1 or rows * jobs <= positions.shape[1]):
+            targets["copy"][k], size = size, size + padded(rows * channels)
+    copies, passes = (scratch("lattice.copies", size * (jobs - 1)).ctypes.data, 4 * size), passes_over(table, targets)
+    starts = split_rows(positions, table, jobs if (passes["pivot"] >= 0).any() else 1)
+    sizes = scratch_words(table)
+    feature_gradients(positions, gradient, table, targets, passes, starts, copies, memory_of(sizes, jobs), sizes, jobs)
+    if size and jobs > 1:
+        add_copies(table, targets, copies, jobs)
 
 
 def lattice_encode(

@@ -18,7 +18,7 @@ from invgraphics.kernels.numba.hash.cells import BLOCK
 from invgraphics.kernels.numba.hash.encode import levels_of
 from invgraphics.kernels.numba.ngp.dense import POINTS
 from invgraphics.kernels.numba.ngp.network import ACTIVATIONS, activate_density, encode, mlp, pack_network, radial_scale
-from invgraphics.kernels.numba.ngp.queue import EDGE, current_interval, empty_queue, next_samples, terminate
+from invgraphics.kernels.numba.ngp.queue import EDGE, current_interval, empty_queue, next_samples, queue_memory, terminate
 from invgraphics.kernels.numba.rays.composite import interval_alpha
 from invgraphics.kernels.numba.rays.march import MAX_INTERVALS, max_steps, pack_intervals, traversal_setup
 from invgraphics.kernels.numba.runtime import array, inlined, parallel, prange, scratch, threads
@@ -28,7 +28,7 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
 @inlined
-def _append_interval(s, raw, scale, queue, far, settings, rows, counts):
+def append_interval(s, raw, scale, queue, far, settings, rows, counts):
     """Append the interval of slot ``s`` to its ray's row; terminate the ray below ``min_transmittance``.
 
     ``scale`` multiplies the density of ``raw``.
@@ -46,7 +46,7 @@ def _append_interval(s, raw, scale, queue, far, settings, rows, counts):
 
 
 @parallel
-def march_visible(rays, setup, table, levels, density_net, settings, jobs, rows, counts):
+def march_visible(rays, setup, table, levels, density_net, settings, queues, jobs, rows, counts):
     """Intervals of every ray up to its termination: starts and ends in ``rows`` (2, n, limit), ``counts`` of them (0 before).
 
     Arguments as in `ngp.render.render`; ``settings`` are density activation, bias, minimum transmittance, and
@@ -57,14 +57,14 @@ def march_visible(rays, setup, table, levels, density_net, settings, jobs, rows,
         entries, weights = np.empty((2, 8 * BLOCK), np.uint32), np.empty((2, 8 * BLOCK), np.float32)
         points, size = np.zeros((3, POINTS), np.float32), sizes.max() * POINTS
         x, ping, pong = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
-        queue = empty_queue()
+        queue = empty_queue(queues, job)
         while next_samples((job, jobs, EDGE), rays, setup, queue, points):
             encode(table, levels, points, entries, weights, x)
             raw = mlp(density_net, x, ping, pong)
             for p in range(POINTS):
                 if queue.slots[p] >= 0:
                     scale = settings[3] * radial_scale(points, p) if settings[3] > _ZERO else _ONE
-                    _append_interval(queue.slots[p], raw[p], scale, queue, rays[3], settings, rows, counts)
+                    append_interval(queue.slots[p], raw[p], scale, queue, rays[3], settings, rows, counts)
 
 
 @torch.no_grad()
@@ -97,7 +97,7 @@ def ngp_march(
         batch_rays = tuple(array(x[first : first + batch]) for x in (rays.origins, rays.directions, start, rays.far))
         n = len(batch_rays[2])
         rows, counts = scratch("reached", 2 * n * limit).reshape(2, n, limit), np.zeros(n, np.int64)
-        march_visible(batch_rays, setup, *model, settings, threads(), rows, counts)
+        march_visible(batch_rays, setup, *model, settings, queue_memory(threads()), threads(), rows, counts)
         found.append(pack_intervals(rows[0], rows[1], counts, first))
     ray, t0, t1 = (torch.cat(columns) for columns in zip(*found, strict=True))
     return March(ray, t0, t1, torch.maximum(start, rays.far))

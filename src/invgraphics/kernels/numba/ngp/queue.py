@@ -25,6 +25,7 @@ from invgraphics.kernels.numba.rays.traversal import (
 )
 from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined
 from invgraphics.kernels.numba.simd.lanes import load, store
+from invgraphics.kernels.numba.simd.partial import doubles_at, floats_at, longs_at
 
 AHEAD = 16
 """Occupied intervals of a ray that are marched ahead and buffered."""
@@ -85,19 +86,42 @@ class RayQueue(NamedTuple):
     march_state: np.ndarray
 
 
+_FLOATS = (POINTS, 6 * POINTS, *2 * [(SLOTS + 1) * ROW], *3 * [SLOTS], 16 * SLOTS, RAY_FLOATS * GROUP, STATE_FLOATS * GROUP)
+"""Numbers of float32 values: midpoints, lane_rays, t0, t1, steps, resume, error, harmonics, march_rays, march_state."""
+_FLOATS_AT = tuple(8 * int(sum(-(-int(size) // 2) for size in _FLOATS[:k])) for k in range(len(_FLOATS) + 1))
+"""First byte of each, and of what follows them: int64 and float64 numbers."""
+_LONGS = (int(POINTS), *3 * [SLOTS], (FREE + 1) * SLOTS, SCHEDULED + 1, SLOTS)
+"""Numbers of those: slots, ray_index, buffered, consumed, lists, counts, transmittance."""
+_LONGS_AT = tuple(_FLOATS_AT[-1] + 8 * sum(_LONGS[:k]) for k in range(len(_LONGS)))
+QUEUE_BYTES = _LONGS_AT[-1] + 8 * _LONGS[-1]
+"""Memory of a job's queue."""
+
+
+def queue_memory(jobs: int) -> np.ndarray:
+    """Zeros for the queues of all jobs."""
+    return np.zeros((jobs, QUEUE_BYTES // 8), np.int64)
+
+
 @inlined
-def empty_queue():
-    """A queue without rays: all slots free, all batch lanes idle."""
+def empty_queue(memory, job):
+    """A queue without rays, all slots free, all batch lanes idle, in a job's part of `queue_memory`.
+
+    Its arrays are not counted (see `simd.partial`).
+    """
+    at = np.int64(memory.ctypes.data) + QUEUE_BYTES * np.int64(job)
+    f, n = _FLOATS_AT, _LONGS_AT
     queue = RayQueue(
-        np.full(POINTS, -1, np.int64), np.zeros(POINTS, np.float32), np.zeros(6 * POINTS, np.float32),
-        np.zeros(SLOTS, np.int64),
+        longs_at(at + n[0], int(POINTS)), floats_at(at + f[0], POINTS), floats_at(at + f[1], 6 * POINTS),
+        longs_at(at + n[1], SLOTS),
         # One row more, for lanes that have no ray.
-        np.zeros((SLOTS + 1) * ROW, np.float32), np.zeros((SLOTS + 1) * ROW, np.float32),
-        np.zeros(SLOTS, np.int64), np.zeros(SLOTS, np.int64),
-        np.zeros(SLOTS, np.float32), np.zeros(SLOTS, np.float32), np.zeros(SLOTS, np.float64), np.zeros(SLOTS, np.float32),
-        np.zeros(16 * SLOTS, np.float32), np.zeros((FREE + 1, SLOTS), np.int64), np.zeros(SCHEDULED + 1, np.int64),
-        np.zeros(RAY_FLOATS * GROUP, np.float32), np.zeros(STATE_FLOATS * GROUP, np.float32),
+        floats_at(at + f[2], (SLOTS + 1) * ROW), floats_at(at + f[3], (SLOTS + 1) * ROW),
+        longs_at(at + n[2], SLOTS), longs_at(at + n[3], SLOTS),
+        floats_at(at + f[4], SLOTS), floats_at(at + f[5], SLOTS), doubles_at(at + n[6], SLOTS), floats_at(at + f[6], SLOTS),
+        floats_at(at + f[7], 16 * SLOTS), longs_at(at + n[4], (FREE + 1, SLOTS)), longs_at(at + n[5], SCHEDULED + 1),
+        floats_at(at + f[8], RAY_FLOATS * GROUP), floats_at(at + f[9], STATE_FLOATS * GROUP),
     )  # fmt: skip
+    for p in range(POINTS):
+        queue.slots[p] = -1
     for s in range(SLOTS):
         _push(queue, FREE, s)
     return queue

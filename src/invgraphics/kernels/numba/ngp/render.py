@@ -28,7 +28,15 @@ from invgraphics.kernels.numba.ngp.network import (
     sigmoid,
     softplus,
 )
-from invgraphics.kernels.numba.ngp.queue import EDGE, current_interval, empty_queue, harmonics_offset, next_samples, terminate
+from invgraphics.kernels.numba.ngp.queue import (
+    EDGE,
+    current_interval,
+    empty_queue,
+    harmonics_offset,
+    next_samples,
+    queue_memory,
+    terminate,
+)
 from invgraphics.kernels.numba.rays.composite import interval_alpha
 from invgraphics.kernels.numba.rays.march import traversal_setup
 from invgraphics.kernels.numba.runtime import LANES, array, index, inlined, parallel, prange, threads
@@ -38,10 +46,10 @@ _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
 @inlined
-def _composite_sample(s, raw, scale, queue, far, settings, sums, alpha):
+def composite_sample(s, raw, scale, queue, far, settings, sums, alpha):
     """Composite the sample of slot ``s``; return the weight of its colour, 0 below the error budget.
 
-    ``scale`` multiplies the density of ``raw``.
+    ``scale`` multiplies the density of ``raw``; of ``settings`` (see `render`) those of colour are not looked at.
     """
     activation, bias, _, _, min_transmittance, max_error, _ = settings
     r = queue.ray_index[s]
@@ -81,7 +89,7 @@ def _shade_queue(network, colour_inputs, ping, pong, sample_rays, weights, count
 
 
 @parallel
-def render(rays, setup, table, levels, density_net, colour_net, widest, settings, width, jobs, sums, alpha):
+def render(rays, setup, table, levels, density_net, colour_net, widest, settings, width, queues, jobs, sums, alpha):
     """Sums of w * (radiance, distance) and of w for every ray; both outputs hold zeros before.
 
     Args:
@@ -95,6 +103,7 @@ def render(rays, setup, table, levels, density_net, colour_net, widest, settings
         settings: density activation, bias, whether radiance is linear, bands, minimum transmittance, error budget,
             `FusedNGP.contracted_density`.
         width: image width in pixels.
+        queues: see `queue.queue_memory`.
         jobs: number of jobs.
         sums: output (n, 4).
         alpha: output (n,).
@@ -108,14 +117,14 @@ def render(rays, setup, table, levels, density_net, colour_net, widest, settings
         ping, pong = np.zeros(size, np.float32), np.zeros(size, np.float32)
         ping_colour, pong_colour = np.zeros(size, np.float32), np.zeros(size, np.float32)
         sample_rays, weights, queued = np.zeros(POINTS, np.int64), np.zeros(POINTS, np.float32), 0
-        queue = empty_queue()
+        queue = empty_queue(queues, job)
         while next_samples((job, jobs, width), rays, setup, queue, points):
             encode(table, levels, points, entries, encoding_weights, x)
             raw = mlp(density_net, x, ping, pong)
             for p in range(POINTS):
                 s = queue.slots[p]
                 scale = settings[6] * radial_scale(points, p) if settings[6] > _ZERO else _ONE
-                weight = _composite_sample(s, raw[p], scale, queue, rays[3], settings, sums, alpha) if s >= 0 else _ZERO
+                weight = composite_sample(s, raw[p], scale, queue, rays[3], settings, sums, alpha) if s >= 0 else _ZERO
                 if weight > _ZERO:
                     _enqueue_sample(p, s, raw, queue.harmonics, queued, latents, bands_squared, colour_inputs)
                     sample_rays[queued], weights[queued] = queue.ray_index[s], weight
@@ -158,5 +167,5 @@ def ngp_render(
     model = array(field.table).reshape(-1), levels_of(field.grid), density_net, colour_net, widest
     setup, outputs = traversal_setup(occupied, bounds, steps), (sums.numpy(), alpha.numpy())
     # Rays that are no image are scheduled in order, as an image as wide as one block.
-    render(batch_rays, setup, *model, settings, width or EDGE, threads(), *outputs)
+    render(batch_rays, setup, *model, settings, width or EDGE, queue_memory(threads()), threads(), *outputs)
     return sums, alpha

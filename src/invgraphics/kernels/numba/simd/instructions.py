@@ -136,6 +136,18 @@ def prefetch(typing: Any, array: Any, row: Any) -> Any:
 
 
 @_intrinsic
+def prefetch_at(typing: Any, flat: Any, at: Any) -> Any:
+    """Prefetch the cache line of a flat array's element ``at`` (uint64), which may lie beyond its end."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        _emit_prefetch(builder, builder.gep(data, [arguments[1]]))
+        return context.get_dummy_value()
+
+    return types.void(flat, types.uint64), generate
+
+
+@_intrinsic
 def prefetch_pair(typing: Any, table: Any, entry: Any) -> Any:
     """`prefetch` of both features of an entry (uint32) of a flat table."""
 

@@ -123,6 +123,38 @@ read_3, write_3 = _row_access(3)
 read_4, write_4 = _row_access(4)
 
 
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+    """Transpose of as many registers as lanes: each stage swaps the off-diagonal blocks of twice the size (Eklundh 1972)."""
+    block = 1
+    while block < GROUP:
+        for k in (k for k in range(GROUP) if not k & block):
+            low, high = rows[k], rows[k + block]
+            # Lane l of ``high`` is source `GROUP` + l.
+            upper = [lane & block for lane in range(GROUP)]
+            rows[k] = _shuffle(builder, low, high, [GROUP + n - block if up else n for n, up in enumerate(upper)])
+            rows[k + block] = _shuffle(builder, low, high, [GROUP + n if up else n + block for n, up in enumerate(upper)])
+        block *= 2
+    return rows
+
+
+@_intrinsic
+def transpose(typing: Any, source: Any, at: Any, stride: Any, target: Any, to: Any, target_stride: Any) -> Any:
+    """Transpose a block of `LANES` x `LANES` values of a flat array, from ``at`` on, into another one (all uint64)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def places(number: int) -> list[Any]:
+            first, _ = _pointer(context, builder, signature.args[number], arguments[number], [arguments[number + 1]])
+            steps = [builder.mul(arguments[number + 2], ir.Constant(_LONG, k)) for k in range(GROUP)]
+            return [_vector_at(builder, builder.gep(first, [step]), GROUP) for step in steps]
+
+        rows = [builder.load(place, align=4) for place in places(0)]
+        for row, place in zip(_transposed(builder, rows), places(3), strict=True):
+            builder.store(row, place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, types.uint64, types.uint64, target, types.uint64, types.uint64), generate
+
+
 def _block_access(channels: int) -> tuple[Any, Any]:
     """Intrinsics that load and store blocks of images of so many channels."""
     row = _EDGE * channels

@@ -1,0 +1,122 @@
+"""Settings of neural fields (`invgraphics.fields.neural`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+from invgraphics.config import Slot
+from invgraphics.core import harmonics
+from invgraphics.fields.density import Activation, Interpolation
+from invgraphics.fields.encodings.frequency import FrequencyConfig, frequency_width
+from invgraphics.fields.encodings.voxels import VoxelsConfig
+
+
+@dataclass(frozen=True)
+class NeuralSettings:
+    """An encoding and two networks; grids can do without either, and colour can have an encoding of its own.
+
+    Attributes:
+        encoding: position to features.
+        geometry: what the first network says: volume density, or signed distance (started as a sphere).
+        layers: hidden layers of the geometry network.
+        width: features of each.
+        skip: hidden layer after which the encoding is concatenated once more, counted from 0; -1 for none.
+        geometry_features: features that the geometry network hands to the colour network.
+        colour_layers: hidden layers of the colour network.
+        colour_width: features of each.
+        direction: how the colour network sees the viewing direction; ``none`` makes colour independent of it.
+        direction_degree: octaves for ``frequency``; bands for ``sh``, 1 to 4.
+        density_activation: ``exp`` stops growing at exp(15); not used for ``sdf``.
+        density_bias: added before that activation (mip-NeRF: softplus and -1).
+        density_per: unit of length of the network's density. ``contracted``: in a contracted space, the box's half-extent after
+            contraction along the radius, so that a new field is as thin a fog all the way to infinity as in a box. ``half``:
+            the same, and in a box its half-extent.
+        density_scale: factor of the density after its activation: with ``half``, half the number of voxels along an edge makes
+            it a density per voxel, as in DVGO.
+        density_interpolation: whether raw values of a voxel grid are activated after interpolation, before it (``in``), or made
+            opacities before it (``pre``); see `DensityActivation`.
+        appearance: a second encoding, which only colour sees (DVGO, TensoRF); ``None``: colour sees what geometry hands on.
+        appearance_basis: features that a linear map without bias makes of the second encoding's (TensoRF: 27); 0 for no map.
+        feature_octaves: octaves of sine and cosine of the colour network's features that are appended to them (TensoRF: 2).
+        geometry_head: ``none``: raw geometry is the encoding's first feature, the others are handed on to colour; of products
+            (``vm``, ``cp``) it is the sum of all. No geometry network then.
+        head: how colour comes from features. ``sh``: they are coefficients of spherical harmonics in the direction, the
+            (degree + 1)^2 of red first; ``none``: they are the raw colour, alike from all sides. No colour network then.
+        hidden_activation: of both networks' hidden layers; those of signed distances are a sharp softplus in any case.
+        colour_activation: of raw colour. ``sigmoid``: softplus in scenes of linear colour; ``clamp``: max(0, 0.5 + x), as
+            Plenoxels and 3DGS do it, with the gradient of a projection.
+        colour_padding: how far the sigmoid exceeds [0, 1] at both ends, so that black and white can be reached (0.001 in EG3D
+            and mip-NeRF).
+    """
+
+    encoding: Annotated[Any, Slot("encodings")] = field(default_factory=FrequencyConfig)
+    geometry: Literal["density", "sdf"] = "density"
+    layers: int = 8
+    width: int = 256
+    skip: int = 4
+    geometry_features: int = 256
+    colour_layers: int = 1
+    colour_width: int = 128
+    direction: Literal["frequency", "sh", "none"] = "frequency"
+    direction_degree: int = 4
+    density_activation: Activation = "softplus"
+    density_bias: float = -1.0
+    density_per: Literal["local", "contracted", "half"] = "local"
+    density_scale: float = 1.0
+    density_interpolation: Interpolation = "post"
+    appearance: Annotated[Any, Slot("encodings")] | None = None
+    appearance_basis: int = 0
+    feature_octaves: int = 0
+    geometry_head: Literal["mlp", "none"] = "mlp"
+    head: Literal["mlp", "sh", "none"] = "mlp"
+    hidden_activation: Literal["relu", "softplus"] = "relu"
+    colour_activation: Literal["sigmoid", "clamp"] = "sigmoid"
+    colour_padding: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.layers < 0 or self.colour_layers < 0:
+            raise ValueError("layers and colour_layers cannot be negative.")
+        if min(self.width, self.colour_width) < 1 or self.geometry_features < 0:
+            raise ValueError("width and colour_width must be at least 1, geometry_features at least 0.")
+        if not -1 <= self.skip < self.layers:
+            raise ValueError(f"skip must name one of the {self.layers} hidden layers (from 0) or be -1, not {self.skip}.")
+        if self.direction == "sh" and not 1 <= self.direction_degree <= harmonics.MAX_DEGREE + 1:
+            raise ValueError(f"direction_degree must be 1 to {harmonics.MAX_DEGREE + 1} for 'sh', not {self.direction_degree}.")
+        if self.direction_degree < 0:
+            raise ValueError("direction_degree cannot be negative.")
+        blind = self.appearance is None and self.geometry_head == "mlp" and self.geometry_features == 0
+        if blind and (self.direction == "none" or self.head != "mlp"):
+            raise ValueError("with geometry_features = 0 and direction = 'none' colour would be the same everywhere.")
+        self._check_heads()
+        self._check_density()
+
+    @property
+    def direction_width(self) -> int:
+        """Number of features of a direction."""
+        widths = {"frequency": frequency_width(self.direction_degree), "sh": self.direction_degree**2, "none": 0}
+        return widths[self.direction]
+
+    @property
+    def two_plain_networks(self) -> bool:
+        """Whether colour and geometry are ReLU networks over one encoding, as fused kernels take them."""
+        networks = self.geometry_head == self.head == "mlp" and self.hidden_activation == "relu"
+        plain_colour = self.colour_activation == "sigmoid" and self.colour_padding == 0
+        return networks and plain_colour and self.appearance is None and self.feature_octaves == 0
+
+    def _check_heads(self) -> None:
+        if min(self.appearance_basis, self.feature_octaves) < 0 or not 0 <= self.colour_padding < 1:
+            raise ValueError("appearance_basis and feature_octaves cannot be negative, colour_padding is in [0, 1).")
+        if self.appearance_basis and self.appearance is None:
+            raise ValueError("appearance_basis needs an appearance encoding.")
+        if self.feature_octaves and self.head != "mlp":
+            raise ValueError("feature_octaves are inputs of a colour network: they need head = 'mlp'.")
+
+    def _check_density(self) -> None:
+        if self.density_scale <= 0:
+            raise ValueError(f"density_scale must be above 0, not {self.density_scale}.")
+        if self.geometry == "sdf" and self.geometry_head == "none":
+            raise ValueError("a signed distance needs geometry_head = 'mlp'.")
+        grid = isinstance(self.encoding, VoxelsConfig) and self.encoding.levels == 1 and self.geometry_head == "none"
+        if self.density_interpolation != "post" and not grid:
+            raise ValueError("density_interpolation other than 'post' needs voxels of one level and geometry_head = 'none'.")

@@ -1,0 +1,140 @@
+"""Pruning of sparse voxel grids by the weight that training rays give them (Plenoxels, Fridovich-Keil et al. 2022, §3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, cast, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
+from typing_extensions import override
+
+from invgraphics.core import RayRenderer
+from invgraphics.core.lattice import LatticeEncoding, LatticeField
+from invgraphics.errors import InputError
+from invgraphics.training.hooks import FitState, Hook
+from invgraphics.training.penalties import LATTICES
+
+
+@runtime_checkable
+class Prunable(Protocol):
+    """Protocol of sparse grids: their links, and how vertices are emptied."""
+
+    links: Tensor
+    rows: Tensor
+
+    def keep(self, kept: Bool[Tensor, "x y z"]) -> Int[Tensor, " k"]:
+        """Empty all vertices but those ``kept``; returns the old rows of those left."""
+        ...
+
+
+@dataclass(frozen=True)
+class PruneConfig:
+    """Emptying of voxels that no training ray sees with weight, at given points of the fit.
+
+    Attributes:
+        at: progress of each pruning, increasing. Where an up-sampling has the same progress, the hook that comes first in the
+            recipe acts first (Plenoxels prunes while it resamples).
+        weight: a vertex is kept that has a sample of this weight in one of its cells, times 1 / vertices along z (Plenoxels:
+            0.256).
+        dilation: vertices around it that are kept too (Plenoxels: 2).
+        rays: random training rays that are looked at (Plenoxels: all).
+    """
+
+    at: tuple[float, ...]
+    weight: float = 0.256
+    dilation: int = 2
+    rays: int = 1 << 16
+
+    def __post_init__(self) -> None:
+        if not self.at or list(self.at) != sorted(set(self.at)) or not 0 < self.at[0] <= self.at[-1] < 1:
+            raise ValueError(f"'at' needs increasing numbers between 0 and 1, not {list(self.at)}.")
+        if self.weight < 0 or self.dilation < 0 or self.rays < 1:
+            raise ValueError("'weight' and 'dilation' must not be negative, and 'rays' must be at least 1.")
+
+    def build(self) -> Prune:
+        """The hook."""
+        return Prune(self)
+
+
+class Prune(Hook):
+    """Empties vertices of all sparse grids of a field, before the step whose progress has come to the next of ``at``."""
+
+    name = "prune"
+    requires = LATTICES
+
+    def __init__(self, config: PruneConfig) -> None:
+        self._config = config
+        self._done = 0
+
+    @override
+    def before_step(self, state: FitState) -> None:
+        due = sum(progress <= state.ctx.progress for progress in self._config.at)
+        if due <= self._done:
+            return
+        self._done = due
+        encodings = list(cast(LatticeField, state.field).lattice_encodings().values())
+        grids = [encoding for encoding in encodings if isinstance(encoding, Prunable)]
+        if not grids or not isinstance(state.renderer, RayRenderer):
+            raise InputError(f"The hook '{self.name}' needs sparse voxel grids and a renderer of rays.")
+        positions, weights = ray_weights(state, state.renderer, self._config.rays)
+        unit = cast(LatticeField, state.field).bounds.to_unit(positions)
+        for grid in grids:
+            size = cast(LatticeEncoding, grid).resolution
+            seen = heaviest(unit, weights, size) >= self._config.weight / size[2]
+            prune(state, grid, dilated(seen, self._config.dilation))
+
+    @override
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"done": torch.tensor(self._done)}
+
+    @override
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self._done = int(state["done"])
+
+
+@torch.no_grad()
+def ray_weights(state: FitState, renderer: RayRenderer, count: int) -> tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]:
+    """Positions and weights of the samples on ``count`` random training rays, drawn from the context's generator."""
+    cameras = [view.camera for view in state.scene.train]
+    ctx = replace(state.ctx, training=False)
+    share = -(-count // len(cameras))
+    positions, weights = [], []
+    for camera in cameras:
+        size = torch.tensor([camera.width, camera.height])
+        pixels = torch.rand(share, 2, generator=state.ctx.generator) * size
+        _, trace = renderer.render_rays(state.field, camera.rays(pixels).to(ctx.bounds.lo.device), ctx)
+        assert trace.samples is not None
+        assert trace.weights is not None
+        positions.append(trace.samples.position)
+        weights.append(trace.weights)
+    return torch.cat(positions), torch.cat(weights)
+
+
+def heaviest(unit: Float[Tensor, "m 3"], weights: Float[Tensor, " m"], resolution: Sequence[int]) -> Float[Tensor, "x y z"]:
+    """Largest weight of a sample in one of the cells around each vertex; samples outside the unit cube do not count."""
+    inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
+    unit, weights = unit[inside], weights[inside]
+    cells = torch.tensor(resolution, device=unit.device) - 1
+    base = torch.minimum((unit * cells).long(), cells - 1)
+    found = weights.new_zeros(tuple(resolution)).flatten()
+    for corner in torch.cartesian_prod(*[torch.arange(2, device=unit.device)] * 3):
+        x, y, z = (base + corner).unbind(dim=1)
+        found.scatter_reduce_(0, (x * resolution[1] + y) * resolution[2] + z, weights, reduce="amax")
+    return found.reshape(tuple(resolution))
+
+
+def dilated(mask: Bool[Tensor, "x y z"], by: int) -> Bool[Tensor, "x y z"]:
+    """The mask and all vertices within ``by`` of it along every axis."""
+    return mask if by == 0 else max_pool3d(mask[None, None].float(), 2 * by + 1, stride=1, padding=by)[0, 0] > 0
+
+
+def prune(state: FitState, grid: Prunable, kept: Bool[Tensor, "x y z"]) -> None:
+    """Empty the vertices of a grid that are not ``kept``; the optimiser's moments of the others stay."""
+    names = {id(parameter): f"field.{name}" for name, parameter in state.field.named_parameters()}
+    name = names[id(grid.rows)]
+    rows = grid.keep(kept)
+    state.optimiser.reindex_rows(name, cast(nn.Parameter, grid.rows), rows, 0)

@@ -1,0 +1,128 @@
+"""Up-sampling of lattices during a fit: coarse to fine, with the optimiser behind it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, cast
+
+import torch
+from torch import Tensor, nn
+from typing_extensions import override
+
+from invgraphics.core.lattice import LatticeEncoding, LatticeField, resampled, vertices_along
+from invgraphics.errors import InputError
+from invgraphics.training.hooks import FitState, Hook
+from invgraphics.training.penalties import LATTICES
+
+Moments = Literal["keep", "drop", "drop_all"]
+"""What becomes of Adam's moments when lattices change: interpolated too, dropped with the lattices, or all dropped."""
+
+
+@dataclass(frozen=True)
+class UpsampleConfig:
+    """Finer lattices at given points of the fit (DVGO, Plenoxels, TensoRF), of about cubic voxels in the field's box.
+
+    Attributes:
+        at: progress of each up-sampling, increasing.
+        resolution: vertices along an edge after the last one, in a box of other proportions as many voxels in all. Voxel
+            counts grow by the same factor each time (TensoRF).
+        resolutions: instead of that, one for each of ``at``.
+        moments: ``keep``: the optimiser's moments are interpolated as the lattices are; ``drop``: those of lattices begin anew
+            (Plenoxels); ``drop_all``: those of networks too (DVGO, TensoRF: a new optimiser).
+        restart_rates: whether all learning rates go back to their start, and take the rest of the fit for their schedules.
+    """
+
+    at: tuple[float, ...]
+    resolution: int = 0
+    resolutions: tuple[int, ...] = ()
+    moments: Moments = "keep"
+    restart_rates: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.at or list(self.at) != sorted(set(self.at)) or not 0 < self.at[0] <= self.at[-1] < 1:
+            raise ValueError(f"'at' needs increasing numbers between 0 and 1, not {list(self.at)}.")
+        if bool(self.resolution) == bool(self.resolutions):
+            raise ValueError("either 'resolution' or 'resolutions' must be given.")
+        if self.resolutions and len(self.resolutions) != len(self.at):
+            raise ValueError(f"'resolutions' needs one entry for each of the {len(self.at)} in 'at'.")
+        if min((self.resolution or 2, *self.resolutions)) < 2:
+            raise ValueError("a resolution is at least 2 vertices along an edge.")
+
+    def build(self) -> Upsample:
+        """The hook."""
+        return Upsample(self)
+
+
+class Upsample(Hook):
+    """Resizes all lattices of a field, before the step whose progress has come to the next of ``at``."""
+
+    name = "upsample"
+    requires = LATTICES
+
+    def __init__(self, config: UpsampleConfig) -> None:
+        self._config = config
+        self._done = 0
+
+    @override
+    def before_step(self, state: FitState) -> None:
+        config = self._config
+        due = sum(progress <= state.ctx.progress for progress in config.at)
+        if due <= self._done:
+            return
+        field = cast(LatticeField, state.field)
+        if not field.lattice_encodings():
+            raise InputError(f"The hook '{self.name}' needs encodings made of lattices, which this field does not have.")
+        edges = field.bounds.half.tolist()
+        sizes = [(encoding, self._next(encoding, due)) for encoding in field.lattice_encodings().values()]
+        change_lattices(state, partial(_resize, sizes, edges), config.moments)
+        if config.restart_rates:
+            state.optimiser.restart(state.ctx.progress)
+        self._done = due
+
+    def _next(self, encoding: LatticeEncoding, due: int) -> float:
+        """Vertices along an edge of a cube after the ``due``-th up-sampling; from the present ones, which a resumed fit has."""
+        if self._config.resolutions:
+            return self._config.resolutions[due - 1]
+        share = (due - self._done) / (len(self._config.at) - self._done)
+        now = math.prod(encoding.resolution) ** (1 / 3)
+        return now ** (1 - share) * self._config.resolution**share
+
+    @override
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"done": torch.tensor(self._done)}
+
+    @override
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self._done = int(state["done"])
+
+
+def _resize(sizes: list[tuple[LatticeEncoding, float]], edges: list[float]) -> None:
+    for encoding, resolution in sizes:
+        encoding.resize(vertices_along(resolution, edges))
+
+
+def change_lattices(state: FitState, change: Callable[[], None], moments: Moments) -> None:
+    """Change the field's lattices, and make the optimiser follow the parameters that are other ones afterwards.
+
+    Args:
+        state: of the fit.
+        change: replaces parameters under their names.
+        moments: what becomes of their moments; kept ones are interpolated over the whole lattice.
+
+    Raises:
+        InputError: moments of linked lattices cannot be kept.
+    """
+    encodings = cast(LatticeField, state.field).lattice_encodings().values()
+    if moments == "keep" and any(lattice.links is not None for encoding in encodings for lattice in encoding.lattices()):
+        raise InputError("Moments of sparse lattices cannot be kept when these change.", "Set moments = 'drop' in the hook.")
+    before = dict(state.field.named_parameters())
+    change()
+    for name, parameter in state.field.named_parameters():
+        if parameter is not before[name]:
+            keep = partial(resampled, size=parameter.shape[:-1]) if moments == "keep" else None
+            state.optimiser.replace(f"field.{name}", cast(nn.Parameter, parameter), keep)
+    if moments == "drop_all":
+        state.optimiser.drop_moments()
