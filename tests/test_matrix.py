@@ -11,7 +11,7 @@ import torch
 from invgraphics import plugins
 from invgraphics.core import Context, Quantity, Scene, check
 from invgraphics.errors import NotComposableError
-from invgraphics.testing import toy_scene
+from invgraphics.testing import stir, toy_scene
 
 FIELDS, RENDERERS, SAMPLERS = (sorted(plugins.names(registry)) for registry in ("fields", "renderers", "samplers"))
 
@@ -40,6 +40,7 @@ def variants(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
         if sampler == "occupancy":
             look = replace(look, steps_per_diagonal=64, cone=0.1)
         field = build("fields", "neural", scene, encoding=encode, geometry=geometry, **small)
+        stir(field)
         renderer = build("renderers", "volumetric", scene, sampler=look)
         yield f"neural/{encoding}/{geometry}", field, f"volumetric/{sampler}", renderer
 

@@ -119,8 +119,25 @@ def toy_scene(
     return scene.with_views(train=train, test=test)
 
 
+def stir(field: Field, amount: float = 0.01) -> None:
+    """Add normal noise to a field's parameters: a new lattice is constant, where no normal is defined.
+
+    Args:
+        field: it is changed in place, by torch's global generator.
+        amount: standard deviation.
+    """
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter.add_(amount * torch.randn_like(parameter))
+
+
 def check_field(field: Field, scene: Scene) -> None:
-    """Assert the contract of a field: shapes, finiteness, only requested quantities, gradients, a state that reloads."""
+    """Assert the contract of a field: shapes, finiteness, only requested quantities, gradients, a state that reloads.
+
+    Its parameters are stirred before (see `stir`) and put back afterwards.
+    """
+    new = {name: value.clone() for name, value in field.state_dict().items()}
+    stir(field)
     pointwise = [quantity for quantity in _POINTWISE if quantity in field.provides]
     position = scene.bounds.from_unit(torch.rand(37, 3)).requires_grad_(True)
     direction = torch.nn.functional.normalize(torch.randn(37, 3), dim=1)
@@ -138,6 +155,7 @@ def check_field(field: Field, scene: Scene) -> None:
     assert pointwise or field.provides, "a field must provide something"
     state = {name: value.clone() for name, value in field.state_dict().items()}
     field.load_state_dict(state)
+    field.load_state_dict(new)
 
 
 def check_renderer(renderer: Renderer, field: Field, scene: Scene) -> None:

@@ -42,6 +42,9 @@ class Grids(Field):
     def lattices(self):
         return self._lattices["geometry"]
 
+    def crop(self, lo, hi, resolution):
+        raise NotImplementedError
+
     def query(self, samples, want):
         return FieldValues(density=torch.full((len(samples),), self._density))
 

@@ -91,7 +91,7 @@ class FieldValues:
         density: volume density, per local length unit, >= 0.
         sdf: signed distance, local units, negative inside.
         radiance: colour seen along the sample's direction, in the scene's colour space, [0, 1] for sRGB.
-        normal: unit normal, pointing out of the surface.
+        normal: unit normal, pointing out of the surface; zero where it is undefined (constant density).
         features: anything else a renderer and a field agree on.
     """
 

@@ -2,27 +2,44 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
+from torch import nn
 
+from invgraphics.core.field import Encoding
 from invgraphics.core.fused import ColourHead, CombinedLattices, DensityHead, FusedLattice, Layers
 from invgraphics.core.ngp import FusedNGP
 from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.encodings.lattices import LatticeFeatures
 from invgraphics.fields.heads import sums_components
+from invgraphics.fields.mlp import Mlp
+from invgraphics.fields.settings import NeuralSettings
 
-if TYPE_CHECKING:
-    from invgraphics.fields.neural import NeuralField
+
+@dataclass(frozen=True, eq=False)
+class FieldParts:
+    """Modules and settings of a neural field, as its attributes of the same names.
+
+    Attributes:
+        density_scale: factor of densities.
+        contracted_density: half-extents per local unit in contracted space, 0 for none (see `FusedNGP.contracted_density`).
+    """
+
+    config: NeuralSettings
+    encoding: Encoding
+    geometry_net: Mlp | None
+    appearance: Encoding | None
+    basis: nn.Linear | None
+    colour_net: Mlp | None
+    colour: Literal["srgb", "linear"]
+    density_scale: float
+    contracted_density: float
 
 
-def fused_parts(field: NeuralField, scale: float, contracted: float) -> FusedNGP | FusedLattice | None:
+def fused_parts(field: FieldParts) -> FusedNGP | FusedLattice | None:
     """Parameters of a field of densities over a hash grid or over lattices.
-
-    Args:
-        field: where they are.
-        scale: factor of densities.
-        contracted: half-extents per local unit in contracted space, 0 for none (see `FusedNGP.contracted_density`).
 
     Returns:
         ``None`` for other encodings, heads or networks than kernels support: of a hash grid with other than two features per
@@ -32,24 +49,24 @@ def fused_parts(field: NeuralField, scale: float, contracted: float) -> FusedNGP
     if config.geometry != "density" or (config.geometry_head == "mlp" and config.skip >= 0):
         return None
     if isinstance(field.encoding, LatticeFeatures):
-        return _lattice_parts(field, DensityHead(config.density_activation, config.density_bias, scale, contracted))
-    return _hash_parts(field, contracted) if scale == 1 else None
+        return _lattice_parts(field)
+    return _hash_parts(field) if field.density_scale == 1 else None
 
 
-def _hash_parts(field: NeuralField, contracted: float) -> FusedNGP | None:
+def _hash_parts(field: FieldParts) -> FusedNGP | None:
     config, encoding = field.config, field.encoding
     if not config.two_plain_networks or config.direction not in ("sh", "none") or not isinstance(encoding, HashEncoding):
         return None
     # Entries of other widths have no compiled kernel, and the plain one keeps every sample of a picture.
     if encoding.window_alpha is not None or encoding.grid.features != 2:
         return None
-    geometry, colour = (net.layers() for net in (field.geometry_net, field.colour_net))
+    geometry, colour = _layers(field.geometry_net), _layers(field.colour_net)
     bands = config.direction_degree if config.direction == "sh" else 0
-    density = config.density_activation, config.density_bias, bands, field.colour, contracted
+    density = config.density_activation, config.density_bias, bands, field.colour, field.contracted_density
     return FusedNGP(encoding.table.detach(), encoding.grid, geometry, colour, *density)
 
 
-def _lattice_parts(field: NeuralField, density: DensityHead) -> FusedLattice | None:
+def _lattice_parts(field: FieldParts) -> FusedLattice | None:
     config, appearance = field.config, field.appearance
     if config.density_interpolation != "post" or not isinstance(appearance, LatticeFeatures | None):
         return None
@@ -61,7 +78,7 @@ def _lattice_parts(field: NeuralField, density: DensityHead) -> FusedLattice | N
     return FusedLattice(
         geometry=_combined(field.encoding),
         geometry_net=_geometry_net(field, field.encoding),
-        density=density,
+        density=DensityHead(config.density_activation, config.density_bias, field.density_scale, field.contracted_density),
         appearance=None if appearance is None else _combined(appearance),
         basis=basis,
         colour=_colour_head(field),
@@ -73,25 +90,29 @@ def _combined(encoding: LatticeFeatures) -> CombinedLattices:
     return CombinedLattices(encoding.lattices(), encoding.combine, encoding.scale)
 
 
-def _geometry_net(field: NeuralField, encoding: LatticeFeatures) -> Layers:
+def _geometry_net(field: FieldParts, encoding: LatticeFeatures) -> Layers:
     """The geometry network; a row of ones where components are added up."""
     if field.config.geometry_head == "mlp":
-        return field.geometry_net.layers()
+        return _layers(field.geometry_net)
     if not sums_components(encoding):
         return ()
     features = encoding.lattices()[0].features
     return ((torch.ones(1, encoding.width, dtype=features.dtype, device=features.device), features.new_zeros(1)),)
 
 
-def _colour_head(field: NeuralField) -> ColourHead:
+def _colour_head(field: FieldParts) -> ColourHead:
     config = field.config
     linear = field.colour == "linear"
     return ColourHead(
         kind=config.head,
-        net=field.colour_net.layers() if config.head == "mlp" else (),
+        net=_layers(field.colour_net),
         octaves=config.feature_octaves,
         direction=config.direction,
         degree=config.direction_degree,
         activation="clamp" if config.colour_activation == "clamp" else "softplus" if linear else "sigmoid",
         padding=config.colour_padding,
     )
+
+
+def _layers(net: Mlp | None) -> Layers:
+    return () if net is None else net.layers()

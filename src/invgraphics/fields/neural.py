@@ -33,7 +33,7 @@ from invgraphics.fields import heads
 from invgraphics.fields.covariance import unit_covariance
 from invgraphics.fields.density import DensityActivation
 from invgraphics.fields.encodings.lattices import LatticeConfig, LatticeFeatures, crop_lattices
-from invgraphics.fields.fused import fused_parts
+from invgraphics.fields.fused import FieldParts, fused_parts
 from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
 
@@ -189,7 +189,13 @@ class NeuralField(Field):
     def fused(self, bounds: Bounds) -> FusedNGP | FusedLattice | None:
         """Detached parameters over ``bounds``, the field's own: of a hash grid or of lattices (see `fused_parts`)."""
         here = bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)
-        return fused_parts(self, self._density_scale, self._contracted_density) if here else None
+        if not here:
+            return None
+        geometry_net = self.geometry_net if self.config.geometry_head == "mlp" else None
+        colour_net = self.colour_net if self.config.head == "mlp" else None
+        geometry = self.config, self.encoding, geometry_net
+        colour = self.appearance, self.basis, colour_net, self.colour
+        return fused_parts(FieldParts(*geometry, *colour, self._density_scale, self._contracted_density))
 
     @property
     def _contracted_density(self) -> float:
