@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from invgraphics.arrays import read_arrays
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
@@ -28,7 +29,6 @@ from invgraphics.runs.environment import Environment
 from invgraphics.runs.folder import RENDERED, RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.renderings import OWN, Difference, Rendering, Renderings
-from invgraphics.tables import read_arrays
 from invgraphics.text import sha256_of
 
 

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.arrays import read_arrays
 from invgraphics.core import Bounds, Camera, Scene
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files, image_size
 from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth, pose
-from invgraphics.tables import read_arrays
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 

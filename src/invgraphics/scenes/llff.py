@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from invgraphics.arrays import read_array
 from invgraphics.core import Camera, Scene
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files
 from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, pose, scene_name
-from invgraphics.tables import read_array
 
 
 class Llff:

@@ -28,13 +28,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from invgraphics.arrays import read_arrays
 from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.files import write_arrays
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
 from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
-from invgraphics.tables import read_arrays
 
 Arrays = Mapping[str, np.ndarray]
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import torch
 
+from invgraphics.arrays import read_arrays
 from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, Photo, load_view
 from invgraphics.scenes.layout import SceneOptions, evenly, pose
 from invgraphics.scenes.mitsuba import cache, ply
-from invgraphics.tables import read_arrays
 
 LINEAR_RESIZE = "area average of linear light"
 """The filter from a larger rendering to the folder's pictures, see `invgraphics.scenes.mitsuba.average`."""

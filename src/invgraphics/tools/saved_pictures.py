@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from invgraphics.arrays import read_numbers
 from invgraphics.core import Camera, Rendering, Scene, View
 from invgraphics.core.colour import srgb_to_linear
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import read_pixels
-from invgraphics.tables import read_numbers
 
 
 def read_truth(path: Path, scene: Scene) -> View:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from invgraphics.arrays import read_numbers
 from invgraphics.errors import InputError
 from invgraphics.scenes import png
-from invgraphics.tables import read_numbers
 
 Arrays = dict[str, Float[ndarray, "..."]]
 """What an ``.npz`` holds: alpha, depth, normal and so on."""

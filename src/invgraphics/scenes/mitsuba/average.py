@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from invgraphics.arrays import read_arrays
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
@@ -31,7 +32,7 @@ from invgraphics.scenes.mitsuba.gbuffer import trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job, Source
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
 from invgraphics.scenes.process import write_error, write_progress
-from invgraphics.tables import read_arrays, read_json
+from invgraphics.tables import read_json
 
 
 def main(folder: Path) -> None:

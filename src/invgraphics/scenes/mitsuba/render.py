@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from invgraphics.arrays import read_arrays
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_arrays
@@ -29,7 +30,6 @@ from invgraphics.scenes.mitsuba.cache import REQUEST, unwritable
 from invgraphics.scenes.mitsuba.gbuffer import GBuffer, sample_points, trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
-from invgraphics.tables import read_arrays
 
 POINTS = 20_000
 
