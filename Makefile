@@ -26,7 +26,8 @@ notebooks: env  ## run the notebooks and write them as pages: reports/notebooks
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"
 	$(BIN)/python notebooks/render.py
 
-test: env  ## the test suite (under 10 minutes on 2 cores)
+test: env  ## the test suite (under 10 minutes on 2 cores, after two of compiling kernels, once, for all its processes)
+	$(BIN)/invgraphics doctor --warm-up
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-notebooks: env  ## every notebook at a small size, and the numbers it prints

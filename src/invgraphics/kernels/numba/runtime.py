@@ -64,7 +64,7 @@ class _Compiler(event.Listener):
         """Fill the cache, once in the life of this process."""
         with self._lock:
             if not self.here:
-                print("compiling kernels, once, less than a minute", file=sys.stderr, flush=True)
+                print("compiling kernels, once, up to two minutes", file=sys.stderr, flush=True)
                 with contextlib.suppress(OSError):
                     # Compilation is single-threaded: two processes share it.
                     for process in [_start_warmup(part) for part in PARTS]:
