@@ -28,7 +28,7 @@ notebooks: env  ## run the notebooks and write them as pages: reports/notebooks
 
 test: env  ## the test suite (under 10 minutes on 2 cores, after two of compiling kernels, once, for all its processes)
 	$(BIN)/invgraphics doctor --warm-up
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-notebooks: env  ## every notebook at a small size, and the numbers it prints
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"

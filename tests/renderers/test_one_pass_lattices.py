@@ -11,6 +11,7 @@ from invgraphics.core import Context, Scene
 from invgraphics.core.fused import FusedLattice
 from invgraphics.core.lattice import Lattice
 from invgraphics.fields.encodings.factors import CpConfig, VmConfig
+from invgraphics.fields.encodings.sparse import SparseVoxels, SparseVoxelsConfig
 from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
@@ -42,6 +43,10 @@ FIELDS = {
         VoxelsConfig(13, 2, levels=3, coarsest=4), layers=1, width=16, skip=-1, geometry_features=5, direction="sh",
         colour_layers=1, colour_width=16, density_activation="exp",
     ),
+    "plenoxels": NeuralFieldConfig(
+        SparseVoxelsConfig(9, 1), **NO_NETWORK, head="sh", direction="none", colour_activation="clamp",
+        density_activation="relu", density_bias=1.0, appearance=SparseVoxelsConfig(9, 27),
+    ),
     "diffuse": NeuralFieldConfig(VoxelsConfig(9, 4), **NO_NETWORK, head="none", direction="none", density_bias=1.0),
 }  # fmt: skip
 
@@ -53,6 +58,8 @@ def fitted(config: NeuralFieldConfig, scene: Scene) -> NeuralField:
     with torch.no_grad():
         for name, parameter in field.named_parameters():
             parameter.copy_(torch.randn(parameter.shape) * (1.0 if "encoding" in name else 0.5))
+    if isinstance(field.encoding, SparseVoxels):
+        field.encoding.keep(torch.rand(9, 9, 9) < 0.7)
     return field
 
 
@@ -68,9 +75,11 @@ def renderer(scene: Scene) -> Volumetric:
     return made
 
 
-@pytest.mark.parametrize("name", FIELDS)
-def test_a_picture_is_the_composed_one(scene, renderer, monkeypatch, name: str) -> None:
+@pytest.mark.parametrize(("name", "cropped"), [*((name, False) for name in FIELDS), ("dvgo", True), ("vm", True)])
+def test_a_picture_is_the_composed_one(scene, renderer, monkeypatch, name: str, cropped: bool) -> None:
     field, ctx, made = fitted(FIELDS[name], scene), Context(scene.bounds), []
+    if cropped:
+        field.crop(*(scene.bounds.from_unit(torch.tensor(corner)) for corner in ((0.2, 0.1, 0.3), (0.9, 0.7, 1.0))), 9)
     original = kernels.lattice_render
     monkeypatch.setattr(kernels, "lattice_render", lambda *args: (made.append(None), original(*args))[1])
     with torch.no_grad():
@@ -85,9 +94,11 @@ def test_a_picture_is_the_composed_one(scene, renderer, monkeypatch, name: str) 
     torch.testing.assert_close(ours.rgb, theirs.rgb, rtol=0, atol=(UNSEEN + 2e-4) * max(1.0, float(theirs.rgb.max())))
 
 
-@pytest.mark.parametrize("name", ["vm", "voxels"])
-def test_training_marches_in_one_pass_and_sees_the_same(scene, renderer, monkeypatch, name: str) -> None:
+@pytest.mark.parametrize(("name", "cropped"), [("vm", False), ("voxels", False), ("dvgo", True), ("plenoxels", False)])
+def test_training_marches_in_one_pass_and_sees_the_same(scene, renderer, monkeypatch, name: str, cropped: bool) -> None:
     field, rays, made = fitted(FIELDS[name], scene), scene.train[0].camera.rays(), []
+    if cropped:
+        field.crop(*(scene.bounds.from_unit(torch.tensor(corner)) for corner in ((0.2, 0.1, 0.3), (0.9, 0.7, 1.0))), 9)
     original = kernels.lattice_march
     monkeypatch.setattr(kernels, "lattice_march", lambda *args: (made.append(None), original(*args))[1])
 

@@ -13,6 +13,7 @@ from invgraphics.core.lattice import Combination, Lattice
 Layers = tuple[tuple[Float[Tensor, "outs ins"], Float[Tensor, " outs"]], ...]
 """Weight and bias of each layer of a network, the last one linear."""
 HiddenActivation = Literal["relu", "softplus"]
+Corner = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +95,8 @@ class FusedLattice:
         basis: layers that make colour's features of appearance's; none: they are those.
         colour: what becomes of colour's features.
         hidden: activation of hidden layers.
+        crop: lowest and highest corner of the field's box, in unit coordinates of the bounds that are marched; the density is 0
+            outside. ``None``: the box is all of the bounds.
     """
 
     geometry: CombinedLattices
@@ -103,6 +106,7 @@ class FusedLattice:
     basis: Layers
     colour: ColourHead
     hidden: HiddenActivation = "relu"
+    crop: tuple[Corner, Corner] | None = None
 
     @property
     def handed(self) -> int:

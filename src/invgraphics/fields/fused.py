@@ -9,10 +9,11 @@ import torch
 from torch import nn
 
 from invgraphics.core.field import Encoding
-from invgraphics.core.fused import ColourHead, CombinedLattices, DensityHead, FusedLattice, Layers
+from invgraphics.core.fused import ColourHead, CombinedLattices, Corner, DensityHead, FusedLattice, Layers
 from invgraphics.core.ngp import FusedNGP
 from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.encodings.lattices import LatticeFeatures
+from invgraphics.fields.encodings.sparse import SparseVoxels
 from invgraphics.fields.heads import sums_components
 from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
@@ -25,6 +26,7 @@ class FieldParts:
     Attributes:
         density_scale: factor of densities.
         contracted_density: half-extents per local unit in contracted space, 0 for none (see `FusedNGP.contracted_density`).
+        crop: the field's box, where it is not all of the bounds (see `FusedLattice`).
     """
 
     config: NeuralSettings
@@ -36,6 +38,7 @@ class FieldParts:
     colour: Literal["srgb", "linear"]
     density_scale: float
     contracted_density: float
+    crop: tuple[Corner, Corner] | None = None
 
 
 def fused_parts(field: FieldParts) -> FusedNGP | FusedLattice | None:
@@ -48,9 +51,9 @@ def fused_parts(field: FieldParts) -> FusedNGP | FusedLattice | None:
     config = field.config
     if config.geometry != "density" or (config.geometry_head == "mlp" and config.skip >= 0):
         return None
-    if isinstance(field.encoding, LatticeFeatures):
+    if isinstance(field.encoding, LatticeFeatures | SparseVoxels):
         return _lattice_parts(field)
-    return _hash_parts(field) if field.density_scale == 1 else None
+    return _hash_parts(field) if field.density_scale == 1 and field.crop is None else None
 
 
 def _hash_parts(field: FieldParts) -> FusedNGP | None:
@@ -68,9 +71,9 @@ def _hash_parts(field: FieldParts) -> FusedNGP | None:
 
 def _lattice_parts(field: FieldParts) -> FusedLattice | None:
     config, appearance = field.config, field.appearance
-    if config.density_interpolation != "post" or not isinstance(appearance, LatticeFeatures | None):
+    if config.density_interpolation != "post" or not isinstance(appearance, LatticeFeatures | SparseVoxels | None):
         return None
-    assert isinstance(field.encoding, LatticeFeatures)
+    assert isinstance(field.encoding, LatticeFeatures | SparseVoxels)
     basis: Layers = ()
     if field.basis is not None:
         weight = field.basis.weight.detach()
@@ -83,14 +86,15 @@ def _lattice_parts(field: FieldParts) -> FusedLattice | None:
         basis=basis,
         colour=_colour_head(field),
         hidden=config.hidden_activation,
+        crop=field.crop,
     )
 
 
-def _combined(encoding: LatticeFeatures) -> CombinedLattices:
+def _combined(encoding: LatticeFeatures | SparseVoxels) -> CombinedLattices:
     return CombinedLattices(encoding.lattices(), encoding.combine, encoding.scale)
 
 
-def _geometry_net(field: FieldParts, encoding: LatticeFeatures) -> Layers:
+def _geometry_net(field: FieldParts, encoding: LatticeFeatures | SparseVoxels) -> Layers:
     """The geometry network; a row of ones where components are added up."""
     if field.config.geometry_head == "mlp":
         return _layers(field.geometry_net)

@@ -187,15 +187,18 @@ class NeuralField(Field):
 
     @override
     def fused(self, bounds: Bounds) -> FusedNGP | FusedLattice | None:
-        """Detached parameters over ``bounds``, the field's own: of a hash grid or of lattices (see `fused_parts`)."""
-        here = bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)
-        if not here:
+        """Detached parameters over ``bounds``: of a hash grid over the field's own, or of lattices (see `fused_parts`)."""
+        crop = None
+        if not (torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)):
+            lo, hi = (tuple(bounds.to_unit(corner).tolist()) for corner in (self.lo, self.hi))
+            crop = lo, hi
+        if bounds.space != self._space or (crop is not None and bounds.space != "box"):
             return None
         geometry_net = self.geometry_net if self.config.geometry_head == "mlp" else None
         colour_net = self.colour_net if self.config.head == "mlp" else None
         geometry = self.config, self.encoding, geometry_net
         colour = self.appearance, self.basis, colour_net, self.colour
-        return fused_parts(FieldParts(*geometry, *colour, self._density_scale, self._contracted_density))
+        return fused_parts(FieldParts(*geometry, *colour, self._density_scale, self._contracted_density, crop))
 
     @property
     def _contracted_density(self) -> float:

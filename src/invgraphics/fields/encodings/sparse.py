@@ -62,6 +62,7 @@ class SparseVoxels(Encoding):
     """
 
     combine: Combination = "concat"
+    scale: float = 1.0
     rows: Tensor
     links: Tensor
 

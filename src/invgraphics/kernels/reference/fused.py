@@ -34,12 +34,13 @@ def lattice_render(
     """See `invgraphics.kernels.lattice_render`; exact: evaluates every occupied interval, whatever the error budget allows."""
     march = ray_march(rays, occupied, bounds, replace(steps, limit=UNLIMITED), rays.near)
     position = _midpoints(rays, march)
-    outputs = _geometry(field, bounds.to_unit(position))
+    unit, inside = _cropped(field, bounds.to_unit(position))
+    outputs = _geometry(field, unit)
     features = outputs[:, 1:]
     if field.appearance is not None:
-        own = _network(field.basis, _encoded(field.appearance, bounds.to_unit(position)), field.hidden)
+        own = _network(field.basis, _encoded(field.appearance, unit), field.hidden)
         features = torch.cat([features, own], dim=1)
-    density = _density(field.density, outputs[:, 0], bounds, position)
+    density = _density(field.density, outputs[:, 0], bounds, position) * inside
     radiance = _radiance(field.colour, features, rays.directions[march.ray], field.hidden)
     channels = torch.cat([radiance, ((march.t0 + march.t1) / 2)[:, None]], dim=1)
     _, sums, alpha = composite(density * (march.t1 - march.t0), channels, march.ray, len(rays))
@@ -59,7 +60,8 @@ def lattice_march(
     """See `invgraphics.kernels.lattice_march`."""
     march = ray_march(rays, occupied, bounds, replace(steps, limit=UNLIMITED), start)
     position = _midpoints(rays, march)
-    density = _density(field.density, _geometry(field, bounds.to_unit(position))[:, 0], bounds, position)
+    unit, inside = _cropped(field, bounds.to_unit(position))
+    density = _density(field.density, _geometry(field, unit)[:, 0], bounds, position) * inside
     tau = (density * (march.t1 - march.t0)).double().clamp_max(OPAQUE)
     kept = transmittance(tau, march.ray, len(rays)) >= min_transmittance
     return March(march.ray[kept], march.t0[kept], march.t1[kept], march.resume)
@@ -67,6 +69,15 @@ def lattice_march(
 
 def _midpoints(rays: Rays, march: March) -> Float[Tensor, "m 3"]:
     return rays.origins[march.ray] + ((march.t0 + march.t1) / 2)[:, None] * rays.directions[march.ray]
+
+
+def _cropped(field: FusedLattice, unit: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "m 3"], Bool[Tensor, " m"]]:
+    """Unit coordinates in the field's box, and whether they lie in it."""
+    if field.crop is None:
+        return unit, torch.ones_like(unit[:, 0], dtype=torch.bool)
+    lo, hi = (unit.new_tensor(corner) for corner in field.crop)
+    unit = (unit - lo) / (hi - lo)
+    return unit, ((unit >= 0) & (unit <= 1)).all(dim=1)
 
 
 def _encoded(encoding: CombinedLattices, unit: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:

@@ -23,7 +23,7 @@ from invgraphics.kernels.numba.fused.heads import (
     points_scratch,
     points_words,
 )
-from invgraphics.kernels.numba.fused.render import density_scale
+from invgraphics.kernels.numba.fused.render import crop_points, density_scale, pack_crop
 from invgraphics.kernels.numba.ngp.dense import POINTS
 from invgraphics.kernels.numba.ngp.march import append_interval
 from invgraphics.kernels.numba.ngp.network import ACTIVATIONS
@@ -34,7 +34,7 @@ from invgraphics.kernels.types import March, MarchSteps
 
 
 @parallel
-def march_visible(rays, setup, geometry, network, smooth, sizes, memory, settings, queues, jobs, rows, counts):
+def march_visible(rays, setup, geometry, network, smooth, crop, sizes, memory, settings, queues, jobs, rows, counts):
     """Intervals of every ray up to its termination: starts and ends in ``rows`` (2, n, limit), ``counts`` of them (0 before).
 
     Arguments as in `render.render`, but for ``settings``: those of `ngp.march.append_interval`, then scale and
@@ -45,11 +45,12 @@ def march_visible(rays, setup, geometry, network, smooth, sizes, memory, setting
         x, ping, pong = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
         corners, queue = points_scratch(memory + 4 * np.int64(job) * sizes[1], geometry), empty_queue(queues, job)
         while next_samples((job, jobs, EDGE), rays, setup, queue, points):
+            crop_points(points, crop)
             encode_points(points, geometry, corners, x)
             raw = apply_network(network, smooth, x, ping, pong)
             for p in range(POINTS):
                 if queue.slots[p] >= 0:
-                    scale = density_scale(settings, points, p)
+                    scale = density_scale(settings, points, crop, p)
                     append_interval(queue.slots[p], raw[p], scale, queue, rays[3], settings[:4], rows, counts)
 
 
@@ -82,7 +83,7 @@ def lattice_march(
         batch_rays = tuple(array(x[first : first + batch]) for x in (rays.origins, rays.directions, start, rays.far))
         n = len(batch_rays[2])
         rows, counts = scratch("reached", 2 * n * limit).reshape(2, n, limit), np.zeros(n, np.int64)
-        model = geometry, network, field.hidden == "softplus", sizes, memory, settings
+        model = geometry, network, field.hidden == "softplus", pack_crop(field), sizes, memory, settings
         march_visible(batch_rays, setup, *model, queue_memory(jobs), jobs, rows, counts)
         found.append(pack_intervals(rows[0], rows[1], counts, first))
     ray, t0, t1 = (torch.cat(columns) for columns in zip(*found, strict=True))

@@ -36,7 +36,7 @@ from invgraphics.kernels.numba.runtime import GROUP, LANES, array, index, inline
 from invgraphics.kernels.numba.simd.partial import floats_at, longs_at
 from invgraphics.kernels.types import MarchSteps
 
-_ZERO = np.float32(0.0)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
 @inlined
@@ -61,9 +61,22 @@ def batch_at(address, size):
 
 
 @inlined
-def density_scale(settings, points, p):
+def crop_points(points, crop):
+    """From unit coordinates of the bounds to those of the field's box; see `pack_crop`."""
+    if crop[2, 0] > _ZERO:
+        for axis in range(3):
+            for p in range(POINTS):
+                points[axis, p] = (points[axis, p] - crop[0, axis]) * crop[1, axis]
+
+
+@inlined
+def density_scale(settings, points, crop, p):
     """Factor of the density of batch lane ``p``; ``settings`` end with `DensityHead.scale` and ``contracted``."""
     scale, contracted = settings[-2], settings[-1]
+    if crop[2, 0] > _ZERO:
+        for axis in range(3):
+            if points[axis, p] < _ZERO or points[axis, p] > _ONE:
+                return _ZERO
     return scale * (contracted * radial_scale(points, p)) if contracted > _ZERO else scale
 
 
@@ -102,8 +115,8 @@ def _shade_queue(appearance, basis, colour_net, head, handed, batch, room, sums)
 
 @parallel
 def render(
-    rays, setup, geometry, appearance, geometry_net, basis, colour_net, head, handed, sizes, memory, settings, width, queues,
-    jobs, sums, alpha,
+    rays, setup, geometry, appearance, geometry_net, basis, colour_net, head, handed, crop, sizes, memory, settings, width,
+    queues, jobs, sums, alpha,
 ):  # fmt: skip
     """Sums of w * (radiance, distance) and of w for every ray; both outputs hold zeros before.
 
@@ -117,6 +130,7 @@ def render(
         colour_net: the same of colour.
         head: see `heads.pack_head`.
         handed: number of features that geometry hands on to colour.
+        crop: see `pack_crop`.
         sizes: see `sizes_of`.
         memory: address of the scratch of all jobs.
         settings: those of `ngp.render.composite_sample`, then scale and contracted scale of the density.
@@ -136,12 +150,13 @@ def render(
         room = points_scratch(rest, appearance), x_colour, ping_colour, pong_colour
         queue, queued = empty_queue(queues, job), 0
         while next_samples((job, jobs, width), rays, setup, queue, points):
+            crop_points(points, crop)
             encode_points(points, geometry, corners, x)
             raw = apply_network(geometry_net, smooth, x, ping, pong)
             for p in range(POINTS):
                 s, weight = queue.slots[p], _ZERO
                 if s >= 0:
-                    scale = density_scale(settings, points, p)
+                    scale = density_scale(settings, points, crop, p)
                     weight = composite_sample(s, raw[p], scale, queue, rays[3], compositing, sums, alpha)
                 if weight > _ZERO:
                     _enqueue_sample(p, s, raw, points, queue, queued, handed, head, inputs, positions)
@@ -152,6 +167,12 @@ def render(
                         _shade_queue(appearance, basis, colour_net, head, handed, batch, room, sums)
                         queued = 0
         _shade_queue(appearance, basis, colour_net, head, handed, (inputs, positions, sample_rays, weights, queued), room, sums)
+
+
+def pack_crop(field: FusedLattice) -> np.ndarray:
+    """Lowest corner and inverse edges of the field's box, and 1 where it is not all of the bounds, in rows."""
+    lo, hi = (np.array(corner, np.float32) for corner in field.crop or ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
+    return np.stack([lo, _ONE / (hi - lo), np.full(3, field.crop is not None, np.float32)])
 
 
 def sizes_of(rows: int, geometry: int, appearance: int) -> tuple[int, int, int, int]:
@@ -188,7 +209,7 @@ def lattice_render(
     sizes, jobs = sizes_of(max(rows) + GROUP, points_words(geometry), points_words(appearance)), threads()
     # Zeros: what no sample has written to yet is evaluated, and thrown away.
     memory = np.zeros(jobs * sizes[3], np.float32)
-    model = geometry, appearance, *networks, head, field.handed, sizes, memory.ctypes.data
+    model = geometry, appearance, *networks, head, field.handed, pack_crop(field), sizes, memory.ctypes.data
     sums, alpha = torch.zeros(len(rays), 4), torch.zeros(len(rays))
     outputs = sums.numpy(), alpha.numpy()
     # Rays that are no image are scheduled in order, as an image as wide as one block.
