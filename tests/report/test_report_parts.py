@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import random
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -107,6 +109,16 @@ def test_report_is_the_same_when_built_again(built_report: Path, comparison_fold
     build_report(comparison_folder)
     for name in ("index.html", "index.md", "results.csv", "table.tex", "figures/psnr-against-model-bytes.svg"):
         assert (comparison_folder / name).read_text() == (built_report / name).read_text(), name
+
+
+@pytest.mark.parametrize("cost", [1e-300, 1e-30, 1e30, math.inf])
+def test_costs_that_no_axis_holds_are_not_drawn(comparison_folder: Path, edit: Callable[..., None], cost: float) -> None:
+    from invgraphics.report.build import build_report
+
+    scores = next(comparison_folder.glob("runs/*/seed-*/scores.json"))
+    edit(scores, lambda table: table["cost"].update(fit_seconds=cost))
+    page = build_report(comparison_folder)
+    ElementTree.parse(page.parent / "figures" / "psnr-against-model-bytes.svg")
 
 
 def test_report_is_small(built_report: Path) -> None:

@@ -72,6 +72,7 @@ def test_folder_without_runs(tmp_path: Path, comparison_folder: Path, edit: Call
         (lambda table: table["quality"]["psnr"].update(per_view=[1.0]), "1 values for 6 views"),
         (lambda table: table["quality"]["psnr"].pop("higher_is_better"), "lacks the key 'quality.psnr.higher_is_better'"),
         (lambda table: table.update(seed="zero"), "'seed' cannot be 'zero'"),
+        (lambda table: table["cost"].update(fit_seconds=1e300), "'cost.fit_seconds' cannot be 1e+300"),
         (lambda table: table.pop("views"), "lacks the key 'views'"),
     ],
 )

@@ -28,6 +28,8 @@ T = TypeVar("T")
 NOT_STORED = {"stored": False}
 """Metadata of a field that is no key of the file."""
 _KILLED = "The run may have been killed before it was written."
+_LARGEST = 1e100
+"""Largest finite number of a record: sums, products and ratios of what is read stay finite."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ def _converted(hint: Any, value: Any, source: Path, key: str) -> Any:
         return {str(name): _converted(args[1], item, source, _join(key, str(name))) for name, item in value.items()}
     elif isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return from_table(hint, value, source, key)
-    elif hint is float and _is_number(value) and not math.isnan(value):
+    elif hint is float and _is_number(value) and (abs(value) <= _LARGEST or abs(value) == math.inf):
         return float(value)
     elif hint is int and _is_number(value) and float(value).is_integer() and abs(value) < 2**63:
         return int(value)

@@ -24,6 +24,8 @@ SUBJECTS = {
 """The costs that are plotted, and what their axis is about."""
 
 
+MOST_COST = 1e15
+"""Costs from its inverse up to it, in units as stored, are drawn; others are no measurements, and no axis holds them."""
 MOST_LABELS = 8
 """Of more points only those on the front are named."""
 
@@ -58,7 +60,9 @@ def _points(summary: Summary, quality: Quantity, cost: Quantity) -> list[Point]:
     points = []
     for row in summary.methods:
         x, y = summary.cell(row, cost.key), summary.cell(row, quality.key)
-        if x is None or y is None or x.mean is None or y.mean is None or not math.isfinite(y.mean) or x.mean <= 0:
+        if x is None or y is None or x.mean is None or y.mean is None or not math.isfinite(y.mean):
+            continue
+        if not 1 / MOST_COST < x.mean < MOST_COST:
             continue
         points.append(Point(row, x.mean * cost.scale, y.mean * quality.scale, y.half_width * quality.scale))
     return points
