@@ -32,7 +32,7 @@ class Adam(ABC):
     """
 
     def __init__(self, groups: Iterable[dict[str, Any]], betas: tuple[float, float], eps: float) -> None:
-        self.param_groups = [{"lr": 0.0} | group for group in groups]
+        self.param_groups: list[dict[str, Any]] = [{"lr": 0.0, **group} for group in groups]
         self.state: defaultdict[nn.Parameter, dict[str, Tensor]] = defaultdict(dict)
         self._betas, self._eps = betas, eps
 
@@ -73,9 +73,22 @@ class DenseAdam(Adam):
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         first, second, steps = ([self.state[parameter][key] for parameter in parameters] for key in (*MOMENTS, "step"))
         beta1, beta2 = self._betas
-        settings = {"beta1": beta1, "beta2": beta2, "lr": lr, "eps": self._eps}
-        tensors = [*parameters], gradients, first, second, [], steps
-        adam(*tensors, **settings, amsgrad=False, weight_decay=0.0, maximize=False, fused=True)
+        adam(
+            [*parameters],
+            gradients,
+            first,
+            second,
+            [],
+            steps,
+            fused=True,
+            amsgrad=False,
+            maximize=False,
+            beta1=beta1,
+            beta2=beta2,
+            lr=lr,
+            weight_decay=0.0,
+            eps=self._eps,
+        )
 
 
 @final
