@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from invgraphics import kernels
+from invgraphics.experiments.recorder import Monitor
 
 pytest_plugins = ["training_fixtures"]
 
@@ -17,6 +18,12 @@ pytest_plugins = ["training_fixtures"]
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _monitored_pixels() -> None:
+    """The monitor looks at few pixels: it takes longer than the steps between its looks in a fit of a few steps."""
+    Monitor.PIXELS = 256
 
 
 @pytest.fixture(autouse=True)

@@ -54,7 +54,10 @@ def _toy_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("thing", [*(getattr(ig, name) for name in EXAMPLES), ScoreTable], ids=[*EXAMPLES, "ScoreTable"])
-def test_the_examples_hold(thing: object) -> None:
+def test_the_examples_hold(thing: object, request: pytest.FixtureRequest) -> None:
+    """Fits of the comparison's example have a process each, as for a user; of the study's, one for all."""
+    if thing is ig.ablate:
+        request.getfixturevalue("in_process")
     (test,) = doctest.DocTestFinder(recurse=False).find(thing, name=thing.__name__)
     assert test.examples
     said = io.StringIO()
@@ -62,7 +65,7 @@ def test_the_examples_hold(thing: object) -> None:
     assert not failed, said.getvalue()
 
 
-def test_the_readme_holds() -> None:
+def test_the_readme_holds(in_process) -> None:
     """Its blocks of Python, one after the other, on the toy and with few steps."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.S | re.M)
     assert len(blocks) == 3
@@ -213,7 +216,7 @@ def test_scenes_are_saved_where_they_can_be() -> None:
         ig.save_scene(toy_scene(views=2, size=8), "toy.npz/kept.npz")
 
 
-def test_a_study_shows_its_figures() -> None:
+def test_a_study_shows_its_figures(in_process) -> None:
     head = 'question = "?"\nscenes = ["toy.npz"]\nmethods = ["splatting/gaussians"]\nseeds = [0]\nbudget = "2steps"\n'
     Path("views.toml").write_text(head + "[factors]\ndata.train_views = [4, 8]\n")
     result = ig.ablate("views.toml", out="views")

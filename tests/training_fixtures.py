@@ -2,8 +2,9 @@
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 import torch
@@ -12,6 +13,9 @@ from PIL import Image
 from invgraphics.core import Scene
 from invgraphics.core.transforms import opencv_to_opengl
 from invgraphics.experiments.build import build_plan
+from invgraphics.experiments.executors.base import Outcome, Resources
+from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.run import fit_run
 from invgraphics.recipes.recipe import Method, load_method
 from invgraphics.testing import toy_scene
 from invgraphics.training.budget import Budget
@@ -43,6 +47,34 @@ SMALL = {
         "hooks.1.start=0.1",
     ],
 }
+
+
+class InProcess:
+    """An executor that fits here and now, and fails with a text that a test wants."""
+
+    made: ClassVar[list[str]]
+    fails: Callable[[FitRequest], str]
+
+    def __init__(self, resources: Resources | None = None) -> None:
+        assert resources is None or resources.threads == torch.get_num_threads()
+
+    def run(self, requests: Sequence[FitRequest], jobs: Path) -> Iterator[Outcome]:
+        for request in requests:
+            if error := type(self).fails(request):
+                yield Outcome(request, 1, error, 0.5)
+                continue
+            fit_run(request)
+            self.made.append(request.out)
+            yield Outcome(request, 0, "", 1.5)
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> type[InProcess]:
+    """Fits of studies and comparisons run in this process: starting one takes longer than a fit of a few steps."""
+    InProcess.made, InProcess.fails = [], staticmethod(lambda request: "")
+    for module in ("invgraphics.experiments.executors.local", "invgraphics.experiments.compare"):
+        monkeypatch.setattr(f"{module}.LocalExecutor", InProcess)
+    return InProcess
 
 
 @pytest.fixture(scope="session")

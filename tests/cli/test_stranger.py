@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from invgraphics.cli import main
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 
@@ -105,62 +105,61 @@ def environment(tmp_path: Path) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "200"}
 
 
-def _invgraphics(environment: dict[str, str], *arguments: str) -> str:
-    command = [sys.executable, "-m", "invgraphics", *arguments]
+def _invgraphics(environment: dict[str, str], *commands: list[str]) -> list[str]:
+    """Outputs of several commands, all given in one process."""
+    code = "import json, sys; from invgraphics.cli.main import run\n"
+    code += "for words in json.loads(sys.argv[1]):\n    assert run(words) == 0, words\n    print('\\f')"
+    command = [sys.executable, "-c", code, json.dumps(commands)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return done.stdout
+    *outputs, _ = done.stdout.split("\f")
+    return outputs
 
 
 def test_a_strangers_field_and_renderer_with_state_take_part(
     environment: dict[str, str], toy_folder: Path, tmp_path: Path
 ) -> None:
     """Listed, fitted, compared with ours, shown beside it for a field that ours fitted, reported and explained."""
-    listed = _invgraphics(environment, "list", "matrix", "renderers", "fields", "methods")
+    out = tmp_path / "report"
+    methods = "volumetric/fog,exposed/fog"
+    words = ["--budget", "20steps", "--out", str(out), "--methods", methods, "--render-with", "exposed/fog"]
+    ours, theirs = (out / "runs" / name / "seed-0" for name in ("volumetric-fog", "exposed-fog"))
+    shown = ours / "rendered" / "exposed-fog"
+    listed, compared, *explained = _invgraphics(
+        environment,
+        ["list", "matrix", "renderers", "fields", "methods"],
+        ["compare", str(toy_folder), *words],
+        *(["explain", str(run), "--view", "0", "--pixel", "12,12"] for run in (theirs, shown)),
+    )
     assert "| exposed volume rendering |" in listed and "stranger_fog:ExposedConfig" in listed
     assert "stranger_fog:FogConfig" in listed and "stranger-fog" in listed and "volumetric/fog" in listed
-    out = tmp_path / "report"
-    words = [
-        "--budget",
-        "20steps",
-        "--out",
-        str(out),
-        "--methods",
-        "volumetric/fog,exposed/fog",
-        "--render-with",
-        "exposed/fog",
-    ]
-    assert "exposed/fog" in _invgraphics(environment, "compare", str(toy_folder), *words)
+    assert "exposed/fog" in compared
     page = (out / "index.html").read_text()
     assert "Even fog from a stranger" in page and "Exposed fog from a stranger" in page
-    ours, theirs = (out / "runs" / name / "seed-0" for name in ("volumetric-fog", "exposed-fog"))
     assert [json.loads((run / "scores.json").read_text())["cost"]["parameters"] for run in (ours, theirs)] == [4, 5]
     state = checkpoint.load(theirs / CHECKPOINT)
     assert abs(float(state["renderer"]["log_exposure"])) > 0.01, "the renderer has learnt nothing"
     # An exposure of 1 stands in, under which our renderer's field looks as it did.
-    shown = ours / "rendered" / "exposed-fog"
     assert json.loads((shown / "scores.json").read_text())["method"] == "volumetric/fog rendered with exposed/fog"
     with np.load(ours / "test" / "0000.npz") as own, np.load(shown / "test" / "0000.npz") as other:
         np.testing.assert_allclose(own["rgb"], other["rgb"], atol=1e-3)
-    several = "import sys; from invgraphics.cli.main import run; [run(['explain', a, *sys.argv[3:]]) for a in sys.argv[1:3]]"
-    command = [sys.executable, "-c", several, str(theirs), str(shown), "--view", "0", "--pixel", "12,12"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.count("8 samples") == 2
+    assert all("8 samples" in text for text in explained)
     for run in (theirs, shown):
         pixel = json.loads((run / "explained" / "test-0000-12-12" / "ray.json").read_text())["pixel"]
         assert pixel["composited"] == pytest.approx(pixel["rendered"], abs=1e-5)
 
 
-def test_a_run_whose_package_is_gone_names_it(environment: dict[str, str], toy_folder: Path, tmp_path: Path) -> None:
+def test_a_run_whose_package_is_gone_names_it(
+    environment: dict[str, str], toy_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "run"
-    _invgraphics(environment, "fit", "volumetric/fog", str(toy_folder), "--budget", "2steps", "--out", str(run))
+    _invgraphics(environment, ["fit", "volumetric/fog", str(toy_folder), "--budget", "2steps", "--out", str(run)])
     plugins = {"fog": "stranger-fog 1.0", "volumetric/fog": "stranger-fog 1.0"}
     assert json.loads((run / "provenance.json").read_text())["plugins"] == plugins
-    shutil.rmtree(tmp_path / "site")
-    command = [sys.executable, "-m", "invgraphics", "evaluate", str(run)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "was made with stranger-fog 1.0, which provides 'fog', 'volumetric/fog' and is not installed here" in done.stderr
+    # Only that process had the package.
+    assert main.run(["evaluate", str(run)]) == main.BAD_INPUT
+    said = capsys.readouterr().err
+    assert "was made with stranger-fog 1.0, which provides 'fog', 'volumetric/fog' and is not installed here" in said
 
 
 def test_a_stranger_that_fails_to_import_is_named(environment: dict[str, str], tmp_path: Path) -> None:

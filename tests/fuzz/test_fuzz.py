@@ -25,7 +25,7 @@ from watched import Process, Reader
 
 COUNT = int(os.environ.get("INVGRAPHICS_FUZZ", "200"))
 SEED = int(os.environ.get("INVGRAPHICS_FUZZ_SEED", f"{datetime.datetime.now(datetime.UTC):%Y%m%d}"))
-PAGE_SHARE = 20
+PAGE_SHARE = 40
 """A page takes as long as this many readings, so that as many times fewer are made."""
 CHECKED = {("images", "*"), ("npz", "flip"), ("idr", "flip"), ("old_spz", "flip")}
 """Readers of files with checksums, and mutations: what is accepted after them reads as if nothing had happened."""
@@ -58,24 +58,22 @@ def spec_of(root: Path, pattern: str, name: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def processes() -> Iterator[dict[str, Process]]:
-    """Kind of reader -> its process."""
-    started: dict[str, Process] = {}
+def process() -> Iterator[Process]:
+    """The process that reads all inputs."""
+    started = Process()
     yield started
-    for process in started.values():
-        process.close()
+    started.close()
 
 
 @pytest.fixture(scope="module", params=list(seeds.SEEDS))
 def good(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, processes: dict[str, Process]
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, process: Process
 ) -> tuple[str, Path, str, Reader]:
-    """Name, folder and pattern of a good input, and the process that has read it."""
+    """Name, folder and pattern of a good input, and what reads its copies."""
     root = tmp_path_factory.mktemp(request.param) / "good"
     root.mkdir()
     pattern = seeds.SEEDS[request.param](root)
-    kind = kind_of(request.param)
-    reader = Reader(processes.setdefault(kind, Process(kind)), spec_of(root, pattern, request.param))
+    reader = Reader(process, kind_of(request.param), spec_of(root, pattern, request.param))
     return request.param, root, pattern, reader
 
 
@@ -101,7 +99,7 @@ def test_damaged_inputs_are_refused_or_right(good: tuple[str, Path, str, Reader]
 
     @seed(SEED)
     @settings(
-        max_examples=max(10, COUNT // PAGE_SHARE) if name.startswith("report") else COUNT,
+        max_examples=max(5, COUNT // PAGE_SHARE) if name.startswith("report") else COUNT,
         deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),

@@ -44,7 +44,7 @@ def process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[watched.Proces
     script = tmp_path_factory.mktemp("script") / "misbehaving.py"
     sizes = {"less": 3 << 28, "much": 3 << 29, "too_much": 3 << 30}
     script.write_text(SCRIPT.format(folder=str(Path(watched.__file__).parent), **sizes))
-    started = watched.Process("recipe", script)
+    started = watched.Process(script)
     yield started
     started.close()
 
@@ -63,5 +63,5 @@ def process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[watched.Proces
 def test_every_bound_is_noticed(process: watched.Process, name: str, outcome: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if name == "sleeps":
         monkeypatch.setattr(watched, "SECONDS", 1.0)
-    reader = watched.Reader(process, Path("good"))
+    reader = watched.Reader(process, "recipe", Path("good"))
     assert reader.read(Path(name))[0] == outcome

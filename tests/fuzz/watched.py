@@ -18,46 +18,49 @@ STARTING = 120.0
 
 
 class Process:
-    """A process of `reader`, started when it is needed; the libraries that it loads serve all inputs of one kind.
+    """A process of `reader`, started when it is needed; the libraries that it has loaded serve all inputs.
 
     Args:
-        kind: what it reads, a key of `reader.READERS`.
         script: what it runs.
     """
 
-    def __init__(self, kind: str, script: Path = READER) -> None:
-        self.kind, self.script = kind, script
+    def __init__(self, script: Path = READER) -> None:
+        self.script = script
         self._process: subprocess.Popen[bytes] | None = None
-        self._good: Path | None = None
+        self._good: tuple[str, Path] | None = None
 
-    def read(self, path: Path, good: Path) -> tuple[str, str]:
-        """Read ``path`` after ``good``, see `Reader.read`."""
+    def begin(self, kind: str, good: Path) -> tuple[str, str]:
+        """Read a good input, from which bounds of memory start; ``kind`` is a key of `reader.READERS`."""
         if self._process is None:
             command = [sys.executable, str(self.script)]
             environment = os.environ | {"OMP_NUM_THREADS": "1"}
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
             )
-            self._good = None
-        if self._good != good:
-            answer = self._ask(good, True, STARTING)
-            if answer[0] != "accepted" or path == good:
+        answer = self._ask(kind, good, True, STARTING)
+        self._good = (kind, good) if answer[0] == "accepted" else None
+        return answer
+
+    def read(self, kind: str, path: Path, good: Path) -> tuple[str, str]:
+        """Read ``path`` after ``good``, see `Reader.read`."""
+        if self._good != (kind, good):
+            answer = self.begin(kind, good)
+            if answer[0] != "accepted":
                 return answer
-            self._good = good
-        return self._ask(path, False, SECONDS)
+        return self._ask(kind, path, False, SECONDS)
 
     def close(self) -> None:
         """End the process."""
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
-            self._process = None
+            self._process = self._good = None
 
-    def _ask(self, path: Path, good: bool, seconds: float) -> tuple[str, str]:
+    def _ask(self, kind: str, path: Path, good: bool, seconds: float) -> tuple[str, str]:
         process = self._process
         assert process is not None and process.stdin is not None and process.stdout is not None
         started = time.monotonic()
-        process.stdin.write(json.dumps([self.kind, str(path), good]).encode() + b"\n")
+        process.stdin.write(json.dumps([kind, str(path), good]).encode() + b"\n")
         process.stdin.flush()
         if not select.select([process.stdout], [], [], seconds)[0]:
             self.close()
@@ -74,9 +77,9 @@ class Process:
 class Reader:
     """A `Process` for the damaged copies of one good input, which it reads first and whose digest is `digest`."""
 
-    def __init__(self, process: Process, good: Path) -> None:
-        self._process, self._good = process, good
-        outcome, self.digest = process.read(good, good)
+    def __init__(self, process: Process, kind: str, good: Path) -> None:
+        self._process, self._kind, self._good = process, kind, good
+        outcome, self.digest = process.begin(kind, good)
         assert outcome == "accepted", self.digest
 
     def read(self, path: Path) -> tuple[str, str]:
@@ -84,4 +87,4 @@ class Reader:
 
         Outcomes: ``accepted``, ``refused``, ``raised``, ``died``; ``hung`` beyond `SECONDS`, ``greedy`` beyond `reader.MEMORY`.
         """
-        return self._process.read(path, self._good)
+        return self._process.read(self._kind, path, self._good)

@@ -2,20 +2,15 @@
 
 import csv
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from training_fixtures import SMALL
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.executors.base import Outcome, Resources
-from invgraphics.experiments.request import AblateRequest, FitRequest
-from invgraphics.experiments.run import fit_run
+from invgraphics.experiments.request import AblateRequest
 from invgraphics.report.study import build_study_report
-from invgraphics.studies import ablate as module
 from invgraphics.studies.ablate import ablate
 from invgraphics.studies.cells import make_plan, select
 from invgraphics.studies.forecast import Forecast
@@ -25,34 +20,6 @@ from invgraphics.training.budget import Budget
 METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians")
 LIST = 'question = "Does it hold?"\ndesign = "list"\nreport = "verdicts"\nscenes = ["a", "b"]\nseeds = [0, 1]\nsize = 64\n'
 LIST += f"methods = {json.dumps(METHODS[1:])}\n"
-
-
-class InProcess:
-    """An executor that fits here and now, and fails with a text that a test wants."""
-
-    made: list[str]
-    fails: Callable[[FitRequest], str]
-
-    def __init__(self, resources: Resources) -> None:
-        assert resources.threads == torch.get_num_threads()
-
-    def run(self, requests, jobs):
-        for request in requests:
-            if error := type(self).fails(request):
-                yield Outcome(request, 1, error, 0.5)
-                continue
-            fit_run(request)
-            self.made.append(request.out)
-            yield Outcome(request, 0, "", 1.5)
-
-
-@pytest.fixture
-def executor(monkeypatch) -> type[InProcess]:
-    InProcess.made, InProcess.fails = [], staticmethod(lambda request: "")
-    load = module.plugins.load
-    instead = staticmethod(lambda registry, name: InProcess if registry == "executors" else load(registry, name))
-    monkeypatch.setattr(module.plugins, "load", instead)
-    return InProcess
 
 
 @pytest.fixture
@@ -85,8 +52,8 @@ def _verdicts(folder: Path) -> dict[tuple[str, str], dict[str, str]]:
         return {(row["cell"], row["rule"]): row for row in csv.DictReader(file)}
 
 
-def test_a_small_gauntlet_from_its_file_to_its_verdicts(executor, gauntlet, toy_folder: Path) -> None:
-    executor.fails = staticmethod(lambda fit: "Step 3: not finite." if fit.size == 16 else "")
+def test_a_small_gauntlet_from_its_file_to_its_verdicts(in_process, gauntlet, toy_folder: Path) -> None:
+    in_process.fails = staticmethod(lambda fit: "Step 3: not finite." if fit.size == 16 else "")
     folder, failed = ablate(gauntlet, _yes)
     name = toy_folder.name
     assert [cell.label for cell in failed] == [f"splatting/gaussians {name}@16 2steps seed=0"]
@@ -111,49 +78,49 @@ def test_a_small_gauntlet_from_its_file_to_its_verdicts(executor, gauntlet, toy_
     assert str(toy_folder) not in text
 
 
-def test_finished_cells_are_kept_when_the_code_has_changed(executor, gauntlet, monkeypatch, toy_folder: Path) -> None:
+def test_finished_cells_are_kept_when_the_code_has_changed(in_process, gauntlet, monkeypatch, toy_folder: Path) -> None:
     """Only if that is asked for; a cell whose recipe changed is another cell."""
     request = replace(gauntlet, cells="splatting/* *")
     ablate(request, _yes)
-    assert len(executor.made) == 3
+    assert len(in_process.made) == 3
     monkeypatch.setattr("invgraphics.experiments.identity.code_version", lambda: "later")
-    executor.made.clear()
+    in_process.made.clear()
     ablate(replace(request, keep=True), _yes)
-    assert executor.made == []
+    assert in_process.made == []
     monkeypatch.delenv("TOY_DATA")  # what is finished needs no data
     ablate(replace(request, keep=True), _yes)
     statuses = [cell["status"] for label, cell in _cells(request).items() if label.startswith("splatting")]
     assert statuses == ["done"] * 3
     monkeypatch.setenv("TOY_DATA", str(toy_folder.parent))
     ablate(request, _yes)
-    assert len(executor.made) == 3
+    assert len(in_process.made) == 3
     source = Path(request.study)
     source.write_text(
         source.read_text().replace('"splatting/gaussians:field.count" = 150', '"splatting/gaussians:field.count" = 140')
     )
-    executor.made.clear()
+    in_process.made.clear()
     ablate(replace(request, keep=True), _yes)
-    assert len(executor.made) == 3
+    assert len(in_process.made) == 3
 
 
-def test_cells_that_are_left_out_stay_what_they_were(executor, gauntlet, toy_folder: Path) -> None:
+def test_cells_that_are_left_out_stay_what_they_were(in_process, gauntlet, toy_folder: Path) -> None:
     request = gauntlet
     seen: list[Forecast] = []
     ablate(replace(request, cells=f"splatting/* {toy_folder.name}@16 *"), seen.append)
     assert (seen[0].runs, seen[0].missing, seen[0].later) == (8, 1, 7) and "7 left out" in str(seen[0])
     ablate(replace(request, cells="splatting/* 2steps *"), _yes)
-    assert len(executor.made) == 2
+    assert len(in_process.made) == 2
     statuses = [cell["status"] for cell in _cells(request).values()]
     assert sorted(statuses) == ["done"] * 2 + ["missing"] * 5 + ["skipped"]
     with pytest.raises(InputError, match="No cell of the study is left"):
         ablate(replace(request, cells="hybrid/*"), _yes)
 
 
-def test_cheap_cells_come_first(executor, gauntlet) -> None:
+def test_cheap_cells_come_first(in_process, gauntlet) -> None:
     """Within a method: fewer steps, then smaller pictures."""
     ablate(replace(gauntlet, cells="splatting/* *"), _yes)
     plan = {planned.fit.out: planned for planned in make_plan(read_study(Path(gauntlet.study)), gauntlet)}
-    made = [(plan[out].fit.budget, plan[out].fit.size) for out in executor.made]
+    made = [(plan[out].fit.budget, plan[out].fit.size) for out in in_process.made]
     assert made[-1] == ("4steps", 24) and sorted(made[:2]) == [("2steps", 16), ("2steps", 24)]
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from invgraphics.errors import NumericalError
+from invgraphics.experiments.recorder import Monitor
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 
@@ -43,6 +44,13 @@ def test_poses_matter(name: str, scene, make_fit) -> None:
     wrong = make_fit(name, scene.with_views(train=shuffled), STEPS[name])
     wrong.run(lambda loss: False)
     assert _psnr(fit) > _psnr(wrong) + 5
+
+
+def test_the_monitor_sees_every_pixel_of_small_views_once(scene, make_fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Monitor, "PIXELS", 4096)
+    assert len(scene.test) * scene.test[0].image[..., 0].numel() < 4096
+    fit = make_fit("splatting/gaussians", scene, 1)
+    assert Monitor(scene, torch.device("cpu")).psnr(fit) == pytest.approx(_psnr(fit), abs=1e-4)
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -89,6 +89,9 @@ def use_kernels(name: str | None) -> None:
 
 
 def use_deterministic_algorithms(device: torch.device) -> None:
-    """Use torch's deterministic algorithms on a CPU, where the same seed and thread count then give the same bits."""
-    torch.use_deterministic_algorithms(device.type == "cpu", warn_only=True)
+    """Use torch's deterministic algorithms on a CPU, where the same seed and thread count then give the same bits.
+
+    By the debug mode: ``torch.use_deterministic_algorithms`` imports torch's compiler, two seconds of every process that fits.
+    """
+    torch.set_deterministic_debug_mode("warn" if device.type == "cpu" else "default")
     torch.utils.deterministic.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]  # a debugging aid, slow

@@ -31,7 +31,7 @@ MARKS = (0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0
 
 
 class Monitor:
-    """PSNR on a fixed set of pixels of a few views that are not trained on, for curves over time.
+    """PSNR on a fixed set of pixels of a few views that are not trained on, all of them if there are few, for curves over time.
 
     Uses validation views, or test views where a data set has none; what it sees never reaches the fit.
     """
@@ -46,8 +46,10 @@ class Monitor:
         self._bounds = scene.bounds.to(device)
         generator = torch.Generator().manual_seed(0)
         per_view = self.PIXELS // len(self._views)
+        counts = [view.image.shape[0] * view.image.shape[1] for view in self._views]
         self._pixels = [
-            torch.randint(v.image.shape[0] * v.image.shape[1], (per_view,), generator=generator) for v in self._views
+            torch.arange(count) if count <= per_view else torch.randint(count, (per_view,), generator=generator)
+            for count in counts
         ]
 
     @torch.no_grad()

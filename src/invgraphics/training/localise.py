@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from invgraphics.core import Batch, Camera, Context, Model, RayRenderer, Scene, View
+from invgraphics.training.adam import DenseAdam
 from invgraphics.training.batches import scaled_view
 from invgraphics.training.poses import motion_about, pivot_depth
 
@@ -50,7 +51,7 @@ def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) ->
     small = _at_scale(view, descent.scale)
     twist = torch.zeros(6, device=device, requires_grad=True)
     reach = torch.tensor([1.0] * 3 + [scene.extent] * 3, device=device)
-    adam = torch.optim.Adam([twist], lr=descent.lr)
+    adam = DenseAdam([{"params": [twist]}], (0.9, 0.999), eps=1e-8)
     generator = torch.Generator().manual_seed(0)
     ctx = model.context()
     start = small.camera.to(device)

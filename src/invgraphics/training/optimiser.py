@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from invgraphics.errors import InputError
-from invgraphics.training.masked_adam import MOMENTS, ROW_RATES, MaskedAdam
+from invgraphics.training.adam import MOMENTS, ROW_RATES, Adam, DenseAdam, MaskedAdam
 
 RESTARTED = "restarted"
 """Name in an optimiser's state of the progress at which rates were restarted last."""
@@ -96,9 +96,9 @@ class Optimiser:
         dense, masked = (
             [group for group in groups if config.groups[str(group["name"])].skip_zero == skip] for skip in (False, True)
         )
-        self._adams: list[torch.optim.Optimizer] = []
+        self._adams: list[Adam] = []
         if dense:
-            self._adams.append(torch.optim.Adam(dense, lr=0.0, betas=betas, eps=config.eps, fused=True))
+            self._adams.append(DenseAdam(dense, betas, config.eps))
         if masked:
             self._adams.append(MaskedAdam(masked, betas, config.eps))
         self._since = 0.0
@@ -113,7 +113,7 @@ class Optimiser:
     def _groups(self) -> list[dict[str, Any]]:
         return [group for adam in self._adams for group in adam.param_groups]
 
-    def _adam_of(self, name: str) -> torch.optim.Optimizer:
+    def _adam_of(self, name: str) -> Adam:
         """The optimiser that holds a parameter."""
         key = self._group_of(name)
         return next(adam for adam in self._adams if any(group["name"] == key for group in adam.param_groups))
@@ -141,7 +141,7 @@ class Optimiser:
     def zero_grad(self) -> None:
         """Drop all gradients."""
         for adam in self._adams:
-            adam.zero_grad(set_to_none=True)
+            adam.zero_grad()
 
     def step(self) -> None:
         """One Adam step."""

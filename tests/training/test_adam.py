@@ -1,9 +1,13 @@
-"""Groups with ``skip_zero``: what they leave alone, rates per row, changes of rows, and resumption to the bit."""
+"""Adam: torch's bits; and with ``skip_zero``: entries left alone, rates per row, changes of rows, resumption to the bit."""
+
+import subprocess
+import sys
 
 import pytest
 import torch
 
 from invgraphics.errors import InputError
+from invgraphics.training.adam import DenseAdam
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 
 CONFIG = OptimiserConfig({"grid": GroupConfig("field.grid", 0.1, skip_zero=True), "net": GroupConfig("field.net", 0.1)})
@@ -24,6 +28,28 @@ def step(parameters, optimiser, seed, touched=slice(0, 2)):
     parameters["field.grid"].grad = gradient
     parameters["field.net"].grad = torch.randn(5, generator=generator)
     optimiser.step()
+
+
+def test_dense_steps_are_those_of_torchs_own_class():
+    generator = torch.Generator().manual_seed(0)
+    ours, theirs = ([torch.nn.Parameter(torch.ones(4, 3)), torch.nn.Parameter(torch.ones(5))] for _ in range(2))
+    adam = DenseAdam([{"params": ours[:1], "lr": 0.1}, {"params": ours[1:], "lr": 0.02}], (0.8, 0.95), 1e-6)
+    groups = [{"params": theirs[:1], "lr": 0.1}, {"params": theirs[1:], "lr": 0.02}]
+    judge = torch.optim.Adam(groups, betas=(0.8, 0.95), eps=1e-6, fused=True)
+    for number in range(5):
+        for a, b in zip(ours, theirs, strict=True):
+            a.grad = torch.randn(a.shape, generator=generator)
+            b.grad = a.grad.clone()
+        if number == 2:
+            ours[0].grad = theirs[0].grad = None
+        adam.step()
+        judge.step()
+        assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+    for a, b in zip(ours, theirs, strict=True):
+        assert adam.state[a].keys() == judge.state[b].keys()
+        assert all(torch.equal(value, judge.state[b][key]) for key, value in adam.state[a].items())
+    adam.zero_grad()
+    assert all(parameter.grad is None for parameter in ours)
 
 
 def test_rows_without_gradient_stay_while_torch_moves_them_by_momentum():
@@ -94,3 +120,23 @@ def test_rates_that_do_not_fit_are_refused():
         optimiser.set_row_rates("field.grid", torch.ones(4))
     with pytest.raises(InputError, match=r"'skip_zero = true' in 'optimiser\.groups\.net'"):
         optimiser.set_row_rates("field.net", torch.ones(()))
+
+
+def test_a_process_that_fits_imports_no_compiler():
+    """As torch's optimisers do, and its switch to deterministic algorithms."""
+    code = (
+        "import sys, torch\n"
+        "from invgraphics.experiments.build import use_deterministic_algorithms\n"
+        "from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig\n"
+        "use_deterministic_algorithms(torch.device('cpu'))\n"
+        "assert torch.are_deterministic_algorithms_enabled()\n"
+        "parameters = {name: torch.nn.Parameter(torch.ones(2, 3)) for name in ('field.a', 'field.b')}\n"
+        "groups = {name[-1]: GroupConfig(name, 0.1, skip_zero=name == 'field.b') for name in parameters}\n"
+        "optimiser = Optimiser(OptimiserConfig(groups), parameters, 1.0)\n"
+        "sum(parameter.sum() for parameter in parameters.values()).backward()\n"
+        "optimiser.step()\n"
+        "assert all(float(parameter.max()) < 1 for parameter in parameters.values())\n"
+        "print([name for name in ('torch._dynamo', 'torch._inductor', 'sympy') if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
