@@ -9,7 +9,7 @@ import torch
 from invgraphics.config import fill, to_table
 from invgraphics.core import Bounds, Quantity, Samples
 from invgraphics.errors import InputError
-from invgraphics.fields import neural
+from invgraphics.fields import geometry
 from invgraphics.fields.encodings.factors import CpConfig, VmConfig
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies
 from invgraphics.fields.encodings.hash import HashConfig
@@ -18,7 +18,7 @@ from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig, unit_covariance
 
-D, S, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.RADIANCE, Quantity.NORMAL
+D, S, G, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.GRADIENT, Quantity.RADIANCE, Quantity.NORMAL
 
 SMALL = NeuralFieldConfig(
     FrequencyConfig(octaves=2), layers=2, width=12, skip=0, geometry_features=5, colour_width=8, direction_degree=2
@@ -41,6 +41,9 @@ KINDS = {
     "hash": HASH,
     "sdf": replace(SMALL, geometry="sdf"),
     "hash sdf": replace(HASH, geometry="sdf", direction="none"),
+    "sdf and its colour": replace(SMALL, geometry="sdf", colour_inputs=("position", "normal")),
+    "hash sdf and its colour": replace(HASH, geometry="sdf", colour_inputs=("normal",)),
+    "density and its colour": replace(SMALL, colour_inputs=("position", "normal")),
     "vm": TENSORF,
     "cp": replace(TENSORF, encoding=CpConfig(5, 2), appearance=CpConfig(5, 3), appearance_basis=0),
     "triplane": replace(
@@ -55,6 +58,8 @@ KINDS = {
     "grid, activated inside": replace(GRID, density_interpolation="in"),
     "grid of opacities": replace(GRID, density_interpolation="pre"),
     "two encodings and handed features": replace(SMALL, appearance=VoxelsConfig(4, features=2)),
+    "triplane sdf": replace(SMALL, encoding=TriplaneConfig(5, 4), geometry="sdf", colour_inputs=("position", "normal")),
+    "vm sdf": replace(SMALL, encoding=VmConfig(5, 2), geometry="sdf", colour_inputs=("position", "normal")),
     "dense sdf": replace(SMALL, encoding=VoxelsConfig(6, features=2, levels=2, coarsest=3), geometry="sdf"),
 }
 
@@ -75,7 +80,7 @@ def _samples(scene, m: int = 6) -> Samples:
 
 def _flat(field: NeuralField, samples: Samples, want: Quantity) -> torch.Tensor:
     values = field.query(samples, want)
-    parts = [values.density, values.sdf, values.radiance]
+    parts = [values.density, values.sdf, values.radiance, values.gradient]
     return torch.cat([part.reshape(-1) for part in parts if part is not None])
 
 
@@ -95,7 +100,8 @@ def test_gradients_to_positions_directions_and_parameters(make_scene, kind, spac
 
     # Parameters: the directional derivative along a random direction in the space of all of them.
     def total():
-        return (_flat(field, samples, want) * torch.arange(1, len(samples) * 4 + 1)).sum()
+        flat = _flat(field, samples, want)
+        return (flat * torch.arange(1, len(flat) + 1)).sum()
 
     parameters = list(field.parameters())
     gradients = torch.autograd.grad(total(), parameters)
@@ -123,8 +129,11 @@ def test_normals_are_the_gradient_even_without_grad(make_scene, kind, space):
         slopes.append(sign * (ahead - behind) / (2 * step))
     expected = torch.nn.functional.normalize(torch.stack(slopes, dim=1), dim=1)
     with torch.no_grad():
-        values = field.query(samples, N | R)
+        values = field.query(samples, (field.provides & G) | N | R)
     assert values.normal is not None
+    if values.gradient is not None:
+        assert not values.gradient.requires_grad
+        torch.testing.assert_close(values.gradient, torch.stack(slopes, dim=1), atol=1e-4, rtol=1e-4)
     assert values.radiance is not None
     assert not values.normal.requires_grad
     assert not values.radiance.requires_grad
@@ -151,10 +160,10 @@ def test_chunks_change_nothing(make_scene, monkeypatch, kind, grad):
     samples = _samples(scene, 50)
     results = []
     for chunk in (1000, 7):
-        monkeypatch.setattr(neural, "CPU_CHUNK", chunk)
+        monkeypatch.setattr(geometry, "CPU_CHUNK", chunk)
         with torch.set_grad_enabled(grad):
             values = field.query(samples, field.provides)
-        results.append([getattr(values, name) for name in ("density", "sdf", "radiance", "normal")])
+        results.append([getattr(values, name) for name in ("density", "sdf", "gradient", "radiance", "normal")])
     for one, other in zip(*results, strict=True):
         assert (one is None) == (other is None)
         if one is not None:

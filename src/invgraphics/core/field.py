@@ -25,6 +25,7 @@ class Quantity(Flag):
     NONE = 0
     DENSITY = auto()
     SDF = auto()
+    GRADIENT = auto()
     RADIANCE = auto()
     NORMAL = auto()
     FEATURES = auto()

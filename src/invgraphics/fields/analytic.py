@@ -86,7 +86,7 @@ class Slab(AnalyticField):
 class Sphere(AnalyticField):
     """Constant density inside a sphere, with its signed distance and normals."""
 
-    provides = AnalyticField.provides | Quantity.SDF | Quantity.NORMAL
+    provides = AnalyticField.provides | Quantity.SDF | Quantity.GRADIENT | Quantity.NORMAL
     centre: Tensor
 
     def __init__(self, density: float, radius: float, centre: Vector = (0, 0, 0), colour: Colour = (1, 1, 1)) -> None:
@@ -113,12 +113,13 @@ class Sphere(AnalyticField):
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
         """See `Field.query`."""
-        values = super().query(samples, want)
+        values, outward = super().query(samples, want), normalize(samples.position - self.centre, dim=1)
         return FieldValues(
             density=values.density,
             radiance=values.radiance,
             sdf=self.sdf_at(samples.position) if Quantity.SDF in want else None,
-            normal=normalize(samples.position - self.centre, dim=1) if Quantity.NORMAL in want else None,
+            gradient=outward if Quantity.GRADIENT in want else None,
+            normal=outward if Quantity.NORMAL in want else None,
         )
 
 

@@ -43,10 +43,11 @@ def fused_parts(field: FieldParts) -> FusedNGP | FusedLattice | None:
 
     Returns:
         ``None`` for other encodings, heads or networks than kernels support: of a hash grid with other than two features per
-        entry or with a coarse-to-fine window, and of lattices whose density is activated before interpolation.
+        entry or with a coarse-to-fine window, of lattices whose density is activated before interpolation, of colours that
+        see more than features and direction.
     """
     config = field.config
-    if config.geometry != "density" or (config.geometry_head == "mlp" and config.skip >= 0):
+    if config.geometry != "density" or config.colour_inputs or (config.geometry_head == "mlp" and config.skip >= 0):
         return None
     if isinstance(field.encoding, LatticeFeatures):
         return _lattice_parts(field)
