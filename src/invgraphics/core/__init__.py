@@ -22,6 +22,7 @@ from invgraphics.core.renderer import check as check
 from invgraphics.core.rendering import Context as Context
 from invgraphics.core.rendering import Rendering as Rendering
 from invgraphics.core.rendering import Screen as Screen
+from invgraphics.core.rendering import SurfaceTrace as SurfaceTrace
 from invgraphics.core.rendering import Trace as Trace
 from invgraphics.core.samples import FieldValues as FieldValues
 from invgraphics.core.samples import Samples as Samples

@@ -8,6 +8,7 @@ RENDERERS = {
     "volumetric": "invgraphics.renderers.volumetric:VolumetricConfig",
     "splatting": "invgraphics.renderers.splatting:SplattingConfig",
     "gaussian_exact": "invgraphics.renderers.gaussian_volume:GaussianExactConfig",
+    "sphere_tracing": "invgraphics.renderers.sphere_tracing:SphereTracingConfig",
     "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
 }
 
