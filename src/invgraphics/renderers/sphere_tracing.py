@@ -136,7 +136,7 @@ def _surface_distance(field: Field, rays: Rays, traced: Tracing, seen: Int[Tenso
     """Distance along the rays ``seen`` to their hits, or to their closest approaches.
 
     A hit follows field and ray by the implicit function theorem, ``t - (f(x) - f(x).detach()) / (n . d)`` with the gradient n
-    of f (IDR, equation 3; Niemeyer et al. 2020): no gradient goes through the march. Where a ray begins inside, its hit is fixed.
+    of f (IDR, equation 3; Niemeyer et al. 2020): none goes through the march. Where a ray begins inside, its hit is fixed.
     """
     t = torch.where(traced.hit, traced.hit_t, traced.low_t)[seen]
     moving = torch.nonzero(traced.hit[seen] & (t > rays.near[seen]))[:, 0]
