@@ -13,6 +13,7 @@ from invgraphics.core.field import Gaussians as Gaussians
 from invgraphics.core.field import Quantity as Quantity
 from invgraphics.core.model import Model as Model
 from invgraphics.core.ngp import FusedNGP as FusedNGP
+from invgraphics.core.ngp import FusedSDF as FusedSDF
 from invgraphics.core.ngp import HashGrid as HashGrid
 from invgraphics.core.rays import Rays as Rays
 from invgraphics.core.renderer import RayRenderer as RayRenderer

@@ -81,3 +81,25 @@ class FusedNGP:
     sh_bands: int
     colour_space: Literal["srgb", "linear"]
     contracted_density: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class FusedSDF:
+    """Detached parameters of a signed distance over a hash grid, for fused sphere tracing.
+
+    Attributes:
+        table: features of all levels.
+        grid: geometry of the levels.
+        net: weight (outs, ins) and bias of each layer of a softplus network from coordinates and grid features to the distance,
+            which is the first output; layers before the last are activated.
+        sharpness: of the softplus.
+        coordinate_scale: the network's coordinates over those in the unit cube mapped to [-1, 1].
+        scale: signed distance in local units over the network's output.
+    """
+
+    table: Float[Tensor, "entries f"]
+    grid: HashGrid
+    net: tuple[tuple[Tensor, Tensor], ...]
+    sharpness: float
+    coordinate_scale: Float[Tensor, " 3"]
+    scale: float

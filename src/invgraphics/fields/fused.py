@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from invgraphics.core.field import Encoding
 from invgraphics.core.fused import ColourHead, CombinedLattices, DensityHead, FusedLattice, Layers
-from invgraphics.core.ngp import FusedNGP
+from invgraphics.core.ngp import FusedNGP, FusedSDF
 from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.encodings.lattices import LatticeFeatures
 from invgraphics.fields.heads import sums_components
@@ -65,6 +65,25 @@ def _hash_parts(field: FieldParts) -> FusedNGP | None:
     bands = config.direction_degree if config.direction == "sh" else 0
     density = config.density_activation, config.density_bias, bands, field.colour, field.contracted_density
     return FusedNGP(encoding.table.detach(), encoding.grid, geometry, colour, *density)
+
+
+def sdf_parts(config: NeuralSettings, encoding: Encoding, net: Mlp, coordinate_scale: Tensor, scale: float) -> FusedSDF | None:
+    """Parameters of a signed distance over a hash grid of two features per entry, in a box; ``None`` for others.
+
+    Args:
+        config: the field's settings.
+        encoding: of positions.
+        net: network of coordinates and features to the distance.
+        coordinate_scale: see `FusedSDF`.
+        scale: local length of the network's unit.
+    """
+    if not isinstance(encoding, HashEncoding) or encoding.window_alpha is not None or encoding.grid.features != 2:
+        return None
+    if config.skip >= 0 or net.sharpness is None or not config.layers:
+        return None
+    *hidden, (weight, bias) = net.layers()
+    layers = (*hidden, (weight[:1], bias[:1]))
+    return FusedSDF(encoding.table.detach(), encoding.grid, layers, net.sharpness, coordinate_scale, scale)
 
 
 def _lattice_parts(field: FieldParts) -> FusedLattice | None:

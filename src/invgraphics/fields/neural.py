@@ -26,14 +26,14 @@ from invgraphics.core.bounds import Bounds, Space
 from invgraphics.core.field import Encoding, Field, Quantity
 from invgraphics.core.fused import FusedLattice
 from invgraphics.core.lattice import Lattice, LatticeEncoding, Role
-from invgraphics.core.ngp import FusedNGP
+from invgraphics.core.ngp import FusedNGP, FusedSDF
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
 from invgraphics.fields import heads
 from invgraphics.fields.covariance import unit_covariance
 from invgraphics.fields.density import DensityActivation
 from invgraphics.fields.encodings.lattices import LatticeConfig, LatticeFeatures, crop_lattices
-from invgraphics.fields.fused import FieldParts, fused_parts
+from invgraphics.fields.fused import FieldParts, fused_parts, sdf_parts
 from invgraphics.fields.geometry import chunks, query_geometry
 from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
@@ -163,14 +163,23 @@ class NeuralField(Field):
     @override
     def fused(self, bounds: Bounds) -> FusedNGP | FusedLattice | None:
         """Detached parameters over ``bounds``, the field's own: of a hash grid or of lattices (see `fused_parts`)."""
-        here = bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)
-        if not here:
+        if not self._covers(bounds):
             return None
         geometry_net = self.geometry_net if self.config.geometry_head == "mlp" else None
         colour_net = self.colour_net if self.config.head == "mlp" else None
         geometry = self.config, self.encoding, geometry_net
         colour = self.appearance, self.basis, colour_net, self.colour
         return fused_parts(FieldParts(*geometry, *colour, self._density_scale, self._contracted_density))
+
+    @override
+    def fused_sdf(self, bounds: Bounds) -> FusedSDF | None:
+        """Detached parameters of a signed distance over ``bounds``, the field's own box: of a hash grid (see `sdf_parts`)."""
+        if not self._covers(bounds) or self.config.geometry != "sdf":
+            return None
+        return sdf_parts(self.config, self.encoding, self.geometry_net, self.bounds.half / self._half, self._half)
+
+    def _covers(self, bounds: Bounds) -> bool:
+        return bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)
 
     @property
     def _contracted_density(self) -> float:

@@ -10,9 +10,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invgraphics import kernels
 from invgraphics.core import Context, Field, Quantity, RayRenderer, Rays, Rendering, Samples, Scene, SurfaceTrace, Trace
+from invgraphics.kernels.reference.tracing import sphere_trace
+from invgraphics.kernels.types import Tracing, TracingLimits
 from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.tracing import Tracing, TracingLimits, sphere_trace
 from invgraphics.renderers.volumetric import query
 
 SATURATION = 8.0
@@ -89,11 +91,7 @@ class SphereTracing(RayRenderer):
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; with normals if ``ctx.geometry`` is set."""
         rays, limits = ctx.bounds.clip(rays), self.limits(ctx)
-
-        def distance(index: Int[Tensor, " k"], t: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-            return _sdf(field, Samples.on(rays, index, t, t), ctx)
-
-        traced = sphere_trace(distance, rays, limits)
+        traced = _trace(field, rays, limits, ctx)
         sharpness = SATURATION / limits.depth
         logit = -sharpness * _lowest(field, rays, traced, ctx)
         surface = SurfaceTrace(logit, sharpness, traced.hit, traced.steps, traced.converged)
@@ -105,6 +103,18 @@ class SphereTracing(RayRenderer):
         values = query(field, samples, want, ctx.chunk)
         trace = Trace(samples, values, alpha[seen], rays=len(rays), surface=surface)
         return _picture(rays, trace, alpha), trace
+
+
+def _trace(field: Field, rays: Rays, limits: TracingLimits, ctx: Context) -> Tracing:
+    """Trace rays through any field, in one compiled pass where a kernel supports it."""
+    fused = field.fused_sdf(ctx.bounds) if ctx.bounds.space == "box" else None
+    if fused is not None and kernels.compiled("sdf_trace", rays.origins):
+        return kernels.sdf_trace(rays, ctx.bounds, fused, limits)
+
+    def distance(index: Int[Tensor, " k"], t: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+        return _sdf(field, Samples.on(rays, index, t, t), ctx)
+
+    return sphere_trace(distance, rays, limits)
 
 
 def _picture(rays: Rays, trace: Trace, alpha: Float[Tensor, " n"]) -> Rendering:

@@ -14,6 +14,7 @@ LOSSES = {
     "background_entropy": "invgraphics.training.losses:BackgroundEntropyLoss",
     "point_colour": "invgraphics.training.losses:PointColourLoss",
     "eikonal": "invgraphics.training.eikonal:EikonalLoss",
+    "mask": "invgraphics.training.losses:MaskLoss",
 }
 
 PENALTIES = {

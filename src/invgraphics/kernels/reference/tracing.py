@@ -1,19 +1,23 @@
 """Sphere tracing: the first hit and the closest approach of rays to the surface of a signed distance.
 
 Every look-up says how far the surface is, so that a ray may go that far without meeting it (Hart 1996). All rays march
-together, without those that are finished. Nothing here is differentiable: `sphere_tracing` differentiates the result.
+together, without those that are finished. Nothing here is differentiable: the renderer differentiates the result.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import linear, softplus
 
-from invgraphics.core import Rays
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.ngp import FusedSDF
+from invgraphics.core.rays import Rays
+from invgraphics.kernels.reference.hash import hash_encode
+from invgraphics.kernels.types import Tracing, TracingLimits
 
 Distance = Callable[[Int[Tensor, " k"], Float[Tensor, " k"]], Float[Tensor, " k"]]
 """Signed distance on the rays of these indices, at these distances from their origins."""
@@ -22,47 +26,8 @@ GOLDEN = (3 - 5**0.5) / 2
 """Share of the larger part of a bracket at which golden-section search looks next."""
 
 
-@dataclass(frozen=True)
-class TracingLimits:
-    """When rays stop, in local length units.
-
-    Attributes:
-        steps: most look-ups of a ray while it marches.
-        relaxation: factor of a step over the distance, in (0, 2); above 1 it is over-relaxed (Keinert et al. 2014).
-        refinements: most look-ups of a ray afterwards, in the bracket of its hit or of its closest approach.
-        least: shortest step; surfaces closer together than this along a ray may be missed.
-        tolerance: a hit is refined until the distance there is at most this.
-        depth: a ray ends where it is this deep inside.
-    """
-
-    steps: int
-    relaxation: float
-    refinements: int
-    least: float
-    tolerance: float
-    depth: float
-
-
-@dataclass(frozen=True, eq=False)
-class Tracing:
-    """Where n rays met a surface, or came closest to it.
-
-    Attributes:
-        hit: whether the distance changes its sign, or is negative from the start.
-        hit_t: distance along the ray of the first such place; ``far`` without one.
-        low_t: distance along the ray of the least signed distance.
-        low: that signed distance; infinite for rays without an interval.
-        steps: look-ups of each ray, refinements left out.
-        converged: whether the hit was refined to the tolerance, or a ray without one has left the bounds within its steps.
-    """
-
-    hit: Bool[Tensor, " n"]
-    hit_t: Float[Tensor, " n"]
-    low_t: Float[Tensor, " n"]
-    low: Float[Tensor, " n"]
-    steps: Int[Tensor, " n"]
-    converged: Bool[Tensor, " n"]
-
+ROUNDING = 1e-5
+"""Relative length by which a step must exceed its sphere to count as over-relaxed."""
 
 _T, _F, _LOW, _LOW_T, _LOW_A, _LOW_B, _HIT_A, _HIT_FA, _HIT_B, _HIT_FB, _NEXT = range(11)
 """Rows of a march's state: the last accepted look-up, the least one with its neighbours, the bracket of the hit with its
@@ -77,10 +42,20 @@ def sphere_trace(distance: Distance, rays: Rays, limits: TracingLimits) -> Traci
     opaque it is. A hit is bracketed by a change of sign and refined there, so that distances need not be exact.
     """
     state, steps, ended = _march(distance, rays, limits)
-    hit = state[_HIT_B].isfinite()
-    solved = _refine_hits(distance, state, limits)
+    _refine_hits(distance, state, limits)
     _refine_closest(distance, state, limits)
-    hit_t = torch.where(hit, state[_HIT_B], rays.far)
+    return result(state, steps, ended, rays, limits)
+
+
+def result(
+    state: Float[Tensor, "11 n"], steps: Int[Tensor, " n"], ended: Bool[Tensor, " n"], rays: Rays, limits: TracingLimits
+) -> Tracing:
+    """The result of a trace from the rays' last states; ``ended`` says which were finished before their steps were used up."""
+    a, _, b, value = state[_HIT_A : _HIT_FB + 1]
+    hit = b.isfinite()
+    # A ray that begins inside has no bracket: its hit is where it begins.
+    solved = (value.abs() <= limits.tolerance) | (a == b)
+    hit_t = torch.where(hit, b, rays.far)
     return Tracing(hit, hit_t, state[_LOW_T], state[_LOW], steps, torch.where(hit, solved, ended))
 
 
@@ -117,7 +92,7 @@ def _advance(state: Float[Tensor, "11 k"], value: Float[Tensor, " k"], limits: T
     # Two spheres that do not meet may have a surface in between: such a step is taken again, as long as the first sphere only.
     safe = before.abs().clamp_min(limits.least)
     jump = t - before_t
-    accepted = ~((jump > safe * (1 + 1e-5)) & (before > 0) & (value.abs() + before < jump)) | first
+    accepted = ~((jump > safe * (1 + ROUNDING)) & (before > 0) & (value.abs() + before < jump)) | first
     crosses = accepted & (value <= 0) & state[_HIT_B].isinf()
     bracket = torch.stack([torch.where(first, t, before_t), torch.where(first, value, before), t, value])
     state[_HIT_A : _HIT_FB + 1] = torch.where(crosses, bracket, state[_HIT_A : _HIT_FB + 1])
@@ -136,27 +111,21 @@ def _advance(state: Float[Tensor, "11 k"], value: Float[Tensor, " k"], limits: T
     state[_NEXT] = torch.where(accepted, t + step, before_t + safe)
 
 
-def _refine_hits(distance: Distance, state: Float[Tensor, "11 n"], limits: TracingLimits) -> Bool[Tensor, " n"]:
-    """Move each hit within its bracket to where the distance is 0, by false position (Illinois); returns which are there."""
-    solved = state[_HIT_FB].abs() <= limits.tolerance
-    # A ray that begins inside has no bracket: its hit is where it begins.
-    solved |= state[_HIT_A] == state[_HIT_B]
-    going = torch.nonzero(state[_HIT_B].isfinite() & ~solved)[:, 0]
-    a, fa, b, fb = state[_HIT_A : _HIT_FB + 1, going]
+def _refine_hits(distance: Distance, state: Float[Tensor, "11 n"], limits: TracingLimits) -> None:
+    """Move each hit within its bracket to where the distance is 0, by false position (Illinois)."""
+    bracket = state[_HIT_A : _HIT_FB + 1]
+    unsolved = bracket[2].isfinite() & (bracket[3].abs() > limits.tolerance) & (bracket[0] != bracket[2])
+    going = torch.nonzero(unsolved)[:, 0]
     for _ in range(limits.refinements):
         if not len(going):
             break
+        a, fa, b, fb = bracket[:, going]
         t = torch.lerp(b, a, fb / (fb - fa))
         value = distance(going, t)
         # The end that stays has its value halved, or one end would stay for ever.
         across = value * fb < 0
-        a, fa = torch.where(across, b, a), torch.where(across, fb, fa / 2)
-        b, fb = t, value
-        state[_HIT_B, going] = t
-        left = torch.nonzero(value.abs() > limits.tolerance)[:, 0]
-        solved[going] = value.abs() <= limits.tolerance
-        going, a, fa, b, fb = going[left], a[left], fa[left], b[left], fb[left]
-    return solved
+        bracket[:, going] = torch.stack([torch.where(across, b, a), torch.where(across, fb, fa / 2), t, value])
+        going = going[value.abs() > limits.tolerance]
 
 
 def _refine_closest(distance: Distance, state: Float[Tensor, "11 n"], limits: TracingLimits) -> None:
@@ -174,3 +143,17 @@ def _refine_closest(distance: Distance, state: Float[Tensor, "11 n"], limits: Tr
         b = torch.where(lower & ~beyond, m, torch.where(~lower & beyond, t, b))
         f, m = torch.where(lower, value, f), torch.where(lower, t, m)
     state[_LOW, going], state[_LOW_T, going] = f, m
+
+
+def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> Tracing:
+    """See `invgraphics.kernels.sdf_trace`."""
+
+    def distance(index: Int[Tensor, " k"], t: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+        unit = bounds.to_unit(torch.addcmul(rays.origins[index], t[:, None], rays.directions[index]))
+        features, _ = hash_encode(unit, field.table, field.grid)
+        x = torch.cat([(2 * unit - 1) * field.coordinate_scale, features], dim=1)
+        for weight, bias in field.net[:-1]:
+            x = softplus(linear(x, weight, bias), beta=field.sharpness)
+        return field.scale * linear(x, *field.net[-1])[:, 0]
+
+    return sphere_trace(distance, rays, limits)
