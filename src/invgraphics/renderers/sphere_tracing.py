@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,7 +19,7 @@ from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.volumetric import query
 
 SATURATION = 8.0
-"""Logit of opacity beyond which a ray counts as opaque, or as empty: alpha is 3e-4 from 1, or from 0."""
+"""Logit of opacity beyond which a ray counts as opaque, or as empty: the sigmoid is 3e-4 from 1, or from 0."""
 MIN_SLOPE = 0.05
 """Least slope of the distance along a ray at its hit, over the gradient's length: hits of grazing rays move infinitely fast."""
 
@@ -45,7 +46,7 @@ class SphereTracingConfig:
     relaxation: float = 1.2
     refinements: int = 8
     least_step: float = 1e-4
-    tolerance: float = 1e-5
+    tolerance: float = 1e-6
     sharpness: float = 50.0
     final_sharpness: float = 1600.0
     sharp_at: float = 1.0
@@ -95,14 +96,20 @@ class SphereTracing(RayRenderer):
         sharpness = SATURATION / limits.depth
         logit = -sharpness * _lowest(field, rays, traced, ctx)
         surface = SurfaceTrace(logit, sharpness, traced.hit, traced.steps, traced.converged)
-        alpha = logit.sigmoid()
-        seen = torch.nonzero(logit.detach() > -SATURATION)[:, 0]
+        alpha = opacity(logit)
+        seen = torch.nonzero(alpha.detach())[:, 0]
         t = _surface_distance(field, rays, traced, seen, ctx)
         samples = Samples.on(rays, seen, t, t)
         want = Quantity.RADIANCE | (Quantity.GRADIENT if ctx.geometry else Quantity.NONE)
         values = query(field, samples, want, ctx.chunk)
         trace = Trace(samples, values, alpha[seen], rays=len(rays), surface=surface)
         return _picture(rays, trace, alpha), trace
+
+
+def opacity(logit: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Sigmoid that reaches 0 and 1 at -`SATURATION` and `SATURATION`: rays end there, without their true least distance."""
+    low, high = 1 / (1 + math.exp(SATURATION)), 1 / (1 + math.exp(-SATURATION))
+    return (logit.clamp(-SATURATION, SATURATION).sigmoid() - low).clamp_min(0) / (high - low)
 
 
 def _trace(field: Field, rays: Rays, limits: TracingLimits, ctx: Context) -> Tracing:
