@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from invgraphics.core.field import Encoding
 from invgraphics.core.fused import ColourHead, CombinedLattices, DensityHead, FusedLattice, Layers
 from invgraphics.core.ngp import FusedNGP, FusedSDF
+from invgraphics.fields.encodings.frequency import FrequencyEncoding
 from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.encodings.lattices import LatticeFeatures
 from invgraphics.fields.heads import sums_components
@@ -68,7 +69,7 @@ def _hash_parts(field: FieldParts) -> FusedNGP | None:
 
 
 def sdf_parts(config: NeuralSettings, encoding: Encoding, net: Mlp, coordinate_scale: Tensor, scale: float) -> FusedSDF | None:
-    """Parameters of a signed distance over a hash grid of two features per entry, in a box; ``None`` for others.
+    """Parameters of a signed distance over a hash grid of two features per entry or over octaves; ``None`` for others.
 
     Args:
         config: the field's settings.
@@ -77,13 +78,16 @@ def sdf_parts(config: NeuralSettings, encoding: Encoding, net: Mlp, coordinate_s
         coordinate_scale: see `FusedSDF`.
         scale: local length of the network's unit.
     """
-    if not isinstance(encoding, HashEncoding) or encoding.window_alpha is not None or encoding.grid.features != 2:
-        return None
     if config.skip >= 0 or net.sharpness is None or not config.layers:
         return None
     *hidden, (weight, bias) = net.layers()
-    layers = (*hidden, (weight[:1], bias[:1]))
-    return FusedSDF(encoding.table.detach(), encoding.grid, layers, net.sharpness, coordinate_scale, scale)
+    network = (*hidden, (weight[:1], bias[:1])), net.sharpness, coordinate_scale, scale
+    if not isinstance(encoding, HashEncoding | FrequencyEncoding) or encoding.window_alpha is not None:
+        return None
+    if isinstance(encoding, FrequencyEncoding):
+        octaves = encoding.config.octaves
+        return FusedSDF(weight.new_zeros(0, 2), None, octaves, *network) if encoding.config.include_input else None
+    return FusedSDF(encoding.table.detach(), encoding.grid, 0, *network) if encoding.grid.features == 2 else None
 
 
 def _lattice_parts(field: FieldParts) -> FusedLattice | None:

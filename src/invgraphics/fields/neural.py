@@ -173,7 +173,7 @@ class NeuralField(Field):
 
     @override
     def fused_sdf(self, bounds: Bounds) -> FusedSDF | None:
-        """Detached parameters of a signed distance over ``bounds``, the field's own box: of a hash grid (see `sdf_parts`)."""
+        """Detached parameters of a signed distance over ``bounds``, its own: of a hash grid or octaves (see `sdf_parts`)."""
         if not self._covers(bounds) or self.config.geometry != "sdf":
             return None
         return sdf_parts(self.config, self.encoding, self.geometry_net, self.bounds.half / self._half, self._half)

@@ -10,7 +10,7 @@ from invgraphics.kernels.types import Tracing, TracingLimits
 
 
 def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> Tracing:
-    """Sphere tracing (Hart 1996) of a hash grid with a network: march, encode, evaluate and refine in one pass.
+    """Sphere tracing (Hart 1996) of a network over a hash grid or octaves: march, encode, evaluate and refine in one pass.
 
     Args:
         rays: with near and far set; rays whose far is not beyond near are left out.

@@ -81,7 +81,7 @@ def samples() -> None:
     ngp_march(rays, everywhere, bounds, MarchSteps(0.1), field, rays.near, 0.5)
     ngp_render(rays, everywhere, bounds, MarchSteps(0.1), field)
     net = (torch.zeros(8, 7), torch.zeros(8)), (torch.zeros(1, 8), torch.zeros(1))
-    distance = FusedSDF(torch.zeros(levels.entries, 2), levels, net, 100.0, torch.ones(3), 1.0)
+    distance = FusedSDF(torch.zeros(levels.entries, 2), levels, 0, net, 100.0, torch.ones(3), 1.0)
     sdf_trace(rays, bounds, distance, TracingLimits(2, 1.0, 1, 1e-3, 1e-3, 1e-2))
     planes = CombinedLattices(tuple(Lattice(torch.zeros(2, 2, 4), axes) for axes in ("xy", "xz", "yz")), "sum")
     dense = FusedLattice(planes, (), DensityHead("exp"), None, (), ColourHead("none"))

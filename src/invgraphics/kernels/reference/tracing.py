@@ -150,10 +150,18 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
 
     def distance(index: Int[Tensor, " k"], t: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
         unit = bounds.to_unit(torch.addcmul(rays.origins[index], t[:, None], rays.directions[index]))
-        features, _ = hash_encode(unit, field.table, field.grid)
-        x = torch.cat([(2 * unit - 1) * field.coordinate_scale, features], dim=1)
+        x = torch.cat([(2 * unit - 1) * field.coordinate_scale, _encode(unit, field)], dim=1)
         for weight, bias in field.net[:-1]:
             x = softplus(linear(x, weight, bias), beta=field.sharpness)
         return field.scale * linear(x, *field.net[-1])[:, 0]
 
     return sphere_trace(distance, rays, limits)
+
+
+def _encode(unit: Float[Tensor, "k 3"], field: FusedSDF) -> Float[Tensor, "k f"]:
+    """Features of a grid, or x and the sines and cosines of its octaves."""
+    if field.grid is not None:
+        return hash_encode(unit, field.table, field.grid)[0]
+    x = 2 * unit - 1
+    phases = [torch.pi * 2.0**octave * x for octave in range(field.octaves)]
+    return torch.cat([x, *(phase.sin() for phase in phases), *(phase.cos() for phase in phases)], dim=1)

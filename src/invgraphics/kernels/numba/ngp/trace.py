@@ -1,4 +1,4 @@
-"""Sphere tracing of a hash-grid signed distance in one pass: `POINTS` rays at a time, each in a batch lane.
+"""Sphere tracing of a signed distance over a hash grid or octaves in one pass: `POINTS` rays at a time, each in a batch lane.
 
 A ray that is finished is replaced at once. Every lane is at one of three things: it marches, refines its hit, or refines its
 closest approach. Judged by `invgraphics.kernels.reference.tracing`, whose rows of state these are.
@@ -24,11 +24,13 @@ from invgraphics.kernels.types import Tracing, TracingLimits
 _T, _F, _LOW, _LOW_T, _LOW_A, _LOW_B, _HIT_A, _HIT_FA, _HIT_B, _HIT_FB, _NEXT = range(11)
 _ROWS = 11
 _MARCH, _HIT, _CLOSEST, _DONE = range(4)
+_NO_LEVELS = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint64)
 _RUN = 32
 """Consecutive rays that are given to one job before the next job has its turn."""
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_INFINITE = np.float32(np.inf)
+_INFINITE, _PI = np.float32(np.inf), np.float32(np.pi)
+_THREE = index(3) * POINTS
 _GOLDEN, _SLACK = np.float32(GOLDEN), np.float32(1 + ROUNDING)
 
 
@@ -152,6 +154,22 @@ def _distances(net, x, ping, pong, sharpness):
 
 
 @inlined
+def _coordinates(points, x, first, settings, octaves):
+    """Write scaled coordinates at ``first``; unless ``octaves`` is negative, behind them x, its sines and its cosines."""
+    for axis in range(3):
+        for p in range(POINTS):
+            u, at = _TWO * points[axis, p] - _ONE, first + index(axis) * POINTS + index(p)
+            x[at] = u * settings[2 + axis]
+            if octaves >= 0:
+                x[at + _THREE] = u
+                sine, cosine = np.sin(_PI * u), np.cos(_PI * u)
+                for octave in range(octaves):
+                    row = at + _THREE * index(2 + octave)
+                    x[row], x[row + _THREE * index(octaves)] = sine, cosine
+                    sine, cosine = _TWO * sine * cosine, cosine * cosine - sine * sine
+
+
+@inlined
 def _next_ray(cursor, job, jobs, near, far):
     """Index of the job's next ray with an interval, -1 at the end; and the cursor behind it. Jobs take runs of rays in turn."""
     while True:
@@ -165,7 +183,7 @@ def _next_ray(cursor, job, jobs, near, far):
 
 
 @parallel
-def trace(rays, box, table, levels, net, widest, settings, limits, jobs, results, steps, ended):
+def trace(rays, box, table, levels, octaves, net, widest, settings, limits, jobs, results, steps, ended):
     """States of all rays at their ends.
 
     Args:
@@ -173,7 +191,8 @@ def trace(rays, box, table, levels, net, widest, settings, limits, jobs, results
         box: lowest corner, and 1 over the edges.
         table: features, flat.
         levels: see `levels_of`.
-        net: layers and sizes as `pack_network` returns them; coordinates are its last inputs.
+        octaves: number of octaves behind the coordinates, -1 for none.
+        net: layers and sizes as `pack_network` returns them; its inputs are the grid's features, then what `_coordinates` says.
         widest: largest number of inputs or outputs of any layer.
         settings: sharpness, scale of the distance, scales of the coordinates.
         limits: as `TracingLimits`.
@@ -208,10 +227,7 @@ def trace(rays, box, table, levels, net, widest, settings, limits, jobs, results
             if busy == 0:
                 break
             encode(table, levels, points, entries, weights, x)
-            for axis in range(3):
-                for p in range(POINTS):
-                    coordinate = (_TWO * points[axis, p] - _ONE) * settings[2 + axis]
-                    x[first + index(axis) * POINTS + index(p)] = coordinate
+            _coordinates(points, x, first, settings, octaves)
             raw = _distances(net, x, ping, pong, settings[0])
             for p in range(POINTS):
                 r = lane_ray[p]
@@ -229,8 +245,11 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
     if field.table.shape[1] != 2:
         return reference.sdf_trace(rays, bounds, field, limits)
     (weight, bias), *others = field.net
-    # The kernel's inputs are the grid's features first, then the coordinates.
-    net = pack_network(((torch.cat([weight[:, 3:], weight[:, :3]], dim=1), bias), *others))
+    levels, octaves = _NO_LEVELS, field.octaves
+    if field.grid is not None:
+        levels, octaves = levels_of(field.grid), -1
+        weight = torch.cat([weight[:, 3:], weight[:, :3]], dim=1)
+    net = pack_network(((weight, bias), *others))
     batch = tuple(array(part) for part in (rays.origins, rays.directions, rays.near, rays.far))
     box = array(bounds.lo), array(1 / (bounds.hi - bounds.lo))
     settings = np.array([field.sharpness, field.scale, *field.coordinate_scale.tolist()], np.float32)
@@ -240,6 +259,6 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
     results[_LOW_T] = rays.near
     steps, ended = torch.zeros(len(rays), dtype=torch.long), rays.far <= rays.near
     outputs = results.numpy(), steps.numpy(), ended.numpy()
-    levels, widest = levels_of(field.grid), int(net[1].max())
-    trace(batch, box, array(field.table).reshape(-1), levels, net, widest, settings, stops, threads(), *outputs)
+    model = array(field.table).reshape(-1), levels, octaves, net, int(net[1].max())
+    trace(batch, box, *model, settings, stops, threads(), *outputs)
     return result(results, steps, ended, rays, limits)
