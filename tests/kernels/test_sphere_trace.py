@@ -72,7 +72,7 @@ def test_the_field_is_zero_at_hits_and_has_the_distances_said(encoding: str) -> 
     assert float(distance(solved, found.hit_t[solved]).abs().max()) < 2e-5
     met = torch.nonzero(found.low.isfinite())[:, 0]
     torch.testing.assert_close(distance(met, found.low_t[met]), found.low[met], atol=2e-5, rtol=0)
-    # No place on a ray that just misses the surface is closer to it; a dent may have several near places, one of which is refined.
+    # No place on a ray that just misses the surface is closer to it; dents have several such places.
     passing = torch.nonzero(found.converged & ~found.hit & (found.low < LIMITS.depth))[:, 0]
     assert len(passing) > 10
     share = torch.linspace(0, 1, 400)

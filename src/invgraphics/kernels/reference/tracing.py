@@ -26,8 +26,8 @@ GOLDEN = (3 - 5**0.5) / 2
 """Share of the larger part of a bracket at which golden-section search looks next."""
 
 
-ROUNDING = 1e-5
-"""Relative length by which a step must exceed its sphere to count as over-relaxed."""
+ROUNDING = 1e-6
+"""Length, over that of the ray so far, by which a step must exceed its sphere to count as over-relaxed."""
 
 _T, _F, _LOW, _LOW_T, _LOW_A, _LOW_B, _HIT_A, _HIT_FA, _HIT_B, _HIT_FB, _NEXT = range(11)
 """Rows of a march's state: the last accepted look-up, the least one with its neighbours, the bracket of the hit with its
@@ -92,7 +92,8 @@ def _advance(state: Float[Tensor, "11 k"], value: Float[Tensor, " k"], limits: T
     # Two spheres that do not meet may have a surface in between: such a step is taken again, as long as the first sphere only.
     safe = before.abs().clamp_min(limits.least)
     jump = t - before_t
-    accepted = ~((jump > safe * (1 + ROUNDING)) & (before > 0) & (value.abs() + before < jump)) | first
+    relaxed = (jump - safe > ROUNDING * (t + safe)) & (before > 0)
+    accepted = ~(relaxed & (value.abs() + before < jump)) | first
     crosses = accepted & (value <= 0) & state[_HIT_B].isinf()
     bracket = torch.stack([torch.where(first, t, before_t), torch.where(first, value, before), t, value])
     state[_HIT_A : _HIT_FB + 1] = torch.where(crosses, bracket, state[_HIT_A : _HIT_FB + 1])

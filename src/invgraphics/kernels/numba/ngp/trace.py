@@ -31,7 +31,7 @@ _RUN = 32
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _INFINITE, _PI = np.float32(np.inf), np.float32(np.pi)
 _THREE = index(3) * POINTS
-_GOLDEN, _SLACK = np.float32(GOLDEN), np.float32(1 + ROUNDING)
+_GOLDEN, _ROUNDING = np.float32(GOLDEN), np.float32(ROUNDING)
 
 
 @inlined
@@ -50,7 +50,8 @@ def _march(state, p, value, limits):
     t, before_t, before = state[_NEXT, p], state[_T, p], state[_F, p]
     first = state[_LOW, p] == _INFINITE
     safe, jump = max(abs(before), least), t - before_t
-    if not first and before > _ZERO and jump > safe * _SLACK and abs(value) + before < jump:
+    relaxed = before > _ZERO and jump - safe > _ROUNDING * (t + safe)
+    if relaxed and not first and abs(value) + before < jump:
         state[_NEXT, p] = before_t + safe
         return
     if value <= _ZERO and state[_HIT_B, p] == _INFINITE:
