@@ -80,7 +80,8 @@ class NeuS(Hybrid):
     @override
     def density(self, field: Field, ctx: Context, *, on_rays: bool = True) -> LogisticDensity:
         seen = 1.0 if self.config.anneal == 0 else min(1.0, ctx.progress / self.config.anneal)
-        return LogisticDensity(field, self.beta(ctx), seen, on_rays)
+        slopes = "steepest" if not on_rays else "neighbours" if ctx.training else "gradient"
+        return LogisticDensity(field, self.beta(ctx), slopes, seen)
 
     @override
     def untrained(self) -> NeuS:
