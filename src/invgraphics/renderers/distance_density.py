@@ -111,8 +111,8 @@ class LogisticDensity(DistanceDensity):
     Args:
         field: with a signed distance.
         beta: 1 / s, local units.
-        slopes: how the distance changes along a ray: by the field's ``gradient``; for searches in training, by differences of
-            ``neighbours``, which cost no gradient, outside the graph; for points on no rays, the ``steepest`` there is.
+        slopes: how the distance changes along a ray: by the field's ``gradient``; outside the graph by differences of
+            ``neighbours``, which cost no gradient, for searches in training; for points on no rays the ``steepest`` there is.
         anneal: from 1 on the slope is that along the ray; at 0 it is halved towards -1, so that a ray sees surfaces that it
             leaves, too (NeuS's ``cos_anneal_ratio``).
     """
