@@ -16,6 +16,15 @@ from invgraphics.testing import stir, toy_scene
 ENCODINGS = sorted(plugins.names("encodings"))
 FIELDS, RENDERERS, SAMPLERS = (sorted(plugins.names(registry)) for registry in ("fields", "renderers", "samplers"))
 
+FEW = {
+    "stratified": {"count": 24},
+    "hierarchical": {"coarse": 12, "fine": 12},
+    "occupancy": {"steps_per_diagonal": 64, "cone": 0.1},
+    "up_sampling": {"coarse": 12, "fine": 12, "rounds": 2},
+    "error_bounded": {"coarse": 12, "fine": 12, "extra": 4, "rounds": 2, "bisections": 4},
+}
+"""Settings of samplers that keep these pictures quick."""
+
 
 @pytest.fixture(params=["box", "contracted"])
 def scene(request: pytest.FixtureRequest) -> Scene:
@@ -37,9 +46,10 @@ def variants(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
     """A small neural field of every encoding and geometry, with every renderer of densities or distances and every sampler."""
     small = {"layers": 1, "width": 16, "skip": -1, "colour_layers": 1, "colour_width": 16, "geometry_features": 7}
     for encoding, geometry, sampler in product(plugins.names("encodings"), ("density", "sdf"), SAMPLERS):
-        encode, look = plugins.load("encodings", encoding)(), plugins.load("samplers", sampler)()
-        if sampler == "occupancy":
-            look = replace(look, steps_per_diagonal=64, cone=0.1)
+        encode, look = (
+            plugins.load("encodings", encoding)(),
+            replace(plugins.load("samplers", sampler)(), **FEW.get(sampler, {})),
+        )
         field = build("fields", "neural", scene, encoding=encode, geometry=geometry, **small)
         stir(field)
         for renderer in ("volumetric", "volsdf", "neus"):

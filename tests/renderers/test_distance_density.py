@@ -254,3 +254,27 @@ def test_a_ray_that_leaves_a_surface_meets_it_only_while_annealed():
     assert not at(1.0).any()
     assert float(at(0.0).max()) > 0.1
     assert Quantity.DENSITY in LaplaceDensity(Plane(), torch.tensor(0.1)).provides
+
+
+@pytest.mark.parametrize("config", [VolSDFConfig, NeuSConfig])
+def test_samples_of_no_weight_are_left_out_in_training_only(config):
+    """By the sampler's own densities; what is left weighs something, and makes the same picture but for the threshold."""
+    scene, field = toy_scene(views=2, size=16), Sphere(1.0, 0.5)
+    sampler, sharp = OccupancyConfig(resolution=16, steps_per_diagonal=256), {"beta": 0.01, "sharpness": 100.0}
+    sharp = {key: value for key, value in sharp.items() if hasattr(config, key)}
+    every, some = (config(sampler, weight_threshold=w, **sharp).build(scene) for w in (0.0, 1e-3))
+    camera, kept, pictures = scene.train[0].camera, [], []
+    for training in (True, False):
+        for renderer in (every, some):
+            ctx = Context(scene.bounds, training=training, generator=torch.Generator().manual_seed(3))
+            rendering, trace = renderer.render_rays(field, camera.rays(), ctx)
+            kept.append(len(trace.weights))
+            pictures.append(rendering.alpha.detach())
+    assert kept[1] < 0.3 * kept[0]
+    assert kept[2] == kept[3]
+    # Rays at the rim have hundreds of samples near the threshold.
+    torch.testing.assert_close(pictures[0], pictures[1], rtol=0, atol=0.06)
+    assert float((pictures[0] - pictures[1]).abs().mean()) < 0.01
+    assert torch.equal(pictures[2], pictures[3])
+    assert some.untrained().volumetric.sampler.threshold == 1e-3
+    assert some.required == every.required

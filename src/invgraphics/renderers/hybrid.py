@@ -140,7 +140,7 @@ class Weighed(Sampler):
         with torch.no_grad():
             depth = samples.density * samples.delta
             weights, _, _ = kernels.composite(depth, depth[:, None], samples.ray, len(rays))
-        return samples[weights > self.threshold], levels
+        return samples[torch.nonzero(weights > self.threshold)[:, 0]], levels
 
     @override
     def update(self, field: Field, ctx: Context) -> None:
