@@ -13,6 +13,7 @@ from invgraphics.fields import geometry
 from invgraphics.fields.encodings.factors import CpConfig, VmConfig
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies
 from invgraphics.fields.encodings.hash import HashConfig
+from invgraphics.fields.encodings.sparse import SparseVoxelsConfig
 from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
@@ -228,18 +229,38 @@ def test_colour_range_follows_the_scene(make_scene):
     assert float(bounded.detach().max()) <= 1
 
 
-@pytest.mark.parametrize("encoding", [FrequencyConfig(octaves=6), HashConfig(log2_size=12)])
+SPHERES = [
+    (FrequencyConfig(octaves=6), 8, 4),
+    (HashConfig(log2_size=12), 1, -1),
+    (VoxelsConfig(9, features=4, levels=2, coarsest=5), 2, -1),
+    (SparseVoxelsConfig(8), 1, -1),
+    (VmConfig(8, 4), 1, -1),
+    (CpConfig(8, 12), 1, -1),
+    (TriplaneConfig(8, 8), 1, -1),
+]
+
+
+@pytest.mark.parametrize(("encoding", "layers", "skip"), SPHERES)
 @pytest.mark.parametrize("space", ["box", "contracted"])
-def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, space):
-    scene = make_scene(space)
-    field = NeuralFieldConfig(encoding, "sdf", layers=8, width=128, skip=4).build(scene)
-    offset = (torch.rand(500, 3) * 2 - 1) * scene.bounds.half
-    with torch.no_grad():
-        sdf = field.query(Samples.at(scene.bounds.centre + offset), S).sdf
-    assert sdf is not None
-    inside = offset.norm(dim=1) < scene.bounds.half[0]  # contracted space bends distances beyond the unit ball
-    error = (sdf - (offset.norm(dim=1) - 0.5 * scene.bounds.half[0]))[inside]
-    assert float(error.abs().mean()) < 0.05 * float(scene.bounds.half[0])
+def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, layers, skip, space):
+    """On every encoding, in a cube and in a flatter box: distances, and gradients of length 1 along the radius."""
+    for flat in (1.0, 0.6):
+        scene = make_scene(space)
+        half = scene.bounds.half * torch.tensor([1.0, 1.0, flat])
+        bounds = Bounds(scene.bounds.centre - half, scene.bounds.centre + half, space)
+        scene = replace(scene, bounds=bounds)
+        field = NeuralFieldConfig(encoding, "sdf", layers, 128, skip, colour_inputs=("position", "normal")).build(scene)
+        offset = (torch.rand(500, 3) * 2 - 1) * half
+        inside = (offset / half).norm(dim=1) < 1  # contracted space bends distances beyond the unit ball
+        values = field.query_no_grad(Samples.at(bounds.centre + offset), S | G)
+        assert values.sdf is not None
+        assert values.gradient is not None
+        error = (values.sdf - (offset.norm(dim=1) - 0.5 * half[2]))[inside]
+        assert float(error.abs().mean()) < 0.05 * float(half.mean())
+        away = inside & (offset.norm(dim=1) > 0.2 * half.mean())
+        cosine = (values.gradient * torch.nn.functional.normalize(offset, dim=1)).sum(dim=1)[away]
+        assert float((cosine - 1).abs().mean()) < 0.1
+        assert float((values.gradient.norm(dim=1)[away] - 1).abs().mean()) < 0.1
 
 
 def test_nerf_and_instant_ngp_have_their_published_sizes(make_scene):

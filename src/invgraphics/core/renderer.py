@@ -35,13 +35,12 @@ class _StatefulModule(nn.Module):
 
 
 class Sampler(_StatefulModule, ABC):
-    """Places samples along rays. May own parameters (proposal networks) and buffers (occupancy grids).
+    """Places samples along rays. May own parameters (proposal networks) and buffers (occupancy grids)."""
 
-    Attributes:
-        requires: quantities of the field that it asks for besides the density.
-    """
-
-    requires: ClassVar[Quantity] = Quantity.NONE
+    @property
+    def requires(self) -> Quantity:
+        """Quantities of the field that it asks for besides the density."""
+        return Quantity.NONE
 
     @abstractmethod
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:

@@ -49,9 +49,14 @@ def query_geometry(
     training = torch.is_grad_enabled()
     raws, handed, slopes, gradient = [], [], [], None
     with torch.set_grad_enabled(training or with_gradient):
+        moving = position
         if with_gradient and not (training and position.requires_grad):
-            position = position.detach().requires_grad_()
-        features = encode(position)
+            moving = position.detach().requires_grad_()
+        features = followed = encode(moving)
+        if training and moving is not position:
+            # Encoded again: backward would spend more on a gradient in these positions, which nobody asks for.
+            again = encode(position)
+            features = again if again.requires_grad else followed
         for (part,) in chunks(features):
             # Outside the graph, one that starts here keeps it from growing over all chunks.
             chunk = part if training or not with_gradient else part.detach().requires_grad_()
@@ -62,7 +67,7 @@ def query_geometry(
             raws.append(outputs[:, 0])
             handed.append(outputs[:, 1:])
         if with_gradient:
-            (gradient,) = torch.autograd.grad(features, position, torch.cat(slopes), create_graph=training)
+            (gradient,) = torch.autograd.grad(followed, moving, torch.cat(slopes), create_graph=training)
     return Geometry(torch.cat(raws), torch.cat(handed) if with_features else None, gradient)
 
 

@@ -43,7 +43,7 @@ class NeuralSettings:
             (``vm``, ``cp``) it is the sum of all. No geometry network then.
         head: how colour comes from features. ``sh``: they are coefficients of spherical harmonics in the direction, the
             (degree + 1)^2 of red first; ``none``: they are the raw colour, alike from all sides. No colour network then.
-        hidden_activation: of both networks' hidden layers; those of signed distances are a sharp softplus in any case.
+        hidden_activation: of both networks' hidden layers; those of a signed distance are a sharp softplus in any case.
         colour_activation: of raw colour. ``sigmoid``: softplus in scenes of linear colour; ``clamp``: max(0, 0.5 + x), as
             Plenoxels and 3DGS do it, with the gradient of a projection.
         colour_padding: how far the sigmoid exceeds [0, 1] at both ends, so that black and white can be reached (0.001 in EG3D

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,9 @@ from torch.nn.functional import softplus
 from typing_extensions import override
 
 from invgraphics.core import Field, FieldValues, Quantity, Samples
+
+Slopes = Literal["gradient", "neighbours", "steepest"]
+"""Where the derivative of the distance along a ray comes from."""
 
 
 def laplace_density(sdf: Float[Tensor, "*m"], beta: Float[Tensor, "*#m"]) -> Float[Tensor, "*m"]:
@@ -107,32 +111,55 @@ class LogisticDensity(DistanceDensity):
     Args:
         field: with a signed distance.
         beta: 1 / s, local units.
-        anneal: from 1 on, the density of a ray that meets the surface at its true angle; from 0, of one whose slope is halved
-            towards -1/2, so that what is seen from behind is dense too (NeuS's ``cos_anneal_ratio``).
-        directional: whether samples lie on rays. Otherwise densities are the largest over all directions, and cost no gradient.
+        slopes: how the distance changes along a ray: by the field's ``gradient``; outside the graph by differences of
+            ``neighbours``, which cost no gradient, for searches in training; for points on no rays the ``steepest`` there is.
+        anneal: from 1 on the slope is that along the ray; at 0 it is halved towards -1, so that a ray sees surfaces that it
+            leaves, too (NeuS's ``cos_anneal_ratio``).
     """
 
-    def __init__(self, field: Field, beta: Float[Tensor, ""], anneal: float = 1.0, directional: bool = True) -> None:
+    def __init__(self, field: Field, beta: Float[Tensor, ""], slopes: Slopes = "gradient", anneal: float = 1.0) -> None:
         super().__init__(field, beta)
+        self.slopes: Slopes = slopes
         self.anneal = anneal
-        self.directional = directional
 
     @property
     @override
     def needs(self) -> Quantity:
-        return Quantity.SDF | Quantity.GRADIENT if self.directional else Quantity.SDF
+        return Quantity.SDF | Quantity.GRADIENT if self._slopes == "gradient" else Quantity.SDF
+
+    @property
+    def _slopes(self) -> Slopes:
+        return "gradient" if self.slopes == "neighbours" and torch.is_grad_enabled() else self.slopes
 
     @override
     def density_of(self, values: FieldValues, samples: Samples) -> Float[Tensor, " m"]:
         assert values.sdf is not None
         sharpness = 1 / self.beta
-        if not self.directional:
+        if self._slopes == "steepest":
             return logistic_density(values.sdf, values.sdf.new_full((), -1.0), sharpness)
-        assert values.gradient is not None
-        slope = (values.gradient * samples.direction).sum(dim=1)
+        if self._slopes == "neighbours":
+            slope = neighbour_slopes(values.sdf, samples)
+        else:
+            assert values.gradient is not None
+            slope = (values.gradient * samples.direction).sum(dim=1)
         if self.anneal < 1:
             slope = torch.lerp(-(0.5 - slope / 2).clamp_min(0), slope.clamp_max(0), self.anneal)
         delta = samples.delta
         there = delta > 0
         mean = section_optical_depth(values.sdf, slope, delta, sharpness) / torch.where(there, delta, 1.0)
         return torch.where(there, mean, logistic_density(values.sdf, slope, sharpness))
+
+
+def neighbour_slopes(sdf: Float[Tensor, " m"], samples: Samples) -> Float[Tensor, " m"]:
+    """Differences of the distance to the next sample of the same ray, of its last sample to the one before it, over length.
+
+    A sample alone on its ray gets the steepest descent, -1.
+    """
+    if len(sdf) < 2:
+        return sdf.new_full(sdf.shape, -1.0)
+    middle = samples.mid
+    step = (sdf.diff() / middle.diff().clamp_min(torch.finfo(sdf.dtype).tiny)).clamp(-1, 1)
+    joined = samples.ray.diff() == 0
+    after, before = (torch.nn.functional.pad(step, ends) for ends in ((0, 1), (1, 0)))
+    has_after, has_before = (torch.nn.functional.pad(joined, ends) for ends in ((0, 1), (1, 0)))
+    return torch.where(has_after, after, torch.where(has_before, before, -1.0))

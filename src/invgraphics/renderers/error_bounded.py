@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -57,11 +56,14 @@ class ErrorBoundedConfig:
 class ErrorBounded(Sampler):
     """Refines each ray until the opacity of the density's own width, or of the least width found for it, is bounded."""
 
-    requires: ClassVar[Quantity] = Quantity.SDF
-
     def __init__(self, config: ErrorBoundedConfig) -> None:
         super().__init__()
         self.config = config
+
+    @property
+    @override
+    def requires(self) -> Quantity:
+        return Quantity.SDF
 
     @override
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:

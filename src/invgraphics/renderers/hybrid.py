@@ -10,7 +10,20 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from typing_extensions import override
 
-from invgraphics.core import Camera, Context, Contributions, Field, Quantity, RayRenderer, Rays, Rendering, Trace
+from invgraphics import kernels
+from invgraphics.core import (
+    Camera,
+    Context,
+    Contributions,
+    Field,
+    Quantity,
+    RayRenderer,
+    Rays,
+    Rendering,
+    Sampler,
+    Samples,
+    Trace,
+)
 from invgraphics.renderers.distance_density import DistanceDensity
 from invgraphics.renderers.volumetric import Volumetric
 
@@ -98,15 +111,60 @@ class Hybrid(RayRenderer):
         self.volumetric.update(self.density(field, ctx, on_rays=False), ctx)
 
 
-def check_settings(first: float, last: float, gradient_reach: float, colour_threshold: float) -> None:
+class Weighed(Sampler):
+    """Samples of another sampler that weigh something, by the densities that it has found on the way; in training only.
+
+    Few samples of a sharp surface weigh anything, and those that do not have no gradient worth its price either: the
+    derivative of a density's tail is as small as the tail.
+
+    Args:
+        sampler: the other; samples that come without densities are all kept.
+        threshold: weights up to this are left out.
+    """
+
+    def __init__(self, sampler: Sampler, threshold: float) -> None:
+        super().__init__()
+        self.sampler = sampler
+        self.threshold = threshold
+
+    @property
+    @override
+    def requires(self) -> Quantity:
+        return self.sampler.requires
+
+    @override
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        samples, levels = self.sampler.sample(rays, field, ctx)
+        if samples.density is None or not ctx.training:
+            return samples, levels
+        with torch.no_grad():
+            depth = samples.density * samples.delta
+            weights, _, _ = kernels.composite(depth, depth[:, None], samples.ray, len(rays))
+        return samples[torch.nonzero(weights > self.threshold)[:, 0]], levels
+
+    @override
+    def update(self, field: Field, ctx: Context) -> None:
+        self.sampler.update(field, ctx)
+
+    @override
+    def untrained(self) -> Weighed:
+        return Weighed(self.sampler.untrained(), self.threshold)
+
+
+def make_volumetric(sampler: Sampler, gradient_reach: float, weight_threshold: float) -> Volumetric:
+    """Volume renderer with a sampler whose samples weigh more than ``weight_threshold`` in training."""
+    return Volumetric(Weighed(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
+
+
+def check_settings(first: float, last: float, gradient_reach: float, weight_threshold: float) -> None:
     """Check settings that all renderers of this family have.
 
     Raises:
-        ValueError: a width that is not positive, or a reach or threshold that volume rendering does not take.
+        ValueError: a width that is not positive, or a reach or threshold out of range.
     """
     if min(first, last) <= 0:
         raise ValueError("the width of a density, or its sharpness, must be above 0.")
     if gradient_reach < 0:
         raise ValueError(f"gradient_reach must not be negative, not {gradient_reach}")
-    if not 0 <= colour_threshold < 1:
-        raise ValueError(f"colour_threshold must be in [0, 1), not {colour_threshold}")
+    if not 0 <= weight_threshold < 1:
+        raise ValueError(f"weight_threshold must be in [0, 1), not {weight_threshold}")

@@ -13,7 +13,7 @@ from typing_extensions import override
 from invgraphics.config import Slot
 from invgraphics.core import Context, Field, Quantity, Scene
 from invgraphics.renderers.distance_density import LogisticDensity
-from invgraphics.renderers.hybrid import Change, Hybrid, check_settings
+from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, make_volumetric
 from invgraphics.renderers.up_sampling import UpSamplingConfig
 from invgraphics.renderers.volumetric import Volumetric
 
@@ -32,7 +32,8 @@ class NeuSConfig:
         change: whether s is ``learnt``, ``scheduled`` log-linearly over the fit, or ``held``.
         anneal: progress until which rays see surfaces that they leave too, less and less (NeuS without masks: 1/6).
         gradient_reach: as of volume rendering.
-        colour_threshold: as of volume rendering.
+        weight_threshold: in training, samples that weigh no more than this by the sampler's own densities, where it
+            has some (``occupancy``), are left out; 0 keeps all.
     """
 
     title: ClassVar[str] = "hybrid implicit-volumetric"
@@ -43,10 +44,10 @@ class NeuSConfig:
     change: Change = "learnt"
     anneal: float = 0.0
     gradient_reach: float = 0.0
-    colour_threshold: float = 0.0
+    weight_threshold: float = 0.0
 
     def __post_init__(self) -> None:
-        check_settings(self.sharpness, self.sharpness_final, self.gradient_reach, self.colour_threshold)
+        check_settings(self.sharpness, self.sharpness_final, self.gradient_reach, self.weight_threshold)
         if not 0 <= self.anneal <= 1:
             raise ValueError(f"anneal must be in [0, 1], not {self.anneal}")
 
@@ -65,7 +66,7 @@ class NeuSConfig:
 
     def build(self, scene: Scene) -> NeuS:
         """The renderer with its sampler."""
-        return NeuS(self, Volumetric(self.sampler.build(scene), self.gradient_reach, self.colour_threshold))
+        return NeuS(self, make_volumetric(self.sampler.build(scene), self.gradient_reach, self.weight_threshold))
 
 
 class NeuS(Hybrid):
@@ -73,14 +74,15 @@ class NeuS(Hybrid):
 
     requires: ClassVar[Quantity] = Hybrid.requires | Quantity.GRADIENT
 
-    def __init__(self, config: NeuSConfig, volumetric: Volumetric) -> None:
-        super().__init__(config, volumetric)
+    def __init__(self, config: NeuSConfig, renderer: Volumetric) -> None:
+        super().__init__(config, renderer)
         self.config = config
 
     @override
     def density(self, field: Field, ctx: Context, *, on_rays: bool = True) -> LogisticDensity:
         seen = 1.0 if self.config.anneal == 0 else min(1.0, ctx.progress / self.config.anneal)
-        return LogisticDensity(field, self.beta(ctx), seen, on_rays)
+        slopes = "steepest" if not on_rays else "neighbours" if ctx.training else "gradient"
+        return LogisticDensity(field, self.beta(ctx), slopes, seen)
 
     @override
     def untrained(self) -> NeuS:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
+from typing_extensions import override
 
 from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.core.spacing import from_spacing, to_spacing
@@ -46,11 +46,14 @@ class UpSamplingConfig:
 class UpSampling(Sampler):
     """Adds edges of intervals where weights, of distances taken as linear in between, say that a surface is."""
 
-    requires: ClassVar[Quantity] = Quantity.SDF
-
     def __init__(self, config: UpSamplingConfig) -> None:
         super().__init__()
         self.config = config
+
+    @property
+    @override
+    def requires(self) -> Quantity:
+        return Quantity.SDF
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Sample every ray that meets the bounds; outside training the rounds' weights are returned as well."""

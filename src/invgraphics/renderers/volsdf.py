@@ -13,7 +13,7 @@ from invgraphics.config import Slot
 from invgraphics.core import Context, Field, Scene
 from invgraphics.renderers.distance_density import LaplaceDensity
 from invgraphics.renderers.error_bounded import ErrorBoundedConfig
-from invgraphics.renderers.hybrid import Change, Hybrid, check_settings
+from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, make_volumetric
 from invgraphics.renderers.volumetric import Volumetric
 
 
@@ -28,7 +28,8 @@ class VolSDFConfig:
         beta_min: least β (VolSDF: 1e-4).
         change: whether β is ``learnt``, ``scheduled`` log-linearly over the fit, or ``held``.
         gradient_reach: as of volume rendering.
-        colour_threshold: as of volume rendering.
+        weight_threshold: in training, samples that weigh no more than this by the sampler's own densities, where it
+            has some (``occupancy``), are left out; 0 keeps all.
     """
 
     title: ClassVar[str] = "hybrid implicit-volumetric"
@@ -39,10 +40,10 @@ class VolSDFConfig:
     beta_min: float = 1e-4
     change: Change = "learnt"
     gradient_reach: float = 0.0
-    colour_threshold: float = 0.0
+    weight_threshold: float = 0.0
 
     def __post_init__(self) -> None:
-        check_settings(self.beta, self.beta_final, self.gradient_reach, self.colour_threshold)
+        check_settings(self.beta, self.beta_final, self.gradient_reach, self.weight_threshold)
         if not 0 < self.beta_min <= min(self.beta, self.beta_final):
             raise ValueError("beta_min must be above 0, and at most beta and beta_final.")
 
@@ -61,14 +62,14 @@ class VolSDFConfig:
 
     def build(self, scene: Scene) -> VolSDF:
         """The renderer with its sampler."""
-        return VolSDF(self, Volumetric(self.sampler.build(scene), self.gradient_reach, self.colour_threshold))
+        return VolSDF(self, make_volumetric(self.sampler.build(scene), self.gradient_reach, self.weight_threshold))
 
 
 class VolSDF(Hybrid):
     """Renders Laplace's density."""
 
-    def __init__(self, config: VolSDFConfig, volumetric: Volumetric) -> None:
-        super().__init__(config, volumetric)
+    def __init__(self, config: VolSDFConfig, renderer: Volumetric) -> None:
+        super().__init__(config, renderer)
         self.config = config
 
     @override

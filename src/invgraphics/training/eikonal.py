@@ -19,7 +19,7 @@ class EikonalPenalty:
     """Mean of (|∇f| - 1)² at random points of the bounds' box and at points near the surface.
 
     A point near the surface is the foot of a random one, x - f ∇f / |∇f|², moved at random: VolSDF takes a uniform point
-    sample next to the surface of every ray, which a penalty, without rays, does not have.
+    and the sample next to the surface of every ray, which a penalty, without rays, does not have.
 
     Attributes:
         weight: factor (VolSDF, NeuS: 0.1).
