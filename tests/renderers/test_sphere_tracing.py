@@ -235,6 +235,16 @@ def test_gradients_equal_finite_differences(make_camera: Callable[..., Camera], 
     assert float(gradient.norm()) > 0.05
 
 
+def test_contributions_are_the_one_surface_point(make_camera: Callable[..., Camera]) -> None:
+    camera, field, renderer = make_camera(), Sphere(1.0, 0.8, colour=(0.2, 0.5, 0.8)).double(), tracing()
+    found = renderer.contributions(field, camera, (6, 5), Context(BOX))
+    picture, _ = renderer.render_image(field, camera, Context(BOX))
+    assert found.kind == "surface points"
+    torch.testing.assert_close(found.colour, picture.rgb[5, 6])
+    torch.testing.assert_close(found.t[0], picture.depth[5, 6])
+    assert len(renderer.contributions(field, camera, (0, 0), Context(BOX))) == 0
+
+
 def test_the_contract() -> None:
     scene = toy_scene(views=2, size=8)
     check_renderer(tracing(), Sphere(1.0, 0.6, colour=(0.2, 0.5, 0.8)), scene)

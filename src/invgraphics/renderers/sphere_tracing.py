@@ -3,16 +3,30 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
+from typing_extensions import override
 
 from invgraphics import kernels
-from invgraphics.core import Context, Field, Quantity, RayRenderer, Rays, Rendering, Samples, Scene, SurfaceTrace, Trace
+from invgraphics.core import (
+    Camera,
+    Context,
+    Contributions,
+    Field,
+    Quantity,
+    RayRenderer,
+    Rays,
+    Rendering,
+    Samples,
+    Scene,
+    SurfaceTrace,
+    Trace,
+)
 from invgraphics.kernels.reference.tracing import sphere_trace
 from invgraphics.kernels.types import Tracing, TracingLimits
 from invgraphics.renderers.base import to_rendering
@@ -104,6 +118,11 @@ class SphereTracing(RayRenderer):
         values = query(field, samples, want, ctx.chunk)
         trace = Trace(samples, values, alpha[seen], rays=len(rays), surface=surface)
         return _picture(rays, trace, alpha), trace
+
+    @override
+    def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
+        """The one surface point of the pixel's ray, if any; see `Renderer.contributions`."""
+        return replace(super().contributions(field, camera, pixel, ctx), kind="surface points")
 
 
 def opacity(logit: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
