@@ -8,12 +8,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Quantity, Rays, Samples
+from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Model, Quantity, Rays, Samples
 from invgraphics.core.transforms import se3_exp
 from invgraphics.errors import NotComposableError
 from invgraphics.fields.analytic import Box, GaussianBlob, Sphere
+from invgraphics.fields.encodings.frequency import FrequencyConfig
+from invgraphics.fields.neural import NeuralFieldConfig
+from invgraphics.renderers.neus import NeuSConfig
+from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.sphere_tracing import SphereTracing, SphereTracingConfig
-from invgraphics.testing import check_renderer, toy_scene
+from invgraphics.testing import check_renderer, stir, toy_scene
 
 F64 = torch.float64
 BOX = Bounds(torch.full((3,), -1.5, dtype=F64), torch.full((3,), 1.5, dtype=F64))
@@ -243,6 +247,24 @@ def test_contributions_are_the_one_surface_point(make_camera: Callable[..., Came
     torch.testing.assert_close(found.colour, picture.rgb[5, 6])
     torch.testing.assert_close(found.t[0], picture.depth[5, 6])
     assert len(renderer.contributions(field, camera, (0, 0), Context(BOX))) == 0
+
+
+def test_one_distance_has_the_depths_of_volume_rendering_as_its_density_sharpens() -> None:
+    """A neural distance through sphere tracing and NeuS, as `--render-with` shows it: the sharper s, the closer the depths."""
+    torch.manual_seed(0)
+    scene = toy_scene(views=2, size=24)
+    field = NeuralFieldConfig(FrequencyConfig(3), "sdf", layers=2, width=32, skip=-1, geometry_features=3).build(scene)
+    stir(field, 0.003)
+    camera, gaps = scene.test[0].camera, []
+    traced = Model(field, SphereTracingConfig(steps=200).build(scene).untrained(), scene.bounds).render(camera)
+    for sharpness in (20.0, 100.0, 500.0):
+        neus = NeuSConfig(StratifiedConfig(512), sharpness=sharpness, change="held").build(scene).untrained()
+        volume = Model(field, neus, scene.bounds).render(camera)
+        both = (traced.alpha > 0.99) & (volume.alpha > 0.99)
+        assert int(both.sum()) > 15
+        gaps.append(float((traced.depth - volume.depth)[both].abs().median()))
+    assert gaps[0] > 2 * gaps[1] > 4 * gaps[2], gaps
+    assert gaps[2] < 5e-3
 
 
 def test_the_contract() -> None:
