@@ -150,12 +150,15 @@ class NeuralField(Field):
         )
         sdf = self.config.geometry == "sdf"
         normal = None if geometry.gradient is None else normalize(geometry.gradient if sdf else -geometry.gradient, dim=1)
-        with_radiance = Quantity.RADIANCE in want and geometry.features is not None
+        radiance = None
+        if Quantity.RADIANCE in want:
+            assert geometry.features is not None
+            radiance = self._radiance(geometry.features, appearance, samples, normal)
         return FieldValues(
             density=self._density(geometry.raw, samples.position) if Quantity.DENSITY in want else None,
             sdf=geometry.raw * self._half if Quantity.SDF in want else None,
             gradient=geometry.gradient * self._half if Quantity.GRADIENT in want and geometry.gradient is not None else None,
-            radiance=self._radiance(geometry.features, appearance, samples, normal) if with_radiance else None,
+            radiance=radiance,
             normal=normal if Quantity.NORMAL in want else None,
             features=geometry.features if Quantity.FEATURES in want else None,
         )
