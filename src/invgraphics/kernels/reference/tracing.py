@@ -24,8 +24,6 @@ Distance = Callable[[Int[Tensor, " k"], Float[Tensor, " k"]], Float[Tensor, " k"
 
 GOLDEN = (3 - 5**0.5) / 2
 """Share of the larger part of a bracket at which golden-section search looks next."""
-
-
 ROUNDING = 1e-6
 """Length, over that of the ray so far, by which a step must exceed its sphere to count as over-relaxed."""
 
