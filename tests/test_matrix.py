@@ -13,7 +13,17 @@ from invgraphics.core import Context, Quantity, Scene, check
 from invgraphics.errors import NotComposableError
 from invgraphics.testing import stir, toy_scene
 
+ENCODINGS = sorted(plugins.names("encodings"))
 FIELDS, RENDERERS, SAMPLERS = (sorted(plugins.names(registry)) for registry in ("fields", "renderers", "samplers"))
+
+FEW = {
+    "stratified": {"count": 24},
+    "hierarchical": {"coarse": 12, "fine": 12},
+    "occupancy": {"steps_per_diagonal": 64, "cone": 0.1},
+    "up_sampling": {"coarse": 12, "fine": 12, "rounds": 2},
+    "error_bounded": {"coarse": 12, "fine": 12, "extra": 4, "rounds": 2, "bisections": 4},
+}
+"""Settings of samplers that keep these pictures quick."""
 
 
 @pytest.fixture(params=["box", "contracted"])
@@ -33,16 +43,20 @@ def registered(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
 
 
 def variants(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
-    """A small neural field of every encoding and geometry, with a volumetric renderer of every sampler."""
+    """A small neural field of every encoding and geometry, with every renderer of densities or distances and every sampler."""
     small = {"layers": 1, "width": 16, "skip": -1, "colour_layers": 1, "colour_width": 16, "geometry_features": 7}
     for encoding, geometry, sampler in product(plugins.names("encodings"), ("density", "sdf"), SAMPLERS):
-        encode, look = plugins.load("encodings", encoding)(), plugins.load("samplers", sampler)()
-        if sampler == "occupancy":
-            look = replace(look, steps_per_diagonal=64, cone=0.1)
+        encode, look = (
+            plugins.load("encodings", encoding)(),
+            replace(plugins.load("samplers", sampler)(), **FEW.get(sampler, {})),
+        )
         field = build("fields", "neural", scene, encoding=encode, geometry=geometry, **small)
         stir(field)
-        renderer = build("renderers", "volumetric", scene, sampler=look)
-        yield f"neural/{encoding}/{geometry}", field, f"volumetric/{sampler}", renderer
+        if sampler == SAMPLERS[0]:
+            yield f"neural/{encoding}/{geometry}", field, "sphere_tracing", build("renderers", "sphere_tracing", scene)
+        for renderer in ("volumetric", "volsdf", "neus"):
+            built = build("renderers", renderer, scene, sampler=look)
+            yield f"neural/{encoding}/{geometry}", field, f"{renderer}/{sampler}", built
 
 
 def assert_draws(field: Any, renderer: Any, scene: Scene) -> None:
@@ -65,7 +79,7 @@ def assert_draws(field: Any, renderer: Any, scene: Scene) -> None:
 def test_every_pair_draws_or_refuses_with_a_sentence(scene: Scene) -> None:
     drawn, refused = set(), set()
     for field_name, field, renderer_name, renderer in (*registered(scene), *variants(scene)):
-        missing = renderer.requires & ~field.provides
+        missing = renderer.required & ~field.provides
         if missing:
             with pytest.raises(NotComposableError) as refusal:
                 check(field, renderer)
@@ -77,10 +91,16 @@ def test_every_pair_draws_or_refuses_with_a_sentence(scene: Scene) -> None:
             assert_draws(field, renderer, scene)
             drawn.add((field_name, renderer_name))
     assert {name for name, _ in drawn} >= set(FIELDS)
-    assert {name for _, name in drawn} >= set(RENDERERS)
+    # With their defaults, renderers of distances meet no field of distances.
+    assert {name.partition("/")[0] for _, name in drawn} >= set(RENDERERS)
     assert ("neural/hash/density", "volumetric/occupancy") in drawn
     assert ("gaussians", "splatting") in drawn
     assert {("neural", "splatting"), ("gaussians", "volumetric"), ("neural/hash/sdf", "volumetric/stratified")} <= refused
+    for renderer in ("volsdf", "neus"):
+        assert {(f"neural/{encoding}/sdf", f"{renderer}/{sampler}") for encoding in ENCODINGS for sampler in SAMPLERS} <= drawn
+        assert {("neural", renderer), ("gaussians", renderer), ("neural/hash/density", f"{renderer}/occupancy")} <= refused
+    assert {(f"neural/{encoding}/sdf", "sphere_tracing") for encoding in ENCODINGS} <= drawn
+    assert {("neural", "sphere_tracing"), ("gaussians", "sphere_tracing"), ("neural/hash/density", "sphere_tracing")} <= refused
 
 
 def test_the_sentence() -> None:

@@ -37,6 +37,7 @@ from invgraphics.renderers.volumetric import VolumetricConfig
 _POINTWISE = {
     Quantity.DENSITY: "density",
     Quantity.SDF: "sdf",
+    Quantity.GRADIENT: "gradient",
     Quantity.RADIANCE: "radiance",
     Quantity.NORMAL: "normal",
     Quantity.FEATURES: "features",
@@ -152,10 +153,27 @@ def check_field(field: Field, scene: Scene) -> None:
             assert torch.allclose(value.norm(dim=1), torch.ones(37), atol=1e-3), "a normal is not of unit length"
         empty = field.query(Samples.at(position[:0], direction[:0]), quantity)
         assert len(getattr(empty, _POINTWISE[quantity])) == 0, "no samples must give no values"
+    if Quantity.GRADIENT in field.provides:
+        _check_gradient(field, Samples.at(position, direction))
     assert pointwise or field.provides, "a field must provide something"
     state = {name: value.clone() for name, value in field.state_dict().items()}
     field.load_state_dict(state)
     field.load_state_dict(new)
+
+
+def _check_gradient(field: Field, samples: Samples) -> None:
+    """Assert that a raw gradient can be had outside the graph, is in it when training, and is what normals are made of."""
+    assert Quantity.SDF in field.provides, "a gradient is that of a signed distance, which the field does not provide"
+    gradient = field.query(samples, Quantity.SDF | Quantity.GRADIENT).gradient
+    outside = field.query_no_grad(samples, Quantity.GRADIENT | (field.provides & Quantity.NORMAL))
+    assert gradient is not None and outside.gradient is not None, "asked for a gradient, got nothing"
+    assert torch.allclose(gradient, outside.gradient, atol=1e-4), "the gradient is another one inside no_grad"
+    assert not outside.gradient.requires_grad, "a gradient inside no_grad is in the graph"
+    assert gradient.requires_grad, "the gradient at positions that are in the graph is not in it"
+    if outside.normal is not None:
+        assert torch.allclose(outside.normal, torch.nn.functional.normalize(outside.gradient, dim=1), atol=1e-4), (
+            "a normal is not the normalised gradient"
+        )
 
 
 def check_renderer(renderer: Renderer, field: Field, scene: Scene) -> None:

@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from invgraphics.core import Quantity, Rays, Samples, harmonics
-from invgraphics.fields.analytic import GaussianBlob, Slab, Sphere
+from invgraphics.fields.analytic import Box, GaussianBlob, Slab, Sphere
 
 COVARIANCE = torch.tensor([[0.5, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.3]])
 FIELDS = {
     "slab": lambda: Slab(1.7, -0.4, 0.6, axis=(1, 2, -1)),
     "sphere": lambda: Sphere(2.3, 0.8, centre=(0.1, -0.2, 0.3)),
+    "box": lambda: Box(1.3, (0.5, 0.7, 0.3), centre=(0.1, -0.2, 0.3)),
     "blob": lambda: GaussianBlob(1.4, COVARIANCE, centre=(0.1, -0.2, 0.3)),
     "round blob": lambda: GaussianBlob(1.4, 0.2),
 }
@@ -50,15 +51,31 @@ def test_unbounded_and_parallel_rays():
     torch.testing.assert_close(blob, torch.tensor([whole / 2, whole * math.exp(-25 / 0.6), whole]))
 
 
-def test_sphere_knows_its_distance_and_normal():
-    sphere = Sphere(1.0, 0.8, centre=(0.1, -0.2, 0.3)).double()
-    position = torch.randn(20, 3, dtype=torch.float64, requires_grad=True)
-    values = sphere.query(Samples.at(position), sphere.provides)
+@pytest.mark.parametrize("name", ["sphere", "box"])
+def test_distances_gradients_and_normals_agree(name):
+    solid = FIELDS[name]().double()
+    position = torch.randn(1000, 3, dtype=torch.float64, requires_grad=True)
+    values = solid.query(Samples.at(position), solid.provides)
     assert values.sdf is not None
     assert values.density is not None
     (gradient,) = torch.autograd.grad(values.sdf.sum(), position)
+    torch.testing.assert_close(values.gradient, gradient)
     torch.testing.assert_close(values.normal, gradient)
+    assert 10 < int((values.density > 0).sum()) < 990
     assert torch.equal(values.density > 0, values.sdf <= 0)
+
+
+def test_distance_of_a_box_is_that_to_its_nearest_point():
+    box = Box(1.0, (0.5, 0.7, 0.3)).double()
+    points = (torch.rand(200_000, 3, dtype=torch.float64) * 2 - 1) * box.half_edges
+    axis = torch.randint(3, (len(points),))
+    sides = torch.arange(len(points)), axis
+    points[sides] = points[sides].sign() * box.half_edges[axis]
+    position = torch.randn(20, 3, dtype=torch.float64)
+    nearest = torch.cdist(position, points).amin(dim=1)
+    inside = (position.abs() <= box.half_edges).all(dim=1)
+    expected = torch.where(inside, -nearest, nearest)
+    torch.testing.assert_close(box.sdf_at(position), expected, atol=1e-2, rtol=0)
 
 
 def test_colours_are_constant_or_follow_the_direction():

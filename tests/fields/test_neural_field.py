@@ -9,16 +9,17 @@ import torch
 from invgraphics.config import fill, to_table
 from invgraphics.core import Bounds, Quantity, Samples
 from invgraphics.errors import InputError
-from invgraphics.fields import neural
+from invgraphics.fields import geometry
 from invgraphics.fields.encodings.factors import CpConfig, VmConfig
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequencies
 from invgraphics.fields.encodings.hash import HashConfig
+from invgraphics.fields.encodings.sparse import SparseVoxelsConfig
 from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig, unit_covariance
 
-D, S, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.RADIANCE, Quantity.NORMAL
+D, S, G, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.GRADIENT, Quantity.RADIANCE, Quantity.NORMAL
 
 SMALL = NeuralFieldConfig(
     FrequencyConfig(octaves=2), layers=2, width=12, skip=0, geometry_features=5, colour_width=8, direction_degree=2
@@ -41,6 +42,9 @@ KINDS = {
     "hash": HASH,
     "sdf": replace(SMALL, geometry="sdf"),
     "hash sdf": replace(HASH, geometry="sdf", direction="none"),
+    "sdf and its colour": replace(SMALL, geometry="sdf", colour_inputs=("position", "normal")),
+    "hash sdf and its colour": replace(HASH, geometry="sdf", colour_inputs=("normal",)),
+    "density and its colour": replace(SMALL, colour_inputs=("position", "normal")),
     "vm": TENSORF,
     "cp": replace(TENSORF, encoding=CpConfig(5, 2), appearance=CpConfig(5, 3), appearance_basis=0),
     "triplane": replace(
@@ -55,6 +59,8 @@ KINDS = {
     "grid, activated inside": replace(GRID, density_interpolation="in"),
     "grid of opacities": replace(GRID, density_interpolation="pre"),
     "two encodings and handed features": replace(SMALL, appearance=VoxelsConfig(4, features=2)),
+    "triplane sdf": replace(SMALL, encoding=TriplaneConfig(5, 4), geometry="sdf", colour_inputs=("position", "normal")),
+    "vm sdf": replace(SMALL, encoding=VmConfig(5, 2), geometry="sdf", colour_inputs=("position", "normal")),
     "dense sdf": replace(SMALL, encoding=VoxelsConfig(6, features=2, levels=2, coarsest=3), geometry="sdf"),
 }
 
@@ -75,7 +81,7 @@ def _samples(scene, m: int = 6) -> Samples:
 
 def _flat(field: NeuralField, samples: Samples, want: Quantity) -> torch.Tensor:
     values = field.query(samples, want)
-    parts = [values.density, values.sdf, values.radiance]
+    parts = [values.density, values.sdf, values.radiance, values.gradient]
     return torch.cat([part.reshape(-1) for part in parts if part is not None])
 
 
@@ -95,7 +101,8 @@ def test_gradients_to_positions_directions_and_parameters(make_scene, kind, spac
 
     # Parameters: the directional derivative along a random direction in the space of all of them.
     def total():
-        return (_flat(field, samples, want) * torch.arange(1, len(samples) * 4 + 1)).sum()
+        flat = _flat(field, samples, want)
+        return (flat * torch.arange(1, len(flat) + 1)).sum()
 
     parameters = list(field.parameters())
     gradients = torch.autograd.grad(total(), parameters)
@@ -123,8 +130,11 @@ def test_normals_are_the_gradient_even_without_grad(make_scene, kind, space):
         slopes.append(sign * (ahead - behind) / (2 * step))
     expected = torch.nn.functional.normalize(torch.stack(slopes, dim=1), dim=1)
     with torch.no_grad():
-        values = field.query(samples, N | R)
+        values = field.query(samples, (field.provides & G) | N | R)
     assert values.normal is not None
+    if values.gradient is not None:
+        assert not values.gradient.requires_grad
+        torch.testing.assert_close(values.gradient, torch.stack(slopes, dim=1), atol=1e-4, rtol=1e-4)
     assert values.radiance is not None
     assert not values.normal.requires_grad
     assert not values.radiance.requires_grad
@@ -151,10 +161,10 @@ def test_chunks_change_nothing(make_scene, monkeypatch, kind, grad):
     samples = _samples(scene, 50)
     results = []
     for chunk in (1000, 7):
-        monkeypatch.setattr(neural, "CPU_CHUNK", chunk)
+        monkeypatch.setattr(geometry, "CPU_CHUNK", chunk)
         with torch.set_grad_enabled(grad):
             values = field.query(samples, field.provides)
-        results.append([getattr(values, name) for name in ("density", "sdf", "radiance", "normal")])
+        results.append([getattr(values, name) for name in ("density", "sdf", "gradient", "radiance", "normal")])
     for one, other in zip(*results, strict=True):
         assert (one is None) == (other is None)
         if one is not None:
@@ -219,18 +229,38 @@ def test_colour_range_follows_the_scene(make_scene):
     assert float(bounded.detach().max()) <= 1
 
 
-@pytest.mark.parametrize("encoding", [FrequencyConfig(octaves=6), HashConfig(log2_size=12)])
+SPHERES = [
+    (FrequencyConfig(octaves=6), 8, 4),
+    (HashConfig(log2_size=12), 1, -1),
+    (VoxelsConfig(9, features=4, levels=2, coarsest=5), 2, -1),
+    (SparseVoxelsConfig(8), 1, -1),
+    (VmConfig(8, 4), 1, -1),
+    (CpConfig(8, 12), 1, -1),
+    (TriplaneConfig(8, 8), 1, -1),
+]
+
+
+@pytest.mark.parametrize(("encoding", "layers", "skip"), SPHERES)
 @pytest.mark.parametrize("space", ["box", "contracted"])
-def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, space):
-    scene = make_scene(space)
-    field = NeuralFieldConfig(encoding, "sdf", layers=8, width=128, skip=4).build(scene)
-    offset = (torch.rand(500, 3) * 2 - 1) * scene.bounds.half
-    with torch.no_grad():
-        sdf = field.query(Samples.at(scene.bounds.centre + offset), S).sdf
-    assert sdf is not None
-    inside = offset.norm(dim=1) < scene.bounds.half[0]  # contracted space bends distances beyond the unit ball
-    error = (sdf - (offset.norm(dim=1) - 0.5 * scene.bounds.half[0]))[inside]
-    assert float(error.abs().mean()) < 0.05 * float(scene.bounds.half[0])
+def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, layers, skip, space):
+    """On every encoding, in a cube and in a flatter box: distances, and gradients of length 1 along the radius."""
+    for flat in (1.0, 0.6):
+        scene = make_scene(space)
+        half = scene.bounds.half * torch.tensor([1.0, 1.0, flat])
+        bounds = Bounds(scene.bounds.centre - half, scene.bounds.centre + half, space)
+        scene = replace(scene, bounds=bounds)
+        field = NeuralFieldConfig(encoding, "sdf", layers, 128, skip, colour_inputs=("position", "normal")).build(scene)
+        offset = (torch.rand(500, 3) * 2 - 1) * half
+        inside = (offset / half).norm(dim=1) < 1  # contracted space bends distances beyond the unit ball
+        values = field.query_no_grad(Samples.at(bounds.centre + offset), S | G)
+        assert values.sdf is not None
+        assert values.gradient is not None
+        error = (values.sdf - (offset.norm(dim=1) - 0.5 * half[2]))[inside]
+        assert float(error.abs().mean()) < 0.05 * float(half.mean())
+        away = inside & (offset.norm(dim=1) > 0.2 * half.mean())
+        cosine = (values.gradient * torch.nn.functional.normalize(offset, dim=1)).sum(dim=1)[away]
+        assert float((cosine - 1).abs().mean()) < 0.1
+        assert float((values.gradient.norm(dim=1)[away] - 1).abs().mean()) < 0.1
 
 
 def test_nerf_and_instant_ngp_have_their_published_sizes(make_scene):

@@ -13,6 +13,7 @@ from invgraphics.core.field import Gaussians as Gaussians
 from invgraphics.core.field import Quantity as Quantity
 from invgraphics.core.model import Model as Model
 from invgraphics.core.ngp import FusedNGP as FusedNGP
+from invgraphics.core.ngp import FusedSDF as FusedSDF
 from invgraphics.core.ngp import HashGrid as HashGrid
 from invgraphics.core.rays import Rays as Rays
 from invgraphics.core.renderer import RayRenderer as RayRenderer
@@ -22,6 +23,7 @@ from invgraphics.core.renderer import check as check
 from invgraphics.core.rendering import Context as Context
 from invgraphics.core.rendering import Rendering as Rendering
 from invgraphics.core.rendering import Screen as Screen
+from invgraphics.core.rendering import SurfaceTrace as SurfaceTrace
 from invgraphics.core.rendering import Trace as Trace
 from invgraphics.core.samples import FieldValues as FieldValues
 from invgraphics.core.samples import Samples as Samples

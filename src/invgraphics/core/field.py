@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.fused import FusedLattice
-from invgraphics.core.ngp import FusedNGP
+from invgraphics.core.ngp import FusedNGP, FusedSDF
 from invgraphics.core.rendering import Context
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.errors import NotComposableError
@@ -25,6 +25,7 @@ class Quantity(Flag):
     NONE = 0
     DENSITY = auto()
     SDF = auto()
+    GRADIENT = auto()
     RADIANCE = auto()
     NORMAL = auto()
     FEATURES = auto()
@@ -88,6 +89,10 @@ class Field(nn.Module, ABC):
 
     def fused(self, bounds: Bounds) -> FusedNGP | FusedLattice | None:
         """Detached parameters over ``bounds`` for fused inference, where a kernel supports such fields; else ``None``."""
+        return None
+
+    def fused_sdf(self, bounds: Bounds) -> FusedSDF | None:
+        """Detached parameters of the signed distance over ``bounds`` for fused sphere tracing, where a kernel supports it."""
         return None
 
     def primitives(self, want: Quantity, ctx: Context) -> Any:

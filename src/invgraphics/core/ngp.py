@@ -81,3 +81,28 @@ class FusedNGP:
     sh_bands: int
     colour_space: Literal["srgb", "linear"]
     contracted_density: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class FusedSDF:
+    """Detached parameters of a signed distance over a hash grid or over octaves, for fused sphere tracing.
+
+    Attributes:
+        table: features of all levels; no rows without a grid.
+        grid: geometry of the levels; ``None`` where positions are encoded by octaves.
+        octaves: sines and cosines of 2^k π x, k = 0 .. octaves - 1 and x the position in the unit cube mapped to [-1, 1],
+            behind x itself (NeRF, equation 4); not used with a grid.
+        net: weight (outs, ins) and bias of each layer of a softplus network from coordinates, followed by the encoding's
+            features, to the distance, which is its one output; layers before the last are activated.
+        sharpness: of the softplus.
+        coordinate_scale: the network's coordinates over x.
+        scale: signed distance in local units over the network's output.
+    """
+
+    table: Float[Tensor, "entries f"]
+    grid: HashGrid | None
+    octaves: int
+    net: tuple[tuple[Tensor, Tensor], ...]
+    sharpness: float
+    coordinate_scale: Float[Tensor, " 3"]
+    scale: float

@@ -37,6 +37,11 @@ class _StatefulModule(nn.Module):
 class Sampler(_StatefulModule, ABC):
     """Places samples along rays. May own parameters (proposal networks) and buffers (occupancy grids)."""
 
+    @property
+    def requires(self) -> Quantity:
+        """Quantities of the field that it asks for besides the density."""
+        return Quantity.NONE
+
     @abstractmethod
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Samples on ``rays``, whose near and far are set, and the traces of earlier passes (coarse or proposal)."""
@@ -72,6 +77,11 @@ class Renderer(_StatefulModule, ABC):
 
     requires: ClassVar[Quantity]
     depth_kind: Literal["mean", "median"] = "mean"
+
+    @property
+    def required(self) -> Quantity:
+        """What `requires` names, and what the parts of this renderer need besides (a sampler's `Sampler.requires`)."""
+        return self.requires
 
     @abstractmethod
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
@@ -152,7 +162,7 @@ def check(field: Field, renderer: Renderer) -> None:
     Raises:
         NotComposableError: names what the renderer needs and the field lacks.
     """
-    missing = renderer.requires & ~field.provides
+    missing = renderer.required & ~field.provides
     if missing:
         raise NotComposableError(
             f"{type(renderer).__name__} needs {missing.words()}, which {type(field).__name__} does not provide.",

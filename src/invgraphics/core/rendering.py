@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
@@ -95,6 +95,26 @@ class Screen:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceTrace:
+    """How n rays were traced to the surface of a signed distance.
+
+    Attributes:
+        logit: of each ray's opacity, ``-sharpness * lowest``, where ``lowest`` is the least signed distance on the ray (IDR,
+            equation 7); -inf for rays that miss the bounds. It has gradients where the opacity itself has saturated.
+        sharpness: of that opacity, per local length unit.
+        hit: whether the ray meets the surface.
+        steps: look-ups of the signed distance on the ray before refinement.
+        converged: whether the hit was refined to its tolerance, or a ray without one left the bounds within its steps.
+    """
+
+    logit: Float[Tensor, " n"]
+    sharpness: float
+    hit: Bool[Tensor, " n"]
+    steps: Int[Tensor, " n"]
+    converged: Bool[Tensor, " n"]
+
+
+@dataclass(frozen=True, eq=False)
 class Trace:
     """Samples, weights and screen-space state behind a rendering, for losses and for study; never for scores.
 
@@ -105,6 +125,7 @@ class Trace:
         levels: traces of earlier passes (coarse or proposal), first to last.
         screen: screen-space state of a splatting pass.
         rays: number of rays rendered.
+        surface: statistics of sphere tracing.
     """
 
     samples: Samples | None = None
@@ -113,6 +134,7 @@ class Trace:
     levels: tuple[Trace, ...] = ()
     screen: Screen | None = None
     rays: int = 0
+    surface: SurfaceTrace | None = None
 
 
 @dataclass(frozen=True, eq=False)

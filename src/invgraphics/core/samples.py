@@ -90,13 +90,16 @@ class FieldValues:
     Attributes:
         density: volume density, per local length unit, >= 0.
         sdf: signed distance, local units, negative inside.
+        gradient: gradient of the signed distance in the position, not normalised: of length 1 only where ``sdf`` is a distance.
         radiance: colour seen along the sample's direction, in the scene's colour space, [0, 1] for sRGB.
-        normal: unit normal, pointing out of the surface; zero where it is undefined (constant density).
+        normal: unit normal, pointing out of the surface; zero where it is undefined (constant density). With a signed distance,
+            its normalised gradient.
         features: anything else a renderer and a field agree on.
     """
 
     density: Float[Tensor, " m"] | None = None
     sdf: Float[Tensor, " m"] | None = None
+    gradient: Float[Tensor, "m 3"] | None = None
     radiance: Float[Tensor, "m 3"] | None = None
     normal: Float[Tensor, "m 3"] | None = None
     features: Float[Tensor, "m f"] | None = None

@@ -86,7 +86,7 @@ class Slab(AnalyticField):
 class Sphere(AnalyticField):
     """Constant density inside a sphere, with its signed distance and normals."""
 
-    provides = AnalyticField.provides | Quantity.SDF | Quantity.NORMAL
+    provides = AnalyticField.provides | Quantity.SDF | Quantity.GRADIENT | Quantity.NORMAL
     centre: Tensor
 
     def __init__(self, density: float, radius: float, centre: Vector = (0, 0, 0), colour: Colour = (1, 1, 1)) -> None:
@@ -113,12 +113,69 @@ class Sphere(AnalyticField):
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
         """See `Field.query`."""
-        values = super().query(samples, want)
+        values, outward = super().query(samples, want), normalize(samples.position - self.centre, dim=1)
         return FieldValues(
             density=values.density,
             radiance=values.radiance,
             sdf=self.sdf_at(samples.position) if Quantity.SDF in want else None,
-            normal=normalize(samples.position - self.centre, dim=1) if Quantity.NORMAL in want else None,
+            gradient=outward if Quantity.GRADIENT in want else None,
+            normal=outward if Quantity.NORMAL in want else None,
+        )
+
+
+class Box(AnalyticField):
+    """Constant density inside an axis-aligned box, with its exact signed distance, that distance's gradient, and normals.
+
+    Args:
+        density: inside.
+        half_edges: half of each edge.
+        centre: of the box.
+        colour: see `Colour`.
+    """
+
+    provides = AnalyticField.provides | Quantity.SDF | Quantity.GRADIENT | Quantity.NORMAL
+    half_edges: Tensor
+    centre: Tensor
+
+    def __init__(self, density: float, half_edges: Vector, centre: Vector = (0, 0, 0), colour: Colour = (1, 1, 1)) -> None:
+        super().__init__(colour)
+        self.density = nn.Parameter(torch.tensor(float(density)))
+        self.register_buffer("half_edges", _vector(half_edges))
+        self.register_buffer("centre", _vector(centre))
+
+    def density_at(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
+        """Density: the constant inside, zero outside."""
+        return self.density * (self.sdf_at(position) <= 0)
+
+    def sdf_at(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
+        """Signed distance to the box, negative inside."""
+        beyond = (position - self.centre).abs() - self.half_edges
+        return beyond.clamp_min(0).norm(dim=1) + beyond.amax(dim=1).clamp_max(0)
+
+    def gradient_at(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        """Gradient of the signed distance: towards the point from the nearest one of the box, or to the nearest face inside."""
+        offset = position - self.centre
+        beyond = offset.abs() - self.half_edges
+        nearest = torch.nn.functional.one_hot(beyond.argmax(dim=1), 3).to(position)
+        outside = (beyond > 0).any(dim=1, keepdim=True)
+        return offset.sign() * torch.where(outside, normalize(beyond.clamp_min(0), dim=1), nearest)
+
+    def optical_depth(self, rays: Rays) -> Float[Tensor, " n"]:
+        """Optical depth: density times the ray's length inside."""
+        slope = torch.where(rays.directions == 0, torch.full_like(rays.directions, 1e-30), rays.directions)
+        a, b = (self.centre + sign * self.half_edges - rays.origins for sign in (-1, 1))
+        enter, leave = torch.minimum(a / slope, b / slope).amax(dim=1), torch.maximum(a / slope, b / slope).amin(dim=1)
+        return self.density * _overlap(rays, enter, leave.maximum(enter))
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        """See `Field.query`."""
+        values, gradient = super().query(samples, want), self.gradient_at(samples.position)
+        return FieldValues(
+            density=values.density,
+            radiance=values.radiance,
+            sdf=self.sdf_at(samples.position) if Quantity.SDF in want else None,
+            gradient=gradient if Quantity.GRADIENT in want else None,
+            normal=gradient if Quantity.NORMAL in want else None,
         )
 
 

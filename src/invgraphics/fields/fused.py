@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from invgraphics.core.field import Encoding
 from invgraphics.core.fused import ColourHead, CombinedLattices, Corner, DensityHead, FusedLattice, Layers
-from invgraphics.core.ngp import FusedNGP
+from invgraphics.core.ngp import FusedNGP, FusedSDF
+from invgraphics.fields.encodings.frequency import FrequencyEncoding
 from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.encodings.lattices import LatticeFeatures
 from invgraphics.fields.encodings.sparse import SparseVoxels
@@ -46,10 +47,11 @@ def fused_parts(field: FieldParts) -> FusedNGP | FusedLattice | None:
 
     Returns:
         ``None`` for other encodings, heads or networks than kernels support: of a hash grid with other than two features per
-        entry or with a coarse-to-fine window, and of lattices whose density is activated before interpolation.
+        entry or with a coarse-to-fine window, of lattices whose density is activated before interpolation, of colours that
+        see more than features and direction.
     """
     config = field.config
-    if config.geometry != "density" or (config.geometry_head == "mlp" and config.skip >= 0):
+    if config.geometry != "density" or config.colour_inputs or (config.geometry_head == "mlp" and config.skip >= 0):
         return None
     if isinstance(field.encoding, LatticeFeatures | SparseVoxels):
         return _lattice_parts(field)
@@ -67,6 +69,28 @@ def _hash_parts(field: FieldParts) -> FusedNGP | None:
     bands = config.direction_degree if config.direction == "sh" else 0
     density = config.density_activation, config.density_bias, bands, field.colour, field.contracted_density
     return FusedNGP(encoding.table.detach(), encoding.grid, geometry, colour, *density)
+
+
+def sdf_parts(config: NeuralSettings, encoding: Encoding, net: Mlp, coordinate_scale: Tensor, scale: float) -> FusedSDF | None:
+    """Parameters of a signed distance over a hash grid of two features per entry or over octaves; ``None`` for others.
+
+    Args:
+        config: the field's settings.
+        encoding: of positions.
+        net: network of coordinates and features to the distance.
+        coordinate_scale: see `FusedSDF`.
+        scale: local length of the network's unit.
+    """
+    if config.skip >= 0 or net.sharpness is None or not config.layers:
+        return None
+    *hidden, (weight, bias) = net.layers()
+    network = (*hidden, (weight[:1], bias[:1])), net.sharpness, coordinate_scale, scale
+    if not isinstance(encoding, HashEncoding | FrequencyEncoding) or encoding.window_alpha is not None:
+        return None
+    if isinstance(encoding, FrequencyEncoding):
+        octaves = encoding.config.octaves
+        return FusedSDF(weight.new_zeros(0, 2), None, octaves, *network) if encoding.config.include_input else None
+    return FusedSDF(encoding.table.detach(), encoding.grid, 0, *network) if encoding.grid.features == 2 else None
 
 
 def _lattice_parts(field: FieldParts) -> FusedLattice | None:

@@ -18,7 +18,7 @@ from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
 
 NEUS_SHARPNESS, EG3D_SHARPNESS = 100.0, 1.0
-"""Of the softplus of hidden layers."""
+"""Of the softplus of hidden layers; NeuS's is that of a signed distance, whose gradient must have one itself."""
 
 
 def geometry_net(settings: NeuralSettings, inputs: int) -> Mlp:
@@ -31,7 +31,7 @@ def geometry_net(settings: NeuralSettings, inputs: int) -> Mlp:
         width=settings.width,
         outputs=1 + settings.geometry_features,
         skip=settings.skip,
-        sharpness=_sharpness(settings),
+        sharpness=NEUS_SHARPNESS if settings.geometry == "sdf" else _sharpness(settings),
     )
 
 
@@ -47,8 +47,6 @@ def colour_net(settings: NeuralSettings, features: int) -> Mlp:
 
 
 def _sharpness(settings: NeuralSettings) -> float | None:
-    if settings.geometry == "sdf":
-        return NEUS_SHARPNESS
     return EG3D_SHARPNESS if settings.hidden_activation == "softplus" else None
 
 

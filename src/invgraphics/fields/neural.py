@@ -11,8 +11,8 @@ Densities are per local length unit, signed distances in local length units, wha
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -26,26 +26,24 @@ from invgraphics.core.bounds import Bounds, Space
 from invgraphics.core.field import Encoding, Field, Quantity
 from invgraphics.core.fused import FusedLattice
 from invgraphics.core.lattice import Lattice, LatticeEncoding, Role
-from invgraphics.core.ngp import FusedNGP
+from invgraphics.core.ngp import FusedNGP, FusedSDF
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
 from invgraphics.fields import heads
 from invgraphics.fields.covariance import unit_covariance
 from invgraphics.fields.density import DensityActivation
 from invgraphics.fields.encodings.lattices import LatticeConfig, LatticeFeatures, crop_lattices
-from invgraphics.fields.fused import FieldParts, fused_parts
+from invgraphics.fields.fused import FieldParts, fused_parts, sdf_parts
+from invgraphics.fields.geometry import chunks, query_geometry
 from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
 
-CPU_CHUNK = 8192
-"""Samples that go through the networks at once on a CPU: larger activations cost more in page faults than in arithmetic."""
-
 INITIAL_RADIUS = 0.5
-"""Radius of the sphere that a signed distance function starts as, in half-extents of the box (NeuS)."""
+"""Radius of the sphere that a signed distance function starts as, in the box's smallest half-extent (NeuS)."""
 
 _POINTWISE = {
     "density": Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL | Quantity.FEATURES,
-    "sdf": Quantity.SDF | Quantity.RADIANCE | Quantity.NORMAL | Quantity.FEATURES,
+    "sdf": Quantity.SDF | Quantity.GRADIENT | Quantity.RADIANCE | Quantity.NORMAL | Quantity.FEATURES,
 }
 
 
@@ -58,23 +56,6 @@ class NeuralFieldConfig(NeuralSettings):
     def build(self, scene: Scene) -> NeuralField:
         """Build the field for ``scene``'s bounds and colour space, its weights drawn from torch's global generator."""
         return NeuralField(self, scene.bounds, scene.colour)
-
-
-@dataclass(frozen=True, eq=False)
-class _NetworkOutputs:
-    """Raw geometry and colour of one chunk.
-
-    Attributes:
-        raw: density before its activation, or signed distance.
-        radiance: colour; ``None`` where it is not wanted.
-        feature_grad: gradient of ``raw`` in the encoding's features; ``None`` without normals.
-        geometry_features: features that geometry hands on to colour; ``None`` where they are not wanted.
-    """
-
-    raw: Float[Tensor, " m"]
-    radiance: Float[Tensor, "m 3"] | None
-    feature_grad: Float[Tensor, "m f"] | None
-    geometry_features: Float[Tensor, "m h"] | None
 
 
 class NeuralField(Field):
@@ -106,7 +87,7 @@ class NeuralField(Field):
         self._near = bounds.near
         self.register_buffer("lo", bounds.lo.clone())
         self.register_buffer("hi", bounds.hi.clone())
-        self._half = float(bounds.half.mean())  # at the start: no crop changes densities
+        self._half = float(bounds.half.mean())  # at the start: no crop changes densities or distances
         self.encoding = _build_encoding(config.encoding, bounds)
         self.appearance = None if config.appearance is None else _build_encoding(config.appearance, bounds)
         self.density_activation = DensityActivation(
@@ -118,7 +99,7 @@ class NeuralField(Field):
         own = 0 if self.appearance is None else config.appearance_basis or self.appearance.width
         heads.check_colour_features(config.head, handed + own)
         if config.head == "mlp":
-            self.colour_net = heads.colour_net(config, handed + own)
+            self.colour_net = heads.colour_net(config, handed + own + 3 * len(config.colour_inputs))
         self.basis: nn.Linear | None = None
         if self.appearance is not None and config.appearance_basis:
             self.basis = nn.Linear(self.appearance.width, own, bias=False)
@@ -127,7 +108,7 @@ class NeuralField(Field):
         self.provides = _POINTWISE[config.geometry] & ~without
         self._needs_geometry_for_colour = handed > 0 or self.appearance is None
         if config.geometry == "sdf":
-            self.geometry_net.initialise_as_sphere(INITIAL_RADIUS)
+            self.geometry_net.initialise_as_sphere(INITIAL_RADIUS * float(bounds.half.min()) / self._half)
 
     @property
     def bounds(self) -> Bounds:
@@ -150,55 +131,62 @@ class NeuralField(Field):
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
         """See `Field.query`.
 
-        Normals are the normalised gradient: of the signed distance, or of minus the density (taken before its activation,
-        which is monotone, so that they are defined where the density saturates). They can be had inside ``no_grad``.
+        Gradients and normals can be had inside ``no_grad``. A normal is the normalised gradient: of the signed distance, or of
+        minus the density (taken before its activation, which is monotone, so that it is defined where the density saturates).
         Features are what geometry hands on to colour; samples that bring them along are not looked at again where only their
-        radiance is wanted.
+        radiance is wanted and colour sees no normal.
         """
-        training = torch.is_grad_enabled()
         appearance = self._appearance(samples) if Quantity.RADIANCE in want else None
+        sees_normal = Quantity.RADIANCE in want and "normal" in self.config.colour_inputs
         known = samples.features if self._needs_geometry_for_colour else samples.position[:, :0]
-        if want == Quantity.RADIANCE and known is not None:
-            chunks = self._chunks(known, appearance, samples.direction)
-            return FieldValues(radiance=torch.cat([self._radiance(*chunk) for chunk in chunks]))
-        with_normal = Quantity.NORMAL in want
-        with torch.set_grad_enabled(training or with_normal):
-            position = samples.position
-            if with_normal and not (training and position.requires_grad):
-                position = position.detach().requires_grad_()
-            features = self._encode(samples, position)
-            chunks = self._chunks(features, appearance, samples.direction)
-            parts = [self._evaluate(*chunk, want, training) for chunk in chunks]
-            raw = torch.cat([part.raw for part in parts])
-            normal = None
-            if with_normal:
-                feature_grad = torch.cat([part.feature_grad for part in parts if part.feature_grad is not None])
-                (gradient,) = torch.autograd.grad(features, position, feature_grad, create_graph=training)
-                normal = normalize(gradient if self.config.geometry == "sdf" else -gradient, dim=1)
-        radiances = [part.radiance for part in parts if part.radiance is not None]
-        geometry_features = [part.geometry_features for part in parts if part.geometry_features is not None]
+        if want == Quantity.RADIANCE and known is not None and not sees_normal:
+            return FieldValues(radiance=self._radiance(known, appearance, samples, None))
+        geometry = query_geometry(
+            partial(self._encode, samples),
+            self._geometry,
+            samples.position,
+            with_features=bool(want & (Quantity.RADIANCE | Quantity.FEATURES)),
+            with_gradient=sees_normal or bool(want & (Quantity.GRADIENT | Quantity.NORMAL)),
+        )
+        sdf = self.config.geometry == "sdf"
+        normal = None if geometry.gradient is None else normalize(geometry.gradient if sdf else -geometry.gradient, dim=1)
+        radiance = None
+        if Quantity.RADIANCE in want:
+            assert geometry.features is not None
+            radiance = self._radiance(geometry.features, appearance, samples, normal)
         return FieldValues(
-            density=self._density(raw, samples.position) if Quantity.DENSITY in want else None,
-            sdf=raw * self.bounds.half.mean() if Quantity.SDF in want else None,
-            radiance=torch.cat(radiances) if Quantity.RADIANCE in want else None,
-            normal=normal,
-            features=torch.cat(geometry_features) if Quantity.FEATURES in want else None,
+            density=self._density(geometry.raw, samples.position) if Quantity.DENSITY in want else None,
+            sdf=geometry.raw * self._half if Quantity.SDF in want else None,
+            gradient=geometry.gradient * self._half if Quantity.GRADIENT in want and geometry.gradient is not None else None,
+            radiance=radiance,
+            normal=normal if Quantity.NORMAL in want else None,
+            features=geometry.features if Quantity.FEATURES in want else None,
         )
 
     @override
     def fused(self, bounds: Bounds) -> FusedNGP | FusedLattice | None:
         """Detached parameters over ``bounds``: of a hash grid over the field's own, or of lattices (see `fused_parts`)."""
         crop = None
-        if not (torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)):
+        if not self._covers(bounds):
+            if bounds.space != self._space or bounds.space != "box":
+                return None
             lo, hi = (tuple(bounds.to_unit(corner).tolist()) for corner in (self.lo, self.hi))
             crop = lo, hi
-        if bounds.space != self._space or (crop is not None and bounds.space != "box"):
-            return None
         geometry_net = self.geometry_net if self.config.geometry_head == "mlp" else None
         colour_net = self.colour_net if self.config.head == "mlp" else None
         geometry = self.config, self.encoding, geometry_net
         colour = self.appearance, self.basis, colour_net, self.colour
         return fused_parts(FieldParts(*geometry, *colour, self._density_scale, self._contracted_density, crop))
+
+    @override
+    def fused_sdf(self, bounds: Bounds) -> FusedSDF | None:
+        """Detached parameters of a signed distance over ``bounds``, its own: of a hash grid or octaves (see `sdf_parts`)."""
+        if not self._covers(bounds) or self.config.geometry != "sdf":
+            return None
+        return sdf_parts(self.config, self.encoding, self.geometry_net, self.bounds.half / self._half, self._half)
+
+    def _covers(self, bounds: Bounds) -> bool:
+        return bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)
 
     @property
     def _contracted_density(self) -> float:
@@ -220,9 +208,13 @@ class NeuralField(Field):
         features = self._features(self.encoding, samples, position, unit)
         if self.config.geometry == "density":
             return features
-        # In half-extents of the box, which is half as long as the unit cube in a contracted space.
+        return torch.cat([self._coordinates(unit), features], dim=1)
+
+    def _coordinates(self, unit: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        """Positions from the middle of the box, in its mean half-extents; after contraction where space is contracted."""
+        # The box is half as long as the unit cube in a contracted space.
         reach = 2 if self._space == "contracted" else 1
-        return torch.cat([reach * (2 * unit - 1), features], dim=1)
+        return (2 * unit - 1) * (reach * self.bounds.half / self._half)
 
     def _encode_activated(self, unit: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
         assert isinstance(self.encoding, LatticeFeatures)
@@ -240,33 +232,6 @@ class NeuralField(Field):
         covariance = unit_covariance(self.bounds, position, samples.covariance) if encoding.needs_covariance else None
         return encoding(unit, covariance)
 
-    def _chunks(
-        self, features: Tensor, appearance: Tensor | None, direction: Tensor
-    ) -> Iterator[tuple[Tensor, Tensor | None, Tensor]]:
-        size = CPU_CHUNK if direction.device.type == "cpu" else max(len(direction), 1)
-        parts = features.split(size), direction.split(size)
-        own = [None] * len(parts[0]) if appearance is None else appearance.split(size)
-        return zip(parts[0], own, parts[1], strict=True)
-
-    def _evaluate(
-        self, features: Tensor, appearance: Tensor | None, direction: Tensor, want: Quantity, training: bool
-    ) -> _NetworkOutputs:
-        """Evaluate geometry and colour on one chunk; detached unless ``training``."""
-        with_colour = Quantity.RADIANCE in want
-        if Quantity.NORMAL in want and not training:
-            # Starting the chunk's graph here keeps it from growing over all chunks.
-            features = features.detach().requires_grad_()
-        outputs = self._geometry(features, with_colour or Quantity.FEATURES in want)
-        raw, feature_grad = outputs[:, 0], None
-        if Quantity.NORMAL in want:
-            (feature_grad,) = torch.autograd.grad(raw.sum(), features, create_graph=training)
-        if not training:
-            raw, outputs = raw.detach(), outputs.detach()
-        with torch.set_grad_enabled(training):
-            geometry_features = outputs[:, 1:]
-            radiance = self._radiance(geometry_features, appearance, direction) if with_colour else None
-            return _NetworkOutputs(raw, radiance, feature_grad, geometry_features if Quantity.FEATURES in want else None)
-
     def _geometry(self, features: Float[Tensor, "m f"], with_features: bool) -> Float[Tensor, "m o"]:
         """Raw geometry, and behind it the features that are handed on."""
         if self.config.geometry_head == "mlp":
@@ -274,12 +239,29 @@ class NeuralField(Field):
         return features.sum(dim=1, keepdim=True) if heads.sums_components(self.encoding) else features
 
     def _radiance(
-        self, geometry: Float[Tensor, "m g"], appearance: Float[Tensor, "m a"] | None, direction: Float[Tensor, "m 3"]
+        self,
+        handed: Float[Tensor, "m g"],
+        appearance: Float[Tensor, "m a"] | None,
+        samples: Samples,
+        normal: Float[Tensor, "m 3"] | None,
     ) -> Float[Tensor, "m 3"]:
-        features = geometry
+        """Colour of what geometry hands on, of the appearance's features and of ``colour_inputs``, chunk by chunk."""
+        position = None
+        if "position" in self.config.colour_inputs:
+            position = self._coordinates(self.bounds.to_unit(samples.position))
+        seen = normal if "normal" in self.config.colour_inputs else None
+        parts = [self._radiance_of(*chunk) for chunk in chunks(samples.direction, handed, appearance, position, seen)]
+        return torch.cat(parts)
+
+    def _radiance_of(
+        self, direction: Float[Tensor, "m 3"], handed: Tensor, appearance: Tensor | None, *surface: Tensor | None
+    ) -> Float[Tensor, "m 3"]:
+        parts = [part for part in surface if part is not None]
+        if self._needs_geometry_for_colour:
+            parts.append(handed)
         if appearance is not None:
-            own = appearance if self.basis is None else self.basis(appearance)
-            features = torch.cat([geometry, own], dim=1) if self._needs_geometry_for_colour else own
+            parts.append(appearance if self.basis is None else self.basis(appearance))
+        features = parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
         raw = heads.raw_colour(self.colour_net if self.config.head == "mlp" else None, features, direction, self.config)
         return heads.activated_colour(raw, self.config, self.colour)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from invgraphics.config import Slot
+from invgraphics.config import OMIT_EMPTY, Slot
 from invgraphics.core import harmonics
 from invgraphics.fields.density import Activation, Interpolation
 from invgraphics.fields.encodings.frequency import FrequencyConfig, frequency_width
@@ -43,11 +43,13 @@ class NeuralSettings:
             (``vm``, ``cp``) it is the sum of all. No geometry network then.
         head: how colour comes from features. ``sh``: they are coefficients of spherical harmonics in the direction, the
             (degree + 1)^2 of red first; ``none``: they are the raw colour, alike from all sides. No colour network then.
-        hidden_activation: of both networks' hidden layers; those of signed distances are a sharp softplus in any case.
+        hidden_activation: of both networks' hidden layers; those of a signed distance are a sharp softplus in any case.
         colour_activation: of raw colour. ``sigmoid``: softplus in scenes of linear colour; ``clamp``: max(0, 0.5 + x), as
             Plenoxels and 3DGS do it, with the gradient of a projection.
         colour_padding: how far the sigmoid exceeds [0, 1] at both ends, so that black and white can be reached (0.001 in EG3D
             and mip-NeRF).
+        colour_inputs: what the colour network sees besides features and direction: the ``position``, in half-extents of the
+            box, the unit ``normal``, or both (IDR, NeuS, VolSDF).
     """
 
     encoding: Annotated[Any, Slot("encodings")] = field(default_factory=FrequencyConfig)
@@ -73,6 +75,7 @@ class NeuralSettings:
     hidden_activation: Literal["relu", "softplus"] = "relu"
     colour_activation: Literal["sigmoid", "clamp"] = "sigmoid"
     colour_padding: float = 0.0
+    colour_inputs: tuple[Literal["position", "normal"], ...] = field(default=(), metadata=OMIT_EMPTY)
 
     def __post_init__(self) -> None:
         if self.layers < 0 or self.colour_layers < 0:
@@ -86,6 +89,7 @@ class NeuralSettings:
         if self.direction_degree < 0:
             raise ValueError("direction_degree cannot be negative.")
         blind = self.appearance is None and self.geometry_head == "mlp" and self.geometry_features == 0
+        blind &= not self.colour_inputs
         if blind and (self.direction == "none" or self.head != "mlp"):
             raise ValueError("with geometry_features = 0 and direction = 'none' colour would be the same everywhere.")
         self._check_heads()
@@ -102,13 +106,18 @@ class NeuralSettings:
         """Whether colour and geometry are ReLU networks over one encoding, as fused kernels take them."""
         networks = self.geometry_head == self.head == "mlp" and self.hidden_activation == "relu"
         plain_colour = self.colour_activation == "sigmoid" and self.colour_padding == 0
-        return networks and plain_colour and self.appearance is None and self.feature_octaves == 0
+        bare = self.appearance is None and self.feature_octaves == 0 and not self.colour_inputs
+        return networks and plain_colour and bare
 
     def _check_heads(self) -> None:
         if min(self.appearance_basis, self.feature_octaves) < 0 or not 0 <= self.colour_padding < 1:
             raise ValueError("appearance_basis and feature_octaves cannot be negative, colour_padding is in [0, 1).")
         if self.appearance_basis and self.appearance is None:
             raise ValueError("appearance_basis needs an appearance encoding.")
+        if len(set(self.colour_inputs)) < len(self.colour_inputs):
+            raise ValueError(f"colour_inputs names each input once, not {', '.join(self.colour_inputs)}.")
+        if self.colour_inputs and self.head != "mlp":
+            raise ValueError("colour_inputs are inputs of a colour network: they need head = 'mlp'.")
         if self.feature_octaves and self.head != "mlp":
             raise ValueError("feature_octaves are inputs of a colour network: they need head = 'mlp'.")
 

@@ -136,3 +136,45 @@ class AdamStep:
     def size(self) -> float:
         """Learning rate times both bias corrections."""
         return self.lr * math.sqrt(1 - self.beta2**self.number) / (1 - self.beta1**self.number)
+
+
+@dataclass(frozen=True)
+class TracingLimits:
+    """When rays stop, in local length units.
+
+    Attributes:
+        steps: most look-ups of a ray while it marches.
+        relaxation: factor of a step over the distance, in (0, 2); above 1 it is over-relaxed (Keinert et al. 2014).
+        refinements: most look-ups of a ray afterwards, in the bracket of its hit or of its closest approach.
+        least: shortest step; surfaces closer together than this along a ray may be missed.
+        tolerance: a hit is refined until the distance there is at most this.
+        depth: a ray ends where it is this deep inside.
+    """
+
+    steps: int
+    relaxation: float
+    refinements: int
+    least: float
+    tolerance: float
+    depth: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tracing:
+    """Where n rays met a surface, or came closest to it.
+
+    Attributes:
+        hit: whether the distance changes its sign, or is negative from the start.
+        hit_t: distance along the ray of the first such place; ``far`` without one.
+        low_t: distance along the ray of the least signed distance.
+        low: that signed distance; infinite for rays without an interval.
+        steps: look-ups of each ray, refinements left out.
+        converged: whether the hit was refined to the tolerance, or a ray without one has left the bounds within its steps.
+    """
+
+    hit: Bool[Tensor, " n"]
+    hit_t: Float[Tensor, " n"]
+    low_t: Float[Tensor, " n"]
+    low: Float[Tensor, " n"]
+    steps: Int[Tensor, " n"]
+    converged: Bool[Tensor, " n"]

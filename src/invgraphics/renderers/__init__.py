@@ -6,8 +6,11 @@ from invgraphics.lazy import submodules
 
 RENDERERS = {
     "volumetric": "invgraphics.renderers.volumetric:VolumetricConfig",
+    "volsdf": "invgraphics.renderers.volsdf:VolSDFConfig",
+    "neus": "invgraphics.renderers.neus:NeuSConfig",
     "splatting": "invgraphics.renderers.splatting:SplattingConfig",
     "gaussian_exact": "invgraphics.renderers.gaussian_volume:GaussianExactConfig",
+    "sphere_tracing": "invgraphics.renderers.sphere_tracing:SphereTracingConfig",
     "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
 }
 
@@ -15,6 +18,8 @@ SAMPLERS = {
     "stratified": "invgraphics.renderers.samplers:StratifiedConfig",
     "hierarchical": "invgraphics.renderers.samplers:HierarchicalConfig",
     "occupancy": "invgraphics.renderers.occupancy:OccupancyConfig",
+    "error_bounded": "invgraphics.renderers.error_bounded:ErrorBoundedConfig",
+    "up_sampling": "invgraphics.renderers.up_sampling:UpSamplingConfig",
 }
 
 if not TYPE_CHECKING:

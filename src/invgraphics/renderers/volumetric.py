@@ -77,6 +77,11 @@ class Volumetric(RayRenderer):
         self.gradient_reach = gradient_reach
         self.colour_threshold = colour_threshold
 
+    @property
+    @override
+    def required(self) -> Quantity:
+        return self.requires | self.sampler.requires
+
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; with normals if ``ctx.geometry`` is set and the field provides them."""
         samples, levels = self.sampler.sample(ctx.bounds.clip(rays), field, ctx)

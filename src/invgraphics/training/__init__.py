@@ -13,12 +13,15 @@ LOSSES = {
     "distortion": "invgraphics.training.losses:DistortionLoss",
     "background_entropy": "invgraphics.training.losses:BackgroundEntropyLoss",
     "point_colour": "invgraphics.training.losses:PointColourLoss",
+    "eikonal": "invgraphics.training.eikonal:EikonalLoss",
+    "mask": "invgraphics.training.losses:MaskLoss",
 }
 
 PENALTIES = {
     "total_variation": "invgraphics.training.penalties:TotalVariationPenalty",
     "l1": "invgraphics.training.penalties:L1Penalty",
     "sparsity": "invgraphics.training.penalties:SparsityPenalty",
+    "eikonal": "invgraphics.training.eikonal:EikonalPenalty",
 }
 
 HOOKS = {

@@ -12,6 +12,7 @@ from invgraphics.kernels.numba.hash.encode import hash_encode as hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode as lattice_encode
 from invgraphics.kernels.numba.ngp.march import ngp_march as ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render as ngp_render
+from invgraphics.kernels.numba.ngp.trace import sdf_trace as sdf_trace
 from invgraphics.kernels.numba.rays.composite import composite as composite
 from invgraphics.kernels.numba.rays.march import ray_march as ray_march
 from invgraphics.kernels.numba.splat.binning import splat_bin as splat_bin

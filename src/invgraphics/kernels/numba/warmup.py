@@ -12,7 +12,7 @@ from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.core.fused import ColourHead, CombinedLattices, DensityHead, FusedLattice
 from invgraphics.core.lattice import Lattice
-from invgraphics.core.ngp import FusedNGP, HashGrid
+from invgraphics.core.ngp import FusedNGP, FusedSDF, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.adam import adam_rows
 from invgraphics.kernels.numba.fused.march import lattice_march
@@ -21,13 +21,14 @@ from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
 from invgraphics.kernels.numba.ngp.march import ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render
+from invgraphics.kernels.numba.ngp.trace import sdf_trace
 from invgraphics.kernels.numba.rays.composite import composite
 from invgraphics.kernels.numba.rays.march import ray_march
 from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
-from invgraphics.kernels.types import AdamStep, MarchSteps
+from invgraphics.kernels.types import AdamStep, MarchSteps, TracingLimits
 
 
 def warm_up() -> float:
@@ -79,6 +80,9 @@ def samples() -> None:
     )
     ngp_march(rays, everywhere, bounds, MarchSteps(0.1), field, rays.near, 0.5)
     ngp_render(rays, everywhere, bounds, MarchSteps(0.1), field)
+    net = (torch.zeros(8, 7), torch.zeros(8)), (torch.zeros(1, 8), torch.zeros(1))
+    distance = FusedSDF(torch.zeros(levels.entries, 2), levels, 0, net, 100.0, torch.ones(3), 1.0)
+    sdf_trace(rays, bounds, distance, TracingLimits(2, 1.0, 1, 1e-3, 1e-3, 1e-2))
     planes = CombinedLattices(tuple(Lattice(torch.zeros(2, 2, 4), axes) for axes in ("xy", "xz", "yz")), "sum")
     dense = FusedLattice(planes, (), DensityHead("exp"), None, (), ColourHead("none"))
     lattice_march(rays, everywhere, bounds, MarchSteps(0.1), dense, rays.near, 0.5)

@@ -15,3 +15,4 @@ from invgraphics.kernels.reference.splat_raster import splat_bin as splat_bin
 from invgraphics.kernels.reference.splat_raster import splat_median as splat_median
 from invgraphics.kernels.reference.splat_raster import splat_rasterise as splat_rasterise
 from invgraphics.kernels.reference.ssim import ssim as ssim
+from invgraphics.kernels.reference.tracing import sdf_trace as sdf_trace

@@ -68,10 +68,10 @@ def curve_of(table: Contributions | Profile | None) -> dict[str, Float[ndarray, 
 
 
 def whole_ray(ray: Ray) -> tuple[float, float]:
-    """(near, far) distances of the whole ray: the sampled interval, or the extent of its Gaussians."""
+    """(near, far) distances of the whole ray: the sampled or traced interval, or the extent of its Gaussians."""
     near, far = ray.record.near, ray.record.far
     ends = np.concatenate([ray.columns["begin"], ray.columns["end"], list(ray.depths.values())])
-    if ray.record.kind == "samples" and near is not None and far is not None and far > near:
+    if ray.record.kind in ("samples", "surface points") and near is not None and far is not None and far > near:
         unbounded = ray.record.space == "contracted"
         return near, min(far, 1.5 * float(ends.max())) if unbounded and len(ends) else far
     if not len(ends):
@@ -89,6 +89,8 @@ def close_up(ray: Ray, whole: tuple[float, float]) -> tuple[float, float] | None
         return None
     inner = order[np.searchsorted(reached / reached[-1], (TAIL, 1 - TAIL)).clip(max=len(order) - 1)]
     low, high = float(ray.columns["begin"][inner[0]]), float(ray.columns["end"][inner[1]])
+    if high <= low:  # one surface point
+        return None
     for value in ray.depths.values():
         if low - 2 * (high - low) <= value <= high + 2 * (high - low):
             low, high = min(low, value), max(high, value)

@@ -1,0 +1,169 @@
+"""Sampling with a bound on the opacity's error (VolSDF, Yariv et al. 2021, §3.3 and 3.4, algorithm 1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+from typing_extensions import override
+
+from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.spacing import from_spacing
+from invgraphics.errors import NotComposableError
+from invgraphics.renderers.distance_density import DistanceDensity, laplace_density
+from invgraphics.renderers.samplers import PADDING, hit_indices, invert, pack, quantiles, strata, uniform, unit_ball_exit
+from invgraphics.renderers.up_sampling import distances
+
+LARGEST_ERROR = 1e6
+"""Bounds are clamped here: far ones overflow, and only say that there is no bound."""
+
+
+@dataclass(frozen=True)
+class ErrorBoundedConfig:
+    """Settings of algorithm 1; the defaults are the paper's.
+
+    Attributes:
+        coarse: strata of the first pass, and samples that a round adds.
+        fine: samples drawn by the opacity of the last round.
+        extra: samples drawn from the places that were looked at.
+        error: bound on the opacity's error, ε.
+        rounds: most rounds.
+        bisections: of the search for the least width that keeps the bound.
+    """
+
+    coarse: int = 128
+    fine: int = 64
+    extra: int = 32
+    error: float = 0.1
+    rounds: int = 5
+    bisections: int = 10
+
+    def __post_init__(self) -> None:
+        if min(self.coarse, self.fine, self.rounds, self.bisections) < 1 or self.extra < 0:
+            raise ValueError("coarse, fine, rounds and bisections must be at least 1, extra at least 0.")
+        if self.error <= 0:
+            raise ValueError(f"error must be above 0, not {self.error}")
+
+    def build(self, scene: Scene) -> ErrorBounded:
+        """The sampler; it needs nothing from the scene."""
+        return ErrorBounded(self)
+
+
+class ErrorBounded(Sampler):
+    """Refines each ray until the opacity of the density's own width, or of the least width found for it, is bounded."""
+
+    def __init__(self, config: ErrorBoundedConfig) -> None:
+        super().__init__()
+        self.config = config
+
+    @property
+    @override
+    def requires(self) -> Quantity:
+        return Quantity.SDF
+
+    @override
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        """Sample every ray that meets the bounds.
+
+        Raises:
+            NotComposableError: the density is not made from a distance, so that it has no width.
+        """
+        if not isinstance(field, DistanceDensity):
+            raise NotComposableError(
+                f"ErrorBounded needs a density that is made from a distance, not that of {type(field).__name__}.",
+                "Use it with the renderers volsdf or neus.",
+            )
+        hit = hit_indices(rays)
+        knee = unit_ball_exit(rays[hit], ctx.bounds)
+        spacing = strata(rays[hit], self.config.coarse, ctx, knee)
+        edges = from_spacing(spacing, ctx.bounds, knee)
+        with torch.no_grad():
+            edges, sdf, beta = self._refined(edges, field, (rays, hit), ctx)
+            delta = edges.diff(dim=1)
+            depth = laplace_density(sdf[:, :-1], beta) * delta
+            weights = torch.exp(-_before(depth)) * -torch.expm1(-depth)
+            drawn = invert(edges, weights + PADDING, quantiles(len(edges), self.config.fine, ctx, like=edges))
+            places = torch.cat([edges[:, :1], drawn, self._extra(edges, ctx), edges[:, -1:]], dim=1).sort(dim=1).values
+        level = Trace(pack(rays, hit, edges), None, weights.flatten(), rays=len(rays))
+        return pack(rays, hit, places), () if ctx.training else (level,)
+
+    def _refined(
+        self, edges: Float[Tensor, "k edges"], field: DistanceDensity, place: tuple[Rays, Tensor], ctx: Context
+    ) -> tuple[Float[Tensor, "k more"], Float[Tensor, "k more"], Float[Tensor, "k 1"]]:
+        """Edges added in rounds where the error may be, their signed distances, and the least width whose error is bounded."""
+        config, target = self.config, field.beta.detach()
+        rays, hit = place
+        sdf = distances(field, rays, hit, edges)
+        # Wide enough for any distances (lemma 2).
+        beta = (edges.diff(dim=1).square().sum(dim=1, keepdim=True) / (4 * math.log1p(config.error))).sqrt().maximum(target)
+        for number in range(config.rounds):
+            delta = edges.diff(dim=1)
+            clear = clear_distance(sdf, delta)
+            beta = self._least_width(target, beta, (delta, sdf, clear))
+            if number + 1 == config.rounds or bool((beta <= target).all()):
+                break
+            mass = error_bounds(delta, sdf, clear, beta) + PADDING
+            added = invert(edges, mass, quantiles(len(edges), config.coarse, ctx, like=edges))
+            edges, order = torch.cat([edges, added], dim=1).sort(dim=1)
+            sdf = torch.cat([sdf, distances(field, rays, hit, added)], dim=1).gather(1, order)
+        return edges, sdf, beta
+
+    def _least_width(
+        self, target: Float[Tensor, ""], beta: Float[Tensor, "k 1"], line: tuple[Tensor, Tensor, Tensor]
+    ) -> Float[Tensor, "k 1"]:
+        """Width between ``target`` and ``beta`` at which the error is still bounded, by bisection."""
+        delta, sdf, clear = line
+
+        def bounded(width: Tensor) -> Tensor:
+            return error_bounds(delta, sdf, clear, width).amax(dim=1, keepdim=True) <= self.config.error
+
+        low, high = target.expand_as(beta), beta
+        for _ in range(self.config.bisections):
+            middle = (low + high) / 2
+            fits = bounded(middle)
+            low, high = torch.where(fits, low, middle), torch.where(fits, middle, high)
+        return torch.where(bounded(target.expand_as(beta)), target, high)
+
+    def _extra(self, edges: Float[Tensor, "k edges"], ctx: Context) -> Float[Tensor, "k extra"]:
+        """Some of the places that were looked at, the same ones of every ray; random in training."""
+        count = min(self.config.extra, edges.shape[1])
+        if not ctx.training:
+            return edges[:, torch.linspace(0, edges.shape[1] - 1, count, device=edges.device).long()]
+        order = uniform((edges.shape[1],), ctx, like=edges).argsort()
+        return edges[:, order[:count]]
+
+
+def clear_distance(sdf: Float[Tensor, "k edges"], delta: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
+    """Lower bound of the distance to the surface along each interval, from that at its ends (equation 14, d*).
+
+    No surface lies in the balls around both ends. Where they overlap, the bound is the height of the triangle of the two
+    distances over the interval, or the smaller distance if the triangle is obtuse there; otherwise 0.
+    """
+    a, b = sdf[:, :-1].abs(), sdf[:, 1:].abs()
+    half = (a + b + delta) / 2
+    area = (half * (half - a) * (half - b) * (half - delta)).clamp_min(0).sqrt()
+    height = 2 * area / delta.clamp_min(torch.finfo(delta.dtype).tiny)
+    obtuse = (a.square() - b.square()).abs() >= delta.square()
+    return torch.where(obtuse, torch.minimum(a, b), torch.where(a + b > delta, height, 0.0))
+
+
+def error_bounds(
+    delta: Float[Tensor, "k bins"], sdf: Float[Tensor, "k edges"], clear: Float[Tensor, "k bins"], beta: Float[Tensor, "k 1"]
+) -> Float[Tensor, "k bins"]:
+    """Bound on the error of the opacity that a left Riemann sum of Laplace's density has at each interval's end (equation 17).
+
+    exp(-R) (exp(E) - 1) with the sum R before the interval, and the bound E = Σ δ² exp(-d* / β) / (4 β²) on its error
+    (theorem 1).
+    """
+    error = (delta.square() * torch.exp(-clear / beta) / (4 * beta.square())).cumsum(dim=1)
+    depth = laplace_density(sdf[:, :-1], beta) * delta
+    return torch.expm1(error.clamp_max(math.log(LARGEST_ERROR))) * torch.exp(-_before(depth))
+
+
+def _before(depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
+    """Optical depth before each interval."""
+    return pad(depth[:, :-1].cumsum(dim=1), (1, 0))

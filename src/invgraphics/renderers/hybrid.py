@@ -1,0 +1,170 @@
+"""Volume rendering of surfaces: a density is made from a signed distance, and its width found by the fit."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar, Literal, Protocol, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from typing_extensions import override
+
+from invgraphics import kernels
+from invgraphics.core import (
+    Camera,
+    Context,
+    Contributions,
+    Field,
+    Quantity,
+    RayRenderer,
+    Rays,
+    Rendering,
+    Sampler,
+    Samples,
+    Trace,
+)
+from invgraphics.renderers.distance_density import DistanceDensity
+from invgraphics.renderers.volumetric import Volumetric
+
+Change = Literal["learnt", "scheduled", "held"]
+"""What becomes of a width during a fit: it follows its gradient, or a log-linear schedule, or stays."""
+
+
+class HybridSettings(Protocol):
+    """What all renderers of this family are configured by."""
+
+    @property
+    def change(self) -> Change:
+        """What becomes of the width."""
+        ...
+
+    @property
+    def widths(self) -> tuple[float, float]:
+        """The density's width at the start, and the one at the end or in an untrained renderer, in half-extents of the box."""
+        ...
+
+    def stored(self, width: float) -> float:
+        """What the parameter is for a width in half-extents."""
+        ...
+
+    def width_of(self, stored: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        """Inverse of `stored`."""
+        ...
+
+
+class Hybrid(RayRenderer):
+    """Volume renderer of a density that a signed distance makes; `VolSDF` and `NeuS` say which.
+
+    Args:
+        settings: the width and what becomes of it.
+        volumetric: renders the density, with a sampler of its own.
+
+    Attributes:
+        width: the density's width as the settings store it: a parameter, which has a gradient only if it is learnt.
+    """
+
+    requires: ClassVar[Quantity] = Quantity.SDF | Quantity.RADIANCE
+
+    def __init__(self, settings: HybridSettings, volumetric: Volumetric) -> None:
+        super().__init__()
+        self.volumetric = volumetric
+        self._settings = settings
+        self.width = nn.Parameter(torch.tensor(settings.stored(settings.widths[0])))
+
+    @property
+    @override
+    def required(self) -> Quantity:
+        return self.requires | self.volumetric.sampler.requires
+
+    @abstractmethod
+    def density(self, field: Field, ctx: Context, *, on_rays: bool = True) -> DistanceDensity:
+        """The field as one of densities; ``on_rays`` says whether its samples will lie on rays."""
+
+    @abstractmethod
+    def untrained(self) -> Self:
+        """Copy with the constant width, and the sampler's constants, in place of learnt state."""
+
+    def beta(self, ctx: Context) -> Float[Tensor, ""]:
+        """The density's width now, local units; in the graph if it is learnt."""
+        stored = self.width if self._settings.change == "learnt" else self.width.detach()
+        return self._settings.width_of(stored) * ctx.bounds.half.mean()
+
+    @override
+    def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
+        """Render n rays; with normals if ``ctx.geometry`` is set and the field provides them."""
+        return self.volumetric.render_rays(self.density(field, ctx), rays, ctx)
+
+    @override
+    @torch.no_grad()
+    def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
+        """The samples of the pixel's ray, and the density between them; see `Renderer.contributions`."""
+        return self.volumetric.contributions(self.density(field, ctx), camera, pixel, ctx)
+
+    @override
+    @torch.no_grad()
+    def update(self, field: Field, ctx: Context) -> None:
+        """Set a scheduled width, and refresh the sampler's state by the density that it makes."""
+        if self._settings.change == "scheduled":
+            first, last = self._settings.widths
+            self.width.fill_(self._settings.stored(first * (last / first) ** ctx.progress))
+        self.volumetric.update(self.density(field, ctx, on_rays=False), ctx)
+
+
+class Weighed(Sampler):
+    """Samples of another sampler that weigh something, by the densities that it has found on the way; in training only.
+
+    Few samples of a sharp surface weigh anything, and those that do not have no gradient worth its price either: the
+    derivative of a density's tail is as small as the tail.
+
+    Args:
+        sampler: the other; samples that come without densities are all kept.
+        threshold: weights up to this are left out.
+    """
+
+    def __init__(self, sampler: Sampler, threshold: float) -> None:
+        super().__init__()
+        self.sampler = sampler
+        self.threshold = threshold
+
+    @property
+    @override
+    def requires(self) -> Quantity:
+        return self.sampler.requires
+
+    @override
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        samples, levels = self.sampler.sample(rays, field, ctx)
+        if samples.density is None or not ctx.training:
+            return samples, levels
+        with torch.no_grad():
+            depth = samples.density * samples.delta
+            weights, _, _ = kernels.composite(depth, depth[:, None], samples.ray, len(rays))
+        return samples[torch.nonzero(weights > self.threshold)[:, 0]], levels
+
+    @override
+    def update(self, field: Field, ctx: Context) -> None:
+        self.sampler.update(field, ctx)
+
+    @override
+    def untrained(self) -> Weighed:
+        return Weighed(self.sampler.untrained(), self.threshold)
+
+
+def make_volumetric(sampler: Sampler, gradient_reach: float, weight_threshold: float) -> Volumetric:
+    """Volume renderer with a sampler whose samples weigh more than ``weight_threshold`` in training."""
+    return Volumetric(Weighed(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
+
+
+def check_settings(first: float, last: float, gradient_reach: float, weight_threshold: float) -> None:
+    """Check settings that all renderers of this family have.
+
+    Raises:
+        ValueError: a width that is not positive, or a reach or threshold out of range.
+    """
+    if min(first, last) <= 0:
+        raise ValueError("the width of a density, or its sharpness, must be above 0.")
+    if gradient_reach < 0:
+        raise ValueError(f"gradient_reach must not be negative, not {gradient_reach}")
+    if not 0 <= weight_threshold < 1:
+        raise ValueError(f"weight_threshold must be in [0, 1), not {weight_threshold}")

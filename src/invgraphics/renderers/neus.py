@@ -1,0 +1,91 @@
+"""NeuS: volume rendering of a signed distance by unbiased weights (Wang et al. 2021, arXiv 2106.10689)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar
+
+from jaxtyping import Float
+from torch import Tensor
+from typing_extensions import override
+
+from invgraphics.config import Slot
+from invgraphics.core import Context, Field, Quantity, Scene
+from invgraphics.renderers.distance_density import LogisticDensity
+from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, make_volumetric
+from invgraphics.renderers.up_sampling import UpSamplingConfig
+from invgraphics.renderers.volumetric import Volumetric
+
+EXPONENT = 10.0
+"""What is stored of s is v = log(s) / 10 (NeuS, its code): a step of the optimiser multiplies s."""
+
+
+@dataclass(frozen=True)
+class NeuSConfig:
+    """Settings of `NeuS`.
+
+    Attributes:
+        sampler: where along the rays to look; ``up_sampling`` is the paper's.
+        sharpness: s of the logistic distribution at the start, per half-extent of the box (NeuS: exp(3) = 20).
+        sharpness_final: s at the end where it is scheduled; stands in for a learnt one that the field was not fitted with.
+        change: whether s is ``learnt``, ``scheduled`` log-linearly over the fit, or ``held``.
+        anneal: progress until which rays see surfaces that they leave too, less and less (NeuS without masks: 1/6).
+        gradient_reach: as of volume rendering.
+        weight_threshold: in training, samples that weigh no more than this by the sampler's own densities, where it
+            has some (``occupancy``), are left out; 0 keeps all.
+    """
+
+    title: ClassVar[str] = "hybrid implicit-volumetric"
+
+    sampler: Annotated[Any, Slot("samplers")] = field(default_factory=UpSamplingConfig)
+    sharpness: float = 20.0
+    sharpness_final: float = 1000.0
+    change: Change = "learnt"
+    anneal: float = 0.0
+    gradient_reach: float = 0.0
+    weight_threshold: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_settings(self.sharpness, self.sharpness_final, self.gradient_reach, self.weight_threshold)
+        if not 0 <= self.anneal <= 1:
+            raise ValueError(f"anneal must be in [0, 1], not {self.anneal}")
+
+    @property
+    def widths(self) -> tuple[float, float]:
+        """1 / s at the start, and the one at the end or in an untrained renderer."""
+        return 1 / self.sharpness, 1 / self.sharpness_final
+
+    def stored(self, width: float) -> float:
+        """What the parameter is for a 1 / s."""
+        return -math.log(width) / EXPONENT
+
+    def width_of(self, stored: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        """Inverse of `stored`."""
+        return (-EXPONENT * stored).exp()
+
+    def build(self, scene: Scene) -> NeuS:
+        """The renderer with its sampler."""
+        return NeuS(self, make_volumetric(self.sampler.build(scene), self.gradient_reach, self.weight_threshold))
+
+
+class NeuS(Hybrid):
+    """Renders the logistic density, section by section."""
+
+    requires: ClassVar[Quantity] = Hybrid.requires | Quantity.GRADIENT
+
+    def __init__(self, config: NeuSConfig, renderer: Volumetric) -> None:
+        super().__init__(config, renderer)
+        self.config = config
+
+    @override
+    def density(self, field: Field, ctx: Context, *, on_rays: bool = True) -> LogisticDensity:
+        seen = 1.0 if self.config.anneal == 0 else min(1.0, ctx.progress / self.config.anneal)
+        slopes = "steepest" if not on_rays else "neighbours" if ctx.training else "gradient"
+        return LogisticDensity(field, self.beta(ctx), slopes, seen)
+
+    @override
+    def untrained(self) -> NeuS:
+        """Copy with ``sharpness_final``, or a held s, and the sampler's constants in place of learnt state."""
+        sharpness = self.config.sharpness if self.config.change == "held" else self.config.sharpness_final
+        return NeuS(replace(self.config, sharpness=sharpness, change="held"), self.volumetric.untrained())

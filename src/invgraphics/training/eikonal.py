@@ -1,0 +1,105 @@
+"""Eikonal terms: the gradient of a signed distance has length 1 (Gropp et al. 2020, IGR, equation 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Batch, Context, Field, Quantity, Renderer, Rendering, Samples, Trace
+from invgraphics.errors import InputError
+from invgraphics.renderers.samplers import uniform
+
+
+@dataclass(frozen=True)
+class EikonalPenalty:
+    """Mean of (|∇f| - 1)² at random points of the bounds' box and at points near the surface.
+
+    A point near the surface is the foot of a random one, x - f ∇f / |∇f|², moved at random: VolSDF takes a uniform point
+    and the sample next to the surface of every ray, which a penalty, without rays, does not have.
+
+    Attributes:
+        weight: factor (VolSDF, NeuS: 0.1).
+        points: number of random points a step.
+        near: number of points near the surface, at most ``points``.
+        spread: standard deviation of these about the surface, in half-extents of the box.
+    """
+
+    name: ClassVar[str] = "eikonal"
+
+    weight: float = 0.1
+    points: int = 1024
+    near: int = 1024
+    spread: float = 0.02
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or self.spread < 0:
+            raise ValueError("'weight' and 'spread' must not be negative.")
+        if self.points < 1 or not 0 <= self.near <= self.points:
+            raise ValueError("'points' must be at least 1, and 'near' from 0 to 'points'.")
+
+    def __call__(self, field: Field, renderer: Renderer, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean.
+
+        Raises:
+            InputError: the field has no signed distance.
+        """
+        if Quantity.GRADIENT not in field.provides:
+            raise InputError(f"The penalty '{self.name}' needs a signed distance, which {type(field).__name__} does not have.")
+        lo, hi = ctx.bounds.lo, ctx.bounds.hi
+        position = torch.lerp(lo, hi, uniform((self.points, 3), ctx, like=lo))
+        values = field.query(Samples.at(position), Quantity.SDF | Quantity.GRADIENT)
+        assert values.sdf is not None
+        assert values.gradient is not None
+        gradient = values.gradient
+        if self.near:
+            with torch.no_grad():
+                kept = slice(self.near)
+                feet = foot_points(position[kept], values.sdf[kept], gradient[kept])
+                # Sums of three uniform numbers are as good as normal ones, and come from the context's generator.
+                noise = 2 * uniform((3, self.near, 3), ctx, like=lo).sum(dim=0) - 3
+                feet = (feet + self.spread * ctx.bounds.half.mean() * noise).clamp(lo, hi)
+            near = field.query(Samples.at(feet), Quantity.GRADIENT).gradient
+            assert near is not None
+            gradient = torch.cat([gradient, near])
+        return self.weight * eikonal_residual(gradient).mean()
+
+
+@dataclass(frozen=True)
+class EikonalLoss:
+    """Mean of (|∇f| - 1)² at the samples of a step, for renderers that ask for the gradient there anyway (NeuS).
+
+    Attributes:
+        weight: factor (NeuS: 0.1).
+    """
+
+    weight: float = 0.1
+
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean; 0 where no ray has a sample.
+
+        Raises:
+            InputError: the renderer did not ask for gradients.
+        """
+        gradient = None if trace.values is None else trace.values.gradient
+        if gradient is None:
+            raise InputError(
+                "The loss 'eikonal' needs samples with gradients of a signed distance, which this renderer does not take.",
+                "The penalty 'eikonal' takes points of its own.",
+            )
+        return self.weight * eikonal_residual(gradient).sum() / max(len(gradient), 1)
+
+
+def eikonal_residual(gradient: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
+    """(|∇f| - 1)²."""
+    return (gradient.norm(dim=1) - 1).square()
+
+
+def foot_points(
+    position: Float[Tensor, "m 3"], sdf: Float[Tensor, " m"], gradient: Float[Tensor, "m 3"]
+) -> Float[Tensor, "m 3"]:
+    """Nearest points on the surface, by one step of Newton's method; exact for a distance."""
+    return position - (sdf / gradient.square().sum(dim=1).clamp_min(1e-6))[:, None] * gradient

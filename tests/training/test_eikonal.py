@@ -1,0 +1,90 @@
+"""Eikonal terms on analytic distances, whose gradients have known lengths."""
+
+import pytest
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from invgraphics.core import Context, Field, FieldValues, Quantity, Samples
+from invgraphics.errors import InputError
+from invgraphics.fields.analytic import GaussianBlob, Sphere
+from invgraphics.renderers.neus import NeuSConfig
+from invgraphics.renderers.samplers import StratifiedConfig
+from invgraphics.renderers.volumetric import VolumetricConfig
+from invgraphics.testing import toy_scene
+from invgraphics.training.eikonal import EikonalLoss, EikonalPenalty, foot_points
+
+
+class Stretched(Field):
+    """A ball whose distance is ``factor`` times too long; notes where it is asked."""
+
+    provides = Quantity.SDF | Quantity.GRADIENT | Quantity.RADIANCE
+
+    def __init__(self, factor: float) -> None:
+        super().__init__()
+        self.factor = torch.nn.Parameter(torch.tensor(factor))
+        self.asked: list[Tensor] = []
+
+    @override
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        self.asked.append(samples.position.detach())
+        radius = samples.position.norm(dim=1, keepdim=True)
+        return FieldValues(
+            sdf=self.factor * (radius[:, 0] - 0.5),
+            gradient=self.factor * samples.position / radius,
+            radiance=torch.ones_like(samples.position),
+        )
+
+
+def context() -> Context:
+    return Context(toy_scene(views=2, size=4).bounds, training=True, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 0.5])
+def test_penalty_and_its_derivative(factor: float) -> None:
+    """(|∇f| - 1)² is (c - 1)² everywhere, its derivative in c is 2 (c - 1)."""
+    field, renderer = Stretched(factor), NeuSConfig(StratifiedConfig(4)).build(toy_scene(views=2, size=4))
+    value = EikonalPenalty(weight=3.0, points=64, near=32)(field, renderer, context())
+    assert float(value.detach()) == pytest.approx(3 * (factor - 1) ** 2, abs=1e-6)
+    value.backward()
+    assert field.factor.grad is not None
+    assert float(field.factor.grad) == pytest.approx(6 * (factor - 1), abs=1e-5)
+
+
+def test_points_are_everywhere_and_near_the_surface() -> None:
+    field, renderer = Stretched(1.5), NeuSConfig(StratifiedConfig(4)).build(toy_scene(views=2, size=4))
+    EikonalPenalty(points=2000, near=500, spread=0.02)(field, renderer, context())
+    anywhere, near = field.asked
+    assert anywhere.shape == (2000, 3)
+    assert near.shape == (500, 3)
+    torch.testing.assert_close(anywhere.square().mean(dim=0), torch.full((3,), 1 / 3), rtol=0.1, atol=0)  # uniform in [-1, 1]
+    away = near.norm(dim=1) - 0.5
+    assert abs(float(away.mean())) < 0.005
+    assert float(away.std()) == pytest.approx(0.02, rel=0.15)
+
+
+def test_foot_points_lie_on_the_surface() -> None:
+    ball, position = Sphere(1.0, 0.5), torch.randn(50, 3)
+    values = ball.query(Samples.at(position), Quantity.SDF | Quantity.GRADIENT)
+    assert values.sdf is not None
+    assert values.gradient is not None
+    foot = foot_points(position, 3 * values.sdf, 3 * values.gradient)
+    torch.testing.assert_close(foot, 0.5 * torch.nn.functional.normalize(position, dim=1), rtol=1e-5, atol=1e-6)
+
+
+def test_loss_is_that_of_the_samples() -> None:
+    scene = toy_scene(views=2, size=8)
+    ctx, field = Context(scene.bounds, training=True), Stretched(2.0)
+    rendering, trace = NeuSConfig(StratifiedConfig(16)).build(scene).render_image(field, scene.train[0].camera, ctx)
+    assert float(EikonalLoss(weight=0.5)(rendering, trace, None, ctx).detach()) == pytest.approx(0.5)  # type: ignore[arg-type]
+    dense, plain = (
+        VolumetricConfig(StratifiedConfig(8)).build(scene).render_image(GaussianBlob(1.0, 0.1), scene.train[0].camera, ctx)
+    )
+    with pytest.raises(InputError, match="samples with gradients"):
+        EikonalLoss()(dense, plain, None, ctx)  # type: ignore[arg-type]
+
+
+def test_a_field_without_a_distance_is_refused() -> None:
+    renderer = VolumetricConfig(StratifiedConfig(4)).build(toy_scene(views=2, size=4))
+    with pytest.raises(InputError, match="needs a signed distance, which GaussianBlob does not have"):
+        EikonalPenalty()(GaussianBlob(1.0, 0.1), renderer, context())

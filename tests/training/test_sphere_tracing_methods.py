@@ -1,0 +1,85 @@
+"""Sphere tracing: each recipe, shrunk, learns a toy scene from pictures and masks, and resumes bit by bit; the mask loss."""
+
+import math
+
+import pytest
+import torch
+from torch.nn.functional import binary_cross_entropy
+
+from invgraphics.core import Batch, Bounds, Context, Rendering, SurfaceTrace, Trace
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.training.losses import MaskLoss
+
+GRIDS = [f"field.{part}.{key}" for part in ("encoding", "appearance") for key in ("levels=4", "log2_size=12", "finest=32")]
+SHRUNK = {
+    "sphere-tracing/hash": [*GRIDS, "renderer.final_sharpness=60", "batches.rays=256"],
+    "sphere-tracing/mlp": ["field.width=32", "renderer.final_sharpness=60", "batches.rays=256"],
+}
+
+
+def scores(fit) -> tuple[float, float, float]:
+    """PSNR, mean absolute error of depth where both have one, and intersection over union of the silhouettes."""
+    scene, errors, depths, overlaps = fit.plan.scene, [], [], []
+    for view in scene.test:
+        picture = fit.plan.model.render(view.camera)
+        errors.append((picture.over(scene.background).clamp(0, 1) - view.over(scene.background)).square().mean())
+        ours, true = picture.alpha >= 0.5, view.alpha >= 0.5
+        depths.append((picture.depth - view.depth)[ours & true].abs())
+        overlaps.append(float((ours & true).sum() / (ours | true).sum()))
+    psnr = -10 * math.log10(float(torch.stack(errors).mean()))
+    return psnr, float(torch.cat(depths).mean()), sum(overlaps) / len(overlaps)
+
+
+@pytest.mark.parametrize("name", SHRUNK)
+def test_finds_two_balls_from_pictures_and_masks(name: str, scene, make_fit) -> None:
+    """From one sphere, which has to part in two."""
+    fit = make_fit(name, scene, 200, 0, *SHRUNK[name])
+    before, _, _ = scores(fit)
+    fit.run(lambda loss: False)
+    after, depth, overlap = scores(fit)
+    assert after > max(before + 5, 18)
+    assert depth < 0.12
+    assert overlap > 0.85
+
+
+@pytest.mark.parametrize("name", SHRUNK)
+def test_resumed_equals_uninterrupted(name: str, scene, make_fit, tmp_path) -> None:
+    whole, first, second = (make_fit(name, scene, 16, 0, *SHRUNK[name]) for _ in range(3))
+    whole.run(lambda loss: False)
+    first.run(lambda loss: first.steps == 9)
+    checkpoint.save(tmp_path / CHECKPOINT, first.state())
+    torch.manual_seed(99)
+    second.load(checkpoint.load(tmp_path / CHECKPOINT), seconds=1.0)
+    second.run(lambda loss: False)
+    one, other = whole.state(), second.state()
+    assert all(torch.equal(one[part][key], other[part][key]) for part in one for key in one[part])
+
+
+def masked(logit: torch.Tensor, true: torch.Tensor, sharpness: float | None) -> torch.Tensor:
+    """Mask loss of weight 2, in a box of half-extent 1.5."""
+    n = len(logit)
+    alpha, flags = logit.sigmoid(), torch.zeros(n, dtype=torch.bool)
+    surface = None if sharpness is None else SurfaceTrace(logit, sharpness, flags, flags.long(), flags)
+    batch = Batch(torch.zeros(n, 3), true, torch.zeros(3))
+    ctx = Context(Bounds(torch.full((3,), -1.5), torch.full((3,), 1.5)))
+    rendering = Rendering(torch.zeros(n, 3), alpha, torch.ones(n))
+    return MaskLoss(2.0)(rendering, Trace(rays=n, surface=surface), batch, ctx)
+
+
+def test_mask_loss_is_the_cross_entropy_over_the_sharpness() -> None:
+    logit, true = torch.tensor([-2.0, 0.3, 3.0, 1.0]), torch.tensor([0.0, 1.0, 0.25, 0.0])
+    plain = binary_cross_entropy(logit.double().sigmoid(), true.double())
+    torch.testing.assert_close(masked(logit, true, None).double(), 2 * plain, rtol=1e-5, atol=0)
+    torch.testing.assert_close(masked(logit, true, 40.0).double(), 2 * plain / 60, rtol=1e-5, atol=0)
+
+
+def test_mask_loss_pulls_on_saturated_rays_and_leaves_those_outside_the_bounds_alone() -> None:
+    distance = torch.tensor([0.9, -0.9, 0.9, torch.inf], requires_grad=True)
+    true = torch.tensor([1.0, 0.0, 0.0, 1.0])
+    for sharpness in (50.0, 1600.0):
+        loss = masked(-sharpness * distance, true, sharpness)
+        (gradient,) = torch.autograd.grad(loss, distance)
+        # Wrong by a whole sigmoid: the slope is the weight over half-extent and number of rays, whatever the sharpness.
+        torch.testing.assert_close(gradient[:3], torch.tensor([1.0, -1.0, 0.0]) * 2 / (1.5 * 4), atol=1e-6, rtol=1e-5)
+        assert float(gradient[3]) == 0
