@@ -18,7 +18,8 @@ from invgraphics.bench.workload import activated, gaussian_field, leaves, scene
 from invgraphics.core import Model, Scene, harmonics
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.gaussian import GaussianField
-from invgraphics.fields.neural import CPU_CHUNK, NeuralField, NeuralFieldConfig
+from invgraphics.fields.geometry import CPU_CHUNK
+from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.splatting import SplattingConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
