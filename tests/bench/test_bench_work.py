@@ -11,7 +11,8 @@ from invgraphics.bench.results import BOTH, FORWARD, Results
 from invgraphics.bench.run import BenchRequest, bench, measure_case
 from invgraphics.bench.timing import Effort
 from invgraphics.fields.encodings.hash import HashConfig
-from invgraphics.fields.neural import CPU_CHUNK, NeuralFieldConfig
+from invgraphics.fields.geometry import CPU_CHUNK
+from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.kernels.types import Footprints
 
 
