@@ -28,6 +28,9 @@ def read(path):
             np.ones({less}, np.uint8)
         case "sleeps":
             time.sleep(60)
+        case "computes":
+            while True:
+                pass
         case "ends":
             sys.stdout.flush()
             import os
@@ -57,11 +60,12 @@ def process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[watched.Proces
         ("takes", "greedy"),
         ("asks", "raised"),
         ("sleeps", "hung"),
+        ("computes", "hung"),
         ("ends", "died"),
     ],
 )
 def test_every_bound_is_noticed(process: watched.Process, name: str, outcome: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if name == "sleeps":
+    if outcome == "hung":
         monkeypatch.setattr(watched, "SECONDS", 1.0)
     reader = watched.Reader(process, "recipe", Path("good"))
     assert reader.read(Path(name))[0] == outcome
