@@ -32,13 +32,24 @@ def end_on_sigterm() -> None:
 
     Python handles signals between two instructions of the main thread, which may be inside a compiler, a kernel or a library
     for longer; and an exception may be caught on its way. The operating system's handler itself writes to a pipe, which a
-    thread reads.
+    thread reads. Where Python swallows the exception, in destructors and callbacks of weak references, the signal comes again.
     """
     signal.signal(signal.SIGTERM, terminate)
+    sys.unraisablehook = _raise_again
     receiver, sender = os.pipe()
     os.set_blocking(sender, False)
     signal.set_wakeup_fd(sender, warn_on_full_buffer=False)
     threading.Thread(target=_end_later, args=(receiver,), daemon=True).start()
+
+
+def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Send SIGTERM again in a moment if its exception was swallowed; show other swallowed exceptions as usual."""
+    if not issubclass(unraisable.exc_type, Terminated):
+        sys.__unraisablehook__(unraisable)
+        return
+    again = threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGTERM))
+    again.daemon = True
+    again.start()
 
 
 def _end_later(receiver: int) -> None:
