@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,10 @@ SMALL = {
     "01-cameras-and-rays": "size = 48",
     "02-volume-rendering-integral": "size, counts = 32, [4, 8, 16, 32, 64, 128]",
     "03-fit-a-nerf": "views, size, steps, curve_steps = 16, 24, 150, 200",
+    "04-grids-and-hashing": (
+        "views, size, steps, samples, grid_steps, points = 8, 16, 100, 4096, 60, 2048\n"
+        "tables, edge, factor_steps, edge_steps = [8, 12, 16], 16, 120, 200"
+    ),
     "07-gaussians-and-ewa": "draws = 100_000",
     "08-fit-gaussians": "views, size, steps, flat_steps, starts = 12, 32, 200, 150, 3",
     "09-the-same-gaussians-two-ways": "size, turns = 72, 21",
@@ -117,6 +122,61 @@ def _nerf(out: _Printed) -> None:
     assert out.numbers("positional encoding:", "of one point moves", "(")[2] > 15
     small, large = (out.numbers(f"T = 2^{log2_size}:", "PSNR")[1] for log2_size in (7, 15))
     assert large > small
+
+
+def _grids(out: _Printed) -> None:
+    assert out.numbers("trilinear: lattice_encode and the equation differ by") < (1e-12,)
+    assert out.numbers("one point moves", "of", "with weights that sum to") == (8, 125, 1)
+    lost, kept = (out.numbers(f"from 5 to {count} vertices along an edge: the function changes by at most") for count in "89")
+    assert kept < (1e-12,) < (0.1,) < lost
+    surface, everything = out.numbers("surface:", "of")
+    for name, count in (("all", everything), ("surface", surface)):
+        random = 100 * (1 - math.exp(-count / 2**16))  # of the entries used, and of the vertices that collide
+        assert out.numbers(f"T = 2^16, {name} vertices:", "% of the entries used,") == pytest.approx((random, random), abs=5)
+    _collisions(out)
+    _ranks(out)
+    _edges(out)
+
+
+def _collisions(out: _Printed) -> None:
+    """What collisions cost, on the surface and in the volume, and which vertices have the gradients."""
+    for model in ("one level, no network", "four levels and a network"):
+        small, middle, large = out.numbers(f"{model}, surface: PSNR in dB, T = 2^8", "T = 2^12", "T = 2^16")
+        assert small + 1 < middle < large
+        assert large > out.numbers(f"{model}, volume: PSNR in dB, T = 2^8", "T = 2^16")[1] + 2
+    small, large, dense = (out.numbers(f"scene, {name}:", "PSNR")[1] for name in ("T = 2^8", "T = 2^15", "dense"))
+    assert small + 3 < large
+    assert large == pytest.approx(dense, abs=1.5)
+    before, vertices = out.numbers("gradients before the fit:", "% at the")
+    assert out.numbers("gradients at its end:")[0] > 1.5 * before > 1.5 * vertices
+
+
+def _ranks(out: _Printed) -> None:
+    """Both factorisations are exact; a box along the axes is of rank 1, one that is turned about z is so for VM alone."""
+    error = {}
+    for kind in ("CP", "VM"):
+        assert out.numbers(f"{kind}: products of interpolated factors and the interpolated tensor differ by") < (1e-8,)
+        assert out.numbers(f"box, {kind}: error") < (2,)
+        error[kind] = out.numbers(f"turned about z, {kind}: error", "rank 1,", "rank 4,")
+    assert error["VM"][0] < 2
+    assert error["CP"][0] > 2 * error["CP"][1] > 4 * error["CP"][2]
+    assert out.numbers("values of 4 bytes") == (4 * 16**3,)
+    assert out.numbers("memory, CP:", "rank 1,") == (4 * 3 * 16, 4 * 3 * 16 * 4)
+    assert out.numbers("memory, VM:") == (4 * 3 * (16**2 + 16),)
+
+
+def _edges(out: _Printed) -> None:
+    """Edges of one voxel, and of a shape in the plane, interpolated before, between and after activation and opacity."""
+    line = "voxel of v = -400 and 100: pre half at", "and", "in half at", "and", "post half at", "and"
+    pre, pre_width, between, between_width, post, post_width = out.numbers(*line)
+    assert (pre, pre_width) == (0.5, 0.8)
+    # 1 - exp(-100 x / 2) is one half at ln 2 / 50, and rises from 0.1 to 0.9 within ln 9 / 50.
+    assert (between, between_width) == pytest.approx((math.log(2) / 50, math.log(9) / 50), abs=2e-3)
+    assert post == pytest.approx(400 / 500, abs=5e-3)
+    assert post_width < 0.02
+    edges = [out.numbers(f"edge, {order}:", "voxels wide, RMS error") for order in ("post", "in", "pre")]
+    assert edges == sorted(edges)
+    assert edges[0][0] < edges[1][0] / 2
 
 
 def _ewa(out: _Printed) -> None:
@@ -222,7 +282,7 @@ def _ablation(out: _Printed) -> None:
 
 
 HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
-    zip(sorted(SMALL), (_cameras, _integral, _nerf, _ewa, _splatting, _two_ways, _photos, _ablation), strict=True)
+    zip(sorted(SMALL), (_cameras, _integral, _nerf, _grids, _ewa, _splatting, _two_ways, _photos, _ablation), strict=True)
 )
 
 
