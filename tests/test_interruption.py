@@ -38,9 +38,12 @@ def test_other_exceptions_of_callbacks_are_shown() -> None:
     assert done.returncode == 0 and "ZeroDivisionError" in done.stderr
 
 
-def test_a_fit_that_may_write_nothing_fails_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+@pytest.mark.parametrize("error", [InputError("The folder cannot be written."), PermissionError(13, "Permission denied")])
+def test_a_fit_that_may_write_nothing_fails_without_a_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys, error: Exception
+) -> None:
     def refuse(*_: object) -> None:
-        raise InputError("The folder cannot be written.")
+        raise error
 
     def deny(path: Path, _: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))

@@ -228,7 +228,7 @@ def work(job: Path) -> int:
     except Exception as error:  # a cell that fails is a result: its sentence goes into the report
         with suppress(InputError, OSError):  # the disk that is full may be this one, and the folder that may not be written
             write_json(job.with_suffix(".error.json"), {"kind": type(error).__name__, "error": str(error)})
-        if not isinstance(error, InputError):
+        if not isinstance(error, InputError | PermissionError):  # which name file and fault; where code is wrong, show it
             traceback.print_exc()
         return 1
     return 0
