@@ -45,3 +45,9 @@ def test_packages_export_few_names(path: Path) -> None:
 @pytest.mark.parametrize("path", [path for path in FILES if path.name == "__init__.py"], ids=_id)
 def test_folders_stay_small(path: Path) -> None:
     assert len(list(path.parent.glob("*.py"))) <= FOLDER_FILES
+
+
+def test_test_files_have_names_of_their_own() -> None:
+    """Pytest imports them by name, and refuses the second of one name."""
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))

@@ -11,7 +11,7 @@ import torch
 from invgraphics import plugins
 from invgraphics.core import Context, Quantity, Scene, check
 from invgraphics.errors import NotComposableError
-from invgraphics.testing import stir, toy_scene
+from invgraphics.testing import perturb, toy_scene
 
 ENCODINGS = sorted(plugins.names("encodings"))
 FIELDS, RENDERERS, SAMPLERS = (sorted(plugins.names(registry)) for registry in ("fields", "renderers", "samplers"))
@@ -51,7 +51,7 @@ def variants(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
             replace(plugins.load("samplers", sampler)(), **FEW.get(sampler, {})),
         )
         field = build("fields", "neural", scene, encoding=encode, geometry=geometry, **small)
-        stir(field)
+        perturb(field)
         if sampler == SAMPLERS[0]:
             yield f"neural/{encoding}/{geometry}", field, "sphere_tracing", build("renderers", "sphere_tracing", scene)
         for renderer in ("volumetric", "volsdf", "neus"):

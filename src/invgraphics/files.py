@@ -27,6 +27,17 @@ FULL = {
     errno.EFBIG: ("a file may not become as large there", "Raise the limit (`ulimit -f unlimited`), or write to another disk."),
 }
 """Errors of a disk that takes no more -> what it is, and the remedy."""
+FAULTS = {
+    errno.EACCES: "permission denied",
+    errno.EPERM: "permission denied",
+    errno.EROFS: "the file system is read-only",
+    errno.ENOENT: "no such file or folder",
+    errno.ENOTDIR: "a part of the path is a file, not a folder",
+    errno.EISDIR: "it is a folder",
+    errno.EEXIST: "it exists, and is not a folder",
+    errno.ENAMETOOLONG: "the name is too long",
+}
+"""Other failures of the file system that a person can mend, in words."""
 _SYSTEM_ERROR = re.compile(r"(?i)\(os error (\d+)\)|\[errno (\d+)\]")  # how Rust and Arrow spell errors of the system in words
 
 
@@ -50,6 +61,20 @@ def full_disk(path: Path | str | None, error: BaseException) -> InputError | Non
     what, remedy = FULL[number]
     subject = "A file" if path is None else f"'{path}'"
     return InputError(f"{subject} cannot be written: {what}.", remedy)
+
+
+def file_fault(error: BaseException) -> InputError | None:
+    """Convert an error of the file system that a person can mend, a full disk among them, to one that names the file.
+
+    Returns:
+        ``None`` for any other error.
+    """
+    if full := full_disk(getattr(error, "filename", None), error):
+        return full
+    if not isinstance(error, OSError) or error.errno not in FAULTS:
+        return None
+    subject = f"'{error.filename}'" if error.filename else "a file"
+    return InputError(f"{subject} cannot be used: {FAULTS[error.errno]}.")
 
 
 @contextmanager

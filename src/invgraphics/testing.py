@@ -120,7 +120,7 @@ def toy_scene(
     return scene.with_views(train=train, test=test)
 
 
-def stir(field: Field, amount: float = 0.01) -> None:
+def perturb(field: Field, amount: float = 0.01) -> None:
     """Add normal noise to a field's parameters: a new lattice is constant, where no normal is defined.
 
     Args:
@@ -135,10 +135,10 @@ def stir(field: Field, amount: float = 0.01) -> None:
 def check_field(field: Field, scene: Scene) -> None:
     """Assert the contract of a field: shapes, finiteness, only requested quantities, gradients, a state that reloads.
 
-    Its parameters are stirred before (see `stir`) and put back afterwards.
+    Its parameters are perturbed before (see `perturb`) and put back afterwards.
     """
     new = {name: value.clone() for name, value in field.state_dict().items()}
-    stir(field)
+    perturb(field)
     pointwise = [quantity for quantity in _POINTWISE if quantity in field.provides]
     position = scene.bounds.from_unit(torch.rand(37, 3)).requires_grad_(True)
     direction = torch.nn.functional.normalize(torch.randn(37, 3), dim=1)

@@ -25,7 +25,7 @@ from watched import Process, Reader
 
 COUNT = int(os.environ.get("INVGRAPHICS_FUZZ", "200"))
 SEED = int(os.environ.get("INVGRAPHICS_FUZZ_SEED", f"{datetime.datetime.now(datetime.UTC):%Y%m%d}"))
-PAGE_SHARE = 40
+PAGE_SHARE = 20
 """A page takes as long as this many readings, so that as many times fewer are made."""
 CHECKED = {("images", "*"), ("npz", "flip"), ("idr", "flip"), ("old_spz", "flip")}
 """Readers of files with checksums, and mutations: what is accepted after them reads as if nothing had happened."""
@@ -99,7 +99,7 @@ def test_damaged_inputs_are_refused_or_right(good: tuple[str, Path, str, Reader]
 
     @seed(SEED)
     @settings(
-        max_examples=max(5, COUNT // PAGE_SHARE) if name.startswith("report") else COUNT,
+        max_examples=max(10, COUNT // PAGE_SHARE) if name.startswith("report") else COUNT,
         deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),

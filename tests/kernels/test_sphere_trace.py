@@ -13,7 +13,7 @@ from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
 from invgraphics.kernels import numba, reference
 from invgraphics.kernels.types import TracingLimits
-from invgraphics.testing import stir, toy_scene
+from invgraphics.testing import perturb, toy_scene
 
 LIMITS = TracingLimits(steps=100, relaxation=1.3, refinements=8, least=1e-3, tolerance=1e-5, depth=0.05)
 ENCODINGS = {"hash": HashConfig(levels=4, log2_size=10, base=4, finest=24), "octaves": FrequencyConfig(4)}
@@ -26,7 +26,7 @@ def case(encoding: str, layers: int = 2) -> tuple[NeuralField, FusedSDF, Bounds,
     scene = replace(scene, bounds=Bounds(torch.tensor([-1.0, -0.9, -1.2]), torch.tensor([1.0, 1.1, 1.0])))
     settings = {"layers": layers, "width": 19, "skip": -1, "geometry_features": 3, "colour_width": 8, "colour_layers": 1}
     field = NeuralFieldConfig(ENCODINGS[encoding], "sdf", **settings).build(scene)
-    stir(field, 0.01)
+    perturb(field, 0.01)
     fused = field.fused_sdf(scene.bounds)
     assert fused is not None
     return field, fused, scene.bounds, scene.bounds.clip(scene.test[0].camera.resized(30, 30).rays())

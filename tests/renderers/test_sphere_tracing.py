@@ -17,7 +17,7 @@ from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.renderers.neus import NeuSConfig
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.sphere_tracing import SphereTracing, SphereTracingConfig
-from invgraphics.testing import check_renderer, stir, toy_scene
+from invgraphics.testing import check_renderer, perturb, toy_scene
 
 F64 = torch.float64
 BOX = Bounds(torch.full((3,), -1.5, dtype=F64), torch.full((3,), 1.5, dtype=F64))
@@ -254,7 +254,7 @@ def test_one_distance_has_the_depths_of_volume_rendering_as_its_density_sharpens
     torch.manual_seed(0)
     scene = toy_scene(views=2, size=24)
     field = NeuralFieldConfig(FrequencyConfig(3), "sdf", layers=2, width=32, skip=-1, geometry_features=3).build(scene)
-    stir(field, 0.003)
+    perturb(field, 0.003)
     camera, gaps = scene.test[0].camera, []
     traced = Model(field, SphereTracingConfig(steps=200).build(scene).untrained(), scene.bounds).render(camera)
     for sharpness in (20.0, 100.0, 500.0):

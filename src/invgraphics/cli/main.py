@@ -5,7 +5,6 @@ Exit status: 0 done, 1 some cells failed, 2 bad input, 130 interrupted or termin
 
 from __future__ import annotations
 
-import errno
 import importlib
 import os
 import sys
@@ -16,7 +15,7 @@ from typing import Any
 
 from invgraphics.cli.arguments import parse
 from invgraphics.errors import InputError, NumericalError, did_you_mean
-from invgraphics.files import full_disk
+from invgraphics.files import file_fault
 from invgraphics.interruption import INTERRUPTED, end_on_sigterm
 
 COMMANDS = {
@@ -54,18 +53,6 @@ COMMANDS = {
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 MOST_LINES = 4
-
-USER_ERRNOS = {
-    errno.EACCES: "permission denied",
-    errno.EPERM: "permission denied",
-    errno.EROFS: "the file system is read-only",
-    errno.ENOENT: "no such file or folder",
-    errno.ENOTDIR: "a part of the path is a file, not a folder",
-    errno.EISDIR: "it is a folder",
-    errno.EEXIST: "it exists, and is not a folder",
-    errno.ENAMETOOLONG: "the name is too long",
-}
-"""Failures of the file system that a person can mend, in words."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -131,11 +118,8 @@ def explain(error: Exception) -> tuple[int, list[str]]:
         return BAD_INPUT, str(error).splitlines()
     if isinstance(error, NumericalError):
         return FAILED, str(error).splitlines()
-    if full := full_disk(getattr(error, "filename", None), error):  # from what is not written through `files`
-        return BAD_INPUT, str(full).splitlines()
-    if isinstance(error, OSError) and error.errno in USER_ERRNOS:
-        where = f"'{error.filename}'" if error.filename else "a file"
-        return BAD_INPUT, [f"{where} cannot be used: {USER_ERRNOS[error.errno]}."]
+    if fault := file_fault(error):
+        return BAD_INPUT, str(fault).splitlines()
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error):
         return FAILED, ["There is not enough memory.", "Try a smaller --size, or smaller settings of the method (--set)."]
     first = (str(error).splitlines() or [""])[0]

@@ -33,6 +33,7 @@ from invgraphics.experiments.recorder import Monitor, Recorder
 from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, initialise_field, memory_forecast
+from invgraphics.files import file_fault
 from invgraphics.interruption import INTERRUPTED, end_on_sigterm, end_with_parent
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
@@ -226,9 +227,10 @@ def work(job: Path) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:  # a cell that fails is a result: its sentence goes into the report
+        fault = file_fault(error) or error
         with suppress(InputError, OSError):  # the disk that is full may be this one, and the folder that may not be written
-            write_json(job.with_suffix(".error.json"), {"kind": type(error).__name__, "error": str(error)})
-        if not isinstance(error, InputError | PermissionError):  # which name file and fault; where code is wrong, show it
+            write_json(job.with_suffix(".error.json"), {"kind": type(fault).__name__, "error": str(fault)})
+        if not isinstance(fault, InputError):
             traceback.print_exc()
         return 1
     return 0

@@ -31,7 +31,11 @@ def markdown() -> str:
 
 def _field_title(field: dict[str, Any]) -> str:
     title = _title("fields", field)
-    return f"{_title('encodings', field['encoding'])} + {title}" if "encoding" in field else title
+    if "encoding" not in field:
+        return title
+    encoding = _title("encodings", field["encoding"])
+    without_network = field.get("geometry_head") == "none" and field.get("head") in ("sh", "none")
+    return encoding if without_network else f"{encoding} + {title}"
 
 
 def _title(registry: str, part: dict[str, Any]) -> str:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
 from typing_extensions import override
 
 from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
@@ -16,7 +15,7 @@ from invgraphics.core.spacing import from_spacing
 from invgraphics.errors import NotComposableError
 from invgraphics.renderers.distance_density import DistanceDensity, laplace_density
 from invgraphics.renderers.samplers import PADDING, hit_indices, invert, pack, quantiles, strata, uniform, unit_ball_exit
-from invgraphics.renderers.up_sampling import distances
+from invgraphics.renderers.up_sampling import depth_before, distances, interval_weights
 
 LARGEST_ERROR = 1e6
 """Bounds are clamped here: far ones overflow, and only say that there is no bound."""
@@ -83,9 +82,7 @@ class ErrorBounded(Sampler):
         edges = from_spacing(spacing, ctx.bounds, knee)
         with torch.no_grad():
             edges, sdf, beta = self._refined(edges, field, (rays, hit), ctx)
-            delta = edges.diff(dim=1)
-            depth = laplace_density(sdf[:, :-1], beta) * delta
-            weights = torch.exp(-_before(depth)) * -torch.expm1(-depth)
+            weights = interval_weights(laplace_density(sdf[:, :-1], beta) * edges.diff(dim=1))
             drawn = invert(edges, weights + PADDING, quantiles(len(edges), self.config.fine, ctx, like=edges))
             places = torch.cat([edges[:, :1], drawn, self._extra(edges, ctx), edges[:, -1:]], dim=1).sort(dim=1).values
         level = Trace(pack(rays, hit, edges), None, weights.flatten(), rays=len(rays))
@@ -161,9 +158,4 @@ def error_bounds(
     """
     error = (delta.square() * torch.exp(-clear / beta) / (4 * beta.square())).cumsum(dim=1)
     depth = laplace_density(sdf[:, :-1], beta) * delta
-    return torch.expm1(error.clamp_max(math.log(LARGEST_ERROR))) * torch.exp(-_before(depth))
-
-
-def _before(depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
-    """Optical depth before each interval."""
-    return pad(depth[:, :-1].cumsum(dim=1), (1, 0))
+    return torch.expm1(error.clamp_max(math.log(LARGEST_ERROR))) * torch.exp(-depth_before(depth))

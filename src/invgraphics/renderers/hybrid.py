@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from typing_extensions import override
 
-from invgraphics import kernels
 from invgraphics.core import (
     Camera,
     Context,
@@ -25,6 +24,7 @@ from invgraphics.core import (
     Trace,
 )
 from invgraphics.renderers.distance_density import DistanceDensity
+from invgraphics.renderers.quadrature import sample_weights
 from invgraphics.renderers.volumetric import Volumetric
 
 Change = Literal["learnt", "scheduled", "held"]
@@ -44,12 +44,12 @@ class HybridSettings(Protocol):
         """The density's width at the start, and the one at the end or in an untrained renderer, in half-extents of the box."""
         ...
 
-    def stored(self, width: float) -> float:
-        """What the parameter is for a width in half-extents."""
+    def to_parameter(self, width: float) -> float:
+        """Value of the parameter for a width in half-extents."""
         ...
 
-    def width_of(self, stored: Float[Tensor, ""]) -> Float[Tensor, ""]:
-        """Inverse of `stored`."""
+    def to_width(self, parameter: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        """Inverse of `to_parameter`."""
         ...
 
 
@@ -61,7 +61,7 @@ class Hybrid(RayRenderer):
         volumetric: renders the density, with a sampler of its own.
 
     Attributes:
-        width: the density's width as the settings store it: a parameter, which has a gradient only if it is learnt.
+        width: the parameter of the density's width (see `HybridSettings.to_parameter`); it has a gradient only if it is learnt.
     """
 
     requires: ClassVar[Quantity] = Quantity.SDF | Quantity.RADIANCE
@@ -70,7 +70,7 @@ class Hybrid(RayRenderer):
         super().__init__()
         self.volumetric = volumetric
         self._settings = settings
-        self.width = nn.Parameter(torch.tensor(settings.stored(settings.widths[0])))
+        self.width = nn.Parameter(torch.tensor(settings.to_parameter(settings.widths[0])))
 
     @property
     @override
@@ -87,8 +87,8 @@ class Hybrid(RayRenderer):
 
     def beta(self, ctx: Context) -> Float[Tensor, ""]:
         """The density's width now, local units; in the graph if it is learnt."""
-        stored = self.width if self._settings.change == "learnt" else self.width.detach()
-        return self._settings.width_of(stored) * ctx.bounds.half.mean()
+        parameter = self.width if self._settings.change == "learnt" else self.width.detach()
+        return self._settings.to_width(parameter) * ctx.bounds.half.mean()
 
     @override
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
@@ -107,12 +107,12 @@ class Hybrid(RayRenderer):
         """Set a scheduled width, and refresh the sampler's state by the density that it makes."""
         if self._settings.change == "scheduled":
             first, last = self._settings.widths
-            self.width.fill_(self._settings.stored(first * (last / first) ** ctx.progress))
+            self.width.fill_(self._settings.to_parameter(first * (last / first) ** ctx.progress))
         self.volumetric.update(self.density(field, ctx, on_rays=False), ctx)
 
 
-class Weighed(Sampler):
-    """Samples of another sampler that weigh something, by the densities that it has found on the way; in training only.
+class WeightPruned(Sampler):
+    """Another sampler's samples, in training without those of negligible weight by the densities that it found on the way.
 
     Few samples of a sharp surface weigh anything, and those that do not have no gradient worth its price either: the
     derivative of a density's tail is as small as the tail.
@@ -138,22 +138,21 @@ class Weighed(Sampler):
         if samples.density is None or not ctx.training:
             return samples, levels
         with torch.no_grad():
-            depth = samples.density * samples.delta
-            weights, _, _ = kernels.composite(depth, depth[:, None], samples.ray, len(rays))
-        return samples[torch.nonzero(weights > self.threshold)[:, 0]], levels
+            seen = torch.nonzero(sample_weights(samples.density, samples, len(rays)) > self.threshold)[:, 0]
+        return samples[seen], levels
 
     @override
     def update(self, field: Field, ctx: Context) -> None:
         self.sampler.update(field, ctx)
 
     @override
-    def untrained(self) -> Weighed:
-        return Weighed(self.sampler.untrained(), self.threshold)
+    def untrained(self) -> WeightPruned:
+        return WeightPruned(self.sampler.untrained(), self.threshold)
 
 
 def make_volumetric(sampler: Sampler, gradient_reach: float, weight_threshold: float) -> Volumetric:
     """Volume renderer with a sampler whose samples weigh more than ``weight_threshold`` in training."""
-    return Volumetric(Weighed(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
+    return Volumetric(WeightPruned(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
 
 
 def check_settings(first: float, last: float, gradient_reach: float, weight_threshold: float) -> None:

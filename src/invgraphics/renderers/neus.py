@@ -18,7 +18,7 @@ from invgraphics.renderers.up_sampling import UpSamplingConfig
 from invgraphics.renderers.volumetric import Volumetric
 
 EXPONENT = 10.0
-"""What is stored of s is v = log(s) / 10 (NeuS, its code): a step of the optimiser multiplies s."""
+"""The parameter of s is v = log(s) / 10 (NeuS, its code): a step of the optimiser multiplies s."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ class NeuSConfig:
         """1 / s at the start, and the one at the end or in an untrained renderer."""
         return 1 / self.sharpness, 1 / self.sharpness_final
 
-    def stored(self, width: float) -> float:
-        """What the parameter is for a 1 / s."""
+    def to_parameter(self, width: float) -> float:
+        """Value of the parameter for a 1 / s."""
         return -math.log(width) / EXPONENT
 
-    def width_of(self, stored: Float[Tensor, ""]) -> Float[Tensor, ""]:
-        """Inverse of `stored`."""
-        return (-EXPONENT * stored).exp()
+    def to_width(self, parameter: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        """Inverse of `to_parameter`."""
+        return (-EXPONENT * parameter).exp()
 
     def build(self, scene: Scene) -> NeuS:
         """The renderer with its sampler."""

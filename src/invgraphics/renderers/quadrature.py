@@ -11,6 +11,18 @@ from invgraphics.core import FieldValues, Rays, Rendering, Samples, Trace
 from invgraphics.renderers.base import to_rendering
 
 
+def sample_weights(density: Float[Tensor, " m"], samples: Samples, rays: int) -> Float[Tensor, " m"]:
+    """Weights T (1 - exp(-sigma * length)) of samples in their rays' sums (NeRF, equation 3).
+
+    Args:
+        density: sigma at the samples.
+        samples: intervals on the rays.
+        rays: number of rays.
+    """
+    weights, _, _ = kernels.composite(density * samples.delta, density[:, None], samples.ray, rays)
+    return weights
+
+
 def integrate(
     rays: Rays,
     samples: Samples,

@@ -10,11 +10,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from typing_extensions import override
 
-from invgraphics import kernels
 from invgraphics.config import Slot
 from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.errors import NotComposableError
+from invgraphics.renderers.quadrature import sample_weights
 
 PADDING = 1e-5
 """Added to every coarse weight so that no part of a ray is ruled out (NeRF, reference code)."""
@@ -118,8 +118,7 @@ class Hierarchical(Sampler):
             values = self.proposal.query(coarse, self.proposal.provides & (Quantity.DENSITY | Quantity.RADIANCE))
             assert values.density is not None
             sigma = values.density
-        weights, _, _ = kernels.composite(sigma * coarse.delta, sigma[:, None], coarse.ray, len(rays))
-        return spacing, Trace(coarse, values, weights, rays=len(rays))
+        return spacing, Trace(coarse, values, sample_weights(sigma, coarse, len(rays)), rays=len(rays))
 
 
 def hit_indices(rays: Rays) -> Int[Tensor, " k"]:

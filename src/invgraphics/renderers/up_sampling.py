@@ -99,5 +99,14 @@ def section_weights(
     slope = sdf.diff(dim=1) / delta.clamp_min(torch.finfo(delta.dtype).tiny)
     slope = torch.minimum(slope, pad(slope[:, :-1], (1, 0))).clamp(-1, 0)
     depth = section_optical_depth((sdf[:, 1:] + sdf[:, :-1]) / 2, slope, delta, sharpness)
-    before = pad(depth[:, :-1].cumsum(dim=1), (1, 0))
-    return torch.exp(-before) * -torch.expm1(-depth)
+    return interval_weights(depth)
+
+
+def depth_before(depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
+    """Optical depth before each of a ray's consecutive intervals."""
+    return pad(depth[:, :-1].cumsum(dim=1), (1, 0))
+
+
+def interval_weights(depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
+    """Weights of a ray's consecutive intervals from their optical depths (NeRF, equation 3)."""
+    return torch.exp(-depth_before(depth)) * -torch.expm1(-depth)

@@ -52,13 +52,13 @@ class VolSDFConfig:
         """β at the start, and the one at the end or in an untrained renderer."""
         return self.beta, self.beta_final
 
-    def stored(self, width: float) -> float:
-        """What the parameter is for a β."""
+    def to_parameter(self, width: float) -> float:
+        """Value of the parameter for a β."""
         return width - self.beta_min
 
-    def width_of(self, stored: Float[Tensor, ""]) -> Float[Tensor, ""]:
-        """Inverse of `stored`, and of its negative."""
-        return stored.abs() + self.beta_min
+    def to_width(self, parameter: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        """Inverse of `to_parameter`, and of its negative."""
+        return parameter.abs() + self.beta_min
 
     def build(self, scene: Scene) -> VolSDF:
         """The renderer with its sampler."""

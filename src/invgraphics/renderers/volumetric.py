@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from invgraphics import kernels
 from invgraphics.config import Slot
 from invgraphics.core import (
     Camera,
@@ -27,7 +26,7 @@ from invgraphics.core import (
     Trace,
 )
 from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.quadrature import integrate
+from invgraphics.renderers.quadrature import integrate, sample_weights
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.termination import contributing_samples
 
@@ -141,7 +140,7 @@ def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldVa
 def _query_contributing(field: Field, samples: Samples, rays: int, want: Quantity, chunk: int) -> FieldValues:
     """Query samples of known density; radiance of samples with negligible weight is skipped and stays zero."""
     assert samples.density is not None
-    weights, _, _ = kernels.composite(samples.density * samples.delta, samples.density[:, None], samples.ray, rays)
+    weights = sample_weights(samples.density, samples, rays)
     seen = contributing_samples(weights, samples.ray, rays, UNSEEN)
     found = query(field, samples[seen], want & ~Quantity.DENSITY, chunk)
     values = {entry.name: getattr(found, entry.name) for entry in fields(FieldValues)}
@@ -159,9 +158,7 @@ def _query_above(threshold: float, field: Field, samples: Samples, rays: int, wa
     values = query(field, samples, (want & ~Quantity.RADIANCE) | features, chunk)
     assert values.density is not None
     with torch.no_grad():
-        depth = values.density.detach() * samples.delta
-        weights, _, _ = kernels.composite(depth, depth[:, None], samples.ray, rays)
-        seen = torch.nonzero(weights > threshold)[:, 0]
+        seen = torch.nonzero(sample_weights(values.density, samples, rays) > threshold)[:, 0]
     asked = replace(samples[seen], features=None if values.features is None else values.features[seen])
     found = query(field, asked, Quantity.RADIANCE, chunk).radiance
     assert found is not None

@@ -15,7 +15,8 @@ from typing_extensions import override
 from invgraphics.core import RayRenderer
 from invgraphics.core.lattice import LatticeEncoding, LatticeField
 from invgraphics.errors import InputError
-from invgraphics.training.hooks import FitState, Hook
+from invgraphics.training.hooks import FitState
+from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.penalties import LATTICES
 
 
@@ -50,8 +51,7 @@ class PruneConfig:
     rays: int = 1 << 16
 
     def __post_init__(self) -> None:
-        if not self.at or list(self.at) != sorted(set(self.at)) or not 0 < self.at[0] <= self.at[-1] < 1:
-            raise ValueError(f"'at' needs increasing numbers between 0 and 1, not {list(self.at)}.")
+        check_milestones(self.at)
         if self.weight < 0 or self.dilation < 0 or self.rays < 1:
             raise ValueError("'weight' and 'dilation' must not be negative, and 'rays' must be at least 1.")
 
@@ -60,22 +60,18 @@ class PruneConfig:
         return Prune(self)
 
 
-class Prune(Hook):
-    """Empties vertices of all sparse grids of a field, before the step whose progress has come to the next of ``at``."""
+class Prune(MilestoneHook):
+    """Empties vertices of all sparse grids of a field at each milestone."""
 
     name = "prune"
     requires = LATTICES
 
     def __init__(self, config: PruneConfig) -> None:
+        super().__init__(config.at)
         self._config = config
-        self._done = 0
 
     @override
-    def before_step(self, state: FitState) -> None:
-        due = sum(progress <= state.ctx.progress for progress in self._config.at)
-        if due <= self._done:
-            return
-        self._done = due
+    def act(self, state: FitState, due: int) -> None:
         encodings = list(cast(LatticeField, state.field).lattice_encodings().values())
         grids = [encoding for encoding in encodings if isinstance(encoding, Prunable)]
         if not grids or not isinstance(state.renderer, RayRenderer):
@@ -86,14 +82,6 @@ class Prune(Hook):
             size = cast(LatticeEncoding, grid).resolution
             seen = heaviest(unit, weights, size) >= self._config.weight / size[2]
             prune(state, grid, dilated(seen, self._config.dilation))
-
-    @override
-    def state_dict(self) -> dict[str, Tensor]:
-        return {"done": torch.tensor(self._done)}
-
-    @override
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self._done = int(state["done"])
 
 
 @torch.no_grad()

@@ -14,7 +14,8 @@ from typing_extensions import override
 from invgraphics.core import Bounds, Field, Quantity, Samples
 from invgraphics.core.lattice import LatticeField
 from invgraphics.errors import InputError
-from invgraphics.training.hooks import FitState, Hook
+from invgraphics.training.hooks import FitState
+from invgraphics.training.milestones import MilestoneHook
 from invgraphics.training.penalties import LATTICES
 from invgraphics.training.upsample import Moments, change_lattices
 
@@ -52,25 +53,22 @@ class TightBoxConfig:
         return TightBox(self)
 
 
-class TightBox(Hook):
+class TightBox(MilestoneHook):
     """Crops the field once; a field that is empty everywhere stays as it is."""
 
     name = "tight_box"
     requires = LATTICES
 
     def __init__(self, config: TightBoxConfig) -> None:
+        super().__init__((config.at,))
         self._config = config
-        self._done = False
 
     @override
-    def before_step(self, state: FitState) -> None:
-        if self._done or state.ctx.progress < self._config.at:
-            return
+    def act(self, state: FitState, due: int) -> None:
         field, config = cast(LatticeField, state.field), self._config
         encodings = field.lattice_encodings()
         if "geometry" not in encodings:
             raise InputError(f"The hook '{self.name}' needs a geometry made of lattices, which this field does not have.")
-        self._done = True
         x, y, z = encodings["geometry"].resolution
         box = occupied_box(state.field, field.bounds, (x, y, z), config.threshold, state.ctx.chunk)
         if box is None:
@@ -80,14 +78,6 @@ class TightBox(Hook):
         change_lattices(state, partial(field.crop, lo, hi, resolution), config.moments)
         if config.restart_rates:
             state.optimiser.restart(state.ctx.progress)
-
-    @override
-    def state_dict(self) -> dict[str, Tensor]:
-        return {"done": torch.tensor(self._done)}
-
-    @override
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self._done = bool(state["done"])
 
 
 Box = tuple[Tensor, Tensor]

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal, cast
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 from typing_extensions import override
 
 from invgraphics.core.lattice import LatticeEncoding, LatticeField, resampled, vertices_along
 from invgraphics.errors import InputError
-from invgraphics.training.hooks import FitState, Hook
+from invgraphics.training.hooks import FitState
+from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.penalties import LATTICES
 
 Moments = Literal["keep", "drop", "drop_all"]
@@ -42,8 +42,7 @@ class UpsampleConfig:
     restart_rates: bool = False
 
     def __post_init__(self) -> None:
-        if not self.at or list(self.at) != sorted(set(self.at)) or not 0 < self.at[0] <= self.at[-1] < 1:
-            raise ValueError(f"'at' needs increasing numbers between 0 and 1, not {list(self.at)}.")
+        check_milestones(self.at)
         if bool(self.resolution) == bool(self.resolutions):
             raise ValueError("either 'resolution' or 'resolutions' must be given.")
         if self.resolutions and len(self.resolutions) != len(self.at):
@@ -56,22 +55,19 @@ class UpsampleConfig:
         return Upsample(self)
 
 
-class Upsample(Hook):
-    """Resizes all lattices of a field, before the step whose progress has come to the next of ``at``."""
+class Upsample(MilestoneHook):
+    """Resizes all lattices of a field at each milestone."""
 
     name = "upsample"
     requires = LATTICES
 
     def __init__(self, config: UpsampleConfig) -> None:
+        super().__init__(config.at)
         self._config = config
-        self._done = 0
 
     @override
-    def before_step(self, state: FitState) -> None:
+    def act(self, state: FitState, due: int) -> None:
         config = self._config
-        due = sum(progress <= state.ctx.progress for progress in config.at)
-        if due <= self._done:
-            return
         field = cast(LatticeField, state.field)
         if not field.lattice_encodings():
             raise InputError(f"The hook '{self.name}' needs encodings made of lattices, which this field does not have.")
@@ -80,23 +76,14 @@ class Upsample(Hook):
         change_lattices(state, partial(_resize, sizes, edges), config.moments)
         if config.restart_rates:
             state.optimiser.restart(state.ctx.progress)
-        self._done = due
 
     def _next(self, encoding: LatticeEncoding, due: int) -> float:
         """Vertices along an edge of a cube after the ``due``-th up-sampling; from the present ones, which a resumed fit has."""
         if self._config.resolutions:
             return self._config.resolutions[due - 1]
-        share = (due - self._done) / (len(self._config.at) - self._done)
+        share = (due - self.done) / (len(self._config.at) - self.done)
         now = math.prod(encoding.resolution) ** (1 / 3)
         return now ** (1 - share) * self._config.resolution**share
-
-    @override
-    def state_dict(self) -> dict[str, Tensor]:
-        return {"done": torch.tensor(self._done)}
-
-    @override
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self._done = int(state["done"])
 
 
 def _resize(sizes: list[tuple[LatticeEncoding, float]], edges: list[float]) -> None:

@@ -13,11 +13,10 @@ from invgraphics.core import harmonics
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.fused import ColourHead, CombinedLattices, DensityHead, FusedLattice, HiddenActivation, Layers
 from invgraphics.core.rays import Rays
-from invgraphics.kernels.reference.composite import OPAQUE, composite, transmittance
 from invgraphics.kernels.reference.lattice import lattice_encode
 from invgraphics.kernels.reference.march import ray_march
-from invgraphics.kernels.reference.ngp import UNLIMITED
-from invgraphics.kernels.types import EXP_LIMIT, March, MarchSteps
+from invgraphics.kernels.reference.ngp import UNLIMITED, activated_density, composited, midpoints, visible
+from invgraphics.kernels.types import March, MarchSteps
 
 
 @torch.no_grad()
@@ -33,7 +32,7 @@ def lattice_render(
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
     """See `invgraphics.kernels.lattice_render`; exact: evaluates every occupied interval, whatever the error budget allows."""
     march = ray_march(rays, occupied, bounds, replace(steps, limit=UNLIMITED), rays.near)
-    position = _midpoints(rays, march)
+    position = midpoints(rays, march)
     unit, inside = _cropped(field, bounds.to_unit(position))
     outputs = _geometry(field, unit)
     features = outputs[:, 1:]
@@ -42,9 +41,7 @@ def lattice_render(
         features = torch.cat([features, own], dim=1)
     density = _density(field.density, outputs[:, 0], bounds, position) * inside
     radiance = _radiance(field.colour, features, rays.directions[march.ray], field.hidden)
-    channels = torch.cat([radiance, ((march.t0 + march.t1) / 2)[:, None]], dim=1)
-    _, sums, alpha = composite(density * (march.t1 - march.t0), channels, march.ray, len(rays))
-    return sums, alpha
+    return composited(march, density, radiance, len(rays))
 
 
 @torch.no_grad()
@@ -59,16 +56,10 @@ def lattice_march(
 ) -> March:
     """See `invgraphics.kernels.lattice_march`."""
     march = ray_march(rays, occupied, bounds, replace(steps, limit=UNLIMITED), start)
-    position = _midpoints(rays, march)
+    position = midpoints(rays, march)
     unit, inside = _cropped(field, bounds.to_unit(position))
     density = _density(field.density, _geometry(field, unit)[:, 0], bounds, position) * inside
-    tau = (density * (march.t1 - march.t0)).double().clamp_max(OPAQUE)
-    kept = transmittance(tau, march.ray, len(rays)) >= min_transmittance
-    return March(march.ray[kept], march.t0[kept], march.t1[kept], march.resume)
-
-
-def _midpoints(rays: Rays, march: March) -> Float[Tensor, "m 3"]:
-    return rays.origins[march.ray] + ((march.t0 + march.t1) / 2)[:, None] * rays.directions[march.ray]
+    return visible(march, density, len(rays), min_transmittance)
 
 
 def _cropped(field: FusedLattice, unit: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "m 3"], Bool[Tensor, " m"]]:
@@ -97,8 +88,7 @@ def _geometry(field: FusedLattice, unit: Float[Tensor, "m 3"]) -> Float[Tensor, 
 
 
 def _density(head: DensityHead, raw: Float[Tensor, " m"], bounds: Bounds, position: Tensor) -> Float[Tensor, " m"]:
-    raw = raw + head.bias
-    density = {"exp": raw.clamp_max(EXP_LIMIT).exp(), "softplus": softplus(raw), "relu": relu(raw)}[head.activation]
+    density = activated_density(raw + head.bias, head.activation)
     if head.contracted > 0:
         density = density * (head.contracted * bounds.radial_scale(position))
     return density * head.scale

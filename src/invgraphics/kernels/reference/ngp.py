@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -35,10 +36,7 @@ def ngp_render(
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
     """See `invgraphics.kernels.ngp_render`; exact: evaluates every occupied interval, whatever the error budget allows."""
     march = ray_march(rays, occupied, bounds, replace(steps, limit=UNLIMITED), rays.near)
-    density, radiance = _query(field, rays, bounds, march)
-    channels = torch.cat([radiance, ((march.t0 + march.t1) / 2)[:, None]], dim=1)
-    _, sums, alpha = composite(density * (march.t1 - march.t0), channels, march.ray, len(rays))
-    return sums, alpha
+    return composited(march, *_query(field, rays, bounds, march), len(rays))
 
 
 @torch.no_grad()
@@ -54,19 +52,42 @@ def ngp_march(
     """See `invgraphics.kernels.ngp_march`."""
     march = ray_march(rays, occupied, bounds, replace(steps, limit=UNLIMITED), start)
     density, _ = _query(field, rays, bounds, march)
+    return visible(march, density, len(rays), min_transmittance)
+
+
+def midpoints(rays: Rays, march: March) -> Float[Tensor, "m 3"]:
+    """Positions in the middle of every interval."""
+    return rays.origins[march.ray] + ((march.t0 + march.t1) / 2)[:, None] * rays.directions[march.ray]
+
+
+def activated_density(raw: Float[Tensor, " m"], activation: Literal["exp", "softplus", "relu"]) -> Float[Tensor, " m"]:
+    """Densities of raw values, to which their bias is added already."""
+    return {"exp": raw.clamp_max(EXP_LIMIT).exp(), "softplus": softplus(raw), "relu": relu(raw)}[activation]
+
+
+def composited(
+    march: March, density: Float[Tensor, " m"], radiance: Float[Tensor, "m 3"], rays: int
+) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
+    """Sums of weight * (radiance, distance), and of the weights, over the intervals of every ray."""
+    channels = torch.cat([radiance, ((march.t0 + march.t1) / 2)[:, None]], dim=1)
+    _, sums, alpha = composite(density * (march.t1 - march.t0), channels, march.ray, rays)
+    return sums, alpha
+
+
+def visible(march: March, density: Float[Tensor, " m"], rays: int, min_transmittance: float) -> March:
+    """The intervals that at least ``min_transmittance`` of the light reaches."""
     tau = (density * (march.t1 - march.t0)).double().clamp_max(OPAQUE)
-    kept = transmittance(tau, march.ray, len(rays)) >= min_transmittance
+    kept = transmittance(tau, march.ray, rays) >= min_transmittance
     return March(march.ray[kept], march.t0[kept], march.t1[kept], march.resume)
 
 
 def _query(field: FusedNGP, rays: Rays, bounds: Bounds, march: March) -> tuple[Float[Tensor, " m"], Float[Tensor, "m 3"]]:
     """Density and radiance at the midpoint of every interval."""
     direction = rays.directions[march.ray]
-    position = rays.origins[march.ray] + ((march.t0 + march.t1) / 2)[:, None] * direction
+    position = midpoints(rays, march)
     features, _ = hash_encode(bounds.to_unit(position), field.table, field.grid)
     outputs = _mlp(field.density_net, features)
-    raw = outputs[:, 0] + field.density_bias
-    density = {"exp": raw.clamp_max(EXP_LIMIT).exp(), "softplus": softplus(raw), "relu": relu(raw)}[field.density_activation]
+    density = activated_density(outputs[:, 0] + field.density_bias, field.density_activation)
     if field.contracted_density > 0:
         density = density * (field.contracted_density * bounds.radial_scale(position))
     inputs = outputs[:, 1:]
