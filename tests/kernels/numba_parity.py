@@ -1,6 +1,6 @@
 """Parity of Numba's kernels with the reference for whatever processor NUMBA_CPU_NAME says; run by `test_instruction_sets`.
 
-Arguments: ``samples``, ``fields`` or ``pictures``, then the widest vector registers that machine code may name: xmm, ymm or zmm.
+Arguments: ``samples``, ``fields`` or ``pictures``; the widest vector registers that machine code may name: xmm, ymm or zmm.
 """
 
 import sys
