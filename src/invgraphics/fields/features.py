@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from invgraphics.config import Slot
-from invgraphics.core.bounds import Bounds
+from invgraphics.core.bounds import Bounds, Space
 from invgraphics.core.field import Encoding, Field, Quantity
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
@@ -61,7 +61,8 @@ class FeatureField(Field):
 
     def __init__(self, config: FeatureFieldConfig, bounds: Bounds) -> None:
         super().__init__()
-        self._space, self._near = bounds.space, bounds.near
+        self._space: Space = bounds.space
+        self._near = bounds.near
         self.register_buffer("lo", bounds.lo.clone())
         self.register_buffer("hi", bounds.hi.clone())
         shaped = isinstance(config.encoding, LatticeConfig)
