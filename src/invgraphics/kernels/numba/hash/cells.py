@@ -79,6 +79,7 @@ def trilinear_weights(f):
 
 @inlined
 def store_corners(values, n, v):
+    """Store the 8 corner values of the block's n-th point."""
     values[n], values[n + _V1], values[n + _V2], values[n + _V3] = v[0], v[1], v[2], v[3]
     values[n + _V4], values[n + _V5], values[n + _V6], values[n + _V7] = v[4], v[5], v[6], v[7]
 
