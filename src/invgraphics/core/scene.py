@@ -16,6 +16,7 @@ from invgraphics.core.camera import Camera
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.compositing import straight_over
 from invgraphics.core.display import contact_sheet, encode_png, figure_html
+from invgraphics.core.mesh import Mesh
 
 Pixels = UInt8[Tensor, "h w c"] | Float[Tensor, "h w c"]
 
@@ -88,14 +89,6 @@ class Points:
     def joined(self, others: Points) -> Points:
         """These points, then the others."""
         return Points(torch.cat([self.position, others.position]), torch.cat([self.rgb, others.rgb]))
-
-
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """A triangle mesh, local frame."""
-
-    vertices: Float[Tensor, "v 3"]
-    faces: Tensor
 
 
 @dataclass(frozen=True, eq=False)

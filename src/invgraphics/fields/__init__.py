@@ -7,6 +7,7 @@ from invgraphics.lazy import submodules
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
+    "mesh": "invgraphics.fields.mesh:MeshFieldConfig",
 }
 
 if not TYPE_CHECKING:
