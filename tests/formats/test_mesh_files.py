@@ -76,7 +76,7 @@ def test_bad_files_get_a_sentence(solid: Mesh, tmp_path: Path) -> None:
         path = tmp_path / f"a{suffix}"
         for content in (b"", b"nonsense\n" * 20):
             path.write_bytes(content)
-            with pytest.raises(InputError, match="mesh|triangles"):
+            with pytest.raises(InputError, match=r"mesh|triangles"):
                 read_mesh(path)
     write_mesh(tmp_path / "a.glb", solid, RGB)
     whole = (tmp_path / "a.glb").read_bytes()

@@ -66,7 +66,7 @@ def test_the_level_of_a_density_is_where_the_surface_is() -> None:
     # The stated meaning: 1% of the diagonal of this density has alpha 1/2.
     assert 1 - math.exp(-default_level(BOX) * 0.01 * 2 * math.sqrt(3)) == pytest.approx(0.5)
     with pytest.raises(InputError, match="no level 200"):
-        extract_mesh(blob, BOX, 16, 200.0).mesh
+        extract_mesh(blob, BOX, 16, 200.0)
 
 
 def test_a_solid_that_leaves_the_box_is_closed_there() -> None:
