@@ -50,8 +50,8 @@ def test_a_ball_in_closed_form(ball: Mesh, camera: Camera) -> None:
     assert bool((seen.alpha.reshape(-1)[inside] == 1).all())
     assert not bool(seen.alpha.reshape(-1)[half < 0].any())
     t = middle - half.clamp_min(0).sqrt()
-    # A chord of a mesh of 32 voxels over 3 units lies at most 0.0014 inside of the sphere; aslant, more along the ray.
-    assert float((seen.depth.reshape(-1) - t)[half > 0.3].abs().max()) < 2.5e-3
+    # The middle of a triangle of 32 voxels over 3 units lies up to 0.005 inside of the sphere; aslant, more along the ray.
+    assert float((seen.depth.reshape(-1) - t)[half > 0.3].abs().max()) < 7e-3
     expected = rays.at(t) / RADIUS
     assert seen.normal is not None
     cosine = (seen.normal.reshape(-1, 3) * expected).sum(dim=1)[inside]
@@ -92,7 +92,7 @@ def test_crop_and_near_open_the_ball(ball: Mesh, camera: Camera) -> None:
     cropped = replace(BOX, crop=(torch.tensor([-2.0, 0.0, -2.0]), torch.full((3,), 2.0)))
     for bounds in (behind, cropped):
         seen = picture(ball, camera, bounds, supersampling=1).depth.reshape(-1)
-        assert float((seen - far)[half > 0.4].abs().max()) < 3e-3
+        assert float((seen - far)[half > 0.4].abs().max()) < 7e-3
 
 
 def test_pictures_are_linear_in_the_harmonics(ball: Mesh, camera: Camera) -> None:
@@ -111,7 +111,7 @@ def test_pictures_are_linear_in_the_harmonics(ball: Mesh, camera: Camera) -> Non
         field.sh_rest.add_(step)
         changed, _ = renderer.render_image(field, camera, ctx)
     expected = float((gradient * step).sum())
-    assert float(((changed.rgb - seen.rgb) * weights).sum()) == pytest.approx(
+    assert float(((changed.rgb - seen.rgb) * weights).sum().detach()) == pytest.approx(
         expected, abs=1e-4 * float(weights.numel()) ** 0.5
     )
     assert abs(expected) > 0.01
@@ -134,8 +134,8 @@ def test_the_pose_has_the_slope_of_the_surface(ball: Mesh, camera: Camera) -> No
     (gradient,) = torch.autograd.grad(values(offset), offset)
     with torch.no_grad():
         numeric = torch.stack([(values(h) - values(-h)) / 0.02 for h in 0.01 * torch.eye(3)])
-    torch.testing.assert_close(gradient, numeric, rtol=0.1, atol=1.0)  # a step crosses faces, whose slopes differ
-    assert float(numeric.abs().max()) > 20
+    torch.testing.assert_close(gradient, numeric, rtol=0.05, atol=0.5)  # a step crosses faces, whose slopes differ
+    assert float(numeric.abs().max()) > 10
 
 
 def test_contracts(ball: Mesh) -> None:
@@ -143,7 +143,7 @@ def test_contracts(ball: Mesh) -> None:
     field, renderer = MeshField(ball, 1), Surface(SurfaceConfig())
     check_field(field, scene)
     check_renderer(renderer, field, scene)
-    with pytest.raises(NotComposableError, match="mesh"):
+    with pytest.raises(NotComposableError, match="MeshField has no gaussians"):
         field.primitives(Quantity.GAUSSIANS, Context(scene.bounds))
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from invgraphics.core import Mesh, Model, Quantity, Scene
+from invgraphics.core.scan import Scan
 from invgraphics.errors import InputError
 from invgraphics.fields.isosurface import extract_mesh
-from invgraphics.metrics.surfaces import F_SCORE_SHARE, SURFACE_METRICS, compare_surfaces
+from invgraphics.metrics.dtu import dtu_score
+from invgraphics.metrics.surfaces import F_SCORE_SHARE, POINTS, SURFACE_METRICS, compare_surfaces
 from invgraphics.runs.scores import Score
 
 RESOLUTION = 192
@@ -43,16 +45,20 @@ def surface_scores(model: Model, scene: Scene) -> Scored:
 def mesh_scores(mesh: Mesh, scene: Scene) -> Scored:
     """Score a mesh against the scene's true one, on surface that training cameras see; lengths in world units.
 
+    Where the truth is a scan, it is scored by DTU's rule instead.
+
     Args:
         mesh: in the scene's local frame.
         scene: whose training cameras count.
     """
     if reason := _unknown(scene):
         return {}, dict.fromkeys(SURFACE_METRICS, reason)
+    if scene.scan is not None:
+        return _dtu_scores(mesh, scene, scene.scan)
     assert scene.mesh is not None
     threshold = F_SCORE_SHARE * float((scene.bounds.hi - scene.bounds.lo).max())
     try:
-        found = compare_surfaces(mesh, scene.mesh, threshold, [view.camera for view in scene.train])
+        found = compare_surfaces(mesh, scene.mesh, threshold, [view.camera for view in scene.train], POINTS)
     except ValueError as error:
         return {}, dict.fromkeys(SURFACE_METRICS, str(error))
     values = {
@@ -78,6 +84,20 @@ def mesh_scores(mesh: Mesh, scene: Scene) -> Scored:
     }, {}
 
 
+def _dtu_scores(mesh: Mesh, scene: Scene, scan: Scan) -> Scored:
+    """Scores by DTU's rule, in the data set's millimetres; it knows neither an F-score nor normals."""
+    rule = f"DTU's rule, {scene.notes.get('reference_scan', '')}".rstrip(", ")
+    try:
+        found = dtu_score(mesh.transformed(scene.world_from_local), scan)
+    except ValueError as error:
+        return {}, dict.fromkeys(SURFACE_METRICS, f"{rule}: {error}")
+    values = {"chamfer": found.overall, "surface_accuracy": found.accuracy, "surface_completeness": found.completeness}
+    quality = {name: Score(mean=value, unit="mm", higher_is_better=False, joined=rule) for name, value in values.items()}
+    return quality, dict.fromkeys(SURFACE_METRICS.keys() - values.keys(), "DTU's rule has no such score")
+
+
 def _unknown(scene: Scene) -> str:
     """Why the scene's true surface is unknown; empty where it is known."""
-    return "the scene has no true surface" if scene.mesh is None else ""
+    if scene.mesh is not None or scene.scan is not None:
+        return ""
+    return scene.notes.get("reference_scan", "the scene has no true surface")

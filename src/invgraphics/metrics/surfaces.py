@@ -129,8 +129,8 @@ def compare_surfaces(
         )
     if not len(ours) or not len(theirs):
         raise ValueError("no camera sees the " + ("predicted" if not len(ours) else "true") + " surface")
-    to_true, at_true = nearest_on(true, ours.position)
-    to_ours, at_ours = nearest_on(predicted, theirs.position)
+    to_true, at_true = nearest_on(true, ours.position, count)
+    to_ours, at_ours = nearest_on(predicted, theirs.position, count)
     normals = [
         float((samples.normal * nearest).sum(dim=1).abs().mean()) for samples, nearest in ((ours, at_true), (theirs, at_ours))
     ]
@@ -192,7 +192,9 @@ def visible(mesh: Mesh, points: Float[Tensor, "n 3"], cameras: Sequence[Camera])
     return seen
 
 
-def nearest_on(mesh: Mesh, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+def nearest_on(
+    mesh: Mesh, points: Float[Tensor, "n 3"], count: int = POINTS
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
     """Distances of points to a mesh, and the unit normals of its nearest triangles, double precision.
 
     Candidates are the triangles of the `CANDIDATES` nearest among the middles of all triangles and as many random samples;
@@ -201,10 +203,11 @@ def nearest_on(mesh: Mesh, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, 
     Args:
         mesh: triangles.
         points: anywhere.
+        count: random samples of the mesh, at least one for each triangle.
     """
     from scipy.spatial import KDTree
 
-    samples = sample_surface(mesh, max(POINTS, len(mesh.faces)), torch.Generator().manual_seed(0))
+    samples = sample_surface(mesh, max(count, len(mesh.faces)), torch.Generator().manual_seed(0))
     corners = mesh.vertices.double()[mesh.faces]
     known = torch.cat([corners.mean(dim=1), samples.position])
     owner = torch.cat([torch.arange(len(mesh.faces)), samples.face])
