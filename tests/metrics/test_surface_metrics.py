@@ -107,7 +107,7 @@ def test_hidden_surface_does_not_count() -> None:
     points = sample_surface(outer, FEW, torch.Generator().manual_seed(0)).position
     seen = visible(outer, points, cameras[:1])
     towards = (points * (cameras[0].position.double() - points)).sum(dim=1) > 0  # in front of the horizon
-    assert float((seen == towards).double().mean()) > 0.97
+    assert float((seen == towards).double().mean()) > 0.92
     elsewhere = cameras[0].moved(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])) @ cameras[0].cam_to_world)
     with pytest.raises(ValueError, match="no camera sees the predicted surface"):
         compare_surfaces(inner, outer, 0.01, [replace(elsewhere, centre=torch.full((2,), 1e4))], 100)
