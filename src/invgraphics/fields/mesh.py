@@ -45,7 +45,7 @@ class MeshFieldConfig:
     sh_degree: int = 2
     init: Literal["hull", "depth"] = "hull"
     source: str = ""
-    resolution: int = 192
+    resolution: int = 128
     level: float | None = None
 
     def __post_init__(self) -> None:
