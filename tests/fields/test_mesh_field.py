@@ -8,7 +8,6 @@ import torch
 from invgraphics.core import Bounds, Context, Mesh, Quantity, Scene, View, harmonics
 from invgraphics.errors import InputError
 from invgraphics.fields.analytic import Sphere
-from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.fields.isosurface import extract_mesh
 from invgraphics.fields.mesh import MeshField, MeshFieldConfig
 from invgraphics.fields.visual_hull import photograph_colours
@@ -16,6 +15,13 @@ from invgraphics.testing import toy_cameras
 
 BOX = Bounds(-torch.ones(3), torch.ones(3))
 RADIUS = 0.55
+
+
+class NoDensity(Sphere):
+    provides = Quantity.FEATURES
+
+    def __init__(self) -> None:
+        super().__init__(1.0, RADIUS)
 
 
 def ball_scene(views: int = 24, size: int = 48) -> Scene:
@@ -101,9 +107,9 @@ def test_a_field_becomes_a_mesh(scene: Scene) -> None:
     assert float((field.vertices.norm(dim=1) - RADIUS).abs().max()) < 2e-3
     again = config.converted(field, scene)
     assert torch.equal(again.vertices, field.vertices)
-    gaussians = GaussianFieldConfig(count=10, init="random").build(scene)
-    with pytest.raises(InputError, match="GaussianField has no density") as refusal:
-        config.converted(gaussians, scene)
+    features = NoDensity()
+    with pytest.raises(InputError, match="NoDensity has no density") as refusal:
+        config.converted(features, scene)
     assert "--to mesh" in str(refusal.value.remedy)
 
 

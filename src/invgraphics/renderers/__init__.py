@@ -13,6 +13,8 @@ RENDERERS = {
     "sphere_tracing": "invgraphics.renderers.sphere_tracing:SphereTracingConfig",
     "surface": "invgraphics.renderers.surface:SurfaceConfig",
     "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
+    "srn": "invgraphics.renderers.srn:SRNConfig",
+    "ray_attention": "invgraphics.renderers.ray_attention:RayAttentionConfig",
 }
 
 SAMPLERS = {

@@ -24,8 +24,8 @@ MOST_PICTURES = 64
 def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
     """Write the model's surface as a triangle mesh with vertex colours: GLB, PLY or OBJ, by the file's name.
 
-    A mesh is written as it is; a density or a distance is cut at a level by marching cubes; of anything else, depth pictures
-    are fused. PLY and OBJ hold the data set's world, GLB is y-up.
+    A mesh is written as it is; a density or a distance is cut at a level by marching cubes, unless it is seen as Gaussians; of
+    anything else, depth pictures are fused. PLY and OBJ hold the data set's world, GLB is y-up.
 
     Raises:
         InputError: the model shows no surface, or the file cannot be written.
@@ -33,7 +33,7 @@ def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
     suffix, scene, provides = check_suffix(request.out), fitted.scene, fitted.model.field.provides
     if Quantity.MESH in provides:
         extracted, how = _own_mesh(fitted, request)
-    elif (Quantity.SDF | Quantity.DENSITY) & provides:
+    elif (Quantity.SDF | Quantity.DENSITY) & provides and Quantity.GAUSSIANS not in fitted.model.renderer.requires:
         extracted, how = _marching_cubes(fitted, request)
     else:
         extracted, how = _fuse_depth(fitted, request)
