@@ -8,6 +8,7 @@ FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
     "features": "invgraphics.fields.features:FeatureFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
+    "mesh": "invgraphics.fields.mesh:MeshFieldConfig",
 }
 
 if not TYPE_CHECKING:

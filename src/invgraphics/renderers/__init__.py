@@ -11,6 +11,7 @@ RENDERERS = {
     "splatting": "invgraphics.renderers.splatting:SplattingConfig",
     "gaussian_exact": "invgraphics.renderers.gaussian_volume:GaussianExactConfig",
     "sphere_tracing": "invgraphics.renderers.sphere_tracing:SphereTracingConfig",
+    "surface": "invgraphics.renderers.surface:SurfaceConfig",
     "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
     "srn": "invgraphics.renderers.srn:SRNConfig",
     "ray_attention": "invgraphics.renderers.ray_attention:RayAttentionConfig",

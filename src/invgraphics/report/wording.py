@@ -81,11 +81,16 @@ _NAMES: dict[str, tuple[str, int]] = {
     "depth_rmse_smooth": ("Depth RMSE off edges", 3),
     "normal_deg": ("Normal error", 1),
     "alpha_iou": ("Alpha IoU", 3),
+    "chamfer": ("Chamfer", 4),
+    "surface_accuracy": ("Surface accuracy", 4),
+    "surface_completeness": ("Surface completeness", 4),
+    "f_score": ("F-score, 1%", 3),
+    "normal_consistency": ("Normal consistency", 3),
     "pose_rotation_deg": ("Pose rotation, median", 2),
     "pose_translation_percent": ("Pose position, median", 2),
 }
 
-_GEOMETRY = ("depth_", "normal_", "alpha_", "pose_")
+_GEOMETRY = ("depth_", "normal_", "alpha_", "pose_", "chamfer", "surface_", "f_score")
 
 _UNITS = {"deg": "°", "degrees": "°", "degree": "°", "world units": "units"}
 
