@@ -17,7 +17,7 @@ from invgraphics.fields.encodings.sparse import SparseVoxelsConfig
 from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
-from invgraphics.fields.neural import NeuralField, NeuralFieldConfig, unit_covariance
+from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
 
 D, S, G, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.GRADIENT, Quantity.RADIANCE, Quantity.NORMAL
 

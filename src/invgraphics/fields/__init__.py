@@ -6,6 +6,7 @@ from invgraphics.lazy import submodules
 
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
+    "density": "invgraphics.fields.density_field:DensityFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
 }
 
