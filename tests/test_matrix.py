@@ -20,6 +20,7 @@ FEW = {
     "stratified": {"count": 24},
     "hierarchical": {"coarse": 12, "fine": 12},
     "occupancy": {"steps_per_diagonal": 64, "cone": 0.1},
+    "proposals": {"counts": (12,), "count": 12},
     "up_sampling": {"coarse": 12, "fine": 12, "rounds": 2},
     "error_bounded": {"coarse": 12, "fine": 12, "extra": 4, "rounds": 2, "bisections": 4},
 }

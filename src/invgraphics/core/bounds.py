@@ -62,9 +62,7 @@ class Bounds:
         x = uncontract((unit * 2 - 1) * 2) if self.space == "contracted" else unit * 2 - 1
         return self.centre + x * self.half
 
-    def unit_covariance(
-        self, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]
-    ) -> Float[Tensor, "m 3 3"]:
+    def unit_covariance(self, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3"]:
         """Transform covariances to the unit cube by the linearised map, J Σ Jᵀ (mip-NeRF 360, equation 9).
 
         Args:

@@ -1,4 +1,4 @@
-"""Encodings built for a region, and evaluated at samples with what they take: positions, or their cones' mean and covariance."""
+"""Encodings built for a region, and evaluated at samples: at their positions, or over their cones' Gaussians."""
 
 from __future__ import annotations
 

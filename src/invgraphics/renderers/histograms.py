@@ -1,4 +1,4 @@
-"""Weights along rays as step functions: dilated, blurred, and drawn from in whole intervals (mip-NeRF 360, §3 and appendix A)."""
+"""Weights along rays as step functions: dilation, blur, and resampling in intervals (mip-NeRF 360, §3 and appendix)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sampling by proposals: densities that are cheap to evaluate say where to look closer (mip-NeRF 360, Barron et al. 2022, §3)."""
+"""Sampling by proposals, small densities that say where to look closer (mip-NeRF 360, Barron et al. 2022, §3)."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class ProposalsConfig:
     Attributes:
         counts: intervals per ray of each proposal level.
         count: intervals per ray of the last level, which is rendered.
-        fields: densities of the proposal levels, one each, trained by the loss ``interlevel`` alone. None at all: each level asks
-            the rendered field, as in NeRF and mip-NeRF.
-        train_levels: whether levels that ask the rendered field are rendered in colour in training, with gradients, for the loss
-            ``coarse`` (mip-NeRF).
+        fields: densities of the proposal levels, one each, trained by the loss ``interlevel`` alone. None at all: each level
+            queries the rendered field, as in NeRF and mip-NeRF.
+        train_levels: whether levels that query the rendered field are rendered in colour in training, with gradients, for the
+            loss ``coarse`` (mip-NeRF).
         dilation: widening of a level's intervals before the next one is drawn, in the longest interval of the spacing's [0, 1]
             over the product of the numbers of intervals so far; thin things then survive between two rays.
         dilation_bias: the same as a share of the ray.
@@ -139,8 +139,9 @@ class Proposals(Sampler):
     def _level(self, index: int, samples: Samples, rays: int, field: Field, ctx: Context) -> Trace:
         """Density and weights of one level."""
         if self.config.fields:
-            still = replace(samples, position=samples.position.detach(), direction=samples.direction.detach())
-            values = self.fields[index].query(still, Quantity.DENSITY)  # type: ignore[operator]
+            still = {name: getattr(samples, name).detach() for name in ("t0", "t1", "position", "direction")}
+            samples = replace(samples, **still)
+            values = self.fields[index].query(samples, Quantity.DENSITY)  # type: ignore[operator]
         elif self.config.train_levels and ctx.training:
             values = field.query(samples, Quantity.DENSITY | (field.provides & Quantity.RADIANCE))
         else:
@@ -149,7 +150,7 @@ class Proposals(Sampler):
         return Trace(samples, values, sample_weights(values.density, samples, rays), rays=rays)
 
     def _with_density(self, samples: Samples, field: Field, ctx: Context) -> Samples:
-        """The samples with the field's density and features, where no gradient is wanted: few deserve a look at their colour."""
+        """Samples with the field's density and features, outside the graph, where colour is queried of few of them only."""
         if ctx.training or torch.is_grad_enabled() or Quantity.DENSITY not in field.provides:
             return samples
         want = Quantity.DENSITY | (field.provides & Quantity.FEATURES)
