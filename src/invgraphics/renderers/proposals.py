@@ -102,21 +102,22 @@ class Proposals(Sampler):
         """Sample every ray that meets the bounds, level by level; outside the graph the last level's density comes along."""
         hit = hit_indices(rays)
         near, far, knee = self._ends(rays, hit, ctx)
-        place = near.new_tensor([0.0, 1.0]).expand(len(hit), 2)
-        mass, levels = near.new_ones(len(hit), 1), []
-        counts = (*self.config.counts, self.config.count)
-        for index, count in enumerate(counts):
-            if index:
-                place, mass = self._widened(place, mass, prod(counts[:index]))
-                mass = (mass + self.config.padding) ** self.config.exponent(ctx.progress if ctx.training else 1.0)
-            place = resample(place, mass, count, ctx, per_ray=self.config.jitter_per_ray)
-            t = from_spacing(torch.lerp(near, far, place), ctx.bounds, knee)
-            samples = pack(rays, hit, t)
-            if index < len(self.config.counts):
-                levels.append(self._level(index, samples, len(rays), field, ctx))
-                weights = levels[-1].weights
-                assert weights is not None
-                mass = weights.detach().view(len(hit), count)
+        place, mass = near.new_tensor([0.0, 1.0]).expand(len(hit), 2), near.new_ones(len(hit), 1)
+        exponent = self.config.exponent(ctx.progress if ctx.training else 1.0)
+        levels: list[Trace] = []
+
+        def intervals(count: int) -> tuple[Tensor, Samples]:
+            drawn = resample(place, mass, count, ctx, per_ray=self.config.jitter_per_ray)
+            return drawn, pack(rays, hit, from_spacing(torch.lerp(near, far, drawn), ctx.bounds, knee))
+
+        for index, count in enumerate(self.config.counts):
+            place, samples = intervals(count)
+            levels.append(self._level(index, samples, len(rays), field, ctx))
+            weights = levels[-1].weights
+            assert weights is not None
+            place, mass = self._widened(place, weights.detach().view(len(hit), count), prod(self.config.counts[: index + 1]))
+            mass = (mass + self.config.padding) ** exponent
+        _, samples = intervals(self.config.count)
         hidden = ctx.training and not self.config.fields and not self.config.train_levels
         return self._with_density(samples, field, ctx), () if hidden else tuple(levels)
 
