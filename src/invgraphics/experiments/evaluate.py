@@ -23,6 +23,7 @@ from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
 from invgraphics.experiments.progress import Reporter, warn
+from invgraphics.experiments.scaled import scaled_scores
 from invgraphics.experiments.surface_scores import surface_scores
 from invgraphics.files import write_arrays, write_picture
 from invgraphics.metrics.cost import model_bytes, parameter_count
@@ -72,8 +73,11 @@ def evaluate(
         poses,
         keep=lambda index, picture: _save_view(folder, index, picture, scene),
     )
+    quality, skipped = scaled_scores(model, scene, protocol, folder.read(Provenance).data, refined=poses is not None)
     result = replace(
         found,
+        quality=found.quality | quality,
+        skipped=found.skipped | skipped,
         preset=method.preset,
         preset_choice=method.preset_choice,
         seed=folder.read(Provenance).seed,

@@ -6,6 +6,7 @@ from invgraphics.lazy import submodules
 
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
+    "density": "invgraphics.fields.density_field:DensityFieldConfig",
     "features": "invgraphics.fields.features:FeatureFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
     "mesh": "invgraphics.fields.mesh:MeshFieldConfig",

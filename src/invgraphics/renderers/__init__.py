@@ -21,6 +21,7 @@ SAMPLERS = {
     "stratified": "invgraphics.renderers.samplers:StratifiedConfig",
     "hierarchical": "invgraphics.renderers.samplers:HierarchicalConfig",
     "occupancy": "invgraphics.renderers.occupancy:OccupancyConfig",
+    "proposals": "invgraphics.renderers.proposals:ProposalsConfig",
     "error_bounded": "invgraphics.renderers.error_bounded:ErrorBoundedConfig",
     "up_sampling": "invgraphics.renderers.up_sampling:UpSamplingConfig",
 }

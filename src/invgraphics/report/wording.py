@@ -90,6 +90,9 @@ _NAMES: dict[str, tuple[str, int]] = {
     "pose_translation_percent": ("Pose position, median", 2),
 }
 
+SCALED = "_at_1_"
+"""Between a metric's name and the divisor of the test views' size, where it is of smaller pictures."""
+
 _GEOMETRY = ("depth_", "normal_", "alpha_", "pose_", "chamfer", "surface_", "f_score")
 
 _UNITS = {"deg": "°", "degrees": "°", "degree": "°", "world units": "units"}
@@ -114,13 +117,16 @@ TIMES = ("fit_seconds", "render_seconds_per_view", "render_fps")
 
 
 def metric_label(key: str) -> str:
-    """Display name of a metric; an unknown key with spaces for underscores."""
-    return _NAMES[key][0] if key in _NAMES else key.replace("_", " ")
+    """Display name of a metric, also at 1/n of the test views' size; an unknown key with spaces for underscores."""
+    name, scaled, divisor = key.partition(SCALED)
+    label = _NAMES[name][0] if name in _NAMES else name.replace("_", " ")
+    return f"{label} at 1/{divisor}" if scaled else label
 
 
 def quality_quantity(key: str, score: Score) -> Quantity:
     """Quantity of a quality metric, with unit and direction from its stored score."""
-    decimals = _NAMES[key][1] if key in _NAMES else None
+    name = key.partition(SCALED)[0]
+    decimals = _NAMES[name][1] if name in _NAMES else None
     better: Direction = "higher" if score.higher_is_better else "lower"
     group: Group = "geometry" if key.startswith(_GEOMETRY) else "image"
     return Quantity(key, metric_label(key), _UNITS.get(score.unit, score.unit), better, group, decimals=decimals)
