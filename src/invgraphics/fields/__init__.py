@@ -7,6 +7,8 @@ from invgraphics.lazy import submodules
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
+    "planes": "invgraphics.fields.planes:PlanesConfig",
+    "depth_maps": "invgraphics.fields.depth_maps:DepthMapsConfig",
 }
 
 if not TYPE_CHECKING:

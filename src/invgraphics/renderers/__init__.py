@@ -11,6 +11,8 @@ RENDERERS = {
     "splatting": "invgraphics.renderers.splatting:SplattingConfig",
     "gaussian_exact": "invgraphics.renderers.gaussian_volume:GaussianExactConfig",
     "sphere_tracing": "invgraphics.renderers.sphere_tracing:SphereTracingConfig",
+    "planes": "invgraphics.renderers.planes:PlanesConfig",
+    "depth_warp": "invgraphics.renderers.depth_warp:DepthWarpConfig",
     "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
 }
 
