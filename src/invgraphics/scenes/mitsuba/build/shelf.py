@@ -11,7 +11,7 @@ from invgraphics.scenes.mitsuba.build.fence import leaf
 from invgraphics.scenes.mitsuba.build.mesh import Mesh, box, cylinder, lathe, merge, polygon, rotation, tube
 from invgraphics.scenes.mitsuba.build.model import Ball, Model, Part
 from invgraphics.scenes.mitsuba.build.noise import Image, checkers, confetti, fractal, wood
-from invgraphics.scenes.mitsuba.build.surfaces import Softbox, glass, matte, metal, plastic, rgb, studio, two_sided
+from invgraphics.scenes.mitsuba.build.surfaces import Softbox, matte, metal, plastic, rgb, studio, two_sided
 
 WALL = 0.6
 SIDE, DEPTH, THICK = 1.0, 0.52, 0.04
@@ -38,7 +38,7 @@ def build(seed: int) -> Model:
     balls = [
         Ball((0.34, 0.22, BOARDS[1] + 0.13), 0.13, plastic(rgb("#c8102e"), 0.06)),
         Ball((-0.66, 0.26, BOARDS[2] + 0.15), 0.15, metal("Ag", 0.12)),
-        Ball((0.62, y - 0.05, top + 0.11), 0.11, glass()),
+        Ball((0.62, y - 0.05, top + 0.11), 0.11, plastic(rgb("#16324f"), 0.05)),
     ]
     return Model(parts=parts, balls=balls, lights={"studio": studio(LAMPS, sky=(0.75, 0.77, 0.8), floor=(0.3, 0.29, 0.28))})
 
@@ -149,7 +149,7 @@ def _table(rng: np.random.Generator) -> Iterator[Part]:
     belly = [(0, 0), (0.11, 0), (0.19, 0.08), (0.21, 0.17), (0.17, 0.27), (0.1, 0.32), (0.1, 0.34), (0.06, 0.36), (0.02, 0.385),
              (0.03, 0.41), (0, 0.43)]  # fmt: skip
     place = np.array([0.16, y, top])
-    yield Part(lathe(belly, 96).moved(place), metal("Au", 0.12))
+    yield Part(lathe(belly, 96).moved(place), metal("Au", 0.18))
     t = np.linspace(-1, 1, 40)[:, None]
     handle = np.column_stack([0.2 + 0.13 * np.cos(0.5 * np.pi * t[:, 0]), 0 * t[:, 0], 0.19 + 0.11 * t[:, 0]])
     spout = np.column_stack([-0.19 - 0.16 * (0.5 + 0.5 * t[:, 0]), 0 * t[:, 0], 0.13 + 0.19 * (0.5 + 0.5 * t[:, 0]) ** 2])
@@ -168,7 +168,7 @@ def _trellis(rng: np.random.Generator) -> Iterator[Part]:
     lo, hi = np.array([-1.15, -0.62]), np.array([-0.3, 0.78])
     slats = []
     for slope, y in ((1.0, TRELLIS), (-1.0, TRELLIS + 0.012)):
-        for offset in np.arange(-3.0, 3.0, 0.19):
+        for offset in np.arange(-3.0, 3.0, 0.25):
             x = np.array([lo[0], hi[0]])
             z = slope * (x - x.mean()) + offset
             if slope < 0:
