@@ -63,14 +63,25 @@ def test_a_wall_moves_by_its_homography(scene: Scene) -> None:
     torch.testing.assert_close(inner, torch.tensor([0.0, 0.0, -1.0]).expand_as(inner), atol=1e-2, rtol=0)
 
 
-def test_the_nearer_surface_wins(scene: Scene) -> None:
-    """A near photograph of a far wall and a far one of a near wall: the near wall hides the other."""
-    far, near = wall(facing(0.02), 4.0, torch.zeros(3)), wall(facing(-0.1), 2.0, torch.tensor([1.0, 0, 0]))
-    field = DepthMapField([far, near], [far.depth, near.depth])
-    _, _, depth, _ = shown(field, facing(), scene, views=2)
-    assert float(depth[5:35, 5:35].max()) < 3.0
-    _, _, depth, _ = shown(field, facing(), scene, views=1)  # the nearest camera's alone
-    assert float(depth[5:35, 5:35].min()) > 3.5
+def test_the_nearer_surface_wins_and_the_next_view_fills_gaps(scene: Scene) -> None:
+    """The left half of a view is a near wall, which moves by 8 px where the far one moves by 4: it hides that, or a gap opens."""
+    far, near, source = wall(facing(), 4.0, torch.ones(3)), wall(facing(), 2.0, torch.zeros(3)), facing()
+    depth = torch.where(torch.arange(40) < 20, near.depth, far.depth)
+    image = torch.where((torch.arange(40) < 20)[:, None], near.image, far.image)
+    cut = View(source, image, "cut", depth=depth)
+    left = facing(-0.4)  # from where things move to the right: 8 px at distance 2, 4 px at distance 4
+    _, alpha, found, _ = shown(DepthMapField([cut], [depth]), left, scene, views=1)
+    assert float(found[5:35, 9:27].max()) < 2.6
+    assert float(found[5:35, 29:].min()) > 3.9
+    assert not bool(alpha[:, :3].any())
+    right = facing(0.4)  # from where the near wall uncovers 4 px of the far one
+    _, alpha, _, _ = shown(DepthMapField([cut], [depth]), right, scene, views=1)
+    assert not bool(alpha[:, 13:15].any())
+    both = DepthMapField([cut, wall(facing(0.9), 4.0, torch.ones(3))], [depth, far.depth])
+    rgb, alpha, found, _ = shown(both, right, scene, views=2)
+    assert bool(alpha[:, 13:15].all())
+    truth = wall(right, 4.0, torch.ones(3)).image
+    torch.testing.assert_close(rgb[:, 13:15], truth[:, 13:15], atol=2e-3, rtol=0)
 
 
 def test_depth_of_a_field_is_the_rendered_one(scene: Scene) -> None:
