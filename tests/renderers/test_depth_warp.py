@@ -64,7 +64,7 @@ def test_a_wall_moves_by_its_homography(scene: Scene) -> None:
 
 
 def test_the_nearer_surface_wins_and_the_next_view_fills_gaps(scene: Scene) -> None:
-    """The left half of a view is a near wall, which moves by 8 px where the far one moves by 4: it hides that, or a gap opens."""
+    """The left half of a view is a near wall, which moves by 8 px where the far one moves by 4: over it, or off a gap."""
     far, near, source = wall(facing(), 4.0, torch.ones(3)), wall(facing(), 2.0, torch.zeros(3)), facing()
     depth = torch.where(torch.arange(40) < 20, near.depth, far.depth)
     image = torch.where((torch.arange(40) < 20)[:, None], near.image, far.image)

@@ -6,6 +6,7 @@ from invgraphics.lazy import submodules
 
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
+    "features": "invgraphics.fields.features:FeatureFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
     "planes": "invgraphics.fields.planes:PlanesConfig",
     "depth_maps": "invgraphics.fields.depth_maps:DepthMapsConfig",

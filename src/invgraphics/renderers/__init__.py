@@ -14,6 +14,8 @@ RENDERERS = {
     "planes": "invgraphics.renderers.planes:PlanesConfig",
     "depth_warp": "invgraphics.renderers.depth_warp:DepthWarpConfig",
     "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
+    "srn": "invgraphics.renderers.srn:SRNConfig",
+    "ray_attention": "invgraphics.renderers.ray_attention:RayAttentionConfig",
 }
 
 SAMPLERS = {
