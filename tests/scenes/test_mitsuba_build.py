@@ -78,7 +78,7 @@ def test_models_are_sound(name):
 
 
 def test_a_scene_depends_on_its_own_builder_only():
-    """The room has leaves of the fence; nothing else shares a builder, so that a new scene leaves the others' pictures alone."""
+    """The room has leaves of the fence; else builders are apart: a new scene leaves the others' pictures alone."""
     folder = Path(job.__file__).parent / "build"
     sources = {name: {path.stem for path in job._builder_sources(folder, name)} for name in ("room", "bricks", "unknown")}
     assert sources["room"] >= {"room", "fence", "mesh", "model", "noise", "surfaces"}

@@ -141,6 +141,24 @@ def depth_span(scene: Scene, reference: Camera) -> tuple[float, float]:
     return max(least, float(z.min())), float(z.max())
 
 
+class FixedPlanes(Field):
+    """Field of constant planes, for rendering without fitting."""
+
+    provides = Quantity.PLANES
+
+    def __init__(self, planes: Planes) -> None:
+        super().__init__()
+        self._planes = planes
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        """Refuse pointwise queries: this field has planes only."""
+        raise NotComposableError(f"FixedPlanes has no {want.words()} at points.", "It provides planes.")
+
+    def primitives(self, want: Quantity, ctx: Context) -> Planes:
+        """The planes."""
+        return self._planes if want == Quantity.PLANES else super().primitives(want, ctx)
+
+
 class PlaneField(Field):
     """p planes of w x h texels. Parameters are stored before activation (a sigmoid); `primitives` activates them.
 
