@@ -16,6 +16,7 @@ from invgraphics.core.model import Model as Model
 from invgraphics.core.ngp import FusedNGP as FusedNGP
 from invgraphics.core.ngp import FusedSDF as FusedSDF
 from invgraphics.core.ngp import HashGrid as HashGrid
+from invgraphics.core.planes import Planes as Planes
 from invgraphics.core.rays import Rays as Rays
 from invgraphics.core.renderer import RayRenderer as RayRenderer
 from invgraphics.core.renderer import Renderer as Renderer

@@ -10,6 +10,8 @@ FIELDS = {
     "features": "invgraphics.fields.features:FeatureFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
     "mesh": "invgraphics.fields.mesh:MeshFieldConfig",
+    "planes": "invgraphics.fields.planes:PlanesConfig",
+    "depth_maps": "invgraphics.fields.depth_maps:DepthMapsConfig",
 }
 
 if not TYPE_CHECKING:

@@ -22,6 +22,8 @@ from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_fil
 
 RESOLUTION, RESOLUTIONS = 192, (8, 512)
 """Voxels along a mesh's longest edge: usual, fewest and most (for which fused pictures take 6 GB of memory)."""
+PLANES = 2, 512
+"""Fewest and most planes of a multi-plane image."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class ExportRequest:
         resolution: voxels along the longest edge that a mesh is made from.
         sh_degree: degree of the spherical harmonics that are written, zeros where the run has fewer bands; ``None`` for what
             readers of the format expect: 3 for PLY, elsewhere the run's own.
+        planes: number of planes that a density is sliced into.
+        view: training view whose camera is the reference of a multi-plane image; ``None`` for the mean of all.
     """
 
     run: Path
@@ -49,8 +53,12 @@ class ExportRequest:
     level: float | None = None
     resolution: int = RESOLUTION
     sh_degree: int | None = None
+    planes: int = 32
+    view: str | None = None
 
     def __post_init__(self) -> None:
+        if not PLANES[0] <= self.planes <= PLANES[1]:
+            raise InputError(f"--planes cannot be {self.planes}.", f"Expected {PLANES[0]} to {PLANES[1]}.")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= harmonics.MAX_DEGREE:
             raise InputError(f"--sh-degree cannot be {self.sh_degree}.", f"Expected 0 to {harmonics.MAX_DEGREE}.")
         low, high = RESOLUTIONS
