@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.figures.style import INK, MUTED, Figure, canvas, save, series_style
 from invgraphics.report.statistics.effects import Effect
-from invgraphics.report.statistics.summary import value_of
+from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity
 from invgraphics.text import file_name
 
