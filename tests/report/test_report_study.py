@@ -51,7 +51,7 @@ def test_effects_are_what_scipy_and_statsmodels_find_in_the_exported_table(built
     page = (built_study / "index.html").read_text()
     rows = re.findall(
         rf'data-factor="([^"]+)" data-before="([^"]+)" data-after="([^"]+)" data-metric="{metric}">.*?data-value="([^"]+)"'
-        r'.*?data-low="([^"]+)" data-high="([^"]+)">.*?</td><td>([^<]+)</td>',
+        r'.*?data-low="([^"]+)" data-high="([^"]+)">.*?</td><td>[^<]*</td><td>([^<]+)</td>',
         page,
     )
     assert [row[:3] for row in rows] == [(VIEWS, "40", "20"), (LEVELS, "8", "12"), (LEVELS, "8", "16"), (LEVELS, "12", "16")]
@@ -63,7 +63,7 @@ def test_effects_are_what_scipy_and_statsmodels_find_in_the_exported_table(built
         interval = expected.confidence_interval()
         assert float(mean) == pytest.approx((one.mean() + other.mean()) / 2, rel=1e-9)
         assert (float(low), float(high)) == pytest.approx((interval.low / 2, interval.high / 2), rel=1e-9)
-        p_values.append(expected.pvalue)
+        p_values.append(stats.ttest_1samp([one.mean(), other.mean()], 0).pvalue)  # scenes are the units of a verdict
     corrected = multipletests(p_values, method="holm")[1]
     assert [float(row[6]) for row in rows] == pytest.approx(corrected, rel=0.06)  # two digits on the page
 
@@ -100,13 +100,15 @@ def test_page_says_what_was_asked_found_and_lost(built_study: Path) -> None:
     for words in (
         "What do training views and hash levels do?",
         "full factorial",
-        "data.train_views 20 instead of 40 costs",
+        "data.train_views 20 instead of 40: no verdict, −",
+        "1 of 40 (1 fit); what is left flatters 40",
         "field.encoding.levels 16 instead of 8 gains",
         "1 of 36 cells failed",
         "1 of 36 cells has not run yet",
         "The loss is not finite at step 7.",
         "34 done, 1 failed, 1 missing",
-        "The unit is the seed: intervals hold for new fits on these scenes",
+        "for new fits on these scenes, each counted equally (the unit is the seed)",
+        "for other scenes like these (the unit is the scene)",
         "2 seeds, not ranked",
         "How to read this",
         "Time to quality",
@@ -119,9 +121,9 @@ def test_page_says_what_was_asked_found_and_lost(built_study: Path) -> None:
     assert all(sentence in page for sentence in sentences)
     markdown = (built_study / "index.md").read_text()
     assert "## Failures" in markdown and "The loss is not finite" in markdown
-    assert "| data.train\\_views | 20 − 40 | **−" in markdown
+    assert "| data.train\\_views | 20 − 40 | −" in markdown
     latex = (built_study / "effects.tex").read_text()
-    assert latex.count(r"\textbf{") == 4
+    assert latex.count(r"\textbf{") == 0  # two scenes are too few for any of the four
     assert latex.count("{") == latex.count("}")
     assert (built_study / "table-balls.tex").is_file() and (built_study / "table-moons.tex").is_file()
     for path in (built_study / "figures").rglob("*.svg"):
@@ -134,7 +136,6 @@ def test_a_variant_that_lacks_a_hard_seed_is_never_called_best(built_study: Path
     short, full = rows["train_views 40, levels 12"], rows["train_views 40, levels 16"]
     assert not short.complete and full.complete
     assert not any(cell.best for cell in short.cells)
-    assert full.cells[0].best
     assert (short.cells[0].mean or 0) > (full.cells[0].mean or 0)  # by luck of the draw, which the mark must not follow
 
 
@@ -180,7 +181,9 @@ def test_null_study_says_no_effect_and_a_planted_one_is_found(tmp_path: Path) ->
     sentences = study_sentences(bare_study(tmp_path, {"data.train_views": [40, 20], "field.seed_name": ["a", "b"]}, psnr_of))
     assert "costs 2." in sentences[0] or "costs 1." in sentences[0]
     assert re.fullmatch(
-        r"field\.seed_name b instead of a: no effect detectable above \d\.\d\d dB, 3 seeds × 2 scenes\.", sentences[1]
+        r"field\.seed_name b instead of a: undecided, .* for new fits on these 2 scenes, .* would be found with 80% power "
+        r"after correction for 2 comparisons\.",
+        sentences[1],
     )
 
 
@@ -196,9 +199,10 @@ def test_methods_are_a_factor_and_factors_of_one_method_stay_its_own(tmp_path: P
     (folder / "study.json").write_text(json.dumps(table | {"cells": own}))
     study = read_study(folder)
     assert study.variants == (METHODS[0], f"{METHODS[1]}, levels 8", f"{METHODS[1]}, levels 16")
+    unknown = "no spread is known, so nothing is tested"
     assert study_sentences(folder) == [
-        f"{METHODS[1]} instead of {METHODS[0]} gains 1.00 dB [1.00, 1.00], 3 seeds × 2 scenes.",
-        f"{factor} 16 instead of 8 gains 1.00 dB [1.00, 1.00], 3 seeds × 2 scenes.",
+        f"{METHODS[1]} instead of {METHODS[0]} gains 1.00 dB by the same amount each time, 3 seeds × 2 scenes: {unknown}.",
+        f"{factor} 16 instead of 8 gains 1.00 dB by the same amount each time, 3 seeds × 2 scenes: {unknown}.",
     ]
 
 

@@ -79,7 +79,7 @@ def study_sentences(folder: Path) -> list[str]:
     study = read_study(folder)
     if study.report == "verdicts":
         return headline(judge(study.cells, study.known))
-    quantities = _quantities(scene_comparisons(study))
+    quantities = _quantities(study, scene_comparisons(study))
     return [effect.sentence for effect in headline_effects(study, quantities[0])] if quantities else []
 
 
@@ -105,7 +105,7 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
         for key, comparison in zip(keys, shown, strict=True)
     )
     observations = study.observations()
-    quantities = [replace(one, margin=study.margins.get(one.key, one.margin)) for one in _quantities(comparisons)]
+    quantities = _quantities(study, comparisons)
     contrasts = draw_contrasts(quantities, study_contrasts(study), observations, study.lost(), folder)
     clean = folder.redactor.text if folder.redactor is not None else str
     crossed = cross_effects(observations, study.approximations, clean)
@@ -114,11 +114,12 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
     return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None, analyses, crossed)
 
 
-def _quantities(comparisons: Sequence[Comparison]) -> list[Quantity]:
-    """Union of the columns of all scenes' tables, quality first; empty without a quality metric."""
+def _quantities(study: Study, comparisons: Sequence[Comparison]) -> list[Quantity]:
+    """Union of the columns of all scenes' tables, quality first, with the study's margins; empty without a quality metric."""
     columns = [column for comparison in comparisons for column in table_columns(comparison)]
     found = {column.key: column for column in reversed(columns)}
-    unique = [found[key] for key in dict.fromkeys(column.key for column in columns)]
+    keys = dict.fromkeys(column.key for column in columns)
+    unique = [replace(found[key], margin=study.margins.get(key, found[key].margin)) for key in keys]
     quality = [column for column in unique if column.group != "cost"]
     return [*quality, *(column for column in unique if column.group == "cost")] if quality else []
 

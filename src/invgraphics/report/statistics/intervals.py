@@ -217,4 +217,5 @@ def _detectable_errors(freedom: float, level: float, power: float) -> float:
         below = nctdtr(freedom, np.minimum(shift, 1e3), critical)
         return float(np.nan_to_num(below, nan=0.0).mean()) - (1 - power)
 
-    return math.exp(float(brentq(missed, math.log(critical) - 3, math.log(critical) + 6, xtol=1e-3)))
+    root = brentq(missed, math.log(critical) - 3, math.log(critical) + 6, xtol=1e-3)
+    return math.exp(root)  # pyright: ignore[reportArgumentType]  # a tuple only with full_output

@@ -148,8 +148,8 @@ def _interaction(contrast: Contrast, quantity: Quantity, here: Sequence[Observat
     sides = []
     for level in (high, low):
         kept = [one for one in here if one.levels.get(factor) == level]
-        tables = (_table(contrast.factor, side, kept, drop=factor) for side in (contrast.before, contrast.after))
-        sides.append(_by_seed(*tables, quantity))
+        before, after = (_table(contrast.factor, side, kept, drop=factor) for side in (contrast.before, contrast.after))
+        sides.append(_by_seed(before, after, quantity))
     if not all(sides):
         return []
     if factor == METHOD:

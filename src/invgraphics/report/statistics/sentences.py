@@ -26,7 +26,7 @@ def _verdict(effect: Effect) -> str:
     basis = f"{value.size}{_scene_counts(effect)}"
     if effect.found:
         return f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}."
-    if effect.flattered and effect.estimate.scenes == 1:
+    if effect.flattered:
         return f"{effect.label}: no verdict, {_signed(effect)}, {basis}."
     if _contradict(effect):
         mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
@@ -82,13 +82,20 @@ def _scene_counts(effect: Effect) -> str:
     if not effect.by_scene:
         return ""
     total = len(effect.by_scene)
+    if all(one.verdict == "undecided" for one in effect.by_scene.values()):
+        return "; no scene decides it alone"
     if all(one.verdict == "untested" for one in effect.by_scene.values()):
         higher = sum(one.estimate.mean > 0 for one in effect.by_scene.values())
         return f"; {_direction(effect, 'higher')} on {higher} of {total} scenes in one fit each"
     lead: Verdict = "higher" if len(effect.scenes("higher")) >= len(effect.scenes("lower")) else "lower"
     rest: Verdict = "lower" if lead == "higher" else "higher"
     parts = [f"{_direction(effect, lead)} on {len(effect.scenes(lead))} of {total} scenes"]
-    for verdict, word in ((rest, _direction(effect, rest)), ("undecided", "undecided"), ("untested", "not tested")):
+    others: list[tuple[Verdict, str]] = [
+        (rest, _direction(effect, rest)),
+        ("undecided", "undecided"),
+        ("untested", "not tested"),
+    ]
+    for verdict, word in others:
         scenes = effect.scenes(verdict)
         if scenes and len(scenes) < total:
             parts.append(f"{word} on {listing(scenes)}")
@@ -107,8 +114,6 @@ def _contradict(effect: Effect) -> bool:
 
 def _reserve(effect: Effect) -> str:
     """Why an effect that single scenes show is no finding about scenes."""
-    if effect.flattered:
-        return "no gain is claimed"
     if effect.across is not None and effect.across.scenes < FEW_SCENES:
         return f"{effect.across.scenes} scenes are too few to tell about others"
     return "the scenes differ too much to tell about others"
