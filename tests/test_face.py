@@ -256,6 +256,14 @@ def test_a_finished_run_shows_new_views_through_other_renderers() -> None:
         run.through("volumetric/nerf")
 
 
+def test_a_run_through_its_own_renderer_keeps_what_that_learnt_and_through_another_takes_a_constant() -> None:
+    method = ig.load_method("hybrid/neus", set={"field.width": 16, "field.layers": 1, "batches.rays": 16})
+    run = ig.fit(method, ig.load_scene("toy.npz"), "2steps")
+    width = run.model.renderer.width
+    assert run.through("hybrid/neus").renderer.width == width != run.through("hybrid/neus:sharpness_final=70").renderer.width
+    assert torch.isclose(run.through("hybrid/volsdf:change=held:beta=0.03").renderer.width, torch.tensor(0.03 - 1e-4))
+
+
 def test_objects_show_themselves() -> None:
     scene = ig.load_scene("toy.npz")
     fit = ig.fit(SPLATS, scene, "5steps")

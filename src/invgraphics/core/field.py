@@ -95,6 +95,11 @@ class Field(nn.Module, ABC):
         """Detached parameters of the signed distance over ``bounds`` for fused sphere tracing, where a kernel supports it."""
         return None
 
+    @property
+    def feature_width(self) -> int | None:
+        """Number of features that `query` returns; ``None`` for fields without any."""
+        return None
+
     def primitives(self, want: Quantity, ctx: Context) -> Any:
         """The explicit primitives of this field: `Gaussians` for ``Quantity.GAUSSIANS``, and so on.
 

@@ -135,7 +135,9 @@ class FittedRun(ABC):
         return ScoreTable(score_model(self.model, self.scene, protocol, self.method.name, self.poses))
 
     def through(self, renderer: str) -> Model:
-        """Model of the fitted field with the renderer of another method.
+        """Model of the fitted field with the renderer of another method; with its own, as it was fitted.
+
+        Another renderer has constants in place of learnt state: an occupancy grid is full, a width the one at a fit's end.
 
         Args:
             renderer: a method's name; settings of its renderer may follow, ``gaussian-volume/exact:steps=8``.
@@ -145,8 +147,9 @@ class FittedRun(ABC):
         """
         variant = variant_named(renderer)
         check_variants([variant], [self.method], self.scene)
-        other = with_renderer(self.method, variant).recipe.renderer.build(self.scene)
-        other = other if variant.table == self.method.table["renderer"] else other.untrained()
+        if variant.table == self.method.table["renderer"]:
+            return self.model
+        other = with_renderer(self.method, variant).recipe.renderer.build(self.scene).untrained()
         return replace(self.model, renderer=other.to(self.model.device))
 
     def __repr__(self) -> str:

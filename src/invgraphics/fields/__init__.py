@@ -6,6 +6,7 @@ from invgraphics.lazy import submodules
 
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
+    "features": "invgraphics.fields.features:FeatureFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
 }
 

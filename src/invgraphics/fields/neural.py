@@ -107,6 +107,7 @@ class NeuralField(Field):
         without = Quantity.NONE if self.appearance is None else Quantity.FEATURES
         self.provides = _POINTWISE[config.geometry] & ~without
         self._needs_geometry_for_colour = handed > 0 or self.appearance is None
+        self._features_handed_on = handed
         if config.geometry == "sdf":
             self.geometry_net.initialise_as_sphere(INITIAL_RADIUS * float(bounds.half.min()) / self._half)
 
@@ -114,6 +115,11 @@ class NeuralField(Field):
     def bounds(self) -> Bounds:
         """The region this field describes."""
         return Bounds(self.lo, self.hi, self._space, self._near)
+
+    @property
+    @override
+    def feature_width(self) -> int | None:
+        return self._features_handed_on if Quantity.FEATURES in self.provides else None
 
     def lattice_encodings(self) -> dict[Role, LatticeEncoding]:
         """Its encodings that are lattices, by role; one that colour shares is geometry's."""

@@ -12,6 +12,8 @@ RENDERERS = {
     "gaussian_exact": "invgraphics.renderers.gaussian_volume:GaussianExactConfig",
     "sphere_tracing": "invgraphics.renderers.sphere_tracing:SphereTracingConfig",
     "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
+    "srn": "invgraphics.renderers.srn:SRNConfig",
+    "ray_attention": "invgraphics.renderers.ray_attention:RayAttentionConfig",
 }
 
 SAMPLERS = {

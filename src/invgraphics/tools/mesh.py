@@ -26,13 +26,15 @@ POINTS = 200_000
 def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
     """Write the model's surface as a triangle mesh with vertex colours, in world coordinates.
 
-    A field of densities is cut at a level by marching cubes; of anything else, depth pictures are fused.
+    A field of densities or distances is cut at a level by marching cubes, unless it is seen as Gaussians; of anything else,
+    depth pictures are fused.
 
     Raises:
         InputError: the model shows no surface, or the file cannot be written.
     """
     scene = fitted.scene
-    if Quantity.SDF in fitted.model.field.provides or Quantity.DENSITY in fitted.model.field.provides:
+    cut = Quantity.SDF | Quantity.DENSITY
+    if fitted.model.field.provides & cut and Quantity.GAUSSIANS not in fitted.model.renderer.requires:
         surface, how = _marching_cubes(fitted, request)
     else:
         surface, how = _fuse_depth(fitted, request)

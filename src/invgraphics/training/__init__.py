@@ -21,6 +21,7 @@ PENALTIES = {
     "total_variation": "invgraphics.training.penalties:TotalVariationPenalty",
     "l1": "invgraphics.training.penalties:L1Penalty",
     "sparsity": "invgraphics.training.penalties:SparsityPenalty",
+    "curvature": "invgraphics.training.eikonal:CurvaturePenalty",
     "eikonal": "invgraphics.training.eikonal:EikonalPenalty",
 }
 
