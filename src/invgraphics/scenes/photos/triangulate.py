@@ -6,6 +6,7 @@ views know nothing of those that were left out.
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,15 +16,40 @@ import numpy as np
 import torch
 from PIL import Image
 
+from invgraphics.arrays import read_arrays
 from invgraphics.core import Points, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
-from invgraphics.files import write_text
+from invgraphics.errors import InputError
+from invgraphics.files import write_arrays, write_text
+from invgraphics.scenes.mitsuba import cache
 
 NEIGHBOURS = 20
 """A photograph is matched with as many of its nearest, by position and direction of the camera."""
 LONGEST_TRACK_ERROR = 2.0
 """Largest reprojection error of a point, px."""
+SCHEMA = 1
+"""Rises where the same photographs give other points."""
 DATABASE, PHOTOS, PAIRS = "features.db", "photos", "pairs.txt"
+
+
+def triangulated(scene: Scene) -> Points:
+    """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else."""
+    sha = hashlib.sha256(f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour}".encode())
+    for view in scene.train:
+        for values in (view.camera.cam_to_world, view.camera.focal, view.camera.centre):
+            sha.update(values.detach().cpu().double().numpy().tobytes())
+    try:
+        folder = cache.root().parent / "points"
+        folder.mkdir(exist_ok=True)
+        path = folder / f"{sha.hexdigest()[:32]}.npz"
+        if path.is_file():
+            arrays = read_arrays(path)
+            return Points(torch.from_numpy(arrays["position"]), torch.from_numpy(arrays["rgb"]))
+    except (InputError, OSError, KeyError):  # no cache, or what is in it is damaged
+        return triangulate(scene)
+    points = triangulate(scene)
+    write_arrays(path, {"position": points.position.numpy(), "rgb": points.rgb.numpy()})
+    return points
 
 
 def triangulate(scene: Scene, seed: int = 0) -> Points:
@@ -37,6 +63,8 @@ def triangulate(scene: Scene, seed: int = 0) -> Points:
         Points in the local frame with display sRGB colours, the mean over the photographs that see them; empty where nothing
         is matched.
     """
+    if len(scene.train) < 2:
+        return Points(torch.zeros(0, 3), torch.zeros(0, 3))
     from invgraphics.scenes.colmap_library import pycolmap
 
     with tempfile.TemporaryDirectory() as name:
