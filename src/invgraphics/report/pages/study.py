@@ -122,6 +122,7 @@ def study_facts(study: Study) -> facts.Facts:
         "budget per fit": budget_words(study.budget),
         **facts.preset_facts([replace(cell.run, method=cell.method) for cell in study.cells if cell.run], study.preset),
         "picture size": study.size,
+        "points to start from": facts.start_fact([cell.run for cell in study.cells if cell.run]),
     }
     return tuple((name, value) for name, value in entries.items() if value)
 

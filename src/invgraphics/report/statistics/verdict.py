@@ -14,6 +14,10 @@ from invgraphics.report.statistics.summary import Row, Summary
 from invgraphics.report.wording import Quantity, budget_words, listing, times
 
 
+EXACT_POINTS = "exact surface points"
+"""How the notes of a rendered scene call points that were taken from its truth."""
+
+
 def verdict(comparison: Comparison, summary: Summary) -> list[str]:
     """Sentences on ranking, significance, costs and warnings, in order of importance."""
     sentences = [*_quality(comparison, summary), *_costs(summary), *_warnings(comparison, summary)]
@@ -127,8 +131,21 @@ def _costs(summary: Summary) -> list[str]:
     return [f"{text}."] if text else []
 
 
+def _unequal_start(comparison: Comparison) -> list[str]:
+    """A warning where methods with primitives may start from points that no method could have found."""
+    told = [run for run in comparison.runs if EXACT_POINTS in str(run.provenance.notes.get("points", ""))]
+    explicit = {run.method for run in told if run.scores.cost.get("primitives")}
+    if not explicit or explicit == {run.method for run in comparison.runs}:
+        return []
+    names = listing(name for name in comparison.methods if name in explicit)
+    return [
+        f"The start is not equal: {names} may begin on exact surface points of the scene, which no method could find and others "
+        "do not use; `--set data.init=sfm` or `data.init=random` makes it equal."
+    ]
+
+
 def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
-    sentences = []
+    sentences = _unequal_start(comparison)
     columns = [column for column in summary.columns if column.group != "cost"]
     reference = _best_baseline(summary, columns[0]) if columns else None
     if reference is not None:
