@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.scores import Score
+from invgraphics.scenes.truth import POINTS
 
 PSNR = quality_quantity("psnr", Score(mean=0.0, unit="dB", higher_is_better=True))
 A, B = "volumetric/nerf", "splatting/gaussians"
@@ -281,6 +283,20 @@ def test_a_method_with_a_diverged_fit_is_not_ranked() -> None:
     summary = summarise(Comparison(**{**comparison.__dict__, "runs": (*comparison.runs[:-1], spoilt)}))
     row = next(row for row in summary.rows if row.label == "m/2")
     assert not row.ranked_in(summary.columns[0]) and not row.cells[0].best and row.ranked_in(summary.columns[1])
+
+
+def test_an_unequal_start_is_told() -> None:
+    """Exact points help only a method that has primitives; a start on what all could have is not spoken of."""
+    quality = {"psnr": Score(mean=25.0, unit="dB", higher_is_better=True)}
+    runs = [made_up_run(quality, name, 0, cost={"primitives": 10.0 if name == B else None}) for name in (A, B)]
+
+    def told(points: str) -> str:
+        noted = [replace(run, provenance=replace(run.provenance, notes={"points": points})) for run in runs]
+        comparison = Comparison(scene="s", question="?", methods=(A, B), runs=tuple(noted), environment=Environment())
+        return " ".join(verdict(comparison, summarise(comparison)))
+
+    assert f"The start is not equal: {B} may begin on exact surface points" in told(POINTS)
+    assert "not equal" not in told("213 from SfM on the training photographs as they are here")
 
 
 def test_contrast_of_renderers_has_a_name() -> None:

@@ -13,7 +13,6 @@ from invgraphics.report.statistics.sentences import detectable_words
 from invgraphics.report.statistics.summary import Row, Summary
 from invgraphics.report.wording import Quantity, budget_words, listing, times
 
-
 EXACT_POINTS = "exact surface points"
 """How the notes of a rendered scene call points that were taken from its truth."""
 
@@ -139,8 +138,8 @@ def _unequal_start(comparison: Comparison) -> list[str]:
         return []
     names = listing(name for name in comparison.methods if name in explicit)
     return [
-        f"The start is not equal: {names} may begin on exact surface points of the scene, which no method could find and others "
-        "do not use; `--set data.init=sfm` or `data.init=random` makes it equal."
+        f"The start is not equal: {names} may begin on exact surface points of the scene, which no method could find and "
+        "others do not use; `--set data.init=sfm` or `data.init=random` makes it equal."
     ]
 
 
