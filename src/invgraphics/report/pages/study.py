@@ -10,6 +10,7 @@ from invgraphics.files import write_text
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.factors import METHOD, StudyCell
 from invgraphics.report.data.studies import Study
+from invgraphics.report.data.variants import base_words
 from invgraphics.report.figures.analyses import AnalysisPart
 from invgraphics.report.figures.style import Figure
 from invgraphics.report.pages import facts
@@ -117,6 +118,7 @@ def study_facts(study: Study) -> facts.Facts:
     entries = {
         "scenes": listing(study.scenes),
         "methods": listing(study.methods),
+        "base, from which variants are named by what differs": base_words(study.factors),
         "seeds": ", ".join(map(str, study.seeds)),
         "cells": _counted(study),
         "budget per fit": budget_words(study.budget),

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
+from invgraphics.report.data.variants import level_words
 from invgraphics.report.statistics.values import clipped, diverged, value_of
 from invgraphics.report.wording import Quantity
 from invgraphics.runs.run import Run
@@ -59,7 +60,9 @@ class Contrast:
 
 
 def contrast_words(factor: str, before: str, after: str) -> str:
-    """Contrast of two levels in words: ``data.train_views 20 instead of 40``."""
+    """Contrast of two levels in words: ``data.train_views 20 instead of 40``; of a switch ``no clone``."""
+    if {before, after} == {"true", "false"}:
+        return level_words(factor, after)
     return f"{after} instead of {before}" if factor == METHOD else f"{factor} {after} instead of {before}"
 
 
