@@ -1,5 +1,8 @@
 """Degraded training data for studies: fewer, smaller, noisier or differently exposed photographs, poses with errors.
 
+Points to start from belong to the training data: `TrainingData.init` says which. Points that came with a scene know all of its
+photographs as they were, so that they are made again, by structure from motion, where photographs are left out or changed.
+
 Test views are never changed. Every degradation is drawn per view from the run's seed, by a generator of its own, and grows
 in proportion to its setting: two levels of one study share their random numbers, and leaving views out changes none that stay.
 """
@@ -9,6 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -21,6 +25,9 @@ from invgraphics.scenes.scales import check_scales, like, resized_view, scene_at
 
 COLOURS = {"black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "white": (1.0, 1.0, 1.0)}
 """Backgrounds that have a name."""
+
+FEWEST_POINTS = 16
+"""Fewer SfM points than this are no start."""
 
 KEEP = "random"
 """The background of a scene as loaded: its photographs keep their alpha, and each step draws a colour."""
@@ -44,6 +51,9 @@ class TrainingData:
             Rendered scenes are rendered at each size, photographs averaged (`invgraphics.scenes.scales`).
         test_scales: divisors at which the test views are scored besides their own size; the scores are ``psnr_at_1_2`` and so
             on. They degrade nothing.
+        init: points that a field may start from: ``scene``, those that came with it (of a rendered scene: exact ones, which no
+            method could have; of photographs: those of structure from motion); ``sfm``, triangulated from the training
+            photographs at their poses, which every method could have; ``random``, none.
     """
 
     train_views: int | None = None
@@ -54,6 +64,12 @@ class TrainingData:
     background: str | tuple[float, float, float] = KEEP
     scales: tuple[int, ...] = (1,)
     test_scales: tuple[int, ...] = ()
+    init: Literal["scene", "sfm", "random"] = "scene"
+
+    @property
+    def changes_photographs(self) -> bool:
+        """Whether photographs or poses are left out or changed, so that points made from all of them know too much."""
+        return self.train_views is not None or self.size is not None or any((self.pose_noise, self.photo_noise, self.exposure))
 
     def __post_init__(self) -> None:
         for name in ("train_views", "size"):
@@ -123,7 +139,22 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
         colour = torch.tensor(COLOURS[data.background] if isinstance(data.background, str) else data.background)
         train = [replace(view, image=like(view.over(colour), view), alpha=None) for view in train]
         scene = replace(scene, background=colour)
-    return replace(scene, train=tuple(train), notes=notes)
+    return _with_points(replace(scene, train=tuple(train), notes=notes), data)
+
+
+def _with_points(scene: Scene, data: TrainingData) -> Scene:
+    """Replace a degraded scene's points by what its photographs tell of them, and note which they are."""
+    if data.init == "random":
+        return replace(scene, points=None, notes=scene.notes | {"points": "none: a random start"})
+    if data.init == "scene" and (scene.points is None or not data.changes_photographs):
+        return scene
+    from invgraphics.scenes.photos.triangulate import triangulated
+
+    points = triangulated(scene)
+    what = f"{len(points):,} from SfM on the training photographs as they are here"
+    if len(points) < FEWEST_POINTS:
+        return replace(scene, points=None, notes=scene.notes | {"points": f"{what}, too few: a random start"})
+    return replace(scene, points=points, notes=scene.notes | {"points": what})
 
 
 def chosen_views(scene: Scene, count: int | None) -> list[int]:
