@@ -16,9 +16,9 @@ from invgraphics.core import Camera, Context, Contributions, Field, Quantity, Ra
 from invgraphics.core.contributions import opacities
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, Opacity
 from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.gaussian_profile import density_profile, transmittance
-from invgraphics.renderers.gaussian_quadrature import Weights, integrate_overlapping, phi
-from invgraphics.renderers.gaussian_rays import (
+from invgraphics.renderers.gaussians.profile import density_profile, transmittance
+from invgraphics.renderers.gaussians.quadrature import Weights, integrate_overlapping, phi
+from invgraphics.renderers.gaussians.rays import (
     MAX_DEVIATIONS,
     Intersections,
     Primitives,
