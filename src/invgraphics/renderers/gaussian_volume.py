@@ -32,6 +32,9 @@ from invgraphics.renderers.gaussian_rays import (
 TILE = 16
 """Edge in pixels of the square whose rays are searched for Gaussians together."""
 
+MAX_STEPS = 1024
+"""Intervals of a ray, each of which is kept for each Gaussian on it; the error falls with their square."""
+
 
 @dataclass(frozen=True)
 class GaussianExactConfig:
@@ -53,8 +56,8 @@ class GaussianExactConfig:
     smallest: float = ALPHA_MIN / 4
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"steps must be at least 1, not {self.steps}.")
+        if not 1 <= self.steps <= MAX_STEPS:
+            raise ValueError(f"steps must be from 1 to {MAX_STEPS}, not {self.steps}.")
         _check_smallest(self.smallest)
 
     def build(self, scene: Scene) -> GaussianExact:
