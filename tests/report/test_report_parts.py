@@ -21,7 +21,8 @@ from PIL import Image
 from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.figures import views as pictures
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
-from invgraphics.report.statistics.summary import pareto_front
+from invgraphics.report.figures.tradeoffs import draw_tradeoffs
+from invgraphics.report.statistics.summary import pareto_front, summarise
 from invgraphics.report.statistics.time_to_quality import seconds_to_reach, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import budget_words, listing, significant_decimals, times
@@ -130,13 +131,22 @@ def test_report_is_the_same_when_built_again(built_report: Path, comparison_fold
 
 
 @pytest.mark.parametrize("cost", [1e-300, 1e-30, 1e30, math.inf])
-def test_costs_that_no_axis_holds_are_not_drawn(comparison_folder: Path, edit: Callable[..., None], cost: float) -> None:
+def test_costs_that_no_axis_holds_are_not_drawn(
+    comparison_folder: Path, tmp_path: Path, edit: Callable[..., None], cost: float
+) -> None:
     from invgraphics.report.build import build_report
 
     scores = next(comparison_folder.glob("runs/*/seed-*/scores.json"))
     edit(scores, lambda table: table["cost"].update(fit_seconds=cost))
-    page = build_report(comparison_folder)
-    ElementTree.parse(page.parent / "figures" / "psnr-against-model-bytes.svg")
+    comparison = read_comparison(comparison_folder)
+    summary = summarise(comparison)
+    assert verdict(comparison, summary)
+    figures = draw_tradeoffs(summary, tmp_path)
+    assert any(figure.path.stem == "psnr-against-model-bytes" for figure in figures)
+    for figure in figures:
+        ElementTree.parse(figure.path)
+    if cost == math.inf:
+        assert build_report(comparison_folder).is_file()
 
 
 def test_report_is_small(built_report: Path) -> None:

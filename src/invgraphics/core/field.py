@@ -31,6 +31,7 @@ class Quantity(Flag):
     FEATURES = auto()
     GAUSSIANS = auto()
     PLANES = auto()
+    DEPTH_MAPS = auto()
     MESH = auto()
 
     def words(self) -> str:

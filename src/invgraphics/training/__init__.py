@@ -11,6 +11,7 @@ LOSSES = {
     "opacity": "invgraphics.training.splat_losses:OpacityLoss",
     "scale": "invgraphics.training.splat_losses:ScaleLoss",
     "distortion": "invgraphics.training.losses:DistortionLoss",
+    "interlevel": "invgraphics.training.interlevel:InterlevelLoss",
     "background_entropy": "invgraphics.training.losses:BackgroundEntropyLoss",
     "point_colour": "invgraphics.training.losses:PointColourLoss",
     "eikonal": "invgraphics.training.eikonal:EikonalLoss",
