@@ -7,6 +7,7 @@ import torch
 from invgraphics.core import Scene, harmonics
 from invgraphics.errors import InputError
 from invgraphics.fields.gaussian import GaussianFieldConfig
+from invgraphics.fields.planes import PlanesConfig
 from invgraphics.memory import check_fits
 from invgraphics.recipes.recipe import Method
 
@@ -14,6 +15,8 @@ COPIES = 6
 """Of each primitive's values during a step: parameter, gradient, Adam's two moments; activated, and the gradient of that."""
 RAY_BYTES = 512
 """Of a ray of a batch: origin, direction, interval, colours and their gradients."""
+TEXEL_BYTES = 16 * COPIES
+"""Of a texel of a multi-plane image: colour and opacity, in as many copies."""
 TRAINED_COPIES = 4
 """Of each parameter of a network: itself, its gradient and Adam's two moments."""
 
@@ -34,6 +37,12 @@ def check_memory(method: Method, scene: Scene) -> None:
         what = f"The field of {method.name} with {primitives:,} Gaussians"
         check_fits(primitives * row * COPIES, what, "Choose a lower field.count or field.max_init.")
         return
+    if isinstance(config, PlanesConfig):
+        pixels = max(view.camera.width * view.camera.height for view in scene.train)
+        texels = round(config.count * pixels * config.texels**2)
+        remedy = "Choose a lower field.count or field.texels."
+        check_fits(texels * TEXEL_BYTES, f"The field of {method.name} with {texels:,} texels or more", remedy)
+        return
     samples = max(rays, method.recipe.batches.samples)  # at least one on each ray
     activations = samples * int(getattr(config, "width", 0)) * 4 * 2  # of one layer, with their gradients
     needed = TRAINED_COPIES * _parameter_bytes(method, scene) + activations
@@ -46,6 +55,8 @@ def _parameter_bytes(method: Method, scene: Scene) -> int:
     try:
         with torch.device("meta"):
             field = method.recipe.field.build(scene)
+    except InputError:
+        return 0  # it does not go with the scene, and says so where it is built
     except (RuntimeError, OverflowError) as error:
         if "overflow" not in str(error).lower():
             return 0  # a field that reads values while it is built: it says itself what it cannot do
