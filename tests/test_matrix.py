@@ -20,6 +20,7 @@ FEW = {
     "stratified": {"count": 24},
     "hierarchical": {"coarse": 12, "fine": 12},
     "occupancy": {"steps_per_diagonal": 64, "cone": 0.1},
+    "proposals": {"counts": (12,), "count": 12},
     "up_sampling": {"coarse": 12, "fine": 12, "rounds": 2},
     "error_bounded": {"coarse": 12, "fine": 12, "extra": 4, "rounds": 2, "bisections": 4},
 }
@@ -92,7 +93,8 @@ def test_every_pair_draws_or_refuses_with_a_sentence(scene: Scene) -> None:
             check(field, renderer)
             assert_draws(field, renderer, scene)
             drawn.add((field_name, renderer_name))
-    assert {name for name, _ in drawn} >= set(FIELDS)
+    # A density alone has no colour: it is for samplers.
+    assert {name for name, _ in drawn} >= set(FIELDS) - {"density"}
     # With their defaults, renderers of distances meet no field of distances.
     assert {name.partition("/")[0] for _, name in drawn} >= set(RENDERERS)
     assert ("neural/hash/density", "volumetric/occupancy") in drawn

@@ -162,6 +162,8 @@ def check_field(field: Field, scene: Scene) -> None:
         assert len(value) == 37 and bool(value.isfinite().all()), f"{quantity.words()} is not finite"
         if quantity is Quantity.DENSITY:
             assert bool((value >= 0).all()), "a density is negative"
+        if quantity is Quantity.FEATURES:
+            assert value.shape[1] == field.feature_width, "feature_width is not the number of features"
         if quantity is Quantity.NORMAL:
             empty = torch.zeros(37, dtype=torch.bool)
             if Quantity.DENSITY in field.provides:

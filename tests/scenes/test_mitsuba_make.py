@@ -141,8 +141,8 @@ def test_transforms_tell_other_programs_the_same_cameras(rendered):
     assert (rendered / f"{other['frames'][0]['file_path']}.png").is_file()
 
 
-def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_file):
-    """Also the proof of determinism: another process in another folder writes the very same files."""
+def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_file, monkeypatch):
+    """Also the proof of determinism: another process in another folder begins the very same files, and this one ends them."""
 
     def interrupt(done, total, what):
         if done == 2:
@@ -154,6 +154,7 @@ def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_
     first = kept.stat().st_mtime_ns
     assert not (fresh / rendered.name).exists()
     reports = []
+    work_here(monkeypatch)
     folder = make(scene_file, progress=lambda *report: reports.append(report))
     assert (folder / "train/0000.npz").stat().st_mtime_ns == first
     assert _contents(folder) == _contents(rendered)
@@ -178,6 +179,7 @@ def test_a_full_disk_is_named_and_rendering_goes_on_when_there_is_room(rendered,
             cache.copy(rendered, disk / "copy")
         assert not list(disk.glob("*copy*"))
         ballast.unlink()
+        work_here(monkeypatch)
         assert _contents(make(scene_file)) == _contents(rendered)
     finally:
         subprocess.run(["umount", "--lazy", str(disk)], check=True)
@@ -225,6 +227,8 @@ def test_whatever_matters_changes_the_key(rendered, scene_file):
         ({"test": -1}, "test"),
         ({"spp": 0}, "samples"),
         ({"seed": -1}, "seed"),
+        ({"size": (1_000_000, 1_000_000)}, "of memory"),
+        ({"test": 1_000_000_000_000}, "of memory"),
     ],
 )
 def test_impossible_options_are_refused(fresh, scene_file, option, word):

@@ -6,18 +6,16 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar
 
-from jaxtyping import Float
 from torch import Tensor, nn
 from typing_extensions import override
 
 from invgraphics.config import Slot
 from invgraphics.core.bounds import Bounds, Space
-from invgraphics.core.field import Encoding, Field, Quantity
+from invgraphics.core.field import Field, Quantity
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
-from invgraphics.fields.covariance import unit_covariance
+from invgraphics.fields.encoded import build_encoding, encode_samples
 from invgraphics.fields.encodings.frequency import FrequencyConfig
-from invgraphics.fields.encodings.lattices import LatticeConfig
 
 
 @dataclass(frozen=True)
@@ -65,8 +63,7 @@ class FeatureField(Field):
         self._near = bounds.near
         self.register_buffer("lo", bounds.lo.clone())
         self.register_buffer("hi", bounds.hi.clone())
-        shaped = isinstance(config.encoding, LatticeConfig)
-        self.encoding: Encoding = config.encoding.build(bounds.half.tolist()) if shaped else config.encoding.build()
+        self.encoding = build_encoding(config.encoding, bounds)
         widths = [self.encoding.width] + [config.width] * (config.layers - 1) + [config.features]
         layers = [nn.Sequential(nn.Linear(before, after), nn.LayerNorm(after), nn.ReLU()) for before, after in pairwise(widths)]
         self.net = nn.Sequential(*layers)
@@ -86,10 +83,4 @@ class FeatureField(Field):
         """Features of the samples' positions, (m, features); see `Field.query`."""
         if Quantity.FEATURES not in want:
             return FieldValues()
-        return FieldValues(features=self.net(self._encode(samples)))
-
-    def _encode(self, samples: Samples) -> Float[Tensor, "m f"]:
-        unit = self.bounds.to_unit(samples.position)
-        if not self.encoding.needs_covariance:
-            return self.encoding(unit)
-        return self.encoding(unit, unit_covariance(self.bounds, samples.position, samples.covariance))
+        return FieldValues(features=self.net(encode_samples(self.encoding, self.bounds, samples)))

@@ -35,7 +35,8 @@ class ExportRequest:
         to: a name in `invgraphics.tools.EXPORTERS`.
         out: the file.
         scene: another copy of the run's scene.
-        world: how the axes of the data set's world point, for formats that want certain axes.
+        world: how the axes of the data set's world point, for formats that want certain axes; ``None`` for the
+            format's default.
         level: density or signed distance of a mesh's surface; ``None`` for the default.
         resolution: voxels along the longest edge that a mesh is made from.
         sh_degree: degree of the spherical harmonics that are written, zeros where the run has fewer bands; ``None`` for what
@@ -48,7 +49,7 @@ class ExportRequest:
     to: str
     out: Path
     scene: str | None = None
-    world: str = WORLD
+    world: str | None = None
     level: float | None = None
     resolution: int = RESOLUTION
     sh_degree: int | None = None
@@ -120,7 +121,8 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     scene = fitted.scene
     axes = plugins.load("formats", request.to).axes
     local = on_cpu(fitted.model.gaussians())
-    placed = on_cpu(transform_gaussians(local, file_from_local(scene, axes, request.world).float()))
+    world = request.world or WORLD
+    placed = on_cpu(transform_gaussians(local, file_from_local(scene, axes, world).float()))
     expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
     placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
     shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
@@ -129,7 +131,7 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)))
 
     _, written = read_gaussians(request.out)
-    back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
+    back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, world).float())
     loss = psnr_between(local, on_device(back, fitted.model.device), fitted)
     degree = harmonics.degree_of(written.gaussians.sh.shape[1])
     had = harmonics.degree_of(local.sh.shape[1])
