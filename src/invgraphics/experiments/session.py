@@ -20,7 +20,7 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.run import prepare, warm_up
-from invgraphics.experiments.variants import variant_named, with_renderer
+from invgraphics.experiments.variants import as_shown, variant_named, with_renderer
 from invgraphics.interruption import Terminated
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
@@ -149,8 +149,8 @@ class FittedRun(ABC):
         check_variants([variant], [self.method], self.scene)
         if variant.table == self.method.table["renderer"]:
             return self.model
-        other = with_renderer(self.method, variant).recipe.renderer.build(self.scene).untrained()
-        return replace(self.model, renderer=other.to(self.model.device))
+        other = with_renderer(self.method, variant).recipe.renderer.build(self.scene).untrained().to(self.model.device)
+        return replace(self.model, field=as_shown(self.model.field, other), renderer=other)
 
     def __repr__(self) -> str:
         last = self.history[-1] if self.history else Moment(step=0, seconds=0.0)
