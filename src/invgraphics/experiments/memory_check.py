@@ -7,6 +7,7 @@ import torch
 from invgraphics.core import Scene, harmonics
 from invgraphics.errors import InputError
 from invgraphics.fields.gaussian import GaussianFieldConfig
+from invgraphics.fields.points import PointFieldConfig
 from invgraphics.memory import check_fits
 from invgraphics.recipes.recipe import Method
 
@@ -26,12 +27,13 @@ def check_memory(method: Method, scene: Scene) -> None:
     """
     config, rays = method.recipe.field, method.recipe.batches.rays
     check_fits(rays * RAY_BYTES, f"A step of {method.name} with {rays:,} rays", "Choose a lower batches.rays.")
-    if isinstance(config, GaussianFieldConfig):
+    if isinstance(config, GaussianFieldConfig | PointFieldConfig):
         at_random = config.init in ("random", "field") or (config.init == "scene" and scene.points is None)
         known = 0 if scene.points is None else min(len(scene.points), config.max_init)
         primitives = config.count if at_random else known
-        row = 4 * (11 + 3 * harmonics.count(config.sh_degree))
-        what = f"The field of {method.name} with {primitives:,} Gaussians"
+        gaussians = isinstance(config, GaussianFieldConfig)
+        row = 4 * (11 + 3 * harmonics.count(config.sh_degree) if gaussians else 7 + config.features)
+        what = f"The field of {method.name} with {primitives:,} {'Gaussians' if gaussians else 'points'}"
         check_fits(primitives * row * COPIES, what, "Choose a lower field.count or field.max_init.")
         return
     samples = max(rays, method.recipe.batches.samples)  # at least one on each ray

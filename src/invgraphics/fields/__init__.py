@@ -7,6 +7,7 @@ from invgraphics.lazy import submodules
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
+    "points": "invgraphics.fields.points:PointFieldConfig",
 }
 
 if not TYPE_CHECKING:

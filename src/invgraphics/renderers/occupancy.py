@@ -75,16 +75,8 @@ class OccupancyConfig:
     chunk: int = 16
 
     def __post_init__(self) -> None:
-        for key in (
-            "resolution",
-            "steps_per_diagonal",
-            "evaluation_steps",
-            "early_steps",
-            "late_steps",
-            "every",
-            "cells",
-            "chunk",
-        ):
+        steps = ("steps_per_diagonal", "evaluation_steps", "early_steps", "late_steps")
+        for key in ("resolution", *steps, "every", "cells", "chunk"):
             value = getattr(self, key)
             if value is not None and value < 1:
                 raise ValueError(f"{key} must be at least 1, not {value}")
@@ -153,8 +145,7 @@ class Occupancy(Sampler):
         fresh.ema.zero_()
         fresh.step.zero_()
         fresh.occupied.fill_(True)
-        if fresh.visible is not None:
-            fresh.occupied &= fresh.visible
+        fresh._leave_out(fresh.visible)
         return fresh
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
@@ -228,6 +219,8 @@ class Occupancy(Sampler):
         """Count a training step, and refresh the occupancy grid every `OccupancyConfig.every` steps after ``grace``."""
         step = int(self.step)
         self.step += 1
+        if step == 0:
+            self._leave_out(field.support(ctx.bounds, self.config.resolution))
         if step >= self.config.grace and step % self.config.every == 0:
             cells = self._all_cells() if step < self.config.warmup else self._sampled_cells(ctx)
             self._refresh(cells, field, ctx)
@@ -249,6 +242,10 @@ class Occupancy(Sampler):
     def _refresh(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> None:
         """Update the EMA at one random point in each of ``cells``, and threshold it to the occupancy grid."""
         fresh = torch.full_like(self.ema, -1.0).flatten()
+        support = field.support(ctx.bounds, self.config.resolution)
+        if support is not None:
+            known = support.flatten()[cells]
+            fresh[cells[~known]], cells = 0.0, cells[known]
         for part in cells.split(ctx.chunk):
             thickness = self._step_optical_depth(part, field, ctx).to(fresh.dtype)
             fresh.scatter_reduce_(0, part, thickness, reduce="amax")
@@ -257,8 +254,13 @@ class Occupancy(Sampler):
         # The mean of equal float32 numbers must not exceed them, or an even fog would vanish: sum in float64.
         mean = float(self.ema.mean(dtype=torch.float64))
         self.occupied.copy_(self.ema >= min(self.config.threshold, mean))
-        if self.visible is not None:
-            self.occupied &= self.visible
+        self._leave_out(self.visible)
+        self._leave_out(support)
+
+    def _leave_out(self, possible: Bool[Tensor, "r r r"] | None) -> None:
+        """Keep only ``possible`` cells occupied; all, where that is ``None``."""
+        if possible is not None:
+            self.occupied &= possible
 
     def _step_optical_depth(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> Float[Tensor, " k"]:
         """Optical depth of one step at a random point of each cell.

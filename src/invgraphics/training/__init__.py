@@ -22,6 +22,7 @@ PENALTIES = {
     "l1": "invgraphics.training.penalties:L1Penalty",
     "sparsity": "invgraphics.training.penalties:SparsityPenalty",
     "eikonal": "invgraphics.training.eikonal:EikonalPenalty",
+    "confidence": "invgraphics.training.points.control:ConfidencePenalty",
 }
 
 HOOKS = {
@@ -32,6 +33,7 @@ HOOKS = {
     "upsample": "invgraphics.training.upsample:UpsampleConfig",
     "tight_box": "invgraphics.training.tight_box:TightBoxConfig",
     "prune": "invgraphics.training.prune:PruneConfig",
+    "point_control": "invgraphics.training.points.control:PointControlConfig",
     "view_rates": "invgraphics.training.view_rates:ViewRatesConfig",
     "sh_degree": "invgraphics.training.hooks:ShDegreeConfig",
 }

@@ -19,6 +19,7 @@ from invgraphics.kernels.numba.fused.march import lattice_march
 from invgraphics.kernels.numba.fused.render import lattice_render
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
+from invgraphics.kernels.numba.near import near_points
 from invgraphics.kernels.numba.ngp.march import ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace
@@ -59,6 +60,7 @@ def samples() -> None:
     """Compile the kernels of volume rendering, and SSIM."""
     image = torch.zeros(8, 8, 3).requires_grad_()
     ssim(image, torch.zeros_like(image)).backward()
+    near_points(torch.zeros(1, 3), torch.zeros(1, 3), 1, 1.0)
     unit = torch.full((2, 3), 0.4).requires_grad_()
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)

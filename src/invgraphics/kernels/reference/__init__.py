@@ -7,6 +7,7 @@ from invgraphics.kernels.reference.fused import lattice_render as lattice_render
 from invgraphics.kernels.reference.hash import hash_encode as hash_encode
 from invgraphics.kernels.reference.lattice import lattice_encode as lattice_encode
 from invgraphics.kernels.reference.march import ray_march as ray_march
+from invgraphics.kernels.reference.near import near_points as near_points
 from invgraphics.kernels.reference.ngp import ngp_march as ngp_march
 from invgraphics.kernels.reference.ngp import ngp_render as ngp_render
 from invgraphics.kernels.reference.splat_discs import splat_project_discs as splat_project_discs
