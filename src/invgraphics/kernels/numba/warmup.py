@@ -17,6 +17,7 @@ from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.adam import adam_rows
 from invgraphics.kernels.numba.fused.march import lattice_march
 from invgraphics.kernels.numba.fused.render import lattice_render
+from invgraphics.kernels.numba.gaussians.integrate import gaussian_integrals
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
 from invgraphics.kernels.numba.near import near_points
@@ -29,6 +30,7 @@ from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
+from invgraphics.kernels.reference.gaussian_rays import precompute
 from invgraphics.kernels.types import AdamStep, MarchSteps, TracingLimits
 
 
@@ -46,6 +48,8 @@ def splats() -> None:
     camera = Camera(pose, torch.full((2,), 8.0), torch.full((2,), 4.0), 8, 8)
     shapes = ((4, 3), (4, 4), (4, 3), (4,), (4, 1, 3))
     gaussians = Gaussians(*(torch.full(shape, 0.5).requires_grad_() for shape in shapes))
+    rays = camera.rays()
+    gaussian_integrals(precompute(gaussians, "peak", 1e-3), rays, 2).sum().backward()
     footprints, rgb = splat_project(gaussians, camera)
     splat_bin(footprints, 8, 8, 4)
     splat_median(footprints, 8, 8)
