@@ -22,6 +22,7 @@ SMALL = {
         "views, size, steps, samples, march = 8, 16, 80, 2048, 48\n"
         "grid_steps, points, tables, edge, factor_steps, edge_steps = 60, 2048, [8, 12, 16], 16, 150, 150"
     ),
+    "06-aliasing-and-open-space": "draws, steps = 100_000, 120",
     "07-gaussians-and-ewa": "draws = 100_000",
     "08-fit-gaussians": "views, size, steps, flat_steps, starts = 12, 32, 200, 150, 3",
     "09-the-same-gaussians-two-ways": "size, turns = 72, 21",
@@ -165,6 +166,28 @@ def _ranks(out: _Printed) -> None:
     assert out.numbers("memory, VM:") == (4 * 3 * (16**2 + 16),)
 
 
+def _cones(out: _Printed) -> None:
+    """The cone's Gaussian and its encoding, against Monte Carlo; proposals that learn; splats with and without a filter."""
+    mean, drawn, middle = out.numbers("cone: mean at", "Monte Carlo", "middle of the interval")
+    assert mean == pytest.approx(drawn, abs=0.01) and mean > middle + 0.3
+    assert out.numbers("cone: covariance and Monte Carlo differ by") < (1,)
+    assert out.numbers("encoding: closed form and Monte Carlo differ by at most") < (1e-2,)
+    assert out.numbers("encoding: without the Gaussian, at its mean, by") > (0.5,)
+    centre, damped = (out.numbers(f"stripes, {name}: RMS error")[0] for name in ("at the centre", "damped"))
+    assert damped < centre / 4
+    for where in ("inside", "outside"):
+        assert out.numbers(f"contraction, {where} the unit ball: encoding and Monte Carlo differ by at most") < (1.5e-2,)
+    first, last = out.numbers("interlevel loss", "at the start,")
+    assert last < first / 20
+    before, after = out.numbers("at the end\nproposals:", "% of the samples inside a ball at the start,")
+    assert after > 1.5 * before
+    flicker = [out.numbers(f"{name}: light x", "flicker") for name in ("no filter", "(3DGS)", "antialiased")]
+    assert flicker[0][1] > 40 and flicker[1][1] < 5 and flicker[2][1] < 20
+    assert flicker[1][0] > 3 and flicker[2][0] == pytest.approx(1, abs=0.1)
+    near, far, half = (out.numbers(f"octaves, {name}:")[0] for name in ("near", "twice as far", "half the size"))
+    assert far == half == near - 1
+
+
 def _edges(out: _Printed) -> None:
     """Edges of one voxel, and of a shape in the plane, interpolated before, between and after activation and opacity."""
     line = "voxel of v = -400 and 100: pre half at", "and", "in half at", "and", "post half at", "and"
@@ -282,7 +305,11 @@ def _ablation(out: _Printed) -> None:
 
 
 HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
-    zip(sorted(SMALL), (_cameras, _integral, _nerf, _grids, _ewa, _splatting, _two_ways, _photos, _ablation), strict=True)
+    zip(
+        sorted(SMALL),
+        (_cameras, _integral, _nerf, _grids, _cones, _ewa, _splatting, _two_ways, _photos, _ablation),
+        strict=True,
+    )
 )
 
 

@@ -44,7 +44,7 @@ def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method
     for method in methods if variants else ():
         for variant in variants:
             try:
-                model = build_model(with_renderer(method, variant), scene, 0, torch.device("cpu"))
+                model = build_model(with_renderer(method, variant), scene, 0, torch.device("cpu"), shown=True)
                 if variant.table != method.table["renderer"]:
                     model.renderer.untrained()
             except InputError as error:

@@ -6,8 +6,13 @@ from invgraphics.lazy import submodules
 
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
+    "density": "invgraphics.fields.density_field:DensityFieldConfig",
+    "features": "invgraphics.fields.features:FeatureFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
     "points": "invgraphics.fields.points:PointFieldConfig",
+    "mesh": "invgraphics.fields.mesh:MeshFieldConfig",
+    "planes": "invgraphics.fields.planes:PlanesConfig",
+    "depth_maps": "invgraphics.fields.depth_maps:DepthMapsConfig",
 }
 
 if not TYPE_CHECKING:

@@ -23,6 +23,8 @@ from invgraphics.kernels.dispatch import in_use as in_use
 from invgraphics.kernels.dispatch import use as use
 from invgraphics.kernels.dispatch import using as using
 from invgraphics.kernels.dispatch import warm_up as warm_up
+from invgraphics.kernels.meshes import mesh_interpolate as mesh_interpolate
+from invgraphics.kernels.meshes import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.tracing import sdf_trace as sdf_trace
 from invgraphics.kernels.types import AdamStep, Bins, Footprints, March, MarchSteps
 

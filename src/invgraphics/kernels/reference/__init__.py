@@ -9,6 +9,8 @@ from invgraphics.kernels.reference.gaussian_rays import gaussian_pairs as gaussi
 from invgraphics.kernels.reference.hash import hash_encode as hash_encode
 from invgraphics.kernels.reference.lattice import lattice_encode as lattice_encode
 from invgraphics.kernels.reference.march import ray_march as ray_march
+from invgraphics.kernels.reference.mesh import mesh_interpolate as mesh_interpolate
+from invgraphics.kernels.reference.mesh import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.reference.near import near_points as near_points
 from invgraphics.kernels.reference.ngp import ngp_march as ngp_march
 from invgraphics.kernels.reference.ngp import ngp_render as ngp_render

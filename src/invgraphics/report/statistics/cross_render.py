@@ -9,8 +9,12 @@ from dataclasses import dataclass, replace
 
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.statistics.summary import quality_columns, value_of
-from invgraphics.report.wording import Quantity
+from invgraphics.report.data.factors import Observation
+from invgraphics.report.statistics.effects import Effect, effects_of
+from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.summary import quality_columns
+from invgraphics.report.statistics.values import value_of
+from invgraphics.report.wording import Quantity, quality_quantity
 from invgraphics.runs.inside import inside
 from invgraphics.runs.renderings import OWN, Renderings
 from invgraphics.runs.run import Run, read_run
@@ -19,6 +23,8 @@ from invgraphics.text import file_name
 
 IDENTICAL = 90.0
 """Pictures closer than this many dB are called the same: they are kept as float16, whose rounding alone is above 75 dB."""
+RENDERER = "renderer"
+"""The renderer that shows a fit, as a factor."""
 SHOWN_VIEW = 0
 """The test view that is shown through every renderer."""
 
@@ -137,6 +143,29 @@ def cross_table(comparison: Comparison, approximations: Sequence[Approximation],
         for exact, other in [(clean(pair.exact), clean(pair.approximate))]
     )
     return CrossTable(columns[0], renderers, tuple(rows), steps, max(map(len, groups)))
+
+
+def cross_effects(
+    observations: Sequence[Observation], approximations: Sequence[Approximation], clean: Callable[[str], str] = str
+) -> list[Effect]:
+    """What each approximation does to the score of the *same* fits: paired by fit, averaged over what made them.
+
+    Args:
+        observations: the fits of a study.
+        approximations: pairs of renderers.
+        clean: makes names public.
+    """
+    shown = []
+    for one in observations:
+        if (crossed := read_renderings(one.run, clean)) is not None:
+            seen = ((name, replace(run, seed=one.run.seed)) for name, run in crossed.seen.items())
+            shown += [Observation(run, one.scene, {**one.levels, RENDERER: name}) for name, run in seen]
+    score = next((run.run.scores.quality["psnr"] for run in shown if "psnr" in run.run.scores.quality), None)
+    if score is None:
+        return []
+    pairs = [(pair.name, clean(pair.exact), clean(pair.approximate)) for pair in approximations]
+    contrasts = [Contrast(RENDERER, exact, other, name=f"{name} ({other} instead of {exact})") for name, exact, other in pairs]
+    return effects_of(contrasts, quality_quantity("psnr", score), shown)
 
 
 def _score(fits: Sequence[CrossRendered], name: str, quantity: Quantity) -> float | None:
