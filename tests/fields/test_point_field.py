@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 from invgraphics.core import Context, Points, Quantity, Samples
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.gaussian import GaussianFieldConfig
-from invgraphics.fields.points import ROWS, PointFieldConfig
+from invgraphics.fields.points.field import ROWS, PointFieldConfig
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig

@@ -19,8 +19,8 @@ from invgraphics.core.fused import FusedLattice
 from invgraphics.core.ngp import FusedNGP
 from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import March, MarchSteps
-from invgraphics.renderers.samplers import uniform
-from invgraphics.renderers.termination import visible_samples
+from invgraphics.renderers.samplers import check_samples, uniform
+from invgraphics.renderers.termination import joined, visible_samples
 from invgraphics.renderers.visibility import visible_cells
 
 LATE_STEPS_START = 0.5
@@ -75,17 +75,28 @@ class OccupancyConfig:
     chunk: int = 16
 
     def __post_init__(self) -> None:
-        steps = ("steps_per_diagonal", "evaluation_steps", "early_steps", "late_steps")
-        for key in ("resolution", *steps, "every", "cells", "chunk"):
-            value = getattr(self, key)
-            if value is not None and value < 1:
-                raise ValueError(f"{key} must be at least 1, not {value}")
+        for key in ("resolution", "every", "cells"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"{key} must be at least 1, not {getattr(self, key)}")
+        for key in ("steps_per_diagonal", "evaluation_steps", "early_steps", "late_steps", "chunk"):
+            if getattr(self, key) is not None:
+                check_samples(**{key: getattr(self, key)})
         if not 0 <= (0.5 if self.early_decay is None else self.early_decay) < 1:
             raise ValueError(f"early_decay must be in [0, 1), not {self.early_decay}")
         if not 0 <= self.decay <= 1 or not 0 <= self.transmittance < 1:
             raise ValueError(f"decay must be in [0, 1] and transmittance in [0, 1), not {self.decay} and {self.transmittance}")
         if min(self.threshold, self.warmup, self.grace, self.cone or 0) < 0:
             raise ValueError("threshold, warmup, grace and cone must not be negative")
+
+    @property
+    def samples_per_ray(self) -> int:
+        """Samples on each ray before any cell is known to be empty, at least."""
+        return self.chunk
+
+    @property
+    def state_bytes(self) -> int:
+        """Memory of the grid and of a refresh: the EMA and its successor, bits, and indices of all cells; later, of some."""
+        return 17 * self.resolution**3 + 32 * self.cells
 
     def decay_at(self, progress: float) -> float:
         """Decay of the occupancy EMA at a progress of the fit in [0, 1]."""
@@ -212,7 +223,7 @@ class Occupancy(Sampler):
             parts.append(replace(march, ray=going[march.ray]))
             unfinished = march.resume < rays.far[going]
             going, march = going[unfinished], replace(march, resume=march.resume[unfinished])
-        return parts[0] if len(parts) == 1 else _joined(parts)
+        return parts[0] if len(parts) == 1 else joined(parts)
 
     @torch.no_grad()
     def update(self, field: Field, ctx: Context) -> None:
@@ -287,11 +298,3 @@ def _compiled(operation: Literal["march", "render"], parts: FusedNGP | FusedLatt
     name = f"{'lattice' if lattices else 'ngp'}_{operation}"
     like = parts.geometry.lattices[0].features if lattices else parts.table
     return getattr(kernels, name) if kernels.compiled(name, like) else None
-
-
-def _joined(parts: list[March]) -> March:
-    """Concatenate consecutive parts of a march, sorted by ray; the sort is stable, which keeps distances in order."""
-    ray = torch.cat([part.ray for part in parts])
-    order = torch.argsort(ray, stable=True)
-    t0, t1 = (torch.cat([getattr(part, name) for part in parts])[order] for name in ("t0", "t1"))
-    return March(ray[order], t0, t1, parts[-1].resume)

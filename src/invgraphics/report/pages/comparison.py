@@ -116,9 +116,13 @@ def markdown_cross_table(crossed: CrossTable | None) -> list[str]:
         lines.append(f"| {text(row.method)} | {' | '.join(cells)} |")
     if crossed.steps:
         names = " | ".join(text(row.method) for row in crossed.rows)
-        lines += ["", "Image difference that one approximation makes, dB.", ""]
+        lines += ["", "Image difference that one approximation makes, dB", ""]
+        lines[-2] += ", and median difference of depth, units of the scene." if crossed.shows_depth else "."
         lines += [f"| approximation | {names} |", "|---" * (1 + len(crossed.rows)) + "|"]
-        lines += [f"| {text(step.name)} | {' | '.join(step.differences)} |" for step in crossed.steps]
+        for step in crossed.steps:
+            pairs = zip(step.differences, step.depths, strict=True)
+            cells = [f"{value}, {depth}" if depth else value for value, depth in pairs]
+            lines.append(f"| {text(step.name)} | {' | '.join(cells)} |")
     return lines
 
 

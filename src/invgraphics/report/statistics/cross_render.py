@@ -16,7 +16,7 @@ from invgraphics.report.statistics.summary import quality_columns
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity, quality_quantity
 from invgraphics.runs.inside import inside
-from invgraphics.runs.renderings import OWN, Renderings
+from invgraphics.runs.renderings import OWN, Difference, Renderings
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.study import Approximation
 from invgraphics.text import file_name
@@ -36,12 +36,12 @@ class CrossRendered:
     Attributes:
         fit: the run, whose own renderer is the first of ``seen``.
         seen: renderer -> the run that shows the fit with it.
-        differences: two renderers -> root mean square per view between their pictures, colours in [0, 1].
+        differences: two renderers -> how far their pictures and depths are apart.
     """
 
     fit: Run
     seen: dict[str, Run]
-    differences: dict[frozenset[str], tuple[float, ...]]
+    differences: dict[frozenset[str], Difference]
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,18 @@ class CrossRow:
 
 @dataclass(frozen=True)
 class StepRow:
-    """An approximation: the renderers without and with it, and the PSNR between their pictures for each method, dB."""
+    """An approximation: the renderers without and with it, and for each method how far their pictures are apart.
+
+    Attributes:
+        differences: PSNR between their pictures, dB.
+        depths: median difference of depth, world units; empty where a fit has none.
+    """
 
     name: str
     exact: str
     approximate: str
     differences: tuple[str, ...]
+    depths: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -100,6 +106,11 @@ class CrossTable:
     steps: tuple[StepRow, ...]
     seeds: int
 
+    @property
+    def shows_depth(self) -> bool:
+        """Whether differences of depth are known."""
+        return any(any(step.depths) for step in self.steps)
+
 
 def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendered | None:
     """Read the renderings of a fit by several renderers; ``None`` where there are none.
@@ -118,7 +129,7 @@ def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendere
         clean(one.renderer): run if one.run == OWN else read_run(inside(run.folder, one.run), run.scores.protocol)
         for one in record.renderings
     }
-    differences = {frozenset(clean(name) for name in one.renderers): one.rmse for one in record.differences}
+    differences = {frozenset(clean(name) for name in one.renderers): one for one in record.differences}
     return CrossRendered(run, seen, differences)
 
 
@@ -138,7 +149,13 @@ def cross_table(comparison: Comparison, approximations: Sequence[Approximation],
             rows.append(CrossRow(method, series, _mark_best(own, renderers, cells, columns[0])))
     groups = [[fit for fit in fits if fit.fit.method == row.method] for row in rows]
     steps = tuple(
-        StepRow(pair.name, exact, other, tuple(_decibels(group, frozenset((exact, other))) for group in groups))
+        StepRow(
+            pair.name,
+            exact,
+            other,
+            tuple(_decibels(group, frozenset((exact, other))) for group in groups),
+            tuple(_depth_gap(group, frozenset((exact, other))) for group in groups),
+        )
         for pair in approximations
         for exact, other in [(clean(pair.exact), clean(pair.approximate))]
     )
@@ -205,9 +222,15 @@ def _decibels(fits: Sequence[CrossRendered], pair: frozenset[str] | None, name: 
         own = next(iter(fit.seen))
         wanted = frozenset((own, name)) if pair is None else pair
         if wanted <= set(fit.seen):
-            squares += [value**2 for value in fit.differences.get(wanted, ())]
+            squares += [value**2 for value in fit.differences[wanted].rmse] if wanted in fit.differences else []
     if not squares:
         return "–"
     mean = statistics.fmean(squares)
     decibels = math.inf if mean == 0 else -10 * math.log10(mean)
     return "same" if decibels > IDENTICAL else f"{decibels:.1f}"
+
+
+def _depth_gap(fits: Sequence[CrossRendered], pair: frozenset[str]) -> str:
+    """Median difference of depth between two renderers, mean over views and fits."""
+    gaps = [gap for fit in fits if pair in fit.differences for gap in fit.differences[pair].depth]
+    return f"{statistics.fmean(gaps):.2g}" if gaps else ""

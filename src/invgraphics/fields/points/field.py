@@ -169,6 +169,12 @@ class PointField(Field):
             outputs=3,
         )
 
+    @property
+    @override
+    def feature_width(self) -> int:
+        """Mean features, and raw colour."""
+        return self.config.width + 3
+
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
         """See `Field.query`; a normal is that of the density's negative gradient and can be had inside ``no_grad``."""
         if want == Quantity.RADIANCE and samples.features is not None:

@@ -26,12 +26,15 @@ from invgraphics.kernels.reference.gaussian_rays import (
     precompute,
 )
 from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.gaussian_profile import density_profile, transmittance
+from invgraphics.renderers.gaussians.profile import density_profile, transmittance
 
 TILE = 16
 """Edge in pixels of the square whose rays are searched for Gaussians together."""
 PART = 1 << 13
 """Rays that are searched and integrated together where that is compiled."""
+
+MAX_STEPS = 1024
+"""Intervals of a ray, each of which is kept for each Gaussian on it; the error falls with their square."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,8 @@ class GaussianExactConfig:
     smallest: float = SMALLEST_DEPTH
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"steps must be at least 1, not {self.steps}.")
+        if not 1 <= self.steps <= MAX_STEPS:
+            raise ValueError(f"steps must be from 1 to {MAX_STEPS}, not {self.steps}.")
         _check_smallest(self.smallest)
 
     def build(self, scene: Scene) -> GaussianExact:
