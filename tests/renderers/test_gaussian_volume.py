@@ -16,7 +16,7 @@ from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Gaussi
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.kernels.extinction import mean_inverse_scale
-from invgraphics.renderers.gaussians.rays import intersect, precompute
+from invgraphics.kernels.reference.gaussian_rays import intersect, precompute
 from invgraphics.renderers.gaussians.volume import GaussianExactConfig, GaussianSortedConfig
 from invgraphics.testing import check_renderer, toy_cameras, toy_scene
 

@@ -8,7 +8,7 @@ from enum import Flag, auto
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from invgraphics.core.bounds import Bounds
@@ -33,6 +33,7 @@ class Quantity(Flag):
     PLANES = auto()
     DEPTH_MAPS = auto()
     MESH = auto()
+    POINTS = auto()
 
     def words(self) -> str:
         """The members in lower case, comma-separated."""
@@ -88,6 +89,10 @@ class Field(nn.Module, ABC):
         assert density is not None
         return density
 
+    def support(self, bounds: Bounds, resolution: int) -> Bool[Tensor, "r r r"] | None:
+        """Cells of the bounds' unit cube outside which the density is zero, for samplers; ``None`` where it may be anywhere."""
+        return None
+
     def fused(self, bounds: Bounds) -> FusedNGP | FusedLattice | None:
         """Detached parameters over ``bounds`` for fused inference, where a kernel supports such fields; else ``None``."""
         return None
@@ -102,7 +107,7 @@ class Field(nn.Module, ABC):
         return None
 
     def primitives(self, want: Quantity, ctx: Context) -> Any:
-        """The explicit primitives of this field: `Gaussians` for ``Quantity.GAUSSIANS``, and so on.
+        """The explicit primitives of this field: `Gaussians` for ``Quantity.GAUSSIANS``, `Points` for ``Quantity.POINTS``.
 
         Raises:
             NotComposableError: it has none of that kind.

@@ -79,17 +79,34 @@ def _floats(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """A coloured point cloud (from SfM or truth), local frame; colours in [0, 1] display sRGB."""
+    """A coloured point cloud, local frame.
+
+    Attributes:
+        position: of each point.
+        rgb: colours in [0, 1], display sRGB in a `Scene`, the scene's colour space in a field.
+        normal: unit normals of the surface; ``None`` where they are not known.
+        features: learnt by a field; ``None`` for points that are measured.
+        confidence: how sure it is that a surface is there, in [0, 1]; ``None`` where nothing is known.
+    """
 
     position: Float[Tensor, "n 3"]
     rgb: Float[Tensor, "n 3"]
+    normal: Float[Tensor, "n 3"] | None = None
+    features: Float[Tensor, "n f"] | None = None
+    confidence: Float[Tensor, " n"] | None = None
 
     def __len__(self) -> int:
         return len(self.position)
 
+    def __getitem__(self, rows: Tensor | slice) -> Points:
+        """Some of the points, by index or mask."""
+        known = {name: value[rows] for name, value in vars(self).items() if value is not None}
+        return Points(**known)
+
     def joined(self, others: Points) -> Points:
-        """These points, then the others."""
-        return Points(torch.cat([self.position, others.position]), torch.cat([self.rgb, others.rgb]))
+        """These points, then the others, with what is known of both."""
+        pairs = {name: (value, getattr(others, name)) for name, value in vars(self).items()}
+        return Points(**{name: torch.cat(pair) for name, pair in pairs.items() if pair[0] is not None and pair[1] is not None})
 
 
 @dataclass(frozen=True, eq=False)

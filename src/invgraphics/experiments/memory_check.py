@@ -14,6 +14,7 @@ from invgraphics.errors import InputError
 from invgraphics.fields.encodings.lattices import LatticeConfig
 from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.fields.planes import PlanesConfig
+from invgraphics.fields.points.field import PointFieldConfig
 from invgraphics.memory import check_fits
 from invgraphics.recipes.recipe import Method
 from invgraphics.recipes.schema import Recipe
@@ -48,20 +49,21 @@ def check_memory(method: Method, scene: Scene) -> None:
     check_fits(rays * on_each * SAMPLE_BYTES, what, "Choose a lower batches.rays, or fewer samples in renderer.sampler.")
     what = f"The sampler of {method.name}"
     check_fits(getattr(sampler, "state_bytes", 0), what, "Choose a lower resolution or fewer cells in renderer.sampler.")
-    if isinstance(recipe.field, GaussianFieldConfig):
-        _check_gaussians(recipe.field, method.name, scene)
+    if isinstance(recipe.field, GaussianFieldConfig | PointFieldConfig):
+        _check_primitives(recipe.field, method.name, scene)
     elif isinstance(recipe.field, PlanesConfig):
         _check_planes(recipe.field, method.name, scene)
     else:
         _check_network(recipe, method.name, scene, rays * on_each)
 
 
-def _check_gaussians(config: GaussianFieldConfig, name: str, scene: Scene) -> None:
+def _check_primitives(config: GaussianFieldConfig | PointFieldConfig, name: str, scene: Scene) -> None:
     at_random = config.init in ("random", "field") or (config.init == "scene" and scene.points is None)
     known = 0 if scene.points is None else min(len(scene.points), config.max_init)
     primitives = config.count if at_random else known
-    row = 4 * (11 + 3 * harmonics.count(config.sh_degree))
-    what = f"The field of {name} with {primitives:,} Gaussians"
+    gaussians = isinstance(config, GaussianFieldConfig)
+    row = 4 * (11 + 3 * harmonics.count(config.sh_degree) if gaussians else 7 + config.features)
+    what = f"The field of {name} with {primitives:,} {'Gaussians' if gaussians else 'points'}"
     check_fits(primitives * row * COPIES, what, "Choose a lower field.count or field.max_init.")
 
 

@@ -9,6 +9,7 @@ FIELDS = {
     "density": "invgraphics.fields.density_field:DensityFieldConfig",
     "features": "invgraphics.fields.features:FeatureFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
+    "points": "invgraphics.fields.points.field:PointFieldConfig",
     "mesh": "invgraphics.fields.mesh:MeshFieldConfig",
     "planes": "invgraphics.fields.planes:PlanesConfig",
     "depth_maps": "invgraphics.fields.depth_maps:DepthMapsConfig",

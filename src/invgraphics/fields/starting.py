@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -37,6 +40,17 @@ def starting_scales(positions: Float[Tensor, "n 3"], bounds: Bounds) -> Float[Te
     return mean.clamp(SCALE_RANGE[0] * reach, SCALE_RANGE[1] * reach)
 
 
+def median_spacing(positions: Float[Tensor, "n 3"], rank: int, bounds: Bounds) -> float:
+    """Median distance of a point to its neighbour of a rank, or to the farthest of fewer; of one point, the scene's radius."""
+    from scipy.spatial import KDTree
+
+    if len(positions) == 1:
+        return SCALE_RANGE[1] * bounds.radius
+    points = positions.detach().double().cpu().numpy()
+    distances, _ = KDTree(points).query(points, k=min(rank, len(points) - 1) + 1)
+    return max(float(np.median(distances[:, -1])), SCALE_RANGE[0] * bounds.radius)
+
+
 def random_points(bounds: Bounds, count: int) -> Points:
     """Draw uniform points of random colour in the box, in a contracted space some of them on distant shells."""
     x = torch.rand(count, 3) * 2 - 1
@@ -55,7 +69,7 @@ def scene_points(scene: Scene, most: int) -> Points:
     """
     assert scene.points is not None
     points = _subset(_checked(scene.points, scene.name), most)
-    return Points(points.position, srgb_to_linear(points.rgb)) if scene.colour == "linear" else points
+    return replace(points, rgb=srgb_to_linear(points.rgb)) if scene.colour == "linear" else points
 
 
 def backdrop_points(scene: Scene, count: int) -> Points:
@@ -95,7 +109,7 @@ def depth_points(scene: Scene, most: int) -> Points:
     views = [view for view in scene.train if view.depth is not None and bool(torch.isfinite(view.depth).any())]
     if not views:
         remedy = "Set field.init = 'scene' or 'random'."
-        raise InputError(f"The training views of scene '{scene.name}' have no depth maps to start Gaussians from.", remedy)
+        raise InputError(f"The training views of scene '{scene.name}' have no depth maps to start from.", remedy)
     shares = [most // len(views) + (i < most % len(views)) for i in range(len(views))]
     parts = [_seen_points(view, share) for view, share in zip(views, shares, strict=True)]
     return Points(torch.cat([part.position for part in parts]), torch.cat([part.rgb for part in parts]))
@@ -122,7 +136,7 @@ def _pixels(view: View, flat: Int[Tensor, " n"]) -> Float[Tensor, "n 2"]:
 def _checked(points: Points, scene: str) -> Points:
     if len(points) == 0:
         remedy = "Set the field's init = 'random', or give the scene points."
-        raise InputError(f"The point cloud of scene '{scene}' is empty, so there is nothing to start Gaussians from.", remedy)
+        raise InputError(f"The point cloud of scene '{scene}' is empty, so there is nothing to start from.", remedy)
     for name in ("position", "rgb"):
         bad = int((~torch.isfinite(getattr(points, name))).any(dim=1).sum())
         if bad:
@@ -134,5 +148,4 @@ def _checked(points: Points, scene: str) -> Points:
 def _subset(points: Points, most: int) -> Points:
     if len(points) <= most:
         return points
-    keep = torch.randperm(len(points))[:most]
-    return Points(points.position[keep], points.rgb[keep])
+    return points[torch.randperm(len(points))[:most]]

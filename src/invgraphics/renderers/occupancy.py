@@ -20,7 +20,7 @@ from invgraphics.core.ngp import FusedNGP
 from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.samplers import check_samples, uniform
-from invgraphics.renderers.termination import visible_samples
+from invgraphics.renderers.termination import joined, visible_samples
 from invgraphics.renderers.visibility import visible_cells
 
 LATE_STEPS_START = 0.5
@@ -156,8 +156,7 @@ class Occupancy(Sampler):
         fresh.ema.zero_()
         fresh.step.zero_()
         fresh.occupied.fill_(True)
-        if fresh.visible is not None:
-            fresh.occupied &= fresh.visible
+        fresh._leave_out(fresh.visible)
         return fresh
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
@@ -224,13 +223,15 @@ class Occupancy(Sampler):
             parts.append(replace(march, ray=going[march.ray]))
             unfinished = march.resume < rays.far[going]
             going, march = going[unfinished], replace(march, resume=march.resume[unfinished])
-        return parts[0] if len(parts) == 1 else _joined(parts)
+        return parts[0] if len(parts) == 1 else joined(parts)
 
     @torch.no_grad()
     def update(self, field: Field, ctx: Context) -> None:
         """Count a training step, and refresh the occupancy grid every `OccupancyConfig.every` steps after ``grace``."""
         step = int(self.step)
         self.step += 1
+        if step == 0:
+            self._leave_out(field.support(ctx.bounds, self.config.resolution))
         if step >= self.config.grace and step % self.config.every == 0:
             cells = self._all_cells() if step < self.config.warmup else self._sampled_cells(ctx)
             self._refresh(cells, field, ctx)
@@ -252,6 +253,10 @@ class Occupancy(Sampler):
     def _refresh(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> None:
         """Update the EMA at one random point in each of ``cells``, and threshold it to the occupancy grid."""
         fresh = torch.full_like(self.ema, -1.0).flatten()
+        support = field.support(ctx.bounds, self.config.resolution)
+        if support is not None:
+            known = support.flatten()[cells]
+            fresh[cells[~known]], cells = 0.0, cells[known]
         for part in cells.split(ctx.chunk):
             thickness = self._step_optical_depth(part, field, ctx).to(fresh.dtype)
             fresh.scatter_reduce_(0, part, thickness, reduce="amax")
@@ -260,8 +265,13 @@ class Occupancy(Sampler):
         # The mean of equal float32 numbers must not exceed them, or an even fog would vanish: sum in float64.
         mean = float(self.ema.mean(dtype=torch.float64))
         self.occupied.copy_(self.ema >= min(self.config.threshold, mean))
-        if self.visible is not None:
-            self.occupied &= self.visible
+        self._leave_out(self.visible)
+        self._leave_out(support)
+
+    def _leave_out(self, possible: Bool[Tensor, "r r r"] | None) -> None:
+        """Keep only ``possible`` cells occupied; all, where that is ``None``."""
+        if possible is not None:
+            self.occupied &= possible
 
     def _step_optical_depth(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> Float[Tensor, " k"]:
         """Optical depth of one step at a random point of each cell.
@@ -288,11 +298,3 @@ def _compiled(operation: Literal["march", "render"], parts: FusedNGP | FusedLatt
     name = f"{'lattice' if lattices else 'ngp'}_{operation}"
     like = parts.geometry.lattices[0].features if lattices else parts.table
     return getattr(kernels, name) if kernels.compiled(name, like) else None
-
-
-def _joined(parts: list[March]) -> March:
-    """Concatenate consecutive parts of a march, sorted by ray; the sort is stable, which keeps distances in order."""
-    ray = torch.cat([part.ray for part in parts])
-    order = torch.argsort(ray, stable=True)
-    t0, t1 = (torch.cat([getattr(part, name) for part in parts])[order] for name in ("t0", "t1"))
-    return March(ray[order], t0, t1, parts[-1].resume)

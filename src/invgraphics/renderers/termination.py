@@ -85,3 +85,11 @@ def contributing_samples(
     """Indices of samples whose complement contributes at most ``max_error`` to each ray."""
     counts = torch.bincount(ray, minlength=rays)
     return torch.nonzero(weights * counts[ray] > max_error)[:, 0]
+
+
+def joined(parts: list[March]) -> March:
+    """Concatenate consecutive parts of a march, sorted by ray; the sort is stable, which keeps distances in order."""
+    ray = torch.cat([part.ray for part in parts])
+    order = torch.argsort(ray, stable=True)
+    t0, t1 = (torch.cat([getattr(part, name) for part in parts])[order] for name in ("t0", "t1"))
+    return March(ray[order], t0, t1, parts[-1].resume)

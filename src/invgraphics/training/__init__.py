@@ -24,6 +24,7 @@ PENALTIES = {
     "sparsity": "invgraphics.training.penalties:SparsityPenalty",
     "curvature": "invgraphics.training.eikonal:CurvaturePenalty",
     "eikonal": "invgraphics.training.eikonal:EikonalPenalty",
+    "confidence": "invgraphics.training.points.control:ConfidencePenalty",
 }
 
 HOOKS = {
@@ -34,6 +35,7 @@ HOOKS = {
     "upsample": "invgraphics.training.upsample:UpsampleConfig",
     "tight_box": "invgraphics.training.tight_box:TightBoxConfig",
     "prune": "invgraphics.training.prune:PruneConfig",
+    "point_control": "invgraphics.training.points.control:PointControlConfig",
     "view_rates": "invgraphics.training.view_rates:ViewRatesConfig",
     "sh_degree": "invgraphics.training.hooks:ShDegreeConfig",
 }

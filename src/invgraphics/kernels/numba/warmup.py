@@ -17,10 +17,12 @@ from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.adam import adam_rows
 from invgraphics.kernels.numba.fused.march import lattice_march
 from invgraphics.kernels.numba.fused.render import lattice_render
+from invgraphics.kernels.numba.gaussians.integrate import gaussian_integrals
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
 from invgraphics.kernels.numba.mesh.interpolate import mesh_interpolate
 from invgraphics.kernels.numba.mesh.rasterise import mesh_rasterise
+from invgraphics.kernels.numba.near import near_points
 from invgraphics.kernels.numba.ngp.march import ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace
@@ -30,6 +32,7 @@ from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median, splat_rasterise
 from invgraphics.kernels.numba.ssim import ssim
+from invgraphics.kernels.reference.gaussian_rays import precompute
 from invgraphics.kernels.types import AdamStep, MarchSteps, TracingLimits
 
 
@@ -47,6 +50,8 @@ def splats() -> None:
     camera = Camera(pose, torch.full((2,), 8.0), torch.full((2,), 4.0), 8, 8)
     shapes = ((4, 3), (4, 4), (4, 3), (4,), (4, 1, 3))
     gaussians = Gaussians(*(torch.full(shape, 0.5).requires_grad_() for shape in shapes))
+    rays = camera.rays()
+    gaussian_integrals(precompute(gaussians, "peak", 1e-3), rays, 2).sum().backward()
     footprints, rgb = splat_project(gaussians, camera)
     splat_bin(footprints, 8, 8, 4)
     splat_median(footprints, 8, 8)
@@ -65,6 +70,7 @@ def samples() -> None:
     """Compile the kernels of volume rendering, and SSIM."""
     image = torch.zeros(8, 8, 3).requires_grad_()
     ssim(image, torch.zeros_like(image)).backward()
+    near_points(torch.zeros(1, 3), torch.zeros(1, 3), 1, 1.0)
     unit = torch.full((2, 3), 0.4).requires_grad_()
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)

@@ -15,21 +15,23 @@ from invgraphics import kernels
 from invgraphics.core import Camera, Context, Contributions, Field, Quantity, RayRenderer, Rays, Rendering, Scene, Trace
 from invgraphics.core.contributions import opacities
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, Opacity
-from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.gaussians.profile import density_profile, transmittance
-from invgraphics.renderers.gaussians.quadrature import Weights, integrate_overlapping, phi
-from invgraphics.renderers.gaussians.rays import (
+from invgraphics.kernels.gaussians import gaussian_integrals
+from invgraphics.kernels.reference.gaussian_quadrature import Weights, integrate_overlapping, phi, weighted_sums
+from invgraphics.kernels.reference.gaussian_rays import (
     MAX_DEVIATIONS,
     Intersections,
     Primitives,
     colours,
     intersect,
-    normals,
     precompute,
 )
+from invgraphics.renderers.base import to_rendering
+from invgraphics.renderers.gaussians.profile import density_profile, transmittance
 
 TILE = 16
 """Edge in pixels of the square whose rays are searched for Gaussians together."""
+PART = 1 << 13
+"""Rays that are searched and integrated together where that is compiled."""
 
 MAX_STEPS = 1024
 """Intervals of a ray, each of which is kept for each Gaussian on it; the error falls with their square."""
@@ -122,7 +124,7 @@ class GaussianRays(RayRenderer):
         """Render every pixel, tile by tile. Depth is left at infinity in training, unless ``ctx.geometry`` is set."""
         gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
         primitives = precompute(gaussians, self._opacity, self._smallest, camera.position)
-        rays, order = camera.rays(), _by_tiles(camera)
+        rays, order = camera.rays(), self._parts(camera)
         axis = camera.cam_to_world[:3, 2]
         parts = [self._render(primitives, rays[part], axis, ctx) for part in order]
         rendering, place = Rendering.cat(parts), torch.cat(order).argsort()
@@ -146,20 +148,22 @@ class GaussianRays(RayRenderer):
 
     def _render(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, ctx: Context) -> Rendering:
         rays = _clip_near(rays, ctx)
-        intersections = intersect(primitives, rays)
         geometry = ctx.geometry or not ctx.training
-        weights, distances = self.blending_weights(intersections, rays, axis, geometry)
-        values = [weights[:, None], weights[:, None] * colours(primitives, intersections)]
-        if distances is not None:
-            values.append(distances[:, None])
-        if ctx.geometry:
-            values.append(weights[:, None] * normals(primitives, intersections, rays))
-        joined = torch.cat(values, dim=1)
-        sums = joined.new_zeros(len(rays), joined.shape[1]).index_add(0, intersections.ray, joined)
+        sums = self._sums(primitives, rays, axis, 4 if ctx.geometry else int(geometry))
         if not geometry:
             return Rendering(sums[:, 1:4], sums[:, 0], rays.far)
         normal = sums[:, 5:] if ctx.geometry else None
         return to_rendering(sums[:, 1:4], sums[:, 0], sums[:, 4], normal, rays.far, rays.directions)
+
+    def _sums(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, extra: int) -> Float[Tensor, "n c"]:
+        """Sums of weights times (1, colour), and ``extra`` columns as of `kernels.gaussians.gaussian_integrals`."""
+        intersections = intersect(primitives, rays)
+        weights, distances = self.blending_weights(intersections, rays, axis, extra > 0)
+        return weighted_sums(primitives, rays, intersections, (weights, distances), extra)
+
+    def _parts(self, camera: Camera) -> list[Tensor]:
+        """Flat indices of the pixels that are rendered together."""
+        return _by_tiles(camera)
 
 
 class GaussianExact(GaussianRays):
@@ -174,6 +178,17 @@ class GaussianExact(GaussianRays):
     ) -> Weights:
         """Integrate overlapping densities to weights (see `integrate_overlapping`), independent of order."""
         return integrate_overlapping(intersections, rays, self.config.steps, with_distances)
+
+    @override
+    def _sums(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, extra: int) -> Float[Tensor, "n c"]:
+        return gaussian_integrals(primitives, rays, self.config.steps, extra)
+
+    @override
+    def _parts(self, camera: Camera) -> list[Tensor]:
+        if not kernels.compiled("gaussian_integrals", camera.focal):
+            return super()._parts(camera)
+        # The compiled search has cells of its own; parts bound the memory of its pairs.
+        return list(torch.arange(camera.width * camera.height).split(PART))
 
     def _list_contributions(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]

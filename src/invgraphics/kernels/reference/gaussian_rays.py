@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 
 from invgraphics.core import Gaussians, Rays, harmonics
 from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.kernels.dispatch import choose
 from invgraphics.kernels.extinction import Opacity, reach, strength
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN
 
@@ -105,7 +106,7 @@ def precompute(gaussians: Gaussians, opacity: Opacity, smallest: float, origin: 
 
 def intersect(primitives: Primitives, rays: Rays) -> Intersections:
     """Intersect rays with Gaussians within their reach, differentiably in Gaussians and rays."""
-    ray, gaussian = _candidate_pairs(primitives, rays)
+    ray, gaussian = choose("gaussian_pairs", primitives.means)(primitives, rays)
     table = torch.cat([primitives.means, primitives.whitening.flatten(1), primitives.strength[:, None]], dim=1)
     # index_select has a faster gradient than indexing.
     means, whitening, factor = table.index_select(0, gaussian).split([3, 9, 1], dim=1)
@@ -152,8 +153,11 @@ def _restrict_to_rays(
 
 
 @torch.no_grad()
-def _candidate_pairs(primitives: Primitives, rays: Rays) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
-    """Find pairs of rays and Gaussians within the Gaussians' reach, sorted by ray, then by Gaussian."""
+def gaussian_pairs(primitives: Primitives, rays: Rays) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
+    """Find pairs of rays and Gaussians within the Gaussians' reach, sorted by ray, then by Gaussian.
+
+    Pairs whose peak is more than `MAX_DEVIATIONS` before near or behind far are left out.
+    """
     some = _in_cone(primitives, rays)
     centres, exact = primitives.means[some], 1 - ROUNDING
     # A ray meets a Gaussian's sphere where |c - o|² - ((c - o).d)² <= r²; terms of one of the two are computed once.

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from invgraphics.core import Rays
-from invgraphics.renderers.gaussians.rays import MAX_DEVIATIONS, Intersections
+from invgraphics.kernels.reference.gaussian_rays import MAX_DEVIATIONS, Intersections, Primitives, colours, intersect, normals
 
 Weights = tuple[Float[Tensor, " p"], Float[Tensor, " p"] | None]
 """Each Gaussian's share of a ray's light; and the same times the distance from which it comes, or ``None``."""
@@ -57,9 +57,30 @@ def integrate_overlapping(intersections: Intersections, rays: Rays, steps: int, 
         weights.append(share[there])
         distances += [distance[there]] if distance is not None else []
     if not places:
-        return intersections.depth, intersections.depth
+        return intersections.depth, intersections.depth if with_distances else None
     back = torch.cat(places).argsort()
     return torch.cat(weights)[back], torch.cat(distances)[back] if with_distances else None
+
+
+def gaussian_integrals(primitives: Primitives, rays: Rays, steps: int, extra: int = 0) -> Float[Tensor, "n c"]:
+    """See `invgraphics.kernels.gaussians.gaussian_integrals`."""
+    found = intersect(primitives, rays)
+    return weighted_sums(primitives, rays, found, integrate_overlapping(found, rays, steps, extra > 0), extra)
+
+
+def weighted_sums(
+    primitives: Primitives, rays: Rays, intersections: Intersections, weights: Weights, extra: int
+) -> Float[Tensor, "n c"]:
+    """Sums over each ray of weights times (1, colour), and times distance and normal for ``extra`` 1 and 4."""
+    weight, distance = weights[0][:, None], weights[1]
+    columns = [weight, weight * colours(primitives, intersections)]
+    if extra > 0:
+        assert distance is not None
+        columns.append(distance[:, None])
+    if extra > 1:
+        columns.append(weight * normals(primitives, intersections, rays))
+    joined = torch.cat(columns, dim=1)
+    return joined.new_zeros(len(rays), joined.shape[1]).index_add(0, intersections.ray, joined)
 
 
 def _in_blocks(intersections: Intersections, rays: int, nodes: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:

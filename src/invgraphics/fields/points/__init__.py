@@ -1,0 +1,1 @@
+"""Neural point clouds."""

@@ -1,0 +1,171 @@
+"""Gradients of the exact line integrals: of each ray's light in its Gaussians and in the ray itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from invgraphics.kernels.numba.gaussians.integrals import STRIDE, all_shares, colour_of
+from invgraphics.kernels.numba.gaussians.pairs import restrict
+from invgraphics.kernels.numba.harmonics import harmonics_gradient
+from invgraphics.kernels.numba.runtime import inlined, parallel, prange
+
+_ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+_ROOT = np.float32(1 / np.sqrt(2 * np.pi))
+
+
+@inlined
+def _cut_off(rgb, gradient):
+    """Gradient through max(0, colour): where it is cut off, only what would raise it passes (see `core.harmonics.colour`)."""
+    return gradient if rgb > _ZERO or gradient < _ZERO else _ZERO
+
+
+@inlined
+def _depths_gradient(nodes, light, falls, wanted, slopes):
+    """Gradients in the optical depths of the intervals, given the summed ones in their light."""
+    behind = _ZERO
+    for k in range(len(light)):
+        s = len(light) - 1 - k
+        # A denser interval absorbs more itself and attenuates what is behind.
+        slopes[s] = wanted[s] * falls[s] - behind
+        behind += wanted[s] * light[s]
+
+
+@inlined
+def _shape_gradient(nodes, t, sigma, own, bells, limits, given, slopes, light):
+    """Gradients of one Gaussian's light in its optical depth, and times that depth in its distance and width.
+
+    ``given`` is the gradient in its weight, ``slopes`` those in the intervals' depths.
+    """
+    first, last = limits
+    along = _ZERO
+    for s in range(first, last):
+        along += own[s] * (given * light[s] + slopes[s])
+    shift, widen, inverse = _ZERO, _ZERO, _ONE / sigma
+    for e in range(first, last + 1):
+        before = given * light[e - 1] + slopes[e - 1] if e > 0 else _ZERO
+        after = given * light[e] + slopes[e] if e < len(light) else _ZERO
+        moved = bells[e] * (before - after)
+        shift -= moved
+        widen -= moved * (nodes[e] - t) * inverse
+    return along, shift * _ROOT * inverse, widen * _ROOT * inverse
+
+
+@inlined
+def _colour_gradient(sh, g, offset, inverse, basis, grad_rgb, grad_sh, buffer):
+    """Add the gradient of a colour to that of its coefficients; returns the one in the offset."""
+    for k in range(STRIDE):
+        buffer[STRIDE * k] = _ZERO
+    for k in range(sh.shape[1]):
+        total = _ZERO
+        for c in range(3):
+            grad_sh[g, k, c] += basis[STRIDE * k] * grad_rgb[c]
+            total += sh[g, k, c] * grad_rgb[c]
+        buffer[STRIDE * k] = total
+    ux, uy, uz = offset[0] * inverse, offset[1] * inverse, offset[2] * inverse
+    gx, gy, gz = harmonics_gradient((ux, uy, uz), buffer, np.uintp(0))
+    radial = gx * ux + gy * uy + gz * uz
+    return (gx - radial * ux) * inverse, (gy - radial * uy) * inverse, (gz - radial * uz) * inverse
+
+
+@inlined
+def _place_gradient(table, strength, physical, g, o, d, found, given, grad):
+    """Add gradients in distance, width and depth to those of a Gaussian's row; returns those in offset and direction."""
+    sigma, depth = found
+    shift, widen, thicken = given
+    t, _, _, (x0, x1, x2), (d0, d1, d2) = restrict(table, g, o[0], o[1], o[2], d[0], d[1], d[2])
+    grad[g, 12] += thicken * depth / strength[g]
+    if physical:
+        widen += thicken * depth / sigma
+    squared = -_HALF * thicken * depth
+    y0, y1, y2 = x0 - t * d0, x1 - t * d1, x2 - t * d2
+    rate = sigma * sigma
+    a, b, c = _TWO * squared, shift * rate, -widen * rate * sigma
+    # Of the whitened offset x and direction d: t = x.d / d.d, sigma = 1 / |d|, and |x - t d|².
+    gx0, gx1, gx2 = a * y0 + b * d0, a * y1 + b * d1, a * y2 + b * d2
+    gd0 = -a * t * y0 + b * (x0 - _TWO * t * d0) + c * d0
+    gd1 = -a * t * y1 + b * (x1 - _TWO * t * d1) + c * d1
+    gd2 = -a * t * y2 + b * (x2 - _TWO * t * d2) + c * d2
+    cx, cy, cz = table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2]
+    grad[g, 3] += gx0 * cx + gd0 * d[0]
+    grad[g, 4] += gx0 * cy + gd0 * d[1]
+    grad[g, 5] += gx0 * cz + gd0 * d[2]
+    grad[g, 6] += gx1 * cx + gd1 * d[0]
+    grad[g, 7] += gx1 * cy + gd1 * d[1]
+    grad[g, 8] += gx1 * cz + gd1 * d[2]
+    grad[g, 9] += gx2 * cx + gd2 * d[0]
+    grad[g, 10] += gx2 * cy + gd2 * d[1]
+    grad[g, 11] += gx2 * cz + gd2 * d[2]
+    offset = (
+        table[g, 3] * gx0 + table[g, 6] * gx1 + table[g, 9] * gx2,
+        table[g, 4] * gx0 + table[g, 7] * gx1 + table[g, 10] * gx2,
+        table[g, 5] * gx0 + table[g, 8] * gx1 + table[g, 11] * gx2,
+    )
+    direction = (
+        table[g, 3] * gd0 + table[g, 6] * gd1 + table[g, 9] * gd2,
+        table[g, 4] * gd0 + table[g, 7] * gd1 + table[g, 10] * gd2,
+        table[g, 5] * gd0 + table[g, 8] * gd1 + table[g, 11] * gd2,
+    )
+    return offset, direction
+
+
+@inlined
+def _weights_gradients(sh, table, gaussian, begin, end, o, depth, grad_sums, room, colours, given):
+    """Colours of a ray's Gaussians, gradients in their weights, and the sums of those in the light of the intervals."""
+    wanted, light, basis, rgb = room[3][3], room[3][1], room[4], room[5]
+    wanted[:] = _ZERO
+    for p in range(begin, end):
+        i, g = p - begin, gaussian[p]
+        colour_of(sh, g, table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2], basis, rgb)
+        value = grad_sums[0]
+        for c in range(3):
+            value += grad_sums[1 + c] * max(rgb[c], _ZERO)
+        given[i] = value
+        weight = _ZERO
+        for s in range(room[2][i, 0], room[2][i, 1]):
+            weight += light[s] * room[0][i, s]
+            wanted[s] += depth[p] * value * room[0][i, s]
+        colours[i] = weight * depth[p]
+
+
+@parallel
+def integrate_backward(rays, primitives, physical, pairs, first_ray, kept, grad_sums, rooms, grads):
+    """Gradients of every job in the rows of Gaussians and in their coefficients, and in each ray's origin and direction."""
+    origins, directions = rays
+    table, strength, sh = primitives
+    gaussian, starts = pairs
+    t, sigma, depth, nodes = kept
+    for job in prange(len(first_ray) - 1):
+        basis, rgb, buffer = (
+            np.empty(STRIDE * STRIDE, np.float32),
+            np.empty(3, np.float32),
+            np.empty(STRIDE * STRIDE, np.float32),
+        )
+        room = rooms[0][job], rooms[1][job], rooms[2][job], rooms[3][job], basis, rgb
+        weights, given = rooms[4][job, 0], rooms[4][job, 1]
+        light, slopes, grad_rgb = room[3][1], room[3][4], np.empty(3, np.float32)
+        grad, grad_sh = grads[0][job], grads[1][job]
+        for r in range(first_ray[job], first_ray[job + 1]):
+            begin, end = starts[r], starts[r + 1]
+            if begin == end:
+                continue
+            o, d = origins[r], directions[r]
+            all_shares(nodes[r], t, sigma, depth, begin, end, room[:4])
+            _weights_gradients(sh, table, gaussian, begin, end, o, depth, grad_sums[r], room, weights, given)
+            _depths_gradient(nodes[r], light, room[3][2], room[3][3], slopes)
+            for p in range(begin, end):
+                i, g = p - begin, gaussian[p]
+                limits = room[2][i, 0], room[2][i, 1]
+                thicken, shift, widen = _shape_gradient(
+                    nodes[r], t[p], sigma[p], room[0][i], room[1][i], limits, given[i], slopes, light
+                )
+                found, moved = (sigma[p], depth[p]), (shift * depth[p], widen * depth[p], thicken)
+                offset, direction = _place_gradient(table, strength, physical, g, o, d, found, moved, grad)
+                cx, cy, cz = table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2]
+                inverse = colour_of(sh, g, cx, cy, cz, basis, rgb)
+                for c in range(3):
+                    grad_rgb[c] = _cut_off(rgb[c], weights[i] * grad_sums[r, 1 + c])
+                seen = _colour_gradient(sh, g, (cx, cy, cz), inverse, basis, grad_rgb, grad_sh, buffer)
+                for c in range(3):
+                    grad[g, c] += offset[c] + seen[c]
+                    grads[2][r, c] -= offset[c] + seen[c]
+                    grads[3][r, c] += direction[c]

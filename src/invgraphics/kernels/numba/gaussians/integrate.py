@@ -1,0 +1,114 @@
+"""Light of rays through overlapping Gaussians, differentiable: memory, jobs and torch around the compiled loops."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core.rays import Rays
+from invgraphics.kernels.numba.gaussians.backward import integrate_backward
+from invgraphics.kernels.numba.gaussians.integrals import integrate
+from invgraphics.kernels.numba.gaussians.nodes import COUNT
+from invgraphics.kernels.numba.gaussians.pairs import gaussian_pairs
+from invgraphics.kernels.numba.runtime import array, once_differentiable, scratch, split_by_work, threads
+from invgraphics.kernels.reference import gaussian_quadrature as reference
+from invgraphics.kernels.reference.gaussian_rays import Primitives
+
+
+class _Work:
+    """Pairs of one call, how its rays are split into jobs, and the jobs' work arrays.
+
+    Attributes:
+        pairs: index of each pair's Gaussian, and the first pair of each ray.
+        first_ray: of each job, and the number of rays.
+    """
+
+    def __init__(self, gaussian: np.ndarray, starts: np.ndarray) -> None:
+        self.pairs = gaussian, starts
+        counts, jobs = np.diff(starts), threads()
+        self.first_ray = np.empty(jobs + 1, np.int64)
+        split_by_work(counts, jobs, self.first_ray)
+        self.most = max(1, int(counts.max(initial=0)))
+
+    def rooms(self, edges: int) -> tuple[np.ndarray, ...]:
+        """Shares and bells of each Gaussian at all edges, its first and last interval, and rows of light."""
+        jobs, most = len(self.first_ray) - 1, self.most
+        shapes = (jobs, most, edges), (jobs, most, edges), (jobs, 5, edges - 1)
+        shares, bells, light = (
+            scratch(f"gaussians.{i}", int(np.prod(shape)))[: int(np.prod(shape))].reshape(shape)
+            for i, shape in enumerate(shapes)
+        )
+        limits = scratch("gaussians.limits", 2 * jobs * most, np.int64)[: 2 * jobs * most].reshape(jobs, most, 2)
+        return shares, bells, limits, light
+
+    def sorting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Arrays in which quadrature nodes are placed."""
+        jobs, size = len(self.first_ray) - 1, 6 * COUNT * self.most
+        rows = scratch("gaussians.nodes", jobs * size)[: jobs * size].reshape(jobs, 6, COUNT * self.most)
+        return rows, np.empty((jobs, 4, 256), np.int32)
+
+
+class _Integrate(torch.autograd.Function):
+    """Differentiable in rows of Gaussians, strengths, coefficients, origins and directions."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, table: Tensor, strength: Tensor, sh: Tensor, origins: Tensor, directions: Tensor, settings: Any
+    ) -> Tensor:
+        work, limits, normals, physical, steps, width = settings
+        rays, p = len(origins), len(work.pairs[0])
+        sums = torch.zeros(rays, width)
+        kept = (*(np.empty(p, np.float32) for _ in range(3)), np.empty((rays, steps + 1), np.float32))
+        given = tuple(array(x) for x in (table, strength, sh, normals))
+        along = (array(origins), array(directions), *(array(x) for x in limits))
+        rooms = (*work.rooms(steps + 1), *work.sorting())
+        integrate(along, given, physical, work.pairs, work.first_ray, kept, sums.numpy(), rooms)
+        ctx.save_for_backward(table, strength, sh, origins, directions)
+        ctx.work, ctx.kept, ctx.physical = work, kept, physical
+        return sums
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        table, strength, sh, origins, directions = ctx.saved_tensors
+        work, edges = ctx.work, ctx.kept[3].shape[1]
+        jobs = len(work.first_ray) - 1
+        rows, coefficients = torch.zeros(jobs, len(table), 13), torch.zeros(jobs, *sh.shape)
+        grad_origins, grad_directions = torch.zeros(len(origins), 3), torch.zeros(len(origins), 3)
+        rooms = *work.rooms(edges), np.empty((jobs, 2, work.most), np.float32)
+        integrate_backward(
+            (array(origins), array(directions)),
+            (array(table), array(strength), array(sh)),
+            ctx.physical,
+            work.pairs,
+            work.first_ray,
+            ctx.kept,
+            array(grad_outputs[0]),
+            rooms,
+            tuple(x.numpy() for x in (rows, coefficients, grad_origins, grad_directions)),
+        )
+        summed = rows.sum(dim=0)
+        return summed[:, :12], summed[:, 12], coefficients.sum(dim=0), grad_origins, grad_directions, None
+
+
+def gaussian_integrals(primitives: Primitives, rays: Rays, steps: int, extra: int = 0) -> Float[Tensor, "n c"]:
+    """See `invgraphics.kernels.gaussians.gaussian_integrals`; gradients of distances and normals are the reference's."""
+    if primitives.opacity == "splat" or (extra and torch.is_grad_enabled()):
+        return reference.gaussian_integrals(primitives, rays, steps, extra)
+    ray, gaussian = gaussian_pairs(primitives, rays)
+    starts = np.zeros(len(rays) + 1, np.int64)
+    np.cumsum(np.bincount(ray.numpy(), minlength=len(rays)), out=starts[1:])
+    table = torch.cat([primitives.means, primitives.whitening.flatten(1)], dim=1)
+    settings = (
+        _Work(gaussian.numpy(), starts),
+        (rays.near, rays.far),
+        primitives.normals,
+        primitives.opacity == "physical",
+        steps,
+        4 + extra,
+    )
+    return _Integrate.apply(table, primitives.strength, primitives.sh, rays.origins, rays.directions, settings)

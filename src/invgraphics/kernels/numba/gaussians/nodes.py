@@ -1,0 +1,101 @@
+"""Edges of a ray's quadrature intervals (`kernels.reference.gaussian_quadrature.place_nodes`), with a radix sort."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from invgraphics.kernels.numba.runtime import exp2, inlined
+from invgraphics.kernels.reference.gaussian_quadrature import EDGES, MAX_OPTICAL_DEPTH, phi
+
+_EDGES = np.array(EDGES, np.float32)
+COUNT = len(EDGES)
+"""Edges of one Gaussian's staircase."""
+
+
+def _rises() -> np.ndarray:
+    """Steps of the staircase of a unit Gaussian's mean density at its `EDGES`."""
+    import torch
+
+    z = torch.tensor(EDGES, dtype=torch.float64)
+    heights = (phi(z).diff() / z.diff()).numpy()
+    return np.diff(heights, prepend=0.0, append=0.0).astype(np.float32)
+
+
+_RISES = _rises()
+_LOG2E = np.float32(1 / np.log(2.0))
+_MOST = np.float32(MAX_OPTICAL_DEPTH)
+_TINY, _EPS = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
+_BITS, _BUCKETS, _PASSES = np.uint32(8), 256, 4
+
+
+@inlined
+def _sort(keys, rises, keys_swap, rises_swap, n, counts):
+    """Sort non-negative floats, viewed as unsigned integers, with what belongs to them; back in the first arrays."""
+    counts[:] = 0
+    for i in range(n):
+        key = keys[i]
+        for p in range(_PASSES):
+            counts[p, (key >> np.uint32(_BITS * np.uint32(p))) & np.uint32(255)] += 1
+    for p in range(_PASSES):
+        shift = np.uint32(_BITS * np.uint32(p))
+        total = np.int32(0)
+        for bucket in range(_BUCKETS):
+            count = counts[p, bucket]
+            counts[p, bucket] = total
+            total += count
+        for i in range(n):
+            bucket = (keys[i] >> shift) & np.uint32(255)
+            place = counts[p, bucket]
+            counts[p, bucket] = place + np.int32(1)
+            keys_swap[place], rises_swap[place] = keys[i], rises[i]
+        keys, keys_swap = keys_swap, keys
+        rises, rises_swap = rises_swap, rises
+
+
+@inlined
+def place_nodes(t, sigma, depth, begin, end, near, far, nodes, scratch, counts):
+    """Fill ``nodes`` with edges from near to far for the Gaussians ``begin`` to ``end - 1`` of a ray.
+
+    ``scratch`` holds six rows of at least `COUNT` entries per Gaussian: keys, rises, both once more, and two sums.
+    """
+    steps = len(nodes) - 1
+    n = 0
+    for i in range(begin, end):
+        height = depth[i] / sigma[i]
+        for e in range(COUNT):
+            at = min(max(t[i] + sigma[i] * _EDGES[e], near), far)
+            # Distances from near are not negative: their bits sort as integers do.
+            scratch[0, n], scratch[1, n] = at - near, height * _RISES[e]
+            n += 1
+    keys, swap = scratch[0].view(np.uint32), scratch[2].view(np.uint32)
+    _sort(keys, scratch[1], swap, scratch[3], n, counts)
+    place, reached, grown = scratch[0], scratch[4], scratch[5]
+    density, total = 0.0, 0.0
+    reached[0] = np.float32(0.0)
+    for i in range(n - 1):
+        # In float64, because the density of thin Gaussians is large and must vanish behind them.
+        density += np.float64(scratch[1, i])
+        total += max(density, 0.0) * np.float64(place[i + 1] - place[i])
+        reached[i + 1] = np.float32(total)
+    last = max(np.float32(total), _TINY)
+    whole = np.float32(1.0) / _one_minus_exp(last)
+    deepest = np.float32(1.0) / min(last, _MOST)
+    for i in range(n):
+        grown[i] = _one_minus_exp(reached[i]) * whole + min(reached[i], _MOST) * deepest
+    nodes[0], nodes[steps] = near, far
+    after = 1
+    for s in range(1, steps):
+        wanted = np.float32(2.0) * np.float32(s) / np.float32(steps)
+        while after < n - 1 and grown[after] < wanted:
+            after += 1
+        low, high = grown[after - 1], grown[after]
+        part = min(max((wanted - low) / max(high - low, _EPS), np.float32(0.0)), np.float32(1.0))
+        nodes[s] = near + place[after - 1] + part * (place[after] - place[after - 1])
+
+
+@inlined
+def _one_minus_exp(x):
+    """1 - exp(-x) for x >= 0; a series where the difference would cancel."""
+    if x < np.float32(0.02):
+        return x * (np.float32(1.0) - x * (np.float32(0.5) - x * np.float32(1 / 6)))
+    return np.float32(1.0) - exp2(-x * _LOG2E)

@@ -1,0 +1,1 @@
+"""Hooks and penalties of neural point clouds."""

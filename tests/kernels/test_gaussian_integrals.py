@@ -1,0 +1,86 @@
+"""Compiled line integrals of Gaussians equal the reference in float64: pairs, light, and every gradient."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from invgraphics import kernels
+from invgraphics.core import Bounds, Gaussians, Rays
+from invgraphics.kernels.dispatch import choose
+from invgraphics.kernels.gaussians import gaussian_integrals
+from invgraphics.kernels.reference.gaussian_rays import gaussian_pairs, precompute
+from invgraphics.testing import toy_cameras
+
+pytestmark = pytest.mark.skipif("numba" not in kernels.dispatch.cpu_implementations(), reason="Numba does not work here")
+SMALLEST = 1e-3
+
+
+def blobs(n: int, seed: int) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=generator) * 0.4,
+        quaternions=torch.randn(n, 4, generator=generator),
+        scales=torch.rand(n, 3, generator=generator) * 0.2 + 0.02,
+        opacities=torch.rand(n, generator=generator) * 0.95,
+        sh=torch.randn(n, 9, 3, generator=generator) * 0.4,
+    )
+
+
+def rays_of(views: int, every: int) -> Rays:
+    """Rays of several cameras, one after the other, within the box in which the Gaussians are."""
+    rays = Rays.cat([camera.rays()[index::every] for index, camera in enumerate(toy_cameras(views, 12))])
+    return Bounds(-1.3 * torch.ones(3), 1.3 * torch.ones(3)).clip(rays)
+
+
+def test_pairs_are_those_of_the_reference() -> None:
+    primitives = precompute(blobs(80, 0), "peak", SMALLEST)
+    all_around = torch.nn.functional.normalize(torch.randn(60, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    inside = Rays.make(torch.full((60, 3), 0.05), all_around)  # in the midst of them: no plane is tangent to all
+    for rays in (rays_of(4, 3), rays_of(1, 1), rays_of(3, 200), inside, rays_of(2, 5)[:0]):
+        found, expected = choose("gaussian_pairs", primitives.means)(primitives, rays), gaussian_pairs(primitives, rays)
+        assert choose("gaussian_pairs", primitives.means) is not gaussian_pairs
+        assert torch.equal(found[0], expected[0])
+        assert torch.equal(found[1], expected[1])
+
+
+@pytest.mark.parametrize("opacity", ["peak", "physical"])
+def test_light_and_gradients_are_the_references(opacity: str) -> None:
+    rays, generator = rays_of(3, 7), torch.Generator().manual_seed(2)
+    wanted = torch.randn(len(rays), 4, generator=generator)
+
+    def run(dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+        tensors = {name: value.to(dtype).requires_grad_() for name, value in vars(blobs(50, 3)).items()}
+        moved = rays.to(dtype)
+        moved = replace(
+            moved, origins=moved.origins.clone().requires_grad_(), directions=moved.directions.clone().requires_grad_()
+        )
+        # Strong gradients make colours negative somewhere: what would lower those further must not pass.
+        sums = gaussian_integrals(precompute(Gaussians(**tensors), opacity, SMALLEST), moved, 32)
+        gradients = torch.autograd.grad((sums * wanted.to(dtype)).sum(), (*tensors.values(), moved.origins, moved.directions))
+        return sums.detach(), *gradients
+
+    for fast, exact in zip(run(torch.float32), run(torch.float64), strict=True):
+        scale = float(exact.abs().max())
+        assert scale > 0.1
+        torch.testing.assert_close(fast.double(), exact, atol=3e-5 * scale, rtol=1e-3)
+
+
+def test_distances_and_normals() -> None:
+    rays, primitives = rays_of(2, 5), precompute(blobs(40, 4), "peak", SMALLEST)
+    with torch.no_grad():
+        fast = gaussian_integrals(primitives, rays, 32, 4)
+        with kernels.using("reference"):
+            exact = gaussian_integrals(primitives, rays, 32, 4)
+    torch.testing.assert_close(fast, exact, atol=2e-5, rtol=1e-4)
+    assert float(exact[:, 4].max()) > 1
+    # A gradient of those is had, by the reference.
+    moving = replace(primitives, means=primitives.means.clone().requires_grad_())
+    gaussian_integrals(moving, rays, 8, 1)[:, 4].sum().backward()
+    assert bool(moving.means.grad.any())
+
+
+def test_nothing_in_view() -> None:
+    primitives = precompute(blobs(5, 0), "peak", SMALLEST)
+    away = Rays.make(torch.full((4, 3), 50.0), torch.tensor([[1.0, 0.0, 0.0]]).expand(4, 3))
+    assert not gaussian_integrals(primitives, away, 8).any()
