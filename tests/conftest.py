@@ -12,7 +12,7 @@ import torch
 from invgraphics import kernels
 from invgraphics.experiments.recorder import Monitor
 
-pytest_plugins = ["training_fixtures"]
+pytest_plugins = ["shared_folders", "training_fixtures"]
 
 
 LONGEST = (

@@ -252,8 +252,8 @@ def test_a_finished_run_shows_new_views_through_other_renderers() -> None:
     )
     splatted, integrated = run.model.render(camera), run.through("gaussian-volume/exact:steps=8").render(camera)
     assert 0 < float((splatted.rgb - integrated.rgb).abs().max()) < 0.5
-    with pytest.raises(InputError, match="cannot be rendered with volumetric/nerf"):
-        run.through("volumetric/nerf")
+    with pytest.raises(InputError, match="cannot be rendered with sphere-tracing/hash"):
+        run.through("sphere-tracing/hash")
 
 
 def test_a_run_through_its_own_renderer_keeps_what_that_learnt_and_through_another_takes_a_constant() -> None:

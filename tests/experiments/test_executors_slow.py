@@ -1,7 +1,10 @@
 """Whole studies on both executors: the same bits, killed in the middle, nodes lost."""
 
+import contextlib
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -59,6 +62,20 @@ def cells(out: Path) -> list[dict]:
 def starts(out: Path) -> dict[str, int]:
     """How often each fit was begun or gone on with, from its log."""
     return {log.stem: log.read_text().count("test views in at most about") for log in (out / "jobs").glob("*.log")}
+
+
+def kill_tree(root: int) -> None:
+    """SIGKILL a process and all below it, as when a machine loses power; a raylet's workers would outlive it by seconds."""
+    parents = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
+    doomed = {root}
+    while below := {process for process, parent in parents.items() if parent in doomed} - doomed:
+        doomed |= below
+    for process in doomed:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
 
 
 @pytest.fixture
@@ -122,6 +139,7 @@ def test_a_lost_node_costs_nothing_but_time(tmp_path: Path, monkeypatch) -> None
     def kill() -> None:
         wait_until(under_way)
         untouched.update({path: path.stat().st_mtime_ns for path in out.glob("runs/*/scores.json")})
+        kill_tree(lost.all_processes["raylet"][0].process.pid)
         cluster.remove_node(lost, allow_graceful=False)
 
     thread = threading.Thread(target=kill)

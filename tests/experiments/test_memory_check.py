@@ -23,6 +23,14 @@ from invgraphics.scenes.open import SceneOptions, open_scene
         ("volumetric/nerf", "batches.rays=1000000000", "batches.rays"),
         ("volumetric/nerf", "field.width=1000000", "field.width"),
         ("volumetric/hash", "field.width=1000000", "field.width"),
+        ("volumetric/nerf", "renderer.sampler.coarse=65536", "renderer.sampler"),
+        ("volumetric/hash", "renderer.sampler.resolution=1000000", "renderer.sampler"),
+        ("volumetric/hash", "renderer.sampler.cells=1000000000", "renderer.sampler"),
+        ("volumetric/dvgo", "field.encoding.resolution=1000000", "field.encoding"),
+        ("volumetric/plenoxels", "hooks.0.rays=1000000000", "rays"),
+        ("volumetric/plenoxels", "hooks.1.resolution=10000", "in the hooks"),
+        ("volumetric/tensorf-vm", "hooks.0.resolution=1000000", "in the hooks"),
+        ("sphere-tracing/mlp", "penalties.0.points=1000000000", "points"),
     ],
 )
 def test_absurd_requests_are_refused_at_once(toy_folder: Path, method: str, override: str, remedy: str) -> None:
@@ -45,10 +53,35 @@ def test_every_method_fits_and_its_parameters_are_counted(toy_folder: Path, monk
 
 
 def test_counted_parameters_are_those_that_are_built(toy_folder: Path) -> None:
-    from invgraphics.experiments.memory_check import _parameter_bytes
+    from invgraphics.experiments.memory_check import _build, _bytes
 
     scene = open_scene(str(toy_folder), SceneOptions())
     for name in ("volumetric/hash", "volumetric/nerf"):
         method = load_method(name)
         model = build_model(method, scene, 0, torch.device("cpu"))
-        assert _parameter_bytes(method, scene) == 4 * sum(parameter.numel() for parameter in model.field.parameters())
+        assert _bytes(_build(method.recipe.field, name, scene)) == 4 * sum(
+            parameter.numel() for parameter in model.field.parameters()
+        )
+
+
+@pytest.mark.parametrize(
+    ("method", "override"),
+    [
+        ("volumetric/nerf", "field.layers=1000000000"),
+        ("volumetric/nerf", "field.colour_layers=1000000000"),
+        ("volumetric/nerf", "field.direction_degree=1000000000"),
+        ("volumetric/tensorf-vm", "field.feature_octaves=1000000000"),
+        ("volumetric/hash", "field.encoding.levels=1000000000"),
+        ("volumetric/dense", "field.encoding.levels=1000000000"),
+        ("volumetric/hash", "renderer.sampler.steps_per_diagonal=1000000000"),
+        ("hybrid/neus", "renderer.sampler.rounds=1000000000"),
+        ("hybrid/volsdf", "renderer.sampler.bisections=1000000000"),
+        ("sphere-tracing/mlp", "renderer.steps=1000000000"),
+        ("gaussian-volume/exact", "renderer.steps=1000000000"),
+    ],
+)
+def test_numbers_of_rounds_have_a_limit(method: str, override: str) -> None:
+    """What is done one after another takes no memory that could be forecast, and for ever."""
+    name = override.partition("=")[0].rpartition(".")[2]
+    with pytest.raises(InputError, match=rf"{name}.* from [01] to \d+"):
+        load_method(method, "", [override])

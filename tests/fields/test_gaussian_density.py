@@ -13,7 +13,7 @@ from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.fields.gaussian import GaussianField
 from invgraphics.fields.gaussian_density import overlapping_pairs, query_density
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, mean_inverse_scale, reach
-from invgraphics.renderers.gaussian_volume import GaussianExactConfig
+from invgraphics.renderers.gaussians.volume import GaussianExactConfig
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig

@@ -16,8 +16,8 @@ from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Gaussi
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.kernels.extinction import mean_inverse_scale
-from invgraphics.renderers.gaussian_rays import intersect, precompute
-from invgraphics.renderers.gaussian_volume import GaussianExactConfig, GaussianSortedConfig
+from invgraphics.renderers.gaussians.rays import intersect, precompute
+from invgraphics.renderers.gaussians.volume import GaussianExactConfig, GaussianSortedConfig
 from invgraphics.testing import check_renderer, toy_cameras, toy_scene
 
 F64 = torch.float64

@@ -134,7 +134,7 @@ def test_the_density_itself_stands_in_for_a_proposal(make_scene: Callable[..., S
 def test_refusals() -> None:
     with pytest.raises(ValueError, match="count"):
         StratifiedConfig(0)
-    with pytest.raises(ValueError, match="coarse and fine"):
+    with pytest.raises(ValueError, match="coarse must be from 1"):
         HierarchicalConfig(coarse=0)
     with pytest.raises(NotComposableError, match="needs density, which Dark"):
         Hierarchical(HierarchicalConfig(), Dark())

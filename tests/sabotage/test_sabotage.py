@@ -1,7 +1,8 @@
 """Faults at random moments of commands: afterwards the same command goes on, and ends with the results of an undisturbed one.
 
 ``INVGRAPHICS_SABOTAGE`` is the number of moments, ``INVGRAPHICS_SABOTAGE_SEED`` repeats a day's (YYYYMMDD). The test suite
-takes a handful of fits and reports; ``make sabotage`` takes 200 of everything.
+takes a handful of fits and reports; ``make sabotage`` takes 200 of everything. ``INVGRAPHICS_SABOTAGE_ONLY`` picks some of them
+by their numbers, ``19,55,100-149`` for instance.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from faults import DONE, faults, small_disk
 HANDFUL = 6
 COUNT = int(os.environ.get("INVGRAPHICS_SABOTAGE", HANDFUL))
 SEED = int(os.environ.get("INVGRAPHICS_SABOTAGE_SEED", f"{datetime.datetime.now(datetime.UTC):%Y%m%d}"))
+ONLY = os.environ.get("INVGRAPHICS_SABOTAGE_ONLY", "")
 ON_A_DISK_OF_ITS_OWN = "full disk"
 
 
@@ -88,6 +90,12 @@ def moments(cases: list[Case], count: int) -> list[tuple[Case, str, float]]:
     return [(case, fault, chance.random()) for case, fault in itertools.islice(itertools.cycle(pairs), count)]
 
 
+def chosen(only: str, count: int) -> set[int]:
+    """Numbers below ``count`` that a list like ``19,55,100-149`` names; all if it is empty."""
+    ranges = [part.partition("-") for part in only.split(",")] if only else [("0", "-", str(count - 1))]
+    return {number for first, _, last in ranges for number in range(int(first), int(last or first) + 1) if number < count}
+
+
 @pytest.mark.timeout(0)
 def test_nothing_is_lost(tmp_path: Path) -> None:
     say(f"INVGRAPHICS_SABOTAGE_SEED={SEED} INVGRAPHICS_SABOTAGE={COUNT}")
@@ -97,6 +105,8 @@ def test_nothing_is_lost(tmp_path: Path) -> None:
     failed: Counter[tuple[str, str]] = Counter()
     failures = []
     for number, (case, fault, share) in enumerate(moments(cases, COUNT)):
+        if number not in chosen(ONLY, COUNT):
+            continue
         if case.name not in wholes:
             wholes[case.name] = Undisturbed(case, tmp_path)
         place = tmp_path / f"{number:03}"

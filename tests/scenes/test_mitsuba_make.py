@@ -227,6 +227,8 @@ def test_whatever_matters_changes_the_key(rendered, scene_file):
         ({"test": -1}, "test"),
         ({"spp": 0}, "samples"),
         ({"seed": -1}, "seed"),
+        ({"size": (1_000_000, 1_000_000)}, "of memory"),
+        ({"test": 1_000_000_000_000}, "of memory"),
     ],
 )
 def test_impossible_options_are_refused(fresh, scene_file, option, word):

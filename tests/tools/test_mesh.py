@@ -239,7 +239,7 @@ def test_a_fitted_density_is_seen_as_a_mesh(runs: dict[str, Path], toy_folder: P
     picture = model.render(run.scene.test[0].camera)
     assert set(picture.alpha.unique().mul(9).round().tolist()) <= set(map(float, range(10)))  # opaque triangles, 9 rays each
     native = run.scores["psnr"]
-    assert shown.quality["psnr"].mean > native - 5
+    assert 15 < shown.quality["psnr"].mean < native  # a level of 1 makes the fog thick
     assert shown.quality["alpha_iou"].mean > 0.7
 
     out = source.parent / "refitted"

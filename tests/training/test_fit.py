@@ -15,7 +15,7 @@ from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 
 METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
-STEPS = {"volumetric/nerf": 200, "volumetric/hash": 180, "splatting/gaussians": 120}
+STEPS = {"volumetric/nerf": 200, "volumetric/hash": 220, "splatting/gaussians": 120}
 FAST = {
     "volumetric/nerf": ["optimiser.groups.field.lr=1.5e-2", "optimiser.groups.field.final=2e-3"],
     "volumetric/hash": ["renderer.sampler.grace=8", "optimiser.groups.table.lr=5e-2"],

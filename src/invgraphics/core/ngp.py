@@ -9,6 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+MAX_LEVELS = 64
+"""Levels between 1 and 2^20 cells along an edge that are worth telling apart."""
+
 
 @dataclass(frozen=True)
 class HashGrid:

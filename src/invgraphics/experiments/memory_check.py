@@ -2,52 +2,133 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import torch
+from torch import nn
 
 from invgraphics.core import Scene, harmonics
+from invgraphics.core.lattice import LatticeField
 from invgraphics.errors import InputError
+from invgraphics.fields.encodings.lattices import LatticeConfig
 from invgraphics.fields.gaussian import GaussianFieldConfig
+from invgraphics.fields.planes import PlanesConfig
 from invgraphics.memory import check_fits
 from invgraphics.recipes.recipe import Method
+from invgraphics.recipes.schema import Recipe
 
 COPIES = 6
 """Of each primitive's values during a step: parameter, gradient, Adam's two moments; activated, and the gradient of that."""
 RAY_BYTES = 512
 """Of a ray of a batch: origin, direction, interval, colours and their gradients."""
+TEXEL_BYTES = 16 * COPIES
+"""Of a texel of a multi-plane image: colour and opacity, in as many copies."""
+SAMPLE_BYTES = 32
+"""Of a sample: its ray, interval, position and density."""
 TRAINED_COPIES = 4
 """Of each parameter of a network: itself, its gradient and Adam's two moments."""
+SAMPLES_REMEDY = "Choose a lower batches.rays or batches.samples, fewer samples in renderer.sampler, or a lower field.width."
+NETWORK_REMEDY = "Choose a smaller network: field.width, field.layers, or the size of field.encoding."
 
 
 def check_memory(method: Method, scene: Scene) -> None:
-    """Check that a method's field and batches fit into free memory; the estimate is a lower bound.
+    """Check that a method's field, sampler and batches fit into free memory; the estimate is a lower bound.
 
     Raises:
         InputError: it does not fit; the remedy names the value to change.
     """
-    config, rays = method.recipe.field, method.recipe.batches.rays
-    check_fits(rays * RAY_BYTES, f"A step of {method.name} with {rays:,} rays", "Choose a lower batches.rays.")
-    if isinstance(config, GaussianFieldConfig):
-        at_random = config.init in ("random", "field") or (config.init == "scene" and scene.points is None)
-        known = 0 if scene.points is None else min(len(scene.points), config.max_init)
-        primitives = config.count if at_random else known
-        row = 4 * (11 + 3 * harmonics.count(config.sh_degree))
-        what = f"The field of {method.name} with {primitives:,} Gaussians"
-        check_fits(primitives * row * COPIES, what, "Choose a lower field.count or field.max_init.")
-        return
-    samples = max(rays, method.recipe.batches.samples)  # at least one on each ray
-    activations = samples * int(getattr(config, "width", 0)) * 4 * 2  # of one layer, with their gradients
-    needed = TRAINED_COPIES * _parameter_bytes(method, scene) + activations
-    remedy = "Choose a smaller network: field.width, field.layers, or the size of field.encoding."
-    check_fits(needed, f"A step of {method.name}, with gradients and moments,", remedy)
+    recipe, step = method.recipe, f"A step of {method.name}"
+    rays, sampler = recipe.batches.rays, getattr(recipe.renderer, "sampler", None)
+    check_fits(rays * RAY_BYTES, f"{step} with {rays:,} rays", "Choose a lower batches.rays.")
+    for hook in recipe.hooks:
+        check_fits(getattr(hook, "rays", 0) * RAY_BYTES, f"A hook of {method.name}", "Choose fewer 'rays' for it.")
+    on_each = getattr(sampler, "samples_per_ray", 1)
+    what = f"{step} with {on_each:,} samples on each of {rays:,} rays"
+    check_fits(rays * on_each * SAMPLE_BYTES, what, "Choose a lower batches.rays, or fewer samples in renderer.sampler.")
+    what = f"The sampler of {method.name}"
+    check_fits(getattr(sampler, "state_bytes", 0), what, "Choose a lower resolution or fewer cells in renderer.sampler.")
+    if isinstance(recipe.field, GaussianFieldConfig):
+        _check_gaussians(recipe.field, method.name, scene)
+    elif isinstance(recipe.field, PlanesConfig):
+        _check_planes(recipe.field, method.name, scene)
+    else:
+        _check_network(recipe, method.name, scene, rays * on_each)
 
 
-def _parameter_bytes(method: Method, scene: Scene) -> int:
-    """Bytes of a field's parameters, from tensor shapes on torch's meta device."""
+def _check_gaussians(config: GaussianFieldConfig, name: str, scene: Scene) -> None:
+    at_random = config.init in ("random", "field") or (config.init == "scene" and scene.points is None)
+    known = 0 if scene.points is None else min(len(scene.points), config.max_init)
+    primitives = config.count if at_random else known
+    row = 4 * (11 + 3 * harmonics.count(config.sh_degree))
+    what = f"The field of {name} with {primitives:,} Gaussians"
+    check_fits(primitives * row * COPIES, what, "Choose a lower field.count or field.max_init.")
+
+
+def _check_network(recipe: Recipe, name: str, scene: Scene, on_rays: int) -> None:
+    config, batches = recipe.field, recipe.batches
+    activation = int(getattr(config, "width", 0)) * 4 * 2  # of one layer, with its gradient
+    for penalty in recipe.penalties:
+        needed = getattr(penalty, "points", 0) * (SAMPLE_BYTES + activation)
+        check_fits(needed, f"A penalty of {name}", "Choose fewer 'points' for it.")
+    parts = [config, *filter(None, [getattr(getattr(recipe.renderer, "sampler", None), "proposal", None)])]
+    trained = TRAINED_COPIES * sum(_bytes(_build(part, name, scene)) for part in parts)
+    check_fits(trained, f"A step of {name}, with gradients and moments,", NETWORK_REMEDY)
+    activations = max(batches.samples or on_rays, batches.rays) * activation
+    check_fits(trained + activations, f"A step of {name}, with what its network keeps for gradients,", SAMPLES_REMEDY)
+    finest = max((size for hook in recipe.hooks for size in _resolutions(hook)), default=0)
+    if grown := _resized(config, finest):
+        needed = _grown_bytes(_build(grown, name, scene))
+        what = f"The field of {name}, up-sampled to {finest:,} vertices along an edge,"
+        check_fits(needed, what, "Choose a lower 'resolution' in the hooks.")
+
+
+def _check_planes(config: PlanesConfig, name: str, scene: Scene) -> None:
+    """Check that a multi-plane image of at least the pictures' size fits."""
+    pixels = max(view.camera.width * view.camera.height for view in scene.train)
+    texels = round(config.count * pixels * config.texels**2)
+    what = f"The field of {name} with {texels:,} texels or more"
+    check_fits(texels * TEXEL_BYTES, what, "Choose a lower field.count or field.texels.")
+
+
+def _resolutions(hook: Any) -> tuple[int, ...]:
+    """Vertices along an edge to which a hook resizes lattices during the fit."""
+    return (getattr(hook, "resolution", 0), *getattr(hook, "resolutions", ()))
+
+
+def _resized(config: Any, resolution: int) -> Any:
+    """A field's settings with lattices of another resolution; ``None`` without one, or without lattices."""
+    names = ("encoding", "appearance")
+    lattices: dict[str, Any] = {name: part for name in names if isinstance(part := getattr(config, name, None), LatticeConfig)}
+    changed = {name: replace(part, resolution=resolution) for name, part in lattices.items()} if resolution else {}
+    return replace(config, **changed) if changed else None
+
+
+def _build(config: Any, name: str, scene: Scene) -> nn.Module | None:
+    """Build a field on torch's meta device, which holds shapes only; ``None`` if it reads values while it is built."""
     try:
         with torch.device("meta"):
-            field = method.recipe.field.build(scene)
-    except (RuntimeError, OverflowError) as error:
+            return config.build(scene)
+    except InputError:
+        return None  # it does not go with the scene, and says so where it is built
+    except (RuntimeError, OverflowError, TypeError) as error:
         if "overflow" not in str(error).lower():
-            return 0  # a field that reads values while it is built: it says itself what it cannot do
-        raise InputError(f"The field of {method.name} has more parameters than can be counted.", "Lower its sizes.") from error
-    return sum(parameter.numel() * parameter.element_size() for parameter in field.parameters())
+            return None  # it says itself what it cannot do
+        remedy = "Lower its sizes, or the 'resolution' of hooks."
+        raise InputError(f"The field of {name} has more parameters than can be counted.", remedy) from error
+
+
+def _bytes(field: nn.Module | None) -> int:
+    """Bytes of a field's parameters."""
+    return 0 if field is None else sum(parameter.numel() * parameter.element_size() for parameter in field.parameters())
+
+
+def _grown_bytes(field: nn.Module | None) -> int:
+    """Bytes of a field whose lattices have grown, with gradients and moments; of sparse ones the links, as rows are pruned."""
+    if not isinstance(field, LatticeField):
+        return 0
+    lattices = [lattice for encoding in field.lattice_encodings().values() for lattice in encoding.lattices()]
+    linked = [lattice for lattice in lattices if lattice.links is not None]
+    links = sum(lattice.links.numel() * lattice.links.element_size() for lattice in linked if lattice.links is not None)
+    rows = sum(lattice.features.numel() * lattice.features.element_size() for lattice in linked)
+    return TRAINED_COPIES * (_bytes(field) - rows) + links

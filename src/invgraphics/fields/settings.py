@@ -8,8 +8,11 @@ from typing import Annotated, Any, Literal
 from invgraphics.config import OMIT_EMPTY, Slot
 from invgraphics.core import harmonics
 from invgraphics.fields.density import Activation, Interpolation
-from invgraphics.fields.encodings.frequency import FrequencyConfig, frequency_width
+from invgraphics.fields.encodings.frequency import MAX_OCTAVES, FrequencyConfig, frequency_width
 from invgraphics.fields.encodings.voxels import VoxelsConfig
+
+MAX_LAYERS = 128
+"""Hidden layers of a network; ten times as many as any method of the field has."""
 
 
 @dataclass(frozen=True)
@@ -78,16 +81,16 @@ class NeuralSettings:
     colour_inputs: tuple[Literal["position", "normal"], ...] = field(default=(), metadata=OMIT_EMPTY)
 
     def __post_init__(self) -> None:
-        if self.layers < 0 or self.colour_layers < 0:
-            raise ValueError("layers and colour_layers cannot be negative.")
+        if not (0 <= self.layers <= MAX_LAYERS and 0 <= self.colour_layers <= MAX_LAYERS):
+            raise ValueError(f"layers and colour_layers must be from 0 to {MAX_LAYERS}.")
         if min(self.width, self.colour_width) < 1 or self.geometry_features < 0:
             raise ValueError("width and colour_width must be at least 1, geometry_features at least 0.")
         if not -1 <= self.skip < self.layers:
             raise ValueError(f"skip must name one of the {self.layers} hidden layers (from 0) or be -1, not {self.skip}.")
         if self.direction == "sh" and not 1 <= self.direction_degree <= harmonics.MAX_DEGREE + 1:
             raise ValueError(f"direction_degree must be 1 to {harmonics.MAX_DEGREE + 1} for 'sh', not {self.direction_degree}.")
-        if self.direction_degree < 0:
-            raise ValueError("direction_degree cannot be negative.")
+        if not 0 <= self.direction_degree <= MAX_OCTAVES:
+            raise ValueError(f"direction_degree must be from 0 to {MAX_OCTAVES}, not {self.direction_degree}.")
         blind = self.appearance is None and self.geometry_head == "mlp" and self.geometry_features == 0
         blind &= not self.colour_inputs
         if blind and (self.direction == "none" or self.head != "mlp"):
@@ -110,8 +113,10 @@ class NeuralSettings:
         return networks and plain_colour and bare
 
     def _check_heads(self) -> None:
-        if min(self.appearance_basis, self.feature_octaves) < 0 or not 0 <= self.colour_padding < 1:
-            raise ValueError("appearance_basis and feature_octaves cannot be negative, colour_padding is in [0, 1).")
+        if self.appearance_basis < 0 or not 0 <= self.colour_padding < 1:
+            raise ValueError("appearance_basis cannot be negative, colour_padding is in [0, 1).")
+        if not 0 <= self.feature_octaves <= MAX_OCTAVES:
+            raise ValueError(f"feature_octaves must be from 0 to {MAX_OCTAVES}, not {self.feature_octaves}.")
         if self.appearance_basis and self.appearance is None:
             raise ValueError("appearance_basis needs an appearance encoding.")
         if len(set(self.colour_inputs)) < len(self.colour_inputs):

@@ -13,6 +13,8 @@ from invgraphics.fields.convert import require_density
 
 SUBSAMPLES = 8
 """Intervals of each plane's slab along a ray."""
+EMPTY = 1e-4
+"""Opacity of a texel below which it has no colour of its own."""
 ROWS = 4096
 """Rays that are looked along at once."""
 
@@ -42,7 +44,14 @@ def slice_density(field: Field, camera: Camera, depths: Float[Tensor, " p"], bou
         cosine = rays.directions @ camera.cam_to_world[:3, 2]
         parts.append(_slabs(field, rays.to(device), (edges / cosine[:, None]).to(device), bounds.to(device)).cpu())
     rgba = torch.cat(parts).view(camera.height, camera.width, len(depths), 4).permute(2, 3, 0, 1)
-    return Planes(camera, depths, rgba[:, :3].contiguous(), rgba[:, 3].contiguous())
+    return Planes(camera, depths, _bled(rgba[:, :3], rgba[:, 3]), rgba[:, 3].contiguous())
+
+
+def _bled(rgb: Float[Tensor, "p 3 h w"], alpha: Float[Tensor, "p h w"]) -> Float[Tensor, "p 3 h w"]:
+    """Straight colours with those of empty texels taken from their neighbours, which interpolation mixes them with."""
+    weight = alpha[:, None]
+    near = torch.nn.functional.avg_pool2d(torch.cat([rgb * weight, weight], dim=1), 3, stride=1, padding=1)
+    return torch.where(weight < EMPTY, near[:, :3] / near[:, 3:].clamp_min(1e-12), rgb)
 
 
 def slab_edges(depths: Float[Tensor, " p"], bounds: Bounds) -> Float[Tensor, " p_times_subsamples_plus_1"]:

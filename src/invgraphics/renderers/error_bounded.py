@@ -14,8 +14,19 @@ from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, S
 from invgraphics.core.spacing import from_spacing
 from invgraphics.errors import NotComposableError
 from invgraphics.renderers.distance_density import DistanceDensity, laplace_density
-from invgraphics.renderers.samplers import PADDING, hit_indices, invert, pack, quantiles, strata, uniform, unit_ball_exit
-from invgraphics.renderers.up_sampling import depth_before, distances, interval_weights
+from invgraphics.renderers.samplers import (
+    MAX_SAMPLES,
+    PADDING,
+    check_samples,
+    hit_indices,
+    invert,
+    pack,
+    quantiles,
+    strata,
+    uniform,
+    unit_ball_exit,
+)
+from invgraphics.renderers.up_sampling import MAX_ROUNDS, depth_before, distances, interval_weights
 
 LARGEST_ERROR = 1e6
 """Bounds are clamped here: far ones overflow, and only say that there is no bound."""
@@ -42,10 +53,18 @@ class ErrorBoundedConfig:
     bisections: int = 10
 
     def __post_init__(self) -> None:
-        if min(self.coarse, self.fine, self.rounds, self.bisections) < 1 or self.extra < 0:
-            raise ValueError("coarse, fine, rounds and bisections must be at least 1, extra at least 0.")
+        check_samples(coarse=self.coarse, fine=self.fine)
+        if not 0 <= self.extra <= MAX_SAMPLES:
+            raise ValueError(f"extra must be from 0 to {MAX_SAMPLES}, not {self.extra}.")
+        if not (1 <= self.rounds <= MAX_ROUNDS and 1 <= self.bisections <= MAX_ROUNDS):
+            raise ValueError(f"rounds and bisections must be from 1 to {MAX_ROUNDS}.")
         if self.error <= 0:
             raise ValueError(f"error must be above 0, not {self.error}")
+
+    @property
+    def samples_per_ray(self) -> int:
+        """Samples on each ray, those of the first pass included."""
+        return self.coarse + self.fine + self.extra
 
     def build(self, scene: Scene) -> ErrorBounded:
         """The sampler; it needs nothing from the scene."""

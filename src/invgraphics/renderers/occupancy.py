@@ -19,7 +19,7 @@ from invgraphics.core.fused import FusedLattice
 from invgraphics.core.ngp import FusedNGP
 from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import March, MarchSteps
-from invgraphics.renderers.samplers import uniform
+from invgraphics.renderers.samplers import check_samples, uniform
 from invgraphics.renderers.termination import visible_samples
 from invgraphics.renderers.visibility import visible_cells
 
@@ -75,25 +75,28 @@ class OccupancyConfig:
     chunk: int = 16
 
     def __post_init__(self) -> None:
-        for key in (
-            "resolution",
-            "steps_per_diagonal",
-            "evaluation_steps",
-            "early_steps",
-            "late_steps",
-            "every",
-            "cells",
-            "chunk",
-        ):
-            value = getattr(self, key)
-            if value is not None and value < 1:
-                raise ValueError(f"{key} must be at least 1, not {value}")
+        for key in ("resolution", "every", "cells"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"{key} must be at least 1, not {getattr(self, key)}")
+        for key in ("steps_per_diagonal", "evaluation_steps", "early_steps", "late_steps", "chunk"):
+            if getattr(self, key) is not None:
+                check_samples(**{key: getattr(self, key)})
         if not 0 <= (0.5 if self.early_decay is None else self.early_decay) < 1:
             raise ValueError(f"early_decay must be in [0, 1), not {self.early_decay}")
         if not 0 <= self.decay <= 1 or not 0 <= self.transmittance < 1:
             raise ValueError(f"decay must be in [0, 1] and transmittance in [0, 1), not {self.decay} and {self.transmittance}")
         if min(self.threshold, self.warmup, self.grace, self.cone or 0) < 0:
             raise ValueError("threshold, warmup, grace and cone must not be negative")
+
+    @property
+    def samples_per_ray(self) -> int:
+        """Samples on each ray before any cell is known to be empty, at least."""
+        return self.chunk
+
+    @property
+    def state_bytes(self) -> int:
+        """Memory of the grid and of a refresh: the EMA and its successor, bits, and indices of all cells; later, of some."""
+        return 17 * self.resolution**3 + 32 * self.cells
 
     def decay_at(self, progress: float) -> float:
         """Decay of the occupancy EMA at a progress of the fit in [0, 1]."""

@@ -20,6 +20,21 @@ PADDING = 1e-5
 """Added to every coarse weight so that no part of a ray is ruled out (NeRF, reference code)."""
 
 
+MAX_SAMPLES = 1 << 16
+"""Samples of a ray; float32 barely tells more apart."""
+
+
+def check_samples(**counts: int) -> None:
+    """Check numbers of samples on a ray, by their names.
+
+    Raises:
+        ValueError: one is below 1 or above `MAX_SAMPLES`.
+    """
+    for name, count in counts.items():
+        if not 1 <= count <= MAX_SAMPLES:
+            raise ValueError(f"{name} must be from 1 to {MAX_SAMPLES}, not {count}")
+
+
 @dataclass(frozen=True)
 class StratifiedConfig:
     """Settings of stratified sampling: equal strata along each ray.
@@ -31,8 +46,12 @@ class StratifiedConfig:
     count: int = 64
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise ValueError(f"count must be at least 1, not {self.count}")
+        check_samples(count=self.count)
+
+    @property
+    def samples_per_ray(self) -> int:
+        """Samples on each ray."""
+        return self.count
 
     def build(self, scene: Scene) -> Stratified:
         """The sampler; it needs nothing from the scene."""
@@ -70,8 +89,12 @@ class HierarchicalConfig:
     proposal: Annotated[Any, Slot("fields")] | None = None
 
     def __post_init__(self) -> None:
-        if self.coarse < 1 or self.fine < 1:
-            raise ValueError(f"coarse and fine must be at least 1, not {self.coarse} and {self.fine}")
+        check_samples(coarse=self.coarse, fine=self.fine)
+
+    @property
+    def samples_per_ray(self) -> int:
+        """Samples on each ray."""
+        return self.coarse + self.fine
 
     def build(self, scene: Scene) -> Hierarchical:
         """The sampler, with its proposal field if it has one."""

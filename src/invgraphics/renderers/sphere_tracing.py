@@ -32,6 +32,8 @@ from invgraphics.kernels.types import Tracing, TracingLimits
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.volumetric import query
 
+MAX_LOOKUPS = 1 << 16
+"""Look-ups of a ray, far more than any needs."""
 SATURATION = 8.0
 """Logit of opacity beyond which a ray counts as opaque, or as empty: the sigmoid is 3e-4 from 1, or from 0."""
 MIN_SLOPE = 0.05
@@ -66,8 +68,8 @@ class SphereTracingConfig:
     sharp_at: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.refinements < 0:
-            raise ValueError("'steps' must be at least 1, 'refinements' must not be negative.")
+        if not (1 <= self.steps <= MAX_LOOKUPS and 0 <= self.refinements <= MAX_LOOKUPS):
+            raise ValueError(f"'steps' must be from 1 to {MAX_LOOKUPS}, 'refinements' from 0 to that.")
         if not 0 < self.relaxation < 2:
             raise ValueError(f"'relaxation' must be in (0, 2), not {self.relaxation}.")
         if min(self.least_step, self.tolerance, self.sharpness, self.final_sharpness, self.sharp_at) <= 0:

@@ -29,7 +29,7 @@ from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.kernels.reference.splat_raster import blending_weights, responses_at, visible_alphas
 from invgraphics.kernels.types import Footprints
 from invgraphics.renderers.base import MIN_SURFACE_ALPHA, normals_from_depth, to_rendering
-from invgraphics.renderers.gaussian_profile import density_profile
+from invgraphics.renderers.gaussians.profile import density_profile
 
 
 @dataclass(frozen=True)

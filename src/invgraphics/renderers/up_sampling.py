@@ -13,7 +13,10 @@ from typing_extensions import override
 from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
 from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.renderers.distance_density import section_optical_depth
-from invgraphics.renderers.samplers import PADDING, hit_indices, invert, pack, quantiles, strata, unit_ball_exit
+from invgraphics.renderers.samplers import PADDING, check_samples, hit_indices, invert, pack, quantiles, strata, unit_ball_exit
+
+MAX_ROUNDS = 64
+"""Rounds of up-sampling; the sharpness doubles with each, and ends far beyond float32's resolution of a box."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,16 @@ class UpSamplingConfig:
     sharpness: float = 64.0
 
     def __post_init__(self) -> None:
-        if min(self.coarse, self.rounds) < 1 or self.fine % self.rounds or self.fine < self.rounds:
-            raise ValueError("coarse and rounds must be at least 1, and fine a multiple of rounds.")
+        check_samples(coarse=self.coarse, fine=self.fine)
+        if not 1 <= self.rounds <= MAX_ROUNDS or self.fine % self.rounds:
+            raise ValueError(f"rounds must be from 1 to {MAX_ROUNDS}, and fine a multiple of rounds.")
         if self.sharpness <= 0:
             raise ValueError(f"sharpness must be above 0, not {self.sharpness}")
+
+    @property
+    def samples_per_ray(self) -> int:
+        """Samples on each ray."""
+        return self.coarse + self.fine
 
     def build(self, scene: Scene) -> UpSampling:
         """The sampler; it needs nothing from the scene."""

@@ -1,4 +1,4 @@
-"""Regularisers of a signed distance: its gradient has length 1 (IGR, equation 2), its surface bends little."""
+"""Regularisers of a signed distance: a gradient of length 1 (Gropp et al. 2020, IGR, equation 2), and little curvature."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class EikonalPenalty:
 
 @dataclass(frozen=True)
 class CurvaturePenalty:
-    """Mean |∇²f| at points near the surface, where it is the sum of the principal curvatures (Neuralangelo, §3.3).
+    """Mean |∇²f| near the surface: of a distance, the sum of the principal curvatures (Neuralangelo, Li et al. 2023, §3.3).
 
     The Laplacian is one of central differences: what is finer than their distance counts by its mean. Points near the surface
     are those of `EikonalPenalty`.

@@ -182,6 +182,40 @@ class MaskLoss:
         return self.weight / sharpness * entropy / max(len(logit), 1)
 
 
+@dataclass(frozen=True)
+class OpacityLoss:
+    """Mean opacity of all Gaussians: those that no photograph needs fade, and can be relocated (3DGS-MCMC).
+
+    Attributes:
+        weight: factor.
+    """
+
+    weight: float = 0.01
+
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean; 0 for renderers without Gaussians on a screen."""
+        if trace.screen is None or trace.screen.opacities is None or trace.screen.opacities.numel() == 0:
+            return batch.target.new_zeros(())
+        return self.weight * trace.screen.opacities.mean()
+
+
+@dataclass(frozen=True)
+class ScaleLoss:
+    """Mean standard deviation of all Gaussians along their axes, in local units (3DGS-MCMC, Kheradmand et al. 2024).
+
+    Attributes:
+        weight: factor.
+    """
+
+    weight: float = 0.01
+
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean; 0 for renderers without Gaussians on a screen."""
+        if trace.screen is None or trace.screen.scales is None or trace.screen.scales.numel() == 0:
+            return batch.target.new_zeros(())
+        return self.weight * trace.screen.scales.mean()
+
+
 def normalised_distance(t: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:
     """Distance along a ray in the spacing of the samplers' strata, in units of the longest interval that a ray can have.
 

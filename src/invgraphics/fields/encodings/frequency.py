@@ -11,6 +11,9 @@ from torch import Tensor
 
 from invgraphics.fields.encodings.window import Windowed
 
+MAX_OCTAVES = 24
+"""Octaves of coordinates in [-1, 1] that float32 resolves."""
+
 
 @dataclass(frozen=True)
 class FrequencyConfig:
@@ -27,8 +30,8 @@ class FrequencyConfig:
     include_input: bool = True
 
     def __post_init__(self) -> None:
-        if not 0 <= self.octaves <= 24:
-            raise ValueError(f"octaves must be from 0 to 24 (float32 resolves no more), not {self.octaves}.")
+        if not 0 <= self.octaves <= MAX_OCTAVES:
+            raise ValueError(f"octaves must be from 0 to {MAX_OCTAVES} (float32 resolves no more), not {self.octaves}.")
         if self.octaves == 0 and not self.include_input:
             raise ValueError("with 0 octaves and include_input = false nothing is left to encode.")
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics import kernels
-from invgraphics.core.ngp import HashGrid
+from invgraphics.core.ngp import MAX_LEVELS, HashGrid
 from invgraphics.fields.encodings.window import Windowed
 
 INITIAL_RANGE = 1e-4
@@ -27,8 +27,8 @@ class HashConfig(HashGrid):
     title: ClassVar[str] = "multi-resolution hash grid"
 
     def __post_init__(self) -> None:
-        if self.levels < 1 or self.features < 1:
-            raise ValueError("levels and features must be at least 1.")
+        if not 1 <= self.levels <= MAX_LEVELS or self.features < 1:
+            raise ValueError(f"levels must be from 1 to {MAX_LEVELS}, features at least 1.")
         if not 1 <= self.log2_size <= 30:
             raise ValueError(f"log2_size must be from 1 to 30, not {self.log2_size}.")
         if not 1 <= self.base <= self.finest < 2**20:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from typing_extensions import override
 
-from invgraphics.core.ngp import HashGrid
+from invgraphics.core.ngp import MAX_LEVELS, HashGrid
 from invgraphics.fields.encodings.hash import INITIAL_RANGE
 from invgraphics.fields.encodings.lattices import CUBE, LatticeConfig, LatticeFeatures, Place, vertices_along
 
@@ -37,8 +37,8 @@ class VoxelsConfig(LatticeConfig):
     spread: float = INITIAL_RANGE
 
     def __post_init__(self) -> None:
-        if self.resolution < 2 or self.features < 1 or self.levels < 1:
-            raise ValueError("resolution must be at least 2, features and levels at least 1.")
+        if self.resolution < 2 or self.features < 1 or not 1 <= self.levels <= MAX_LEVELS:
+            raise ValueError(f"resolution must be at least 2, features at least 1, levels from 1 to {MAX_LEVELS}.")
         if self.levels > 1 and not 2 <= self.coarsest <= self.resolution:
             raise ValueError(f"coarsest must be from 2 to resolution = {self.resolution}, not {self.coarsest}.")
         if self.spread < 0:

@@ -71,7 +71,7 @@ def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
         parts += ["## Failures", ""]
         parts += [f"- {text(cell.method)}, seed {cell.seed}: {text(cell.error)}" for cell in comparison.failures]
     if contrasts.tables:
-        parts += ["", "## Differences between methods", "", *(f"- {text(effect.sentence)}" for effect in contrasts.first)]
+        parts += ["", "## Differences between methods", "", *(f"- {text(one)}" for one in contrasts.sentences)]
         parts += ["", markdown_effects(contrasts.first)]
     parts += markdown_figures([*([contrasts.figure] if contrasts.figure else []), *part.drawn.figures], folder)
     parts += ["", "## Provenance", "", *(f"- {text(name)}: {text(value)}" for name, value in facts.shared_facts(comparison))]
@@ -116,9 +116,13 @@ def markdown_cross_table(crossed: CrossTable | None) -> list[str]:
         lines.append(f"| {text(row.method)} | {' | '.join(cells)} |")
     if crossed.steps:
         names = " | ".join(text(row.method) for row in crossed.rows)
-        lines += ["", "Image difference that one approximation makes, dB.", ""]
+        lines += ["", "Image difference that one approximation makes, dB", ""]
+        lines[-2] += ", and median difference of depth, units of the scene." if crossed.shows_depth else "."
         lines += [f"| approximation | {names} |", "|---" * (1 + len(crossed.rows)) + "|"]
-        lines += [f"| {text(step.name)} | {' | '.join(step.differences)} |" for step in crossed.steps]
+        for step in crossed.steps:
+            pairs = zip(step.differences, step.depths, strict=True)
+            cells = [f"{value}, {depth}" if depth else value for value, depth in pairs]
+            lines.append(f"| {text(step.name)} | {' | '.join(cells)} |")
     return lines
 
 

@@ -154,13 +154,6 @@ class Effect:
         """The interval for other scenes like these as text; empty where there is none."""
         return self.bounds(self.across)
 
-    @property
-    def sentence(self) -> str:
-        """The effect in words: difference, both intervals, verdict by scene, and what could have been found."""
-        from invgraphics.report.statistics.sentences import effect_sentence
-
-        return effect_sentence(self)
-
 
 def contrasts_of(
     factors: Sequence[Factor], each: str = "", interactions: Sequence[Sequence[str]] = (), among: Sequence[str] = ()
@@ -232,7 +225,7 @@ def _effect(contrast: Contrast, quantity: Quantity, values: Sample, observations
         contrast=contrast,
         quantity=quantity,
         estimate=whole,
-        across=over_scenes(groups) if len(groups) > 1 else None,
+        across=over_scenes(groups, least_error=whole.error) if len(groups) > 1 else None,
         adjusted=None,
         comparisons=0,
         pairs=values.pairs,

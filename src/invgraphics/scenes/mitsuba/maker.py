@@ -9,12 +9,18 @@ from pathlib import Path
 
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
+from invgraphics.memory import check_fits
 from invgraphics.scenes.mitsuba import cache, llvm
 from invgraphics.scenes.mitsuba.forecast import RenderingForecast
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.larger import averaged
 from invgraphics.scenes.mitsuba.spec import Counts, description_path, read
 from invgraphics.scenes.process import Progress, run_worker
+
+FILM_BYTES = 44
+"""Of a pixel while its view is rendered: colour, alpha, depth and normal, and their filter weights."""
+PICTURE_BYTES = 3
+"""Of a pixel of a view that is loaded: 8-bit colour."""
 
 
 def make(
@@ -76,7 +82,11 @@ def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int |
         default if given is None else given for given, default in zip(views, (spec.views.train, spec.views.test), strict=True)
     )
     samples = spec.samples if spp is None else spec.samples.scaled(spp)
-    return Job(spec, size or spec.size, Counts(train, spec.views.val, test), samples, seed, llvm.status().variant)
+    job = Job(spec, size or spec.size, Counts(train, spec.views.val, test), samples, seed, llvm.status().variant)
+    (width, height), remedy = job.size, "Choose a lower --size, or fewer views."
+    needed = width * height * (FILM_BYTES + job.total * PICTURE_BYTES)
+    check_fits(needed, f"The scene '{spec.name}' with {job.total:,} views of {width:,}x{height:,} pixels", remedy)
+    return job
 
 
 def _make(job: Job, folder: Path, progress: Progress, lock: int) -> None:

@@ -16,9 +16,9 @@ from invgraphics.core import Camera, Context, Contributions, Field, Quantity, Ra
 from invgraphics.core.contributions import opacities
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, Opacity
 from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.gaussian_profile import density_profile, transmittance
-from invgraphics.renderers.gaussian_quadrature import Weights, integrate_overlapping, phi
-from invgraphics.renderers.gaussian_rays import (
+from invgraphics.renderers.gaussians.profile import density_profile, transmittance
+from invgraphics.renderers.gaussians.quadrature import Weights, integrate_overlapping, phi
+from invgraphics.renderers.gaussians.rays import (
     MAX_DEVIATIONS,
     Intersections,
     Primitives,
@@ -30,6 +30,9 @@ from invgraphics.renderers.gaussian_rays import (
 
 TILE = 16
 """Edge in pixels of the square whose rays are searched for Gaussians together."""
+
+MAX_STEPS = 1024
+"""Intervals of a ray, each of which is kept for each Gaussian on it; the error falls with their square."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,8 @@ class GaussianExactConfig:
     smallest: float = SMALLEST_DEPTH
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"steps must be at least 1, not {self.steps}.")
+        if not 1 <= self.steps <= MAX_STEPS:
+            raise ValueError(f"steps must be from 1 to {MAX_STEPS}, not {self.steps}.")
         _check_smallest(self.smallest)
 
     def build(self, scene: Scene) -> GaussianExact:
