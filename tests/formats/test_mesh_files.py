@@ -29,7 +29,7 @@ def solid() -> Mesh:
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_what_is_written_is_read(solid: Mesh, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"solid{suffix}"
-    write_mesh(path, solid, RGB, ("made by a test",))
+    write_mesh(path, solid, RGB, ("made by a test", "in two lines"))
     back = read_mesh(path)
     torch.testing.assert_close(back.vertices, CORNERS)
     assert torch.equal(back.faces, FACES)

@@ -22,6 +22,7 @@ SMALL = {
         "views, size, steps, samples, march = 8, 16, 80, 2048, 48\n"
         "grid_steps, points, tables, edge, factor_steps, edge_steps = 60, 2048, [8, 12, 16], 16, 150, 150"
     ),
+    "05-surfaces": "size, pixels, march, views, steps = 48, 41, 256, 8, 60",
     "06-aliasing-and-open-space": "draws, steps = 100_000, 120",
     "07-gaussians-and-ewa": "draws = 100_000",
     "08-fit-gaussians": "views, size, steps, flat_steps, starts = 12, 32, 200, 150, 3",
@@ -202,6 +203,43 @@ def _edges(out: _Printed) -> None:
     assert edges[0][0] < edges[1][0] / 2
 
 
+def _surfaces(out: _Printed) -> None:
+    """Which combinations are distances, what steps cost, which derivatives are right, where weights are largest, depths."""
+    for name in ("ball", "box", "union", "ball cut out", "rounded by 0.1"):
+        assert out.numbers(f"{name}: the gradient's length is between", "and") == (1, 1)
+    assert out.numbers("welded: the gradient's length is between", "and")[0] < 0.9
+    assert out.numbers("squashed ball: the gradient's length is between", "and")[1] == pytest.approx(2, abs=0.01)
+    assert out.numbers("ray, square:") < out.numbers("ray, past both:") < out.numbers("ray, grazing:")
+    steep, grazing = (out.numbers(f"unrolled at {angle}°: after 16 steps off by")[0] for angle in (12, 74))
+    assert steep < 1e-6
+    assert grazing > 1
+    assert out.numbers("unrolled bisection: the derivative is")[0] == 0
+    assert out.numbers("implicit: differs from the closed form by")[0] < 1e-9
+    for angle in (0, 60, 80):
+        line = f"plane at {angle}°, width 0.02: the weight is largest at naive", ", VolSDF", ", NeuS"
+        naive, volsdf, neus = out.numbers(*line)
+        assert naive < -0.005 and abs(neus) < 1e-3
+        assert volsdf == pytest.approx(0.02 * _early(angle), abs=2e-4)
+    wide, narrow = out.numbers("ball, NeuS: off by", "by")
+    assert wide > 20 * narrow
+    turned = [out.numbers(f"ripples of 0.001, {waves} radians per length: normals turn by")[0] for waves in (20, 60, 180)]
+    assert turned == sorted(turned) and turned[2] > 3
+    wide, narrow = (out.numbers(f"one distance, VolSDF, β = {beta}: median depth")[0] for beta in (0.02, 0.003))
+    assert narrow < wide
+    half, formula = out.numbers("half of the light at 70°:", "by the formula")
+    assert half == pytest.approx(formula, abs=1e-4)
+
+
+def _early(angle: float) -> float:
+    """Where VolSDF's weight on a plane is largest, in widths along the ray: the density's slope cos/β σ equals its square."""
+    cosine = math.cos(math.radians(angle))
+    # Before the plane σ = exp(-f/β) / (2 β); behind it σ = (1 - exp(f/β) / 2) / β, and (1 - u)² = u cos with u = exp(f/β) / 2.
+    if cosine <= 0.5:
+        return math.log(2 * cosine) / cosine
+    u = 1 + cosine / 2 - math.sqrt(cosine + cosine**2 / 4)
+    return -math.log(2 * u) / cosine
+
+
 def _ewa(out: _Printed) -> None:
     assert out.numbers("(2 pi)^(-3/2) |V|^(-1/2) =") == (1.0,)
     for claim in ("M V M^T by", "the block of V by", "W V W^T by"):
@@ -307,7 +345,7 @@ def _ablation(out: _Printed) -> None:
 HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
     zip(
         sorted(SMALL),
-        (_cameras, _integral, _nerf, _grids, _cones, _ewa, _splatting, _two_ways, _photos, _ablation),
+        (_cameras, _integral, _nerf, _grids, _surfaces, _cones, _ewa, _splatting, _two_ways, _photos, _ablation),
         strict=True,
     )
 )

@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -57,6 +57,10 @@ def test_scores_and_differences_are_means_over_seeds_and_views(crossed_folder: P
     decibels = f"{-10 * math.log10(square):.1f}"
     assert (own.own, own.difference, other.own, other.difference) == (True, "", False, decibels)
     assert own.best and not other.best
+    comparison = read_comparison(crossed_folder)
+    once = replace(comparison, runs=tuple(run for run in comparison.runs if run.seed == 0))
+    single = cross_table(once, [PAIR], Folder(crossed_folder))
+    assert single is not None and not any(cell and cell.best for cell in single.rows[0].cells)  # one seed leads nothing
     assert [step.differences for step in crossed.steps] == [(decibels,)]
     depth = 2.5 * 0.01 * (1 + 0.1 * (VIEWS - 1) / 2)
     assert [step.depths for step in crossed.steps] == [(f"{depth:.2g}",)] and crossed.shows_depth

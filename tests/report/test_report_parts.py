@@ -22,7 +22,8 @@ from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.figures import views as pictures
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
 from invgraphics.report.figures.tradeoffs import draw_tradeoffs
-from invgraphics.report.statistics.summary import pareto_front, seconds_to_reach, summarise, time_to_quality
+from invgraphics.report.statistics.summary import pareto_front, summarise
+from invgraphics.report.statistics.time_to_quality import seconds_to_reach, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import budget_words, listing, significant_decimals, times
 from invgraphics.runs.run import Run
@@ -52,6 +53,22 @@ def test_time_to_reach_is_the_first_crossing(built_report: Path) -> None:
     assert reach is not None
     assert list(reach.levels) == sorted(reach.levels)
     assert all(any(times[i] != "not reached" for _, _, times in reach.rows) for i in range(len(reach.levels)))
+
+
+def test_a_time_is_told_as_exactly_as_the_monitor_looked(built_report: Path) -> None:
+    """A look every 6 s is no 42.0 s; one every 0.2 s is."""
+    comparison = read_comparison(built_report)
+
+    def told(gap: float) -> set[str]:
+        history = tuple(
+            replace(comparison.runs[0].history[0], seconds=gap * i, psnr=10.0 + 20.0 * (i >= 7) + 0.01 * i) for i in range(12)
+        )
+        reach = time_to_quality(replace(comparison, runs=tuple(replace(run, history=history) for run in comparison.runs)))
+        assert reach is not None
+        return {time for _, _, times in reach.rows for time in times}
+
+    assert told(6.0) == {"36–42 s"}
+    assert told(0.2) == {"1.4 s"}
 
 
 def test_error_maps_average_to_the_reported_flip(built_report: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from invgraphics.core import Bounds, Camera, Points, Scene, View
-from invgraphics.scenes.degrade import TrainingData, degrade
+from invgraphics.scenes.degrade import ENOUGH_POINTS, TrainingData, degrade
 from invgraphics.scenes.photos import triangulate as sfm
 
 SIZE, CAMERAS = 128, 6
@@ -112,8 +112,12 @@ def test_the_start_is_declared(plane: Scene) -> None:
     assert degrade(plane, TrainingData(), 0) is plane
     assert degrade(plane, TrainingData(init="random"), 0).points is None
     made = degrade(plane, TrainingData(init="sfm"), 0)
-    assert made.points is not None and len(made.points) > 50
-    assert made.notes["points"] == f"{len(made.points)} from SfM on the training photographs as they are here"
+    found = sfm.triangulated(plane)
+    assert made.points is not None and torch.equal(made.points.position[: len(found)], found.position)
+    rest = made.points.position[len(found) :]
+    assert len(rest) == ENOUGH_POINTS and bool(((rest >= plane.bounds.lo) & (rest <= plane.bounds.hi)).all())
+    words = f"{len(found)} from SfM on the training photographs as they are here, and 5,000 random ones"
+    assert made.notes["points"] == words
     grey = tuple(replace(view, image=torch.full_like(view.image, 99)) for view in plane.train)
     empty = degrade(replace(plane, train=grey), TrainingData(init="sfm"), 0)
     assert empty.points is None and "too few: a random start" in empty.notes["points"]

@@ -29,7 +29,7 @@ SHRUNK = {
     "volumetric/triplane": ["field.encoding.resolution=24", "field.encoding.features=8"],
     "volumetric/dense": ["field.encoding.resolution=33", "field.encoding.coarsest=5", "field.encoding.levels=4"],
 }
-STEPS = 240
+STEPS = 300
 
 
 def _psnr(fit) -> float:

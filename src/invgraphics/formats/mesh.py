@@ -51,25 +51,27 @@ def write_mesh(path: Path, mesh: Mesh, rgb: Float[Tensor, "v 3"], comments: Sequ
     Raises:
         InputError: the name has another ending, or the disk is full.
     """
-    import trimesh
+    from trimesh import Trimesh
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.exchange.obj import export_obj
+    from trimesh.exchange.ply import export_ply
+    from trimesh.visual import ColorVisuals
 
     suffix = check_suffix(path)
     normals = None if mesh.normals is None else mesh.normals.numpy()
-    solid = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), vertex_normals=normals, process=False)
+    solid = Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), vertex_normals=normals, process=False)
     if suffix == ".glb":
         solid.vertex_attributes[LINEAR] = srgb_to_linear(rgb).numpy().astype(np.float32)
-        data = trimesh.exchange.gltf.export_glb(
-            solid, include_normals=normals is not None, tree_postprocessor=lambda tree: _finish(tree, comments)
-        )
+        data = export_glb(solid, include_normals=normals is not None, tree_postprocessor=lambda tree: _finish(tree, comments))
     else:
         bytes_ = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-        solid.visual = trimesh.visual.ColorVisuals(solid, vertex_colors=bytes_)
+        solid.visual = ColorVisuals(solid, vertex_colors=bytes_)
         if suffix == ".ply":
-            data = trimesh.exchange.ply.export_ply(solid, vertex_normal=normals is not None)
+            data = export_ply(solid, vertex_normal=normals is not None)
             lines = "".join(f"comment {line}\n" for line in comments).encode("ascii", errors="replace")
             data = data.replace(b"\nelement", b"\n" + lines + b"element", 1)
         else:
-            text = trimesh.exchange.obj.export_obj(solid, include_normals=normals is not None, header="\n".join(comments))
+            text = export_obj(solid, include_normals=normals is not None, header="\n# ".join(comments))
             data = str(text).encode()
     write_bytes(path, data)
 

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core import Scene, View
+from invgraphics.core import Points, Scene, View
 from invgraphics.core.colour import linear_to_srgb, srgb_to_linear
 from invgraphics.errors import InputError
 from invgraphics.scenes.scales import check_scales, like, resized_view, scene_at
@@ -26,8 +26,10 @@ from invgraphics.scenes.scales import check_scales, like, resized_view, scene_at
 COLOURS = {"black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "white": (1.0, 1.0, 1.0)}
 """Backgrounds that have a name."""
 
-FEWEST_POINTS = 16
-"""Fewer SfM points than this are no start."""
+FEWEST_POINTS, ENOUGH_POINTS = 16, 5000
+"""Fewer SfM points than the first are no start. Fewer than the second, as small pictures give them, are joined by as many
+random ones: a few hundred alone begin below a random start. PSNR of `splatting/gaussians` at 128 px after 400 steps, bricks and
+textured: SfM 24.9 and 25.0 dB, random 27.1 and 25.6, both 27.2 and 26.3; exact points 29.1 and 28.6."""
 
 KEEP = "random"
 """The background of a scene as loaded: its photographs keep their alpha, and each step draws a colour."""
@@ -53,7 +55,7 @@ class TrainingData:
             on. They degrade nothing.
         init: points that a field may start from: ``scene``, those that came with it (of a rendered scene: exact ones, which no
             method could have; of photographs: those of structure from motion); ``sfm``, triangulated from the training
-            photographs at their poses, which every method could have; ``random``, none.
+            photographs at their poses, which every method could have, with random ones where they are few; ``random``, none.
     """
 
     train_views: int | None = None
@@ -139,10 +141,10 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
         colour = torch.tensor(COLOURS[data.background] if isinstance(data.background, str) else data.background)
         train = [replace(view, image=like(view.over(colour), view), alpha=None) for view in train]
         scene = replace(scene, background=colour)
-    return _with_points(replace(scene, train=tuple(train), notes=notes), data)
+    return _with_points(replace(scene, train=tuple(train), notes=notes), data, seed)
 
 
-def _with_points(scene: Scene, data: TrainingData) -> Scene:
+def _with_points(scene: Scene, data: TrainingData, seed: int) -> Scene:
     """Replace a degraded scene's points by what its photographs tell of them, and note which they are."""
     if data.init == "random":
         return replace(scene, points=None, notes=scene.notes | {"points": "none: a random start"})
@@ -154,6 +156,10 @@ def _with_points(scene: Scene, data: TrainingData) -> Scene:
     what = f"{len(points):,} from SfM on the training photographs as they are here"
     if len(points) < FEWEST_POINTS:
         return replace(scene, points=None, notes=scene.notes | {"points": f"{what}, too few: a random start"})
+    if len(points) < ENOUGH_POINTS:
+        unit = torch.rand(2, ENOUGH_POINTS, 3, generator=_generator(seed, "points", 0))
+        points = points.joined(Points(scene.bounds.lo + unit[0] * (scene.bounds.hi - scene.bounds.lo), unit[1]))
+        what = f"{what}, and {ENOUGH_POINTS:,} random ones"
     return replace(scene, points=points, notes=scene.notes | {"points": what})
 
 

@@ -6,7 +6,7 @@ import itertools
 import math
 import statistics
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,10 +56,10 @@ def _draw_intervals(effects: Sequence[Effect], title: str, stem: Path, width: fl
     with canvas(width, FRAME + (ROW + LINE * (lines - 1)) * len(effects) + LINE * len(key)) as (figure, axes):
         axes.axvline(0, color=INK.light, linewidth=1.1, zorder=1)
         colours = {path: i for i, path in enumerate(dict.fromkeys(effect.factor for effect in effects))}
-        for line, effect in enumerate(effects):
-            _draw_row(axes, line, effect, (colours[effect.factor], parts), round(width / LETTER))
         axes.set_ylim(len(effects) - 0.4, -0.75)
         axes.set_xlim(*_limits(effects))
+        for line, effect in enumerate(effects):
+            _draw_row(axes, line, effect, (colours[effect.factor], parts), round(width / LETTER))
         axes.set_yticks([])
         axes.spines["left"].set_visible(False)
         unit = f" ({quantity.unit})" if quantity.unit else ""
@@ -94,8 +94,9 @@ def _draw_row(axes: Axes, line: int, effect: Effect, look: tuple[int, Sequence[s
     colour, order = look
     style, scale, value = series_style(colour), effect.quantity.scale, effect.estimate
     small: dict[str, Any] = {"color": MUTED.light, "fontsize": 9.5, "ha": "center", "va": "top", "zorder": 2}
-    for name, mean in _parts(effect).items():
-        axes.text(mean * scale, line + 0.1, str(order.index(name) + 1), clip_on=True, **small)
+    low, high = axes.get_xlim()
+    for place, names in _clusters(_parts(effect), 2.5 * (high - low) / letters / scale):
+        axes.text(place * scale, line + 0.1, " ".join(str(order.index(name) + 1) for name in names), clip_on=True, **small)
     if effect.across is not None:
         ends = [effect.across.low * scale, effect.across.high * scale]
         axes.plot(ends, [line, line], color=style.colour, linewidth=0.9, zorder=3)
@@ -115,6 +116,17 @@ def _draw_row(axes: Axes, line: int, effect: Effect, look: tuple[int, Sequence[s
     axes.annotate(label, (0, line), (2, 7), color=INK.light, fontsize=11.5, zorder=5, **place)
     if letters >= WIDE_LETTERS:
         axes.annotate(text, (1, line), (-2, 7), color=style.colour, fontsize=11.5, ha="right", zorder=5, **place)
+
+
+def _clusters(means: Mapping[str, float], gap: float) -> list[tuple[float, list[str]]]:
+    """Group names whose means are closer than ``gap`` to the first of their group: (place, names), from left to right."""
+    groups: list[tuple[float, list[str]]] = []
+    for name, mean in sorted(means.items(), key=lambda item: item[1]):
+        if groups and mean - groups[-1][0] < gap:
+            groups[-1][1].append(name)
+        else:
+            groups.append((mean, [name]))
+    return groups
 
 
 def _label(effect: Effect, letters: int) -> list[str]:

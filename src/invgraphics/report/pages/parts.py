@@ -17,7 +17,8 @@ from invgraphics.report.figures.views import ViewPage, draw_views, publish_truth
 from invgraphics.report.statistics.cross_render import CrossTable, cross_table
 from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
 from invgraphics.report.statistics.pairing import Contrast
-from invgraphics.report.statistics.summary import Row, Summary, TimeToQuality, quality_columns, summarise, time_to_quality
+from invgraphics.report.statistics.summary import Row, Summary, quality_columns, summarise
+from invgraphics.report.statistics.time_to_quality import TimeToQuality, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import Quantity
 from invgraphics.runs.study import Approximation

@@ -52,7 +52,7 @@ class CrossCell:
         text: its score against the truth.
         difference: of its picture from the fitting renderer's, PSNR in dB; empty for that renderer itself.
         own: whether this is the fitting renderer.
-        best: whether no renderer shows this fit better.
+        best: whether this renderer shows the fits better than all others, by more than chance.
         picture: a test view; empty where there is none.
     """
 
@@ -206,13 +206,21 @@ def _cell(fits: Sequence[CrossRendered], name: str, quantity: Quantity, folder: 
 def _mark_best(
     fits: Sequence[CrossRendered], renderers: Sequence[str], cells: Sequence[CrossCell | None], quantity: Quantity
 ) -> tuple[CrossCell | None, ...]:
+    """Mark the renderer that shows these fits better than every other one by more than chance, paired by fit."""
     scores = {
-        cell.text: quantity.sort_key(_score(fits, name, quantity) or 0.0)
+        name: quantity.sort_key(_score(fits, name, quantity) or 0.0)
         for name, cell in zip(renderers, cells, strict=True)
         if cell
     }
-    best = min(scores, key=lambda text: scores[text]) if len(scores) > 1 else None
-    return tuple(cell and replace(cell, best=cell.text == best) for cell in cells)
+    if len(scores) < 2:
+        return tuple(cells)
+    best = min(scores, key=lambda name: scores[name])
+    shown = [
+        Observation(replace(run, seed=fit.fit.seed), "", {RENDERER: name}) for fit in fits for name, run in fit.seen.items()
+    ]
+    effects = [effects_of([Contrast(RENDERER, other, best)], quantity, shown) for other in scores if other != best]
+    leads = all(found and found[0].found and found[0].better > 0 for found in effects)
+    return tuple(cell and replace(cell, best=leads and name == best) for name, cell in zip(renderers, cells, strict=True))
 
 
 def _decibels(fits: Sequence[CrossRendered], pair: frozenset[str] | None, name: str = "") -> str:

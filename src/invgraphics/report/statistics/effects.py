@@ -232,7 +232,7 @@ def _effect(contrast: Contrast, quantity: Quantity, values: Sample, observations
         contrast=contrast,
         quantity=quantity,
         estimate=whole,
-        across=over_scenes(groups) if len(groups) > 1 else None,
+        across=over_scenes(groups, least_error=whole.error) if len(groups) > 1 else None,
         adjusted=None,
         comparisons=0,
         pairs=values.pairs,

@@ -137,8 +137,14 @@ def over_seeds(scenes: Sequence[Groups], confidence: float = CONFIDENCE) -> Esti
     return _student_estimate(mean, (math.sqrt(shares.sum()) / len(scenes), satterthwaite), "seed", size, confidence)
 
 
-def over_scenes(scenes: Sequence[Groups], confidence: float = CONFIDENCE) -> Estimate | None:
-    """Mean over scenes as a sample of scenes, with the interval for scenes like these; ``None`` without scenes."""
+def over_scenes(scenes: Sequence[Groups], confidence: float = CONFIDENCE, least_error: float = 0.0) -> Estimate | None:
+    """Mean over scenes as a sample of scenes, with the interval for scenes like these; ``None`` without scenes.
+
+    Args:
+        scenes: groups of fits of each.
+        confidence: of the interval.
+        least_error: standard error that the fits' own spread makes; scenes that agree better than that do so by chance.
+    """
     if not scenes:
         return None
     means = np.array([_signed_mean(groups) for groups in scenes])
@@ -146,7 +152,8 @@ def over_scenes(scenes: Sequence[Groups], confidence: float = CONFIDENCE) -> Est
     spread = float(means.std(ddof=1)) if len(means) > 1 else 0.0
     if spread <= 1e-12 * float(np.abs(means).max()):
         return Estimate(mean, mean, mean, None, "none", *size)
-    return _student_estimate(mean, (spread / math.sqrt(len(means)), len(means) - 1.0), "scene", size, confidence)
+    error = max(spread / math.sqrt(len(means)), least_error)
+    return _student_estimate(mean, (error, len(means) - 1.0), "scene", size, confidence)
 
 
 def _signed_mean(groups: Groups) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from invgraphics.report.data.factors import METHOD
+from invgraphics.report.data.variants import level_words
 from invgraphics.report.statistics.effects import Effect, Verdict
 from invgraphics.report.statistics.intervals import POWER, Estimate
 from invgraphics.report.wording import Quantity, listing
@@ -130,7 +132,9 @@ def detectable_words(effect: Effect) -> str:
 
 def _lost(effect: Effect) -> str:
     """Diverged and failed fits in words."""
-    parts = [f"{count} of {level}" for count, level in zip(effect.lost, (effect.before, effect.after), strict=True) if count]
+    names = (level_words(effect.factor.rpartition(".")[2], level) for level in (effect.before, effect.after))
+    names = (effect.before, effect.after) if effect.factor == METHOD else names
+    parts = [f"{count} of {name}" for count, name in zip(effect.lost, names, strict=True) if count]
     if not parts:
         return ""
     fits = "fit" if sum(effect.lost) == 1 else "fits"

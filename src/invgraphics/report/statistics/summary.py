@@ -158,56 +158,6 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def seconds_to_reach(run: Run, level: float) -> float | None:
-    """Seconds of optimisation after which the monitored PSNR first was at least ``level`` dB."""
-    return next((entry.seconds for entry in run.history if entry.psnr is not None and entry.psnr >= level), None)
-
-
-@dataclass(frozen=True)
-class TimeToQuality:
-    """Time to quality: median seconds of each method to reach each PSNR level.
-
-    Attributes:
-        levels: PSNR thresholds in dB, rising.
-        rows: (method, series, one text per level).
-    """
-
-    levels: tuple[int, ...]
-    rows: tuple[tuple[str, int, tuple[str, ...]], ...]
-
-
-def time_to_quality(comparison: Comparison, count: int = 4) -> TimeToQuality | None:
-    """Median seconds over seeds to reach ``count`` round PSNR levels between the slowest start and the best end."""
-    starts, peaks = [], []
-    for method in comparison.methods:
-        curves = [[entry.psnr for entry in run.history if entry.psnr is not None] for run in comparison.runs_of(method)]
-        curves = [curve for curve in curves if curve]
-        if curves:
-            starts.append(statistics.median(curve[0] for curve in curves))
-            peaks.append(statistics.median_low(max(curve) for curve in curves))
-    if not starts:
-        return None
-    low, high = max(starts), max(peaks)
-    first, last = math.ceil(low + 0.1), math.floor(high)
-    if last < first:
-        return None
-    step = max(1, (last - first) // max(1, count - 1))
-    levels = tuple(range(last, first - 1, -step))[:count][::-1]
-    rows = []
-    for series, method in enumerate(comparison.methods):
-        runs = comparison.runs_of(method)
-        if runs:
-            rows.append((method, series, tuple(_reach_text(runs, level) for level in levels)))
-    return TimeToQuality(levels, tuple(rows))
-
-
-def _reach_text(runs: Sequence[Run], level: float) -> str:
-    times = [time for run in runs if (time := seconds_to_reach(run, level)) is not None]
-    if 2 * len(times) <= len(runs):
-        return "not reached"
-    return f"{statistics.median(times):.1f} s"
-
-
 def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
     """Columns of the summary: quality metrics, then the costs that any run has."""
     time_budget = budget_words(comparison.budget).endswith(" s")
