@@ -58,7 +58,7 @@ def test_the_hull_encloses_the_ball_closely(scene: Scene) -> None:
     assert float(radii.mean()) < RADIUS + 0.03
     # Colours come from the photographs: of the ball's place, seen through the hull's.
     assert mesh.rgb is not None
-    error = (mesh.rgb - (mesh.vertices / radii[:, None] + 1) / 2).abs()
+    error = (mesh.rgb.detach() - (mesh.vertices / radii[:, None] + 1) / 2).abs()
     assert float(error.mean()) < 0.03
     assert field.sh_rest.shape[1:] == (3, 3)
 

@@ -14,6 +14,7 @@ from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
 from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of, effects_on
 from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import quality_quantity
@@ -121,8 +122,8 @@ def test_opposite_scenes_are_no_common_effect(gains: tuple[float, ...]) -> None:
     for _ in range(20):
         effect = effect_of((len(gains), 3), lambda s, k, level: gains[s] * (level == B) + rng.normal(0, 0.05))
         assert not effect.found and not effect.equivalent
-        assert "no common direction" in effect.sentence and "no effect" not in effect.sentence
-        assert "worse on scene-1" in effect.sentence or f"better on {gains.count(5.0)} of" in effect.sentence
+        assert "no common direction" in effect_sentence(effect) and "no effect" not in effect_sentence(effect)
+        assert "worse on scene-1" in effect_sentence(effect) or f"better on {gains.count(5.0)} of" in effect_sentence(effect)
 
 
 def test_the_verdict_reads_by_scene_and_both_estimands_are_given() -> None:
@@ -131,8 +132,8 @@ def test_the_verdict_reads_by_scene_and_both_estimands_are_given() -> None:
     effect = effect_of((6, 3), lambda s, k, level: gains[s] * (level == B) + rng.normal(0, 0.1))
     assert effect.found and effect.across is not None
     assert effect.estimate.half_width < 0.2 and 3 < effect.across.half_width < 5
-    assert "for new fits on these 6 scenes" in effect.sentence and "for scenes like these" in effect.sentence
-    assert "better on 5 of 6 scenes, undecided on scene-5" in effect.sentence
+    assert "for new fits on these 6 scenes" in effect_sentence(effect) and "for scenes like these" in effect_sentence(effect)
+    assert "better on 5 of 6 scenes, undecided on scene-5" in effect_sentence(effect)
 
 
 def test_the_estimand_does_not_jump_with_the_number_of_seeds_or_scenes() -> None:
@@ -157,7 +158,7 @@ def test_a_fit_that_diverges_never_helps_its_method() -> None:
 
     kept = effect_of((1, 5), survives)
     assert kept.estimate.p is not None and kept.estimate.p < 0.01
-    assert not kept.found and "Diverged or failed" in kept.sentence and "gains" not in kept.sentence
+    assert not kept.found and "Diverged or failed" in effect_sentence(kept) and "gains" not in effect_sentence(kept)
     failed = tuple(Lost("scene-0", {METHOD: B}) for _ in range(1))
     assert not effect_of((1, 5), lambda s, k, level: 25 + 3 * (level == B) + rng.normal(0, 0.1), lost=failed).found
     worse = effect_of((1, 5), lambda s, k, level: nan if level == B and k == 0 else 25 - 3 * (level == B) + rng.normal(0, 0.1))
@@ -176,7 +177,7 @@ def test_a_scene_without_numbers_is_spoken_of() -> None:
     rng = np.random.default_rng(10)
     effect = effect_of((3, 3), lambda s, k, level: math.nan if s == 2 and level == B else 25 + rng.normal(0, 0.1))
     assert effect.silent == ("scene-2",)
-    assert "Nothing is known on scene-2" in effect.sentence
+    assert "Nothing is known on scene-2" in effect_sentence(effect)
 
 
 def test_perfect_views_count() -> None:
@@ -188,7 +189,7 @@ def test_perfect_views_count() -> None:
 
 def test_two_seeds_that_agree_are_not_certain() -> None:
     effect = effect_of((1, 2), lambda s, k, level: 20.0 + k + (level == "16"), SIZE)
-    assert effect.adjusted is None and not effect.found and "nothing is tested" in effect.sentence
+    assert effect.adjusted is None and not effect.found and "nothing is tested" in effect_sentence(effect)
 
 
 def test_seeds_of_different_methods_do_not_pair() -> None:
@@ -215,7 +216,7 @@ def test_an_interaction_is_what_is_tested_where_it_is_the_question() -> None:
     effect, *rest = effects_of(contrasts_of([steps, table], interactions=[(table.path, steps.path)]), PSNR, observations)
     assert effect.contrast.against == ("sampler.steps", "96", "384") and len(rest) == 2
     assert effect.found and effect.estimate.mean == pytest.approx(-1.0, abs=0.2)
-    assert "at sampler.steps 384 rather than 96" in effect.sentence
+    assert "at sampler.steps 384 rather than 96" in effect_sentence(effect)
 
 
 def test_questions_that_say_each_are_answered_for_each() -> None:

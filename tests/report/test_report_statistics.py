@@ -17,6 +17,7 @@ from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.statistics.effects import Effect, effects_on
 from invgraphics.report.statistics.intervals import Estimate, band, estimate, holm
 from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.run import Run
 from invgraphics.runs.scores import Score
@@ -84,7 +85,7 @@ def test_planted_effect_is_found_and_nothing_else(shape: tuple[int, int, int]) -
     effects = effects_on(PSNR, FACTORS[1:], simulated(np.random.default_rng(3), FACTORS[1:], shape, effect=-9.0))
     assert [effect.found for effect in effects] == [effect.factor == "data.train_views" for effect in effects]
     assert effects[0].estimate.low < -9.0 < effects[0].estimate.high
-    assert effects[0].sentence.startswith("data.train_views 20 instead of 40 costs ")
+    assert effect_sentence(effects[0]).startswith("data.train_views 20 instead of 40 costs ")
 
 
 @pytest.mark.parametrize(("shape", "over"), [((1, 3, 5), "seeds"), ((2, 4, 5), "seeds"), ((6, 2, 3), "scenes")])
@@ -194,27 +195,29 @@ def effect_with(mean: float, half: float, **changes: Any) -> Effect:
 
 
 def test_sentences() -> None:
-    assert effect_with(-2.1, 0.3).sentence == "data.train_views 20 instead of 40 costs 2.10 dB [1.80, 2.40], 3 seeds."
-    assert "gains 2.10 dB [1.80, 2.40]" in effect_with(2.1, 0.3).sentence
-    nothing = effect_with(0.1, 0.3).sentence
+    assert effect_sentence(effect_with(-2.1, 0.3)) == "data.train_views 20 instead of 40 costs 2.10 dB [1.80, 2.40], 3 seeds."
+    assert "gains 2.10 dB [1.80, 2.40]" in effect_sentence(effect_with(2.1, 0.3))
+    nothing = effect_sentence(effect_with(0.1, 0.3))
     assert nothing.startswith("data.train_views 20 instead of 40: undecided, 0.10 dB [−0.20, 0.40], 3 seeds; an effect of ")
     assert nothing.endswith(" would be found with 80% power after correction for 5 comparisons.")
     doubtful = effect_with(-2.1, 0.3, adjusted=0.08)
     assert not doubtful.found
-    assert "with 5 comparisons in this study that may be chance (corrected p = 0.08)" in doubtful.sentence
+    assert "with 5 comparisons in this study that may be chance (corrected p = 0.08)" in effect_sentence(doubtful)
     flip = quality_quantity("flip", Score(mean=0.0, higher_is_better=False))
-    assert "costs 0.030 FLIP [0.020, 0.040]" in effect_with(0.03, 0.01, quantity=flip).sentence
+    assert "costs 0.030 FLIP [0.020, 0.040]" in effect_sentence(effect_with(0.03, 0.01, quantity=flip))
     alone = Estimate(-1.0, -1.0, -1.0, None, "none", 1, (1, 1))
-    assert "in the one seed there is: an observation" in effect_with(0, 0, estimate=alone, adjusted=None).sentence
+    assert "in the one seed there is: an observation" in effect_sentence(effect_with(0, 0, estimate=alone, adjusted=None))
     same = Estimate(0.0, 0.0, 0.0, None, "none", 1, (3, 3))
-    assert effect_with(0, 0, estimate=same).sentence == "data.train_views 20 instead of 40: no difference at all, 3 seeds."
+    assert (
+        effect_sentence(effect_with(0, 0, estimate=same)) == "data.train_views 20 instead of 40: no difference at all, 3 seeds."
+    )
     steady = Estimate(-1.0, -1.0, -1.0, None, "none", 1, (2, 2))
-    assert "by the same amount each time, 2 seeds: no spread is known" in effect_with(0, 0, estimate=steady).sentence
-    assert "different pictures" in effect_with(-2.1, 0.3, truths_differ=True).sentence
-    equal = effect_with(0.05, 0.1, equivalence=0.01).sentence
+    assert "by the same amount each time, 2 seeds: no spread is known" in effect_sentence(effect_with(0, 0, estimate=steady))
+    assert "different pictures" in effect_sentence(effect_with(-2.1, 0.3, truths_differ=True))
+    equal = effect_sentence(effect_with(0.05, 0.1, equivalence=0.01))
     assert "no effect beyond ±0.20 dB (equivalence test), 0.05 dB [−0.05, 0.15], 3 seeds." in equal
     between = effect_with(1, 0.1, contrast=Contrast(METHOD, "a/b", "c/d"))
-    assert between.sentence.startswith("c/d instead of a/b gains")
+    assert effect_sentence(between).startswith("c/d instead of a/b gains")
 
 
 def test_many_levels_are_compared_with_the_reference_only() -> None:

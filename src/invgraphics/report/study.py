@@ -23,6 +23,7 @@ from invgraphics.report.statistics.cross_render import cross_effects
 from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.rules import headline, judge
+from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.summary import quality_columns, table_columns
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity
@@ -80,7 +81,7 @@ def study_sentences(folder: Path) -> list[str]:
     if study.report == "verdicts":
         return headline(judge(study.cells, study.known))
     quantities = _quantities(study, scene_comparisons(study))
-    return [effect.sentence for effect in headline_effects(study, quantities[0])] if quantities else []
+    return [effect_sentence(effect) for effect in headline_effects(study, quantities[0])] if quantities else []
 
 
 def headline_effects(study: Study, quantity: Quantity, clean: Callable[[str], str] = str) -> list[Effect]:

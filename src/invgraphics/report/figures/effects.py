@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.figures.style import INK, MUTED, PAGE, Figure, canvas, save, series_style
 from invgraphics.report.statistics.effects import Effect
+from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity
 from invgraphics.text import file_name
@@ -45,7 +46,7 @@ def draw_intervals(effects: Sequence[Effect], folder: Path) -> Figure | None:
     title = f"Differences in {quantity.label}"
     wide = _draw_intervals(shown, title, folder / f"effects-{file_name(quantity.key)}", WIDE)
     narrow = _draw_intervals(shown, title, folder / f"effects-{file_name(quantity.key)}-narrow", NARROW)
-    return Figure(wide, narrow, title, " ".join(effect.sentence for effect in shown))
+    return Figure(wide, narrow, title, " ".join(map(effect_sentence, shown)))
 
 
 def _draw_intervals(effects: Sequence[Effect], title: str, stem: Path, width: float) -> Path:
@@ -95,8 +96,8 @@ def _draw_row(axes: Axes, line: int, effect: Effect, look: tuple[int, Sequence[s
     style, scale, value = series_style(colour), effect.quantity.scale, effect.estimate
     small: dict[str, Any] = {"color": MUTED.light, "fontsize": 9.5, "ha": "center", "va": "top", "zorder": 2}
     low, high = axes.get_xlim()
-    for place, names in _clusters(_parts(effect), 2.5 * (high - low) / letters / scale):
-        axes.text(place * scale, line + 0.1, " ".join(str(order.index(name) + 1) for name in names), clip_on=True, **small)
+    for where, names in _clusters(_parts(effect), 2.5 * (high - low) / letters / scale):
+        axes.text(where * scale, line + 0.1, " ".join(str(order.index(name) + 1) for name in names), clip_on=True, **small)
     if effect.across is not None:
         ends = [effect.across.low * scale, effect.across.high * scale]
         axes.plot(ends, [line, line], color=style.colour, linewidth=0.9, zorder=3)

@@ -71,7 +71,7 @@ def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
         parts += ["## Failures", ""]
         parts += [f"- {text(cell.method)}, seed {cell.seed}: {text(cell.error)}" for cell in comparison.failures]
     if contrasts.tables:
-        parts += ["", "## Differences between methods", "", *(f"- {text(effect.sentence)}" for effect in contrasts.first)]
+        parts += ["", "## Differences between methods", "", *(f"- {text(one)}" for one in contrasts.sentences)]
         parts += ["", markdown_effects(contrasts.first)]
     parts += markdown_figures([*([contrasts.figure] if contrasts.figure else []), *part.drawn.figures], folder)
     parts += ["", "## Provenance", "", *(f"- {text(name)}: {text(value)}" for name, value in facts.shared_facts(comparison))]

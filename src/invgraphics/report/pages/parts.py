@@ -17,6 +17,7 @@ from invgraphics.report.figures.views import ViewPage, draw_views, publish_truth
 from invgraphics.report.statistics.cross_render import CrossTable, cross_table
 from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
 from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.summary import Row, Summary, quality_columns, summarise
 from invgraphics.report.statistics.time_to_quality import TimeToQuality, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
@@ -74,6 +75,11 @@ class Contrasts:
     def first(self) -> list[Effect]:
         """Effects on the first metric."""
         return self.tables[0][1] if self.tables else []
+
+    @property
+    def sentences(self) -> list[str]:
+        """Effects on the first metric in words."""
+        return list(map(effect_sentence, self.first))
 
 
 @dataclass(frozen=True)

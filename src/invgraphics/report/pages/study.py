@@ -19,6 +19,7 @@ from invgraphics.report.pages.parts import Contrasts, Part
 from invgraphics.report.pages.tables import escape_markdown, markdown_effects
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.intervals import CONFIDENCE, POWER
+from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity, budget_words, listing
 from invgraphics.text import duration
@@ -56,7 +57,7 @@ class StudyPage:
     def headline(self) -> list[str]:
         """Unfinished cells, a sentence per comparison that the question asks for, and the population of the intervals."""
         effects = [*self.crossed, *self.contrasts.first]
-        return [*_progress(self.study), *(effect.sentence for effect in effects), *_scope(self)]
+        return [*_progress(self.study), *map(effect_sentence, effects), *_scope(self)]
 
 
 @dataclass(frozen=True)

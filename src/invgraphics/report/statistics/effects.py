@@ -154,13 +154,6 @@ class Effect:
         """The interval for other scenes like these as text; empty where there is none."""
         return self.bounds(self.across)
 
-    @property
-    def sentence(self) -> str:
-        """The effect in words: difference, both intervals, verdict by scene, and what could have been found."""
-        from invgraphics.report.statistics.sentences import effect_sentence
-
-        return effect_sentence(self)
-
 
 def contrasts_of(
     factors: Sequence[Factor], each: str = "", interactions: Sequence[Sequence[str]] = (), among: Sequence[str] = ()
