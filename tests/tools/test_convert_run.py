@@ -10,7 +10,7 @@ import torch
 from training_fixtures import SMALL, write_blender
 
 from invgraphics.cli import main
-from invgraphics.core import Field, Model, Samples, Scene
+from invgraphics.core import Context, Field, Model, Samples, Scene
 from invgraphics.core.field import Quantity
 from invgraphics.core.samples import FieldValues
 from invgraphics.core.transforms import quaternion_to_matrix
@@ -25,7 +25,7 @@ from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.testing import TwoBalls, toy_scene
-from invgraphics.tools.conversions import quaternions_to, surface_points, to_gaussians, to_lattice, to_planes
+from invgraphics.tools.conversions import quaternions_to, surface_points, to_gaussians, to_lattice, to_mesh, to_planes
 from invgraphics.tools.convert import ConvertRequest
 
 RADIUS, CENTRE = 0.6, torch.tensor([0.1, -0.1, 0.05])
@@ -125,6 +125,16 @@ def test_planes_show_what_the_density_shows(scene: Scene) -> None:
     truth, method = model_of(TwoBalls(), scene), load_method("planes/mpi", "laptop", ["field.init='uniform'"])
     shown = Model(to_planes(truth, scene, method, 0), method.recipe.renderer.build(scene), scene.bounds)
     assert psnr(shown, truth, scene) > 19.5  # 18.5 where empty texels are black
+
+
+def test_a_mesh_is_the_surface_of_the_density(scene: Scene) -> None:
+    method = load_method("surface/mesh", "laptop", ["field.source='run'", "field.resolution=40"])
+    field = to_mesh(model_of(TwoBalls(), scene), scene, method, 40)
+    mesh, balls = field.primitives(Quantity.MESH, Context(scene.bounds)), TwoBalls()
+    distance = ((mesh.vertices[:, None] - balls.centres).norm(dim=2) - balls.radii).abs().amin(dim=1)
+    assert float(distance.max()) < 0.05  # a voxel
+    shown = Model(field, method.recipe.renderer.build(scene), scene.bounds)
+    assert psnr(shown, model_of(balls, scene), scene) > 17
 
 
 def test_a_converted_run_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

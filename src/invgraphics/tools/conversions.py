@@ -21,6 +21,7 @@ from invgraphics.errors import InputError
 from invgraphics.fields.convert import require_density, visible_points
 from invgraphics.fields.encodings.sparse import SparseVoxels
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
+from invgraphics.fields.mesh import MeshFieldConfig
 from invgraphics.fields.neural import NeuralField
 from invgraphics.fields.planes import PlanesConfig
 from invgraphics.fields.slicing import slice_density
@@ -166,6 +167,18 @@ def to_planes(model: Model, scene: Scene, method: Method, size: int) -> Field:
     return config.from_planes(slice_density(model.field, camera, depths, model.bounds))
 
 
+def to_mesh(model: Model, scene: Scene, method: Method, size: int) -> Field:
+    """The isosurface of a density or signed distance, in the photographs' mean colours; its shape is not refitted.
+
+    Raises:
+        InputError: the model has neither, or the method fits no mesh.
+    """
+    config = method.recipe.field
+    if not isinstance(config, MeshFieldConfig):
+        raise InputError(f"{method.name} fits no mesh.", "Use --method surface/mesh.")
+    return config.converted(model.field, scene)
+
+
 @torch.no_grad()
 def to_lattice(model: Model, scene: Scene, method: Method, size: int) -> Field:
     """Density at the vertices of a voxel grid, and spherical harmonics fitted to the radiance towards training cameras.
@@ -223,9 +236,9 @@ class Target:
     Attributes:
         method: whose field is made and refitted, unless another is asked for.
         hub: what the conversion goes through, in words.
-        size: number of primitives, or vertices along an edge; 0 where the method alone decides.
+        size: number of primitives, or of vertices or voxels along an edge; 0 where the method alone decides.
         convert: makes the field of a model, on a scene, for a method, of a size.
-        overrides: of the method's recipe, with ``{size}`` in place of that number.
+        overrides: of the method's recipe, with ``{size}`` in place of that number and ``{run}`` of the run's folder.
     """
 
     method: str
@@ -244,6 +257,7 @@ TARGETS = {
         to_lattice,
         ("field.encoding.resolution={size}", "field.appearance.resolution={size}", "hooks=[]"),
     ),
+    "mesh": Target("surface/mesh", "density or distance", 128, to_mesh, ("field.source='{run}'", "field.resolution={size}")),
     "mpi": Target("planes/mpi", "density and colour", 0, to_planes, ("field.init='uniform'",)),
 }
 """Targets by the name that ``convert --to`` takes."""

@@ -38,7 +38,8 @@ class ConvertRequest:
         out: folder of the new run.
         method: whose field is made and refitted; empty for the target's own.
         refit: budget of the refit, ``10s`` or ``500steps``.
-        size: number of Gaussians, or vertices along a lattice's longest edge; ``None`` for the target's own.
+        size: number of Gaussians, or of vertices or voxels along the longest edge of a lattice or of what a mesh is cut from;
+            ``None`` for the target's own.
         overrides: ``key=value`` items laid over the method's recipe.
         seed: of sampling and refit.
         scene: another copy of the run's scene.
@@ -146,7 +147,7 @@ def _job(request: ConvertRequest, fitted: Fitted) -> Job:
             out=str(request.out),
             method=request.method or target.method,
             budget=request.refit,
-            overrides=tuple(item.format(size=size) for item in target.overrides) + request.overrides,
+            overrides=tuple(item.format(size=size, run=request.run) for item in target.overrides) + request.overrides,
             size=options.size,
             test_views=options.test_views,
             spp=options.spp,
