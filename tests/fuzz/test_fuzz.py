@@ -53,7 +53,7 @@ def kind_of(name: str) -> str:
 
 def spec_of(root: Path, pattern: str, name: str) -> Path:
     """What a person would name: the folder of a scene, or the file."""
-    folder = name in seeds.FOLDERS and name != "checkpoint"
+    folder = name in seeds.FOLDERS and name not in ("checkpoint", "description", "camera_path")
     return root if folder or (kind_of(name) == "scene" and name != "npz") else root / pattern
 
 
@@ -127,6 +127,8 @@ def test_damaged_inputs_are_refused_or_right(good: tuple[str, Path, str, Reader]
 def test_harmless_changes_are_accepted_as_the_same(good: tuple[str, Path, str, Reader]) -> None:
     name, root, pattern, reader = good
     for path in sorted(root.glob(pattern)):
+        if name == "rendered" and path.name != "truth.json":
+            continue  # which lists their sizes
         before = path.read_bytes()
         try:
             if mutations.harmless(path):
