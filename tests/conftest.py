@@ -12,7 +12,24 @@ import torch
 from invgraphics import kernels
 from invgraphics.experiments.recorder import Monitor
 
-pytest_plugins = ["training_fixtures"]
+pytest_plugins = ["shared_folders", "training_fixtures"]
+
+
+LONGEST = (
+    "fuzz/test_fuzz.py",
+    "viewer/test_viewer_browser.py",
+    "scenes/test_import_photos.py",
+    "sabotage/test_sabotage.py",
+    "experiments/test_terminated.py",
+    "report/test_report_browser.py",
+)
+"""Files that come first, so that none of them is left to one of several processes when the others have finished."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order files by `LONGEST`, all others as they are."""
+    place = {Path(__file__).parent / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(LONGEST)))
 
 
 @pytest.fixture(autouse=True)

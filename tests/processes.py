@@ -14,7 +14,7 @@ from pathlib import Path
 
 PRELOADED = [
     *("invgraphics.experiments.compare", "invgraphics.studies.ablate", "invgraphics.report.study", "invgraphics.tools.photos"),
-    *("invgraphics.recipes.recipe", "invgraphics.training.fit", "invgraphics.scenes.colmap_library", "torch._dynamo", "numba"),
+    *("invgraphics.recipes.recipe", "invgraphics.training.fit", "invgraphics.scenes.colmap_library", "numba"),
     *(
         "matplotlib.pyplot",
         "pyarrow.parquet",

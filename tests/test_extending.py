@@ -73,19 +73,13 @@ def test_signatures_on_the_page_are_those_of_the_contract() -> None:
         assert f"`{name}({written}) -> {hints['return']}`" in PAGE, name
 
 
-def test_the_parts_conform(environment: dict[str, str]) -> None:
+def test_the_parts_conform_and_take_part(environment: dict[str, str], turntable: Path, tmp_path: Path) -> None:
     code = (
         "from voxel_world import VoxelsConfig, BrightestConfig\n"
-        "from invgraphics.testing import TwoBalls, check_field, check_renderer, toy_scene\n"
-        "scene = toy_scene(views=2, size=8)\n"
-        "check_field(VoxelsConfig(resolution=8).build(scene), scene)\n"
-        "check_renderer(BrightestConfig(count=16).build(scene), VoxelsConfig(resolution=8).build(scene), scene)\n"
-    )
-    _run(environment, "-c", code)
-
-
-def test_the_parts_take_part(environment: dict[str, str], turntable: Path, tmp_path: Path) -> None:
-    code = (
+        "from invgraphics.testing import check_field, check_renderer, toy_scene\n"
+        "toy = toy_scene(views=2, size=8)\n"
+        "check_field(VoxelsConfig(resolution=8).build(toy), toy)\n"
+        "check_renderer(BrightestConfig(count=16).build(toy), VoxelsConfig(resolution=8).build(toy), toy)\n"
         "import invgraphics as ig\n"
         "from invgraphics.cli import main\n"
         "main.run(['list', 'fields', 'renderers', 'methods'])\n"

@@ -55,8 +55,8 @@ def _toy_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("thing", [*(getattr(ig, name) for name in EXAMPLES), ScoreTable], ids=[*EXAMPLES, "ScoreTable"])
 def test_the_examples_hold(thing: object, request: pytest.FixtureRequest) -> None:
-    """Fits of the comparison's example have a process each, as for a user; of the study's, one for all."""
-    if thing is ig.ablate:
+    """Fits of comparison and study are made in this process."""
+    if thing in (ig.ablate, ig.compare):
         request.getfixturevalue("in_process")
     (test,) = doctest.DocTestFinder(recurse=False).find(thing, name=thing.__name__)
     assert test.examples
@@ -79,21 +79,20 @@ def test_the_readme_holds(in_process) -> None:
     assert names["splatted"].rgb.shape == names["integrated"].rgb.shape == (128, 128, 3)
 
 
-def test_names_are_lazy_and_typed() -> None:
-    code = "import sys, invgraphics as ig; print('torch' in sys.modules, set(ig.__all__) <= set(dir(ig)), ig.Camera.__module__)"
+def test_names_are_lazy_and_typed_and_packages_load_at_any_depth() -> None:
+    code = (
+        "import sys, invgraphics as ig\n"
+        "print('torch' in sys.modules, set(ig.__all__) <= set(dir(ig)), ig.Camera.__module__)\n"
+        "print(ig.fields.encodings.frequency.FrequencyConfig(octaves=2).build().width)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "True", "invgraphics.core.camera"]
+    # x, and sine and cosine of two octaves, of three coordinates
+    assert done.stdout.split() == ["False", "True", "invgraphics.core.camera", "15"]
     for name, home in ig._HOMES.items():
         assert getattr(importlib.import_module(home), name) is getattr(ig, name)
     assert sorted(ig._HOMES) == sorted(ig.__all__)
     with pytest.raises(AttributeError, match="no attribute 'render'"):
         ig.render  # noqa: B018
-
-
-def test_packages_load_on_first_use_at_any_depth() -> None:
-    code = "import invgraphics as ig; print(ig.fields.encodings.frequency.FrequencyConfig(octaves=2).build().width)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "15"  # x, and sine and cosine of two octaves, of three coordinates
     with pytest.raises(AttributeError, match=r"'invgraphics\.core' has no attribute 'optics'"):
         ig.core.optics  # noqa: B018
     with pytest.raises(ImportError, match="cannot import name 'optics'"):
@@ -164,6 +163,7 @@ def test_methods_come_in_every_shape(out: str | None) -> None:
 
 
 def test_a_comparison_of_a_scene_made_in_python() -> None:
+    """Its fits have a process each, as for a user."""
     scene = toy_scene(views=8, size=24)
     broken = ig.load_method("splatting/gaussians", set={"field.init": "field", "field.source": "nowhere"})
     report = ig.compare(scene, [SPLATS, broken], budget="2steps", seeds=(3,), out="report")
@@ -252,8 +252,16 @@ def test_a_finished_run_shows_new_views_through_other_renderers() -> None:
     )
     splatted, integrated = run.model.render(camera), run.through("gaussian-volume/exact:steps=8").render(camera)
     assert 0 < float((splatted.rgb - integrated.rgb).abs().max()) < 0.5
-    with pytest.raises(InputError, match="cannot be rendered with volumetric/nerf"):
-        run.through("volumetric/nerf")
+    with pytest.raises(InputError, match="cannot be rendered with sphere-tracing/hash"):
+        run.through("sphere-tracing/hash")
+
+
+def test_a_run_through_its_own_renderer_keeps_what_that_learnt_and_through_another_takes_a_constant() -> None:
+    method = ig.load_method("hybrid/neus", set={"field.width": 16, "field.layers": 1, "batches.rays": 16})
+    run = ig.fit(method, ig.load_scene("toy.npz"), "2steps")
+    width = run.model.renderer.width
+    assert run.through("hybrid/neus").renderer.width == width != run.through("hybrid/neus:sharpness_final=70").renderer.width
+    assert torch.isclose(run.through("hybrid/volsdf:change=held:beta=0.03").renderer.width, torch.tensor(0.03 - 1e-4))
 
 
 def test_objects_show_themselves() -> None:

@@ -143,7 +143,9 @@ for words in {commands!r}:
 def test_a_limit_on_the_size_of_files_is_said_with_its_remedy(run: Path, toy_folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("resource", reason="limits on files are POSIX's")
     commands = [COMMANDS[name](run, tmp_path) for name in ("export ply", "render", "report", "explain")]
-    commands.append(["fit", METHOD, str(toy_folder), "--out", str(tmp_path / "run"), "--budget", "2steps"])
+    small = [word for setting in SMALL[METHOD] for word in ("--set", setting)]
+    fit = ["fit", METHOD, str(toy_folder), "--out", str(tmp_path / "run"), "--budget", "2steps", "--kernels", "reference"]
+    commands.append([*fit, *small])
     code = LIMITED.format(commands=commands)
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr

@@ -9,6 +9,7 @@ from typing import ClassVar
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from invgraphics.core import Scene
 from invgraphics.core.transforms import opencv_to_opengl
@@ -17,6 +18,7 @@ from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.recipes.recipe import Method, load_method
+from invgraphics.runs import checkpoint
 from invgraphics.testing import toy_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -82,13 +84,13 @@ def scene() -> Scene:
     return toy_scene()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def small() -> Callable[..., Method]:
     """A built-in method, shrunk for the toy scene."""
     return lambda name, *more: load_method(name, None, [*SMALL.get(name, []), *more])
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_fit(small: Callable[..., Method]) -> Callable[..., Fit]:
     """A fit of a shrunk method."""
 
@@ -96,6 +98,37 @@ def make_fit(small: Callable[..., Method]) -> Callable[..., Fit]:
         return Fit(build_plan(small(name, *more), scene, Budget(steps=steps), seed, torch.device("cpu")))
 
     return make
+
+
+State = dict[str, dict[str, Tensor]]
+
+
+def run_whole(fit: Fit, steps: int, path: Path, left: int = 12) -> State:
+    """Final state of a fit that nothing interrupts; its checkpoint at ``path`` is of ``left`` steps before the last."""
+
+    def save(loss: float) -> bool:
+        if fit.steps == steps - left:
+            checkpoint.save(path, fit.state())
+        return False
+
+    fit.run(save)
+    return {part: {key: value.clone() for key, value in content.items()} for part, content in fit.state().items()}
+
+
+def resume(fit: Fit, path: Path) -> State:
+    """Final state of a new fit that goes on from a checkpoint, whatever torch's random state was."""
+    torch.manual_seed(99)
+    fit.load(checkpoint.load(path), seconds=1.0)
+    fit.run(lambda loss: False)
+    return fit.state()
+
+
+def same_state(one: State, other: State) -> bool:
+    """Whether two states are equal bit by bit."""
+    return one.keys() == other.keys() and all(
+        one[part].keys() == other[part].keys() and all(torch.equal(one[part][key], other[part][key]) for key in one[part])
+        for part in one
+    )
 
 
 def write_blender(scene: Scene, folder: Path) -> Path:

@@ -74,20 +74,34 @@ class TwoBalls(Field):
         return FieldValues(density=30.0 * (distance.amin(dim=1) < 0), radiance=self.colours[nearest] * shade)
 
 
-def toy_cameras(count: int, size: int, turn: float = 0.0, zoom: float = 1.0) -> list[Camera]:
-    """Place cameras on a spiral around the origin at distance 3; all of [-1, 1]³ is in view unless ``zoom`` exceeds 1."""
+Facing = Literal["around", "forward"]
+
+
+def toy_cameras(count: int, size: int, turn: float = 0.0, zoom: float = 1.0, facing: Facing = "around") -> list[Camera]:
+    """Place cameras on a spiral around the origin at distance 3; all of [-1, 1]³ is in view unless ``zoom`` exceeds 1.
+
+    With ``facing = "forward"`` the spiral lies on a disc of radius 0.6 before the origin, at y = -3.
+    """
     cameras = []
     for i in range(count):
         azimuth = 2 * math.pi * (i * 0.618034 + turn)
         height = -0.5 + 1.4 * (i + 0.5) / count
         eye = 3 * torch.tensor([math.cos(azimuth) * math.cos(height), math.sin(azimuth) * math.cos(height), math.sin(height)])
+        if facing == "forward":
+            radius = 0.6 * math.sqrt((i + 0.5) / count)
+            eye = torch.tensor([radius * math.cos(azimuth), -3.0, radius * math.sin(azimuth)])
         pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
         cameras.append(Camera(pose, torch.full((2,), 1.3 * zoom * size), torch.full((2,), size / 2), size, size))
     return cameras
 
 
 def toy_scene(
-    views: int = 12, size: int = 24, space: Literal["box", "contracted"] = "box", checks: float = 0.0, zoom: float = 1.0
+    views: int = 12,
+    size: int = 24,
+    space: Literal["box", "contracted"] = "box",
+    checks: float = 0.0,
+    zoom: float = 1.0,
+    facing: Facing = "around",
 ) -> Scene:
     """Make a scene of two balls of fog with alpha, points and a white background; fits in well under a second.
 
@@ -97,6 +111,7 @@ def toy_scene(
         space: kind of bounds.
         checks: fineness of a checkerboard on the balls (see `TwoBalls`).
         zoom: multiplies the focal length; the balls fill the pictures at 1.35.
+        facing: whether cameras surround the balls, or see them from one side.
     """
     bounds = Bounds(-torch.ones(3), torch.ones(3), space)
     truth, field = VolumetricConfig(StratifiedConfig(count=128)), TwoBalls(checks)
@@ -113,10 +128,8 @@ def toy_scene(
     which = torch.arange(400) % 2
     points = Points(field.centres[which] + field.radii[which][:, None] * directions, field.colours[which])
     scene = Scene("toy", (), (), torch.ones(3), bounds, points=points)
-    train = tuple(view(camera, f"train{i}") for i, camera in enumerate(toy_cameras(views, size, zoom=zoom)))
-    test = tuple(
-        view(camera, f"test{i}") for i, camera in enumerate(toy_cameras(max(2, views // 4), size, turn=0.3, zoom=zoom))
-    )
+    train = tuple(view(camera, f"train{i}") for i, camera in enumerate(toy_cameras(views, size, 0.0, zoom, facing)))
+    test = tuple(view(camera, f"test{i}") for i, camera in enumerate(toy_cameras(max(2, views // 4), size, 0.3, zoom, facing)))
     return scene.with_views(train=train, test=test)
 
 
@@ -149,8 +162,15 @@ def check_field(field: Field, scene: Scene) -> None:
         assert len(value) == 37 and bool(value.isfinite().all()), f"{quantity.words()} is not finite"
         if quantity is Quantity.DENSITY:
             assert bool((value >= 0).all()), "a density is negative"
+        if quantity is Quantity.FEATURES:
+            assert value.shape[1] == field.feature_width, "feature_width is not the number of features"
         if quantity is Quantity.NORMAL:
-            assert torch.allclose(value.norm(dim=1), torch.ones(37), atol=1e-3), "a normal is not of unit length"
+            empty = torch.zeros(37, dtype=torch.bool)
+            if Quantity.DENSITY in field.provides:
+                density = field.query(Samples.at(position, direction), Quantity.DENSITY).density
+                empty = torch.zeros_like(empty) if density is None else density == 0
+            length = value.norm(dim=1)
+            assert bool((((length - 1).abs() < 1e-3) | empty).all()), "a normal is not of unit length"
         empty = field.query(Samples.at(position[:0], direction[:0]), quantity)
         assert len(getattr(empty, _POINTWISE[quantity])) == 0, "no samples must give no values"
     if Quantity.GRADIENT in field.provides:

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -93,48 +94,73 @@ ENTRY_POINTS = (
 )
 
 
-@pytest.fixture
-def environment(tmp_path: Path) -> dict[str, str]:
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """A process environment in which the stranger's package is installed."""
-    info = tmp_path / "site" / "stranger_fog-1.0.dist-info"
-    info.mkdir(parents=True)
+    info = tmp_path_factory.mktemp("site") / "stranger_fog-1.0.dist-info"
+    info.mkdir()
     (info.parent / "stranger_fog.py").write_text(MODULE)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger-fog\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
-    paths = [str(info.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = [str(info.parent), str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "200"}
 
 
-def _invgraphics(environment: dict[str, str], *commands: list[str]) -> list[str]:
-    """Outputs of several commands, all given in one process."""
-    code = "import json, sys; from invgraphics.cli.main import run\n"
-    code += "for words in json.loads(sys.argv[1]):\n    assert run(words) == 0, words\n    print('\\f')"
-    command = [sys.executable, "-c", code, json.dumps(commands)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    *outputs, _ = done.stdout.split("\f")
-    return outputs
+COMMANDS = """
+import json, sys
+from training_fixtures import InProcess
+from invgraphics.cli.main import run
+from invgraphics.experiments import compare
+compare.LocalExecutor, InProcess.made, InProcess.fails = InProcess, [], lambda request: ""
+for words in json.loads(sys.argv[1]):
+    assert run(words) == 0, words
+    print("\\f")
+"""
 
 
-def test_a_strangers_field_and_renderer_with_state_take_part(
-    environment: dict[str, str], toy_folder: Path, tmp_path: Path
-) -> None:
-    """Listed, fitted, compared with ours, shown beside it for a field that ours fitted, reported and explained."""
-    out = tmp_path / "report"
+@dataclass(frozen=True)
+class Stranger:
+    """What commands printed in a process that has the stranger's package, and the folders that they wrote."""
+
+    listed: str
+    compared: str
+    explained: tuple[str, ...]
+    report: Path
+    ours: Path
+    theirs: Path
+    shown: Path
+    lone: Path
+
+
+@pytest.fixture(scope="module")
+def stranger(environment: dict[str, str], toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Stranger:
+    """All commands in one process, comparisons' fits too: starting one takes longer than they do."""
+    out = tmp_path_factory.mktemp("stranger") / "report"
     methods = "volumetric/fog,exposed/fog"
     words = ["--budget", "20steps", "--out", str(out), "--methods", methods, "--render-with", "exposed/fog"]
     ours, theirs = (out / "runs" / name / "seed-0" for name in ("volumetric-fog", "exposed-fog"))
-    shown = ours / "rendered" / "exposed-fog"
-    listed, compared, *explained = _invgraphics(
-        environment,
+    shown, lone = ours / "rendered" / "exposed-fog", out.with_name("lone")
+    commands = [
         ["list", "matrix", "renderers", "fields", "methods"],
         ["compare", str(toy_folder), *words],
         *(["explain", str(run), "--view", "0", "--pixel", "12,12"] for run in (theirs, shown)),
-    )
+        ["fit", "volumetric/fog", str(toy_folder), "--budget", "2steps", "--out", str(lone)],
+    ]
+    command = [sys.executable, "-c", COMMANDS, json.dumps(commands)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    listed, compared, *explained, _, _ = done.stdout.split("\f")
+    return Stranger(listed, compared, tuple(explained), out, ours, theirs, shown, lone)
+
+
+def test_a_strangers_field_and_renderer_with_state_take_part(stranger: Stranger) -> None:
+    """Listed, fitted, compared with ours, shown beside it for a field that ours fitted, reported and explained."""
+    ours, theirs, shown = stranger.ours, stranger.theirs, stranger.shown
+    listed = stranger.listed
     assert "| exposed volume rendering |" in listed and "stranger_fog:ExposedConfig" in listed
     assert "stranger_fog:FogConfig" in listed and "stranger-fog" in listed and "volumetric/fog" in listed
-    assert "exposed/fog" in compared
-    page = (out / "index.html").read_text()
+    assert "exposed/fog" in stranger.compared
+    page = (stranger.report / "index.html").read_text()
     assert "Even fog from a stranger" in page and "Exposed fog from a stranger" in page
     assert [json.loads((run / "scores.json").read_text())["cost"]["parameters"] for run in (ours, theirs)] == [4, 5]
     state = checkpoint.load(theirs / CHECKPOINT)
@@ -143,27 +169,24 @@ def test_a_strangers_field_and_renderer_with_state_take_part(
     assert json.loads((shown / "scores.json").read_text())["method"] == "volumetric/fog rendered with exposed/fog"
     with np.load(ours / "test" / "0000.npz") as own, np.load(shown / "test" / "0000.npz") as other:
         np.testing.assert_allclose(own["rgb"], other["rgb"], atol=1e-3)
-    assert all("8 samples" in text for text in explained)
+    assert len(stranger.explained) == 2 and all("8 samples" in text for text in stranger.explained)
     for run in (theirs, shown):
         pixel = json.loads((run / "explained" / "test-0000-12-12" / "ray.json").read_text())["pixel"]
         assert pixel["composited"] == pytest.approx(pixel["rendered"], abs=1e-5)
 
 
-def test_a_run_whose_package_is_gone_names_it(
-    environment: dict[str, str], toy_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    _invgraphics(environment, ["fit", "volumetric/fog", str(toy_folder), "--budget", "2steps", "--out", str(run)])
+def test_a_run_whose_package_is_gone_names_it(stranger: Stranger, capsys: pytest.CaptureFixture[str]) -> None:
     plugins = {"fog": "stranger-fog 1.0", "volumetric/fog": "stranger-fog 1.0"}
-    assert json.loads((run / "provenance.json").read_text())["plugins"] == plugins
+    assert json.loads((stranger.lone / "provenance.json").read_text())["plugins"] == plugins
     # Only that process had the package.
-    assert main.run(["evaluate", str(run)]) == main.BAD_INPUT
+    assert main.run(["evaluate", str(stranger.lone)]) == main.BAD_INPUT
     said = capsys.readouterr().err
     assert "was made with stranger-fog 1.0, which provides 'fog', 'volumetric/fog' and is not installed here" in said
 
 
 def test_a_stranger_that_fails_to_import_is_named(environment: dict[str, str], tmp_path: Path) -> None:
-    (tmp_path / "site" / "stranger_fog.py").write_text("import a_module_that_is_not_there\n")
+    (tmp_path / "stranger_fog.py").write_text("import a_module_that_is_not_there\n")
+    environment = environment | {"PYTHONPATH": os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])}
     command = [sys.executable, "-m", "invgraphics", "fit", "volumetric/fog", "bricks", "--out", str(tmp_path / "run")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2

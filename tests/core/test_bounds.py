@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from invgraphics.core import Bounds, Rays
-from invgraphics.core.bounds import FAR, contract, uncontract
+from invgraphics.core.bounds import FAR, Space, contract, contract_jacobian, uncontract
 
 F64 = torch.float64
 
@@ -79,3 +79,24 @@ def test_contracted_rays_end_far_away() -> None:
     clipped = region.clip(Rays.make(torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0, 1.0]], dtype=F64)))
     assert float(clipped.near) == 0.3
     assert float(clipped.far) == FAR * 2.0
+
+
+@pytest.mark.parametrize("space", ["box", "contracted"])
+def test_covariances_go_through_the_jacobian_that_autograd_finds(space: Space) -> None:
+    bounds = Bounds(torch.tensor([-1.0, -2.0, -0.5]).double(), torch.tensor([1.5, 1.0, 2.0]).double(), space)
+    position = torch.randn(8, 3, dtype=torch.float64) * 3
+    root = torch.randn(8, 3, 3, dtype=torch.float64)
+    mapped = bounds.unit_covariance(position, root @ root.mT)
+    for point, factor, result in zip(position, root, mapped, strict=True):
+        jacobian = torch.autograd.functional.jacobian(bounds.to_unit, point)
+        torch.testing.assert_close(result, jacobian @ factor @ factor.T @ jacobian.T)
+    moving = lambda p: bounds.unit_covariance(p, root @ root.mT)  # noqa: E731
+    assert torch.autograd.gradcheck(moving, (position.requires_grad_(),))
+
+
+def test_the_contraction_s_jacobian_is_the_identity_up_to_the_unit_sphere() -> None:
+    direction = torch.nn.functional.normalize(torch.randn(5, 3, dtype=torch.float64), dim=1)
+    eye = torch.eye(3, dtype=torch.float64).expand(5, 3, 3)
+    assert torch.equal(contract_jacobian(0.999 * direction), eye)
+    torch.testing.assert_close(contract_jacobian((1 + 1e-9) * direction), eye, atol=1e-8, rtol=0)
+    assert torch.equal(contract_jacobian(torch.zeros(1, 3, dtype=torch.float64)), eye[:1])

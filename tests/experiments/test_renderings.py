@@ -25,7 +25,7 @@ from invgraphics.experiments.run import fit_run
 from invgraphics.experiments.variants import variant_named
 from invgraphics.recipes.recipe import load_method
 from invgraphics.recipes.schema import Recipe
-from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
+from invgraphics.renderers.gaussians.volume import GaussianSorted, GaussianSortedConfig
 from invgraphics.renderers.volumetric import Volumetric
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT

@@ -10,6 +10,7 @@ from invgraphics.core import Context, Quantity
 from invgraphics.errors import InputError
 from invgraphics.fields.convert import visible_points
 from invgraphics.fields.gaussian import GaussianFieldConfig
+from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.fields.starting import depth_points
 from invgraphics.testing import TwoBalls, toy_scene
 
@@ -73,7 +74,7 @@ def test_empty_and_other_fields_are_refused(scene) -> None:
     with pytest.raises(InputError, match="shows nothing"):
         visible_points(Nothing(), scene, 1)
     with pytest.raises(InputError, match="not density and radiance"):
-        visible_points(GaussianFieldConfig().build(scene), scene, 1)
+        visible_points(NeuralFieldConfig(geometry="sdf", layers=1, width=8, skip=-1).build(scene), scene, 1)
     for wrong in ({"init": "field"}, {"source": "somewhere"}):
         with pytest.raises(ValueError, match="source"):
             GaussianFieldConfig(**wrong)

@@ -234,9 +234,9 @@ def test_a_checkpoint_of_another_size_loads(make_scene):
         GaussianFieldConfig(sh_degree=1).build(scene).load_state_dict(big.state_dict())
 
 
-def test_points_cannot_be_asked(make_scene):
+def test_what_gaussians_do_not_have_is_refused(make_scene):
     field = GaussianFieldConfig().build(make_scene(points=_points()))
-    with pytest.raises(NotComposableError, match="density"):
-        field.query(Samples.at(torch.zeros(1, 3)), Quantity.DENSITY)
+    with pytest.raises(NotComposableError, match="sdf"):
+        field.query(Samples.at(torch.zeros(1, 3)), Quantity.DENSITY | Quantity.SDF)
     with pytest.raises(NotComposableError, match="planes"):
         field.primitives(Quantity.PLANES, Context(make_scene().bounds))

@@ -17,7 +17,7 @@ from invgraphics.fields.encodings.sparse import SparseVoxelsConfig
 from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
-from invgraphics.fields.neural import NeuralField, NeuralFieldConfig, unit_covariance
+from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
 
 D, S, G, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.GRADIENT, Quantity.RADIANCE, Quantity.NORMAL
 
@@ -307,19 +307,6 @@ def test_mlp_skip_is_the_written_out_product():
     expected = h @ net.output.weight.T + net.output.bias
     torch.testing.assert_close(net(x), expected)
     torch.testing.assert_close(net(x, 2), expected[:, :2])
-
-
-@pytest.mark.parametrize("space", ["box", "contracted"])
-def test_covariance_goes_through_the_jacobian(space):
-    bounds = Bounds(torch.tensor([-1.0, -2.0, -0.5]).double(), torch.tensor([1.5, 1.0, 2.0]).double(), space)
-    position = torch.randn(8, 3, dtype=torch.float64) * 3
-    root = torch.randn(8, 3, 3, dtype=torch.float64)
-    mapped = unit_covariance(bounds, position, root @ root.mT)
-    for point, factor, result in zip(position, root, mapped, strict=True):
-        jacobian = torch.autograd.functional.jacobian(bounds.to_unit, point)
-        torch.testing.assert_close(result, jacobian @ factor @ factor.T @ jacobian.T)
-    moving = lambda p: unit_covariance(bounds, p, root @ root.mT)  # noqa: E731
-    assert torch.autograd.gradcheck(moving, (position.requires_grad_(),))
 
 
 def test_directions_reach_the_colour_as_octaves(make_scene):

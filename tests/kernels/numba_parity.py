@@ -1,6 +1,6 @@
 """Parity of Numba's kernels with the reference for whatever processor NUMBA_CPU_NAME says; run by `test_instruction_sets`.
 
-Arguments: ``samples`` or ``pictures``, then the widest vector registers that the machine code may name: xmm, ymm or zmm.
+Arguments: ``samples``, ``fields`` or ``pictures``; the widest vector registers that machine code may name: xmm, ymm or zmm.
 """
 
 import sys
@@ -40,38 +40,45 @@ def assert_equal(fast, plain, inputs: list[Tensor], tolerance: float = 1e-5) -> 
         assert worst <= tolerance, worst
 
 
+GRID = HashGrid(levels=4, features=2, log2_size=8, base=4, finest=100)
+
+
 def samples() -> list[str]:
-    """Hash encoding, compositing, and pictures of hash grids; returns the machine code."""
-    grid = HashGrid(levels=4, features=2, log2_size=8, base=4, finest=100)
+    """Hash encoding, marching and compositing; returns the machine code."""
     unit = torch.rand(200, 3) * 1.2 - 0.1
-    ours, theirs = (lambda t, k=k: k.hash_encode(unit.to(t.dtype), t, grid) for k in (numba, reference))
-    assert_equal(ours, theirs, [torch.randn(grid.entries, 2)])
+    ours, theirs = (lambda t, k=k: k.hash_encode(unit.to(t.dtype), t, GRID) for k in (numba, reference))
+    assert_equal(ours, theirs, [torch.randn(GRID.entries, 2)])
+    (bounds, rays), occupied = box_of_rays(), torch.rand(24, 24, 24) < 0.05
+    ours, theirs = (k.ray_march(rays, occupied, bounds, MarchSteps(0.01), rays.near) for k in (numba, reference))
+    assert len(ours.ray) > 0
+    assert all(torch.equal(getattr(ours, name), getattr(theirs, name)) for name in ("ray", "t0", "t1", "resume"))
+    ray = torch.repeat_interleave(torch.arange(30), torch.randint(0, 40, (30,)))
+    inputs = [torch.rand(len(ray)) ** 6 * 2, torch.randn(len(ray), 4)]
+    assert_equal(lambda d, c: numba.composite(d, c, ray, 30), lambda d, c: reference.composite(d, c, ray, 30), inputs)
+    return assembly(
+        *("hash.encode.encode", "hash.encode.encode_backward", "rays.march.traverse"),
+        *("rays.composite.accumulate", "rays.composite.accumulate_backward"),
+    )
+
+
+def fields() -> list[str]:
+    """Lattices, and pictures of hash grids; returns the machine code."""
+    unit = torch.rand(200, 3) * 1.2 - 0.1
     plane, line = [torch.randn(5, 6, 21), torch.randn(7, 21)]
     ours, theirs = (
         lambda p, q, k=k: k.lattice_encode(unit.to(p.dtype), [Lattice(p, "xy"), Lattice(q, "z")], "vm")
         for k in (numba, reference)
     )
     assert_equal(ours, theirs, [plane, line])
-    ray = torch.repeat_interleave(torch.arange(30), torch.randint(0, 40, (30,)))
-    inputs = [torch.rand(len(ray)) ** 6 * 2, torch.randn(len(ray), 4)]
-    assert_equal(lambda d, c: numba.composite(d, c, ray, 30), lambda d, c: reference.composite(d, c, ray, 30), inputs)
     networks = [((torch.randn(16, 8), torch.randn(16)), (torch.randn(4, 16), torch.randn(4)))]
     networks += [((torch.randn(5, 7), torch.randn(5)), (torch.randn(3, 5), torch.randn(3)))]
-    field = FusedNGP(torch.randn(grid.entries, 2), grid, *networks, "exp", -2.0, 2, "srgb")
+    field = FusedNGP(torch.randn(GRID.entries, 2), GRID, *networks, "exp", -2.0, 2, "srgb")
     bounds, rays = box_of_rays()
     call = rays, torch.rand(8, 8, 8) < 0.5, bounds, MarchSteps(0.05), field
     for number, true in zip(numba.ngp_render(*call), reference.ngp_render(*call), strict=True):
         assert true.abs().max() > 0.1
         assert (number - true).abs().max() <= 1e-4 * true.abs().max()
-    parts = (
-        "lattice.encode.encode",
-        "lattice.backward.feature_gradients",
-        "hash.encode.encode",
-        "hash.encode.encode_backward",
-        "rays.composite.accumulate",
-        "rays.composite.accumulate_backward",
-    )
-    return assembly(*parts, "ngp.render.render")
+    return assembly("lattice.encode.encode", "lattice.backward.feature_gradients", "ngp.render.render")
 
 
 def box_of_rays() -> tuple[Bounds, Rays]:
@@ -81,7 +88,7 @@ def box_of_rays() -> tuple[Bounds, Rays]:
 
 
 def pictures() -> list[str]:
-    """Splatting, SSIM and marching; returns the machine code."""
+    """Splatting and SSIM; returns the machine code."""
     pose = torch.eye(4)
     pose[2, 3] = -3.0
     camera = Camera(pose, torch.tensor([70.0, 75.0]), torch.tensor([35.0, 20.0]), 61, 45)
@@ -99,11 +106,7 @@ def pictures() -> list[str]:
     assert_equal(lambda *x: render(numba, *x), lambda *x: render(reference, *x), leaves, 2e-4)
     target = torch.rand(37, 45, 3)
     assert_equal(lambda x: numba.ssim(x, target), lambda x: reference.ssim(x, target.double()), [torch.rand(37, 45, 3)])
-    (bounds, rays), occupied = box_of_rays(), torch.rand(24, 24, 24) < 0.05
-    ours, theirs = (k.ray_march(rays, occupied, bounds, MarchSteps(0.01), rays.near) for k in (numba, reference))
-    assert len(ours.ray) > 0
-    assert all(torch.equal(getattr(ours, name), getattr(theirs, name)) for name in ("ray", "t0", "t1", "resume"))
-    return assembly("splat.raster.rasterise", "splat.raster_backward.rasterise_backward", "rays.march.traverse")
+    return assembly("splat.raster.rasterise", "splat.raster_backward.rasterise_backward")
 
 
 def assembly(*names: str) -> list[str]:
@@ -121,7 +124,7 @@ if __name__ == "__main__":
     compile_here()  # cached kernels have no assembly to look at
     torch.manual_seed(0)
     part, widest = sys.argv[1:]
-    code = {"samples": samples, "pictures": pictures}[part]()
+    code = {"samples": samples, "fields": fields, "pictures": pictures}[part]()
     assert code, "nothing was compiled"
     for register in WIDER[widest]:
         assert not any(f"%{register}" in text for text in code), f"{register} registers are used"

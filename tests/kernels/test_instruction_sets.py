@@ -1,7 +1,7 @@
 """Numba's kernels compiled for older processors give the same numbers, with the vector registers those have.
 
 Each level runs in a process of its own, because Numba reads the processor's name when it is imported, and with a cache of its
-own. The splats take longer to compile and are checked with the slow tests.
+own. What takes longer to compile is checked with the slow tests.
 """
 
 import os
@@ -52,12 +52,13 @@ def test_samples(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("processor", ["nehalem", "haswell", "skylake-avx512"])
-def test_pictures(processor: str, tmp_path: Path) -> None:
-    finish(start("pictures", processor, tmp_path), "pictures", processor)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("processor", ["haswell", "skylake-avx512"])
 def test_samples_with_wider_registers(processor: str, tmp_path: Path) -> None:
     finish(start("samples", processor, tmp_path), "samples", processor)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["fields", "pictures"])
+@pytest.mark.parametrize("processor", ["nehalem", "haswell", "skylake-avx512"])
+def test_fields_and_pictures(processor: str, part: str, tmp_path: Path) -> None:
+    finish(start(part, processor, tmp_path), part, processor)

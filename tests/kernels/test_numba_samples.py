@@ -54,6 +54,20 @@ def test_hash_encoding(grid):
     assert_equal(lambda u, t: numba.hash_encode(u, t, grid), lambda u, t: reference.hash_encode(u, t, grid), [unit, table])
 
 
+@pytest.mark.parametrize("features", [2, 3])
+def test_the_gradient_of_positions_is_differentiable_in_table_and_cotangent(features):
+    grid = HashGrid(levels=5, features=features, log2_size=9, base=3, finest=70)
+    unit = torch.cat([POINTS, CORNERS])
+
+    def gradient(kernels, table, cotangent):
+        moving = unit.to(table.dtype).requires_grad_()
+        encoded = kernels.hash_encode(moving, table, grid)[0]
+        return torch.autograd.grad(encoded, moving, cotangent, create_graph=True)[0]
+
+    inputs = [torch.randn(grid.entries, features), torch.randn(len(unit), grid.levels * features)]
+    assert_equal(lambda t, c: gradient(numba, t, c), lambda t, c: gradient(reference, t, c), inputs)
+
+
 def test_a_position_just_below_a_vertex_lies_in_the_cell_below():
     """Its product with the number of cells is rounded up to the vertex; the derivative along it tells the cells apart."""
     grid = HashGrid(levels=1, features=2, log2_size=12, base=4093, finest=4093)

@@ -22,6 +22,8 @@ SMALL = {
         "views, size, steps, samples, march = 8, 16, 80, 2048, 48\n"
         "grid_steps, points, tables, edge, factor_steps, edge_steps = 60, 2048, [8, 12, 16], 16, 150, 150"
     ),
+    "05-surfaces": "size, pixels, march, views, steps = 48, 41, 256, 8, 60",
+    "06-aliasing-and-open-space": "draws, steps = 100_000, 120",
     "07-gaussians-and-ewa": "draws = 100_000",
     "08-fit-gaussians": "views, size, steps, flat_steps, starts = 12, 32, 200, 150, 3",
     "09-the-same-gaussians-two-ways": "size, turns = 72, 21",
@@ -165,6 +167,28 @@ def _ranks(out: _Printed) -> None:
     assert out.numbers("memory, VM:") == (4 * 3 * (16**2 + 16),)
 
 
+def _cones(out: _Printed) -> None:
+    """The cone's Gaussian and its encoding, against Monte Carlo; proposals that learn; splats with and without a filter."""
+    mean, drawn, middle = out.numbers("cone: mean at", "Monte Carlo", "middle of the interval")
+    assert mean == pytest.approx(drawn, abs=0.01) and mean > middle + 0.3
+    assert out.numbers("cone: covariance and Monte Carlo differ by") < (1,)
+    assert out.numbers("encoding: closed form and Monte Carlo differ by at most") < (1e-2,)
+    assert out.numbers("encoding: without the Gaussian, at its mean, by") > (0.5,)
+    centre, damped = (out.numbers(f"stripes, {name}: RMS error")[0] for name in ("at the centre", "damped"))
+    assert damped < centre / 4
+    for where in ("inside", "outside"):
+        assert out.numbers(f"contraction, {where} the unit ball: encoding and Monte Carlo differ by at most") < (1.5e-2,)
+    first, last = out.numbers("interlevel loss", "at the start,")
+    assert last < first / 20
+    before, after = out.numbers("at the end\nproposals:", "% of the samples inside a ball at the start,")
+    assert after > 1.5 * before
+    flicker = [out.numbers(f"{name}: light x", "flicker") for name in ("no filter", "(3DGS)", "antialiased")]
+    assert flicker[0][1] > 40 and flicker[1][1] < 5 and flicker[2][1] < 20
+    assert flicker[1][0] > 3 and flicker[2][0] == pytest.approx(1, abs=0.1)
+    near, far, half = (out.numbers(f"octaves, {name}:")[0] for name in ("near", "twice as far", "half the size"))
+    assert far == half == near - 1
+
+
 def _edges(out: _Printed) -> None:
     """Edges of one voxel, and of a shape in the plane, interpolated before, between and after activation and opacity."""
     line = "voxel of v = -400 and 100: pre half at", "and", "in half at", "and", "post half at", "and"
@@ -177,6 +201,43 @@ def _edges(out: _Printed) -> None:
     edges = [out.numbers(f"edge, {order}:", "voxels wide, RMS error") for order in ("post", "in", "pre")]
     assert all(list(column) == sorted(column) for column in zip(*edges, strict=True))
     assert edges[0][0] < edges[1][0] / 2
+
+
+def _surfaces(out: _Printed) -> None:
+    """Which combinations are distances, what steps cost, which derivatives are right, where weights are largest, depths."""
+    for name in ("ball", "box", "union", "ball cut out", "rounded by 0.1"):
+        assert out.numbers(f"{name}: the gradient's length is between", "and") == (1, 1)
+    assert out.numbers("welded: the gradient's length is between", "and")[0] < 0.9
+    assert out.numbers("squashed ball: the gradient's length is between", "and")[1] == pytest.approx(2, abs=0.01)
+    assert out.numbers("ray, square:") < out.numbers("ray, past both:") < out.numbers("ray, grazing:")
+    steep, grazing = (out.numbers(f"unrolled at {angle}°: after 16 steps off by")[0] for angle in (12, 74))
+    assert steep < 1e-6
+    assert grazing > 1
+    assert out.numbers("unrolled bisection: the derivative is")[0] == 0
+    assert out.numbers("implicit: differs from the closed form by")[0] < 1e-9
+    for angle in (0, 60, 80):
+        line = f"plane at {angle}°, width 0.02: the weight is largest at naive", ", VolSDF", ", NeuS"
+        naive, volsdf, neus = out.numbers(*line)
+        assert naive < -0.005 and abs(neus) < 1e-3
+        assert volsdf == pytest.approx(0.02 * _early(angle), abs=2e-4)
+    wide, narrow = out.numbers("ball, NeuS: off by", "by")
+    assert wide > 20 * narrow
+    turned = [out.numbers(f"ripples of 0.001, {waves} radians per length: normals turn by")[0] for waves in (20, 60, 180)]
+    assert turned == sorted(turned) and turned[2] > 3
+    wide, narrow = (out.numbers(f"one distance, VolSDF, β = {beta}: median depth")[0] for beta in (0.02, 0.003))
+    assert narrow < wide
+    half, formula = out.numbers("half of the light at 70°:", "by the formula")
+    assert half == pytest.approx(formula, abs=1e-4)
+
+
+def _early(angle: float) -> float:
+    """Where VolSDF's weight on a plane is largest, in widths along the ray: the density's slope cos/β σ equals its square."""
+    cosine = math.cos(math.radians(angle))
+    # Before the plane σ = exp(-f/β) / (2 β); behind it σ = (1 - exp(f/β) / 2) / β, and (1 - u)² = u cos with u = exp(f/β) / 2.
+    if cosine <= 0.5:
+        return math.log(2 * cosine) / cosine
+    u = 1 + cosine / 2 - math.sqrt(cosine + cosine**2 / 4)
+    return -math.log(2 * u) / cosine
 
 
 def _ewa(out: _Printed) -> None:
@@ -282,7 +343,11 @@ def _ablation(out: _Printed) -> None:
 
 
 HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
-    zip(sorted(SMALL), (_cameras, _integral, _nerf, _grids, _ewa, _splatting, _two_ways, _photos, _ablation), strict=True)
+    zip(
+        sorted(SMALL),
+        (_cameras, _integral, _nerf, _grids, _surfaces, _cones, _ewa, _splatting, _two_ways, _photos, _ablation),
+        strict=True,
+    )
 )
 
 

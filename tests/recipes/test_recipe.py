@@ -31,7 +31,7 @@ def test_recipe_reads_and_survives_a_round_trip(name: str, preset: str) -> None:
 @pytest.mark.parametrize("name", list(methods()))
 @pytest.mark.parametrize("space", ["box", "contracted"])
 def test_recipe_conforms(name: str, space: str) -> None:
-    scene = toy_scene(views=3, size=8, space=space)
+    scene = toy_scene(views=3, size=8, space=space, facing="forward")
     model = build_model(load_method(name), scene, 0, torch.device("cpu"))
     check_field(model.field, scene)
     check_renderer(model.renderer, model.field, scene)

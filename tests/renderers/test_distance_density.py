@@ -103,15 +103,32 @@ def test_neus_is_unbiased_and_laplace_is_not(angle):
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_volsdf_transmittance_on_a_plane(angle):
-    """Optical depth up to distance f is G(f) / cos, with the tail integral G of Ψ(-f) / β: e^(-f/β) / 2 before the plane."""
+@pytest.mark.parametrize(("count", "sections"), [(4000, False), (23, True)])
+def test_volsdf_transmittance_on_a_plane(angle, count, sections):
+    """With sections exactly, however long the interval.
+
+    Optical depth up to distance f is G(f) / cos, with the tail integral G of Ψ(-f) / β: e^(-f/β) / 2 before the plane."""
     beta, rays = 0.05, ray_at(angle)
-    weights, samples = weights_on(volsdf(4000, beta=beta), Plane(), rays, box())
+    weights, samples = weights_on(volsdf(count, beta=beta, sections=sections), Plane(), rays, box())
     f = (rays.origins + samples.t1[:, None] * rays.directions)[:, 2]
     tail = lambda x: 0.5 * torch.exp(-x.abs() / beta) + (-x).clamp_min(0) / beta  # noqa: E731
     start = tail(rays.origins[:, 2])
     expected = 1 - torch.exp(-(tail(f) - start) / math.cos(angle))
-    torch.testing.assert_close(weights.cumsum(0), expected, rtol=0, atol=2e-4)
+    torch.testing.assert_close(weights.cumsum(0), expected, rtol=0, atol=1e-6 if sections else 2e-4)
+
+
+def test_sections_take_the_bias_of_long_steps_away():
+    """A plane at all depths within a step much longer than β: in the mean seen half a step too far without sections."""
+    count, beta, errors = 40, 1e-4, []
+    step = 2 / count
+    height = 1 - step * (torch.arange(20, dtype=torch.float64) + 0.25) / 20
+    origins = torch.stack([torch.zeros_like(height), torch.zeros_like(height), height], dim=1)
+    down = origins.new_tensor([0.0, 0.0, -1.0]).expand(20, 3)
+    rays = Rays.make(origins, down).within(torch.zeros_like(height), torch.full_like(height, 2.0))
+    for sections in (False, True):
+        rendering, _ = volsdf(count, beta=beta, sections=sections).render_rays(Plane(), rays, Context(box(1.1)))
+        errors.append(float((rendering.depth - height).mean()))
+    assert errors == pytest.approx([step / 2, 0], abs=0.05 * step)
 
 
 @pytest.mark.parametrize("make", ["volsdf", "neus"])

@@ -17,8 +17,8 @@ import torch
 
 from invgraphics.core import Bounds, Camera, Context, Gaussians, Rays, harmonics
 from invgraphics.fields.gaussian import GaussianField
-from invgraphics.renderers.gaussian_rays import Intersections
-from invgraphics.renderers.gaussian_volume import GaussianSorted, GaussianSortedConfig
+from invgraphics.renderers.gaussians.rays import Intersections
+from invgraphics.renderers.gaussians.volume import GaussianSorted, GaussianSortedConfig
 from invgraphics.scenes.mitsuba.llvm import FAST, status
 from invgraphics.testing import toy_cameras
 

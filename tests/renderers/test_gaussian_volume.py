@@ -15,8 +15,9 @@ from scipy.stats import multivariate_normal, norm
 from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Gaussians, Quantity, Rays, Samples
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.fields.gaussian import GaussianFieldConfig
-from invgraphics.renderers.gaussian_rays import intersect, mean_inverse_scale, precompute
-from invgraphics.renderers.gaussian_volume import GaussianExactConfig, GaussianSortedConfig
+from invgraphics.kernels.extinction import mean_inverse_scale
+from invgraphics.renderers.gaussians.rays import intersect, precompute
+from invgraphics.renderers.gaussians.volume import GaussianExactConfig, GaussianSortedConfig
 from invgraphics.testing import check_renderer, toy_cameras, toy_scene
 
 F64 = torch.float64

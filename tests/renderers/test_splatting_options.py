@@ -8,7 +8,7 @@ from test_splatting import BOUNDS, F64, Fixed, gaussians
 
 from invgraphics.core import Camera, Context
 from invgraphics.core.transforms import quaternion_to_matrix
-from invgraphics.renderers.ellipsoids import draw_ellipsoids
+from invgraphics.renderers.gaussians.ellipsoids import draw_ellipsoids
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 
 GEOMETRY = Context(BOUNDS, geometry=True)

@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 from report_folders import write_comparison, write_study
+from shared_folders import Once
 
 
 @pytest.fixture(scope="session")
-def pristine_comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pristine_comparison(once: Once) -> Path:
     """A comparison folder that nobody may change."""
-    return write_comparison(tmp_path_factory.mktemp("comparison") / "balls")
+    return once("comparison", lambda folder: write_comparison(folder / "balls")) / "balls"
 
 
 @pytest.fixture
@@ -25,12 +26,11 @@ def comparison_folder(pristine_comparison: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def built_report(pristine_comparison: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built_report(pristine_comparison: Path, once: Once) -> Path:
     """The folder of a finished report; read only."""
     from invgraphics.report.build import build_report
 
-    folder = Path(shutil.copytree(pristine_comparison, tmp_path_factory.mktemp("built") / "balls"))
-    return build_report(folder).parent
+    return once("report", lambda folder: build_report(shutil.copytree(pristine_comparison, folder / "balls"))) / "balls"
 
 
 @pytest.fixture
@@ -46,9 +46,9 @@ def edit() -> Callable[[Path, Callable[[dict[str, Any]], None]], None]:
 
 
 @pytest.fixture(scope="session")
-def pristine_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pristine_study(once: Once) -> Path:
     """A study folder that nobody may change."""
-    return write_study(tmp_path_factory.mktemp("study") / "views")
+    return once("study", lambda folder: write_study(folder / "views")) / "views"
 
 
 @pytest.fixture
@@ -58,9 +58,8 @@ def small_study(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def built_study(pristine_study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built_study(pristine_study: Path, once: Once) -> Path:
     """The folder of a reported study; read only."""
     from invgraphics.report.study import build_study_report
 
-    folder = Path(shutil.copytree(pristine_study, tmp_path_factory.mktemp("built-study") / "views"))
-    return build_study_report(folder).parent
+    return once("study-report", lambda folder: build_study_report(shutil.copytree(pristine_study, folder / "views"))) / "views"

@@ -150,7 +150,7 @@ def test_copy_button_copies_the_command(opened: Any) -> None:
     assert page.evaluate("navigator.clipboard.readText()").startswith("invgraphics compare balls")
 
 
-@pytest.mark.parametrize("width", [375, 768, 1280])
+@pytest.mark.parametrize("width", [360, 768, 1280])
 def test_no_sideways_scrolling(opened: Any, either: Path, width: int) -> None:
     page = opened(either, viewport={"width": width, "height": 800})
     page.evaluate("document.querySelectorAll('details').forEach(details => (details.open = true))")

@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -30,7 +30,8 @@ def add_renderings(run: Path, method: str, rmse: float) -> None:
     entries = [{"renderer": OWN, "run": "."}, {"renderer": OTHER, "run": "rendered/other"}]
     values = [rmse * (1 + 0.1 * view) for view in range(len(truth))]
     record = {"fitted_by": method, "views": scores["views"], "renderings": entries}
-    record |= {"differences": [{"renderers": [OWN, OTHER], "rmse": values, "largest": values}]}
+    differences = {"rmse": values, "largest": values, "depth": [2.5 * value for value in values]}
+    record |= {"differences": [{"renderers": [OWN, OTHER], **differences}]}
     (run / "renderings.json").write_text(json.dumps(record))
 
 
@@ -56,7 +57,13 @@ def test_scores_and_differences_are_means_over_seeds_and_views(crossed_folder: P
     decibels = f"{-10 * math.log10(square):.1f}"
     assert (own.own, own.difference, other.own, other.difference) == (True, "", False, decibels)
     assert own.best and not other.best
+    comparison = read_comparison(crossed_folder)
+    once = replace(comparison, runs=tuple(run for run in comparison.runs if run.seed == 0))
+    single = cross_table(once, [PAIR], Folder(crossed_folder))
+    assert single is not None and not any(cell and cell.best for cell in single.rows[0].cells)  # one seed leads nothing
     assert [step.differences for step in crossed.steps] == [(decibels,)]
+    depth = 2.5 * 0.01 * (1 + 0.1 * (VIEWS - 1) / 2)
+    assert [step.depths for step in crossed.steps] == [(f"{depth:.2g}",)] and crossed.shows_depth
 
 
 def test_the_page_shows_it(crossed_folder: Path) -> None:
@@ -95,7 +102,7 @@ def test_a_study_shows_approximations_and_analyses(small_study: Path) -> None:
     (small_study / "analyses").mkdir()
     (small_study / "analyses" / "one.json").write_text(json.dumps(analysis | {"logarithmic": True}))
     page = build_study_report(small_study).read_text()
-    assert 'data-step="all that is approximate"' in page and "<td>34.0</td>" in page
+    assert 'data-step="all that is approximate"' in page and "<td>34.0<small>depth" in page
     assert "It is twice as &lt;much&gt;." in page and 'href="#analyses"' in page
     figure = (small_study / "figures" / "analysis-one.svg").read_text()
     assert "rendered" in figure and "error" in figure

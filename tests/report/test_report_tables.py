@@ -90,16 +90,17 @@ def test_spread_is_the_sample_deviation(built_report: Path) -> None:
     assert shown == pytest.approx(abs(values[0] - values[1]) / 2**0.5, abs=0.006)
 
 
-def test_best_marks_respect_direction(built_report: Path) -> None:
+def test_only_a_lead_beyond_chance_is_bold(built_report: Path) -> None:
+    """Two seeds resolve little: what is marked is the best in its direction, and counts that no seed changes are marked."""
     cells = Cells((built_report / "index.html").read_text()).cells
     scores = run_scores(built_report)
     for metric in HIGHER | LOWER:
         means = {method: statistics.fmean(expected(scores, method, metric)) for method in scores}
         best = (max if metric in HIGHER else min)(means, key=lambda method: means[method])
         marked = [method for (method, key), (_, mark, _) in cells.items() if key == metric and mark]
-        text = cells[(best, metric)][2].split("±")[0]
-        assert best in marked, metric
-        assert all(cells[(method, metric)][2].split("±")[0] == text for method in marked), metric
+        assert set(marked) <= {best}, metric
+        assert metric != "model_bytes" or marked == [best]
+        assert metric != "psnr" or not marked  # 30.4 dB with a deviation of 1.3 dB over two seeds
     neutral = {"fit_seconds", "steps", "parameters", "primitives"}
     assert not [key for key, (_, mark, _) in cells.items() if key[1] in neutral and mark]
 
@@ -139,7 +140,8 @@ def test_markdown_table_parses_back(built_report: Path) -> None:
     for method in scores:
         mean = statistics.fmean(expected(scores, method, "psnr"))
         assert found[method].replace("*", "").split("±")[0].strip() == f"{mean:.2f}"
-    assert [method for method, text in found.items() if text.startswith("**")] == ["volumetric/hash"]
+    model = next(i for i, head in enumerate(rows[0]) if head.startswith("Model"))
+    assert [row[0] for row in rows[2:] if row[model].startswith("**")] == ["volumetric/nerf"]
 
 
 def test_latex_table_parses_back(built_report: Path) -> None:
@@ -154,7 +156,8 @@ def test_latex_table_parses_back(built_report: Path) -> None:
         if name in scores:
             mean = statistics.fmean(expected(scores, name, "psnr"))
             assert re.search(r"[\d.]+", row[1])[0] == f"{mean:.2f}"  # type: ignore[index]
-            assert row[1].startswith(r"\textbf") == (name == "volumetric/hash")
+            assert any(cell.strip().startswith(r"\textbf") for cell in row[1:2]) is False  # two seeds resolve no lead in PSNR
+    assert body.count(r"\textbf") >= 1
 
 
 def test_failures_are_never_hidden(comparison_folder: Path, edit: Callable[..., None]) -> None:

@@ -18,6 +18,12 @@ EVERYTHING = TrainingData(train_views=5, size=12, pose_noise=2.0, photo_noise=0.
 
 
 @pytest.fixture
+def scene(scene: Scene) -> Scene:
+    """Without points, which `test_degraded_points` is about: making them again takes seconds."""
+    return replace(scene, points=None)
+
+
+@pytest.fixture
 def many(scene: Scene) -> Scene:
     """A grey scene of very many small views, for statistics."""
     image = torch.full((4, 4, 3), 118, dtype=torch.uint8)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from dots import save
+from in_process import work_here
 from photo_box import Box, orbit, poses, shoot
 from PIL import Image, ImageFilter
 
@@ -45,6 +46,12 @@ def imported(box_photos: Path, tmp_path_factory) -> tuple[Path, dict]:
     assert [done for done, _, _ in steps] == sorted(done for done, _, _ in steps)
     assert {what.split()[0] for _, _, what in steps} >= {"reading", "features", "matching", "placing", "checking"}
     return out, quality
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reconstruct in this process."""
+    work_here(monkeypatch)
 
 
 def truth_errors(quality: dict, eyes=EYES):
@@ -102,6 +109,7 @@ def test_the_same_request_is_answered_at_once(imported, box_photos: Path, monkey
     assert reconstruct(PhotoJob(str(box_photos), lens="pinhole"), out) == quality
 
 
+@pytest.mark.usefixtures("in_process")
 def test_another_mapper_finds_features_and_matches(imported, box_photos: Path, tmp_path: Path) -> None:
     """The data base that lies there is used: what a stranger has written into it is still there afterwards."""
     out = tmp_path / "scene"
@@ -157,6 +165,7 @@ def test_another_folder_gets_the_same_bits(imported, box_photos: Path, tmp_path:
         assert (tmp_path / "again/sparse/0" / name).read_bytes() == (imported[0] / "sparse/0" / name).read_bytes()
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_mixed_bag_keeps_what_can_be_used(box_photos: Path, tmp_path: Path) -> None:
     """Turned by EXIF, 16 bits, smaller, EXIF focal length, a copy, HEIC without a decoder, a stump, and a blurred one."""
     bag = tmp_path / "bag of photos"
@@ -222,6 +231,7 @@ def refused(folder: Path, out: Path) -> str:
     return " ".join(quality["refusal"])
 
 
+@pytest.mark.usefixtures("in_process")
 def test_blurred_photographs(box_photos: Path, tmp_path: Path) -> None:
     blurred = [np.array(Image.open(path).filter(ImageFilter.GaussianBlur(12))) for path in sorted(box_photos.iterdir())[:4]]
     message = refused(made_of(blurred, tmp_path / "blurred"), tmp_path / "out")
@@ -229,6 +239,7 @@ def test_blurred_photographs(box_photos: Path, tmp_path: Path) -> None:
     assert "sharp" in message
 
 
+@pytest.mark.usefixtures("in_process")
 def test_photographs_from_one_place(box_photos: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     still = np.array(Image.open(box_photos / "000.png")).astype(float)
@@ -238,6 +249,7 @@ def test_photographs_from_one_place(box_photos: Path, tmp_path: Path) -> None:
     assert "Step sideways" in message
 
 
+@pytest.mark.usefixtures("in_process")
 def test_photographs_that_do_not_overlap(tmp_path: Path) -> None:
     """One face each."""
     box = Box(repeated=False, floor=False)
@@ -255,6 +267,7 @@ def _frontal_eyes():
     return level
 
 
+@pytest.mark.usefixtures("in_process")
 def test_what_little_could_be_placed_is_kept(box_photos: Path, tmp_path: Path) -> None:
     """Four good photographs among nine that show nothing."""
     folder = tmp_path / "few"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from in_process import work_here
 
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.mitsuba import average, cache, llvm, make, maker
@@ -52,6 +53,7 @@ def _rendered(scene_file: str, root: Path, **options) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(maker.llvm, "status", lambda: llvm.Status(llvm.PORTABLE, None, "For the test."))
         patch.setenv(cache.VARIABLE, str(root))
+        work_here(patch)
         return make(scene_file, **options)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from invgraphics.errors import InputError
-from invgraphics.scenes.mitsuba import ply
+from invgraphics.scenes.mitsuba import job, ply
 from invgraphics.scenes.mitsuba.build import mesh as meshes
 from invgraphics.scenes.mitsuba.build.noise import fractal
 from invgraphics.scenes.mitsuba.render import build
@@ -75,6 +75,16 @@ def test_models_are_sound(name):
         shell = np.ones(model.fog.extinction.shape, bool)
         shell[1:-1, 1:-1, 1:-1] = False
         assert model.fog.extinction[shell].max() < 0.05 * model.fog.extinction.max()
+
+
+def test_a_scene_depends_on_its_own_builder_only():
+    """The room has leaves of the fence; else builders are apart: a new scene leaves the others' pictures alone."""
+    folder = Path(job.__file__).parent / "build"
+    sources = {name: {path.stem for path in job._builder_sources(folder, name)} for name in ("room", "bricks", "unknown")}
+    assert sources["room"] >= {"room", "fence", "mesh", "model", "noise", "surfaces"}
+    assert "bricks" in sources["bricks"]
+    assert not sources["bricks"] & {"room", "fence", "shelf"}
+    assert not sources["unknown"]
 
 
 def test_a_seed_makes_one_model():

@@ -4,12 +4,14 @@ import json
 import os
 import shutil
 import subprocess
-import sys
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from in_process import work_here
 from PIL import Image
 
 from invgraphics.core import Camera
@@ -52,6 +54,7 @@ def rendered(scene_file, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(maker.llvm, "status", lambda: llvm.Status(llvm.PORTABLE, None, "For the test."))
         patch.setenv(cache.VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        work_here(patch)
         return make(scene_file)
 
 
@@ -138,8 +141,8 @@ def test_transforms_tell_other_programs_the_same_cameras(rendered):
     assert (rendered / f"{other['frames'][0]['file_path']}.png").is_file()
 
 
-def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_file):
-    """Also the proof of determinism: another process in another folder writes the very same files."""
+def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_file, monkeypatch):
+    """Also the proof of determinism: another process in another folder begins the very same files, and this one ends them."""
 
     def interrupt(done, total, what):
         if done == 2:
@@ -151,6 +154,7 @@ def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_
     first = kept.stat().st_mtime_ns
     assert not (fresh / rendered.name).exists()
     reports = []
+    work_here(monkeypatch)
     folder = make(scene_file, progress=lambda *report: reports.append(report))
     assert (folder / "train/0000.npz").stat().st_mtime_ns == first
     assert _contents(folder) == _contents(rendered)
@@ -175,6 +179,7 @@ def test_a_full_disk_is_named_and_rendering_goes_on_when_there_is_room(rendered,
             cache.copy(rendered, disk / "copy")
         assert not list(disk.glob("*copy*"))
         ballast.unlink()
+        work_here(monkeypatch)
         assert _contents(make(scene_file)) == _contents(rendered)
     finally:
         subprocess.run(["umount", "--lazy", str(disk)], check=True)
@@ -191,11 +196,17 @@ def test_cache_hit_renders_nothing(rendered, fresh, scene_file, tmp_path):
     assert make(scene_file, out=target) == target  # already there
 
 
-def test_damaged_cache_is_rendered_again(rendered, fresh, scene_file):
+def test_damaged_cache_is_rendered_again(rendered, fresh, scene_file, monkeypatch):
     folder = _copy(rendered, fresh)
     picture = folder / "test/0000.png"
     picture.write_bytes(picture.read_bytes()[:100])
     (folder / "stray.txt").write_text("not ours")
+
+    def render(module, partial, *_, **__):
+        assert module.endswith(".render") and [path.name for path in partial.iterdir()] == ["job.json"]
+        shutil.copytree(rendered, partial, dirs_exist_ok=True)
+
+    monkeypatch.setattr(maker, "run_worker", render)
     assert make(scene_file) == folder
     assert _contents(folder) == _contents(rendered)
 
@@ -227,7 +238,7 @@ def test_impossible_options_are_refused(fresh, scene_file, option, word):
 
 @pytest.mark.usefixtures("fresh")
 def test_unknown_scene():
-    with pytest.raises(InputError, match=r"bricks, cloud, fence, materials, room, textured"):
+    with pytest.raises(InputError, match=r"bricks, cloud, fence, materials, room, shelf, textured"):
         make("lego")
 
 
@@ -248,7 +259,8 @@ def test_copy_does_not_overwrite_other_things(rendered, fresh, scene_file, tmp_p
 
 
 @pytest.mark.usefixtures("fresh")
-def test_surfaces_outside_the_box_are_reported(tmp_path):
+def test_surfaces_outside_the_box_are_reported(tmp_path, monkeypatch):
+    work_here(monkeypatch)
     (tmp_path / "scene.toml").write_text(SCENE.replace("[1.05, 1.05, 0.7]", "[0.3, 1.05, 0.7]"))
     with pytest.raises(InputError, match="Widen 'lo' and 'hi'") as caught:
         make(str(tmp_path))
@@ -263,20 +275,25 @@ def test_a_renderer_that_dies_is_reported_in_one_line(scene_file, monkeypatch):
     assert len(str(caught.value).splitlines()) <= 2
 
 
+def _wait_for_lock(path: Path, said: Connection) -> None:
+    said.recv()
+    with cache.locked(path, waiting=lambda: said.send("waiting")):
+        said.send("in")
+
+
 def test_second_process_waits_for_the_first(fresh):
     fresh.mkdir(parents=True)
-    told = []
+    told, (mine, theirs) = [], Pipe()
+    # Forked, before there is a lock to inherit: importing torch takes longer than all the rest.
+    other = get_context("fork").Process(target=_wait_for_lock, args=(fresh / "scene", theirs))
+    other.start()
     with cache.locked(fresh / "scene", waiting=lambda: told.append("first")):
-        code = (
-            "import sys; from pathlib import Path; from invgraphics.scenes.mitsuba import cache\n"
-            "with cache.locked(Path(sys.argv[1]), waiting=lambda: print('waiting', flush=True)): print('in', flush=True)"
-        )
-        other = subprocess.Popen([sys.executable, "-c", code, str(fresh / "scene")], stdout=subprocess.PIPE, text=True)
-        assert other.stdout is not None
-        assert other.stdout.readline() == "waiting\n"
-        assert other.poll() is None
-    assert other.stdout.read() == "in\n"
-    assert other.wait() == 0
+        mine.send("go")
+        assert mine.recv() == "waiting"
+        assert not mine.poll(0.2)
+    assert mine.recv() == "in"
+    other.join()
+    assert other.exitcode == 0
     assert told == []
 
 

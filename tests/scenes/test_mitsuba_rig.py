@@ -93,7 +93,7 @@ def test_wrong_rigs_are_refused(table, word):
 
 
 def test_built_in_scenes_describe_themselves():
-    assert set(names()) >= {"bricks", "cloud", "fence", "materials", "room", "textured"}
+    assert set(names()) >= {"bricks", "cloud", "fence", "materials", "room", "shelf", "textured"}
     for name in names():
         spec = read(description_path(name))
         assert spec.name == name

@@ -8,7 +8,9 @@ import torch
 from invgraphics.core import Points
 from invgraphics.core.transforms import look_at
 from invgraphics.scenes.layout import NEAR, contracted_frame
+from invgraphics.scenes.open import space_note
 from invgraphics.scenes.region import CLEARANCE, MARGIN, near_plane, subject_half
+from invgraphics.testing import toy_scene
 
 F64 = torch.float64
 
@@ -46,3 +48,10 @@ def test_frame_measures_in_its_own_units() -> None:
     assert bounds.near == pytest.approx(CLEARANCE * 3.5 / 4, rel=0.02)
     plain = contracted_frame(ring(4.0)).bounds
     assert (plain.near, float(plain.hi[0])) == (NEAR, 1.0)
+
+
+def test_the_choice_of_bounds_is_described() -> None:
+    assert space_note(toy_scene(views=2, size=4)) == ""
+    note = space_note(toy_scene(views=2, size=4, space="contracted"))
+    assert "half-edge 1 (from three quarters of 400 known points)" in note
+    assert "nearer than 0.05 to a camera" in note

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from invgraphics.renderers.gaussian_volume import GaussianExact, GaussianExactConfig
+from invgraphics.renderers.gaussians.volume import GaussianExact, GaussianExactConfig
 from invgraphics.studies import approximations as alone
 
 

@@ -17,7 +17,7 @@ from invgraphics.experiments.fitted import open_fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.fields.analytic import Sphere
-from invgraphics.renderers.gaussian_volume import GaussianExact, GaussianExactConfig, GaussianSorted, GaussianSortedConfig
+from invgraphics.renderers.gaussians.volume import GaussianExact, GaussianExactConfig, GaussianSorted, GaussianSortedConfig
 from invgraphics.renderers.samplers import Hierarchical, HierarchicalConfig, Stratified, StratifiedConfig
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.renderers.volumetric import Volumetric

@@ -10,25 +10,30 @@ import torch
 from plyfile import PlyData
 from training_fixtures import SMALL
 
+import invgraphics as ig
 from invgraphics.cli import main
 from invgraphics.cli.export import Export
-from invgraphics.core import Bounds, Camera, Context, Quantity, Rendering
+from invgraphics.core import Bounds, Camera, Context, Mesh, Quantity, Rendering
 from invgraphics.errors import InputError
 from invgraphics.experiments import fitted as opened
+from invgraphics.experiments.mesh_files import mesh_from_file
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.fields.analytic import GaussianBlob, Sphere
-from invgraphics.metrics.surfaces import points_on, surface_distance
+from invgraphics.fields.depth_fusion import fuse_depth
+from invgraphics.fields.isosurface import VoxelGrid, default_level, extract_mesh, without_specks
+from invgraphics.fields.mesh import MeshField
+from invgraphics.formats.mesh import read_mesh
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
+from invgraphics.runs.folder import RunFolder
 from invgraphics.studies.approximations import field_of, isotropic_gaussians
 from invgraphics.testing import TwoBalls, toy_cameras
 from invgraphics.tools.export import ExportRequest, export_run
-from invgraphics.tools.surface_extraction import Lattice, Surface, default_level, field_surface, fused_surface, without_specks
 
 BOX = Bounds(-torch.ones(3), torch.ones(3))
 
 
-def _volume(surface: Surface) -> float:
+def _volume(surface: Mesh) -> float:
     """Signed volume by the divergence theorem: positive where faces look outwards."""
     a, b, c = surface.vertices.double()[surface.faces].unbind(dim=1)
     return float((a * torch.linalg.cross(b, c)).sum() / 6)
@@ -43,35 +48,35 @@ class _Density(Sphere):
 @pytest.mark.parametrize("kind", [Sphere, _Density])
 def test_a_ball_keeps_its_radius(kind: type[Sphere]) -> None:
     centre = torch.tensor([0.1, -0.2, 0.05])
-    surface = field_surface(kind(50.0, 0.6, centre, colour=(0.2, 0.6, 0.4)), BOX, 40)
+    surface = extract_mesh(kind(50.0, 0.6, centre, colour=(0.2, 0.6, 0.4)), BOX, 40).mesh
     radii = (surface.vertices - centre).norm(dim=1)
     # Half a voxel of 2/40 for a density with a jump; next to nothing for a distance.
     assert float((radii - 0.6).abs().max()) < (0.026 if kind is _Density else 2e-3)
     assert _volume(surface) == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.05)
-    assert surface.open_edges == 0
+    assert surface.open_edges() == 0
     assert surface.rgb.unique(dim=0).flatten().tolist() == pytest.approx([0.2, 0.6, 0.4])
 
 
 def test_the_level_of_a_density_is_where_the_surface_is() -> None:
     blob = GaussianBlob(peak=100.0, covariance=0.09)
     for level in (default_level(BOX), 60.0):
-        surface = field_surface(blob, BOX, 48, level)
+        surface = extract_mesh(blob, BOX, 48, level).mesh
         expected = 0.3 * math.sqrt(2 * math.log(100 / level))
         assert float((surface.vertices.norm(dim=1) - expected).abs().max()) < 0.01
     # The stated meaning: 1% of the diagonal of this density has alpha 1/2.
     assert 1 - math.exp(-default_level(BOX) * 0.01 * 2 * math.sqrt(3)) == pytest.approx(0.5)
     with pytest.raises(InputError, match="no level 200"):
-        field_surface(blob, BOX, 16, 200.0)
+        extract_mesh(blob, BOX, 16, 200.0)
 
 
 def test_a_solid_that_leaves_the_box_is_closed_there() -> None:
-    surface = field_surface(_Density(50.0, 1.2), BOX, 24)
-    assert surface.open_edges == 0
+    surface = extract_mesh(_Density(50.0, 1.2), BOX, 24).mesh
+    assert surface.open_edges() == 0
     assert float(surface.vertices.abs().max()) < 1.05
 
 
 def test_colours_are_those_of_the_place() -> None:
-    surface = field_surface(TwoBalls(), BOX, 40)
+    surface = extract_mesh(TwoBalls(), BOX, 40).mesh
     left, right = surface.vertices[:, 0] < 0, surface.vertices[:, 0] > 0.2
     assert bool((surface.rgb[left, 0] > surface.rgb[left, 2]).all()), "the left ball is red"
     assert bool((surface.rgb[right, 0] < surface.rgb[right, 2]).all()), "the right ball is blue"
@@ -82,24 +87,23 @@ def test_colours_are_seen_from_outside() -> None:
 
     class Looking(_Density):
         def radiance_along(self, direction: torch.Tensor) -> torch.Tensor:
-            return direction
+            return (direction + 1) / 2
 
-    surface = field_surface(Looking(50.0, 0.6), BOX, 40)
-    along = (surface.rgb * surface.vertices).sum(dim=1) / 0.6
+    surface = extract_mesh(Looking(50.0, 0.6), BOX, 40).mesh
+    along = ((2 * surface.rgb - 1) * surface.vertices).sum(dim=1) / 0.6
     assert float(along.max()) < -0.5  # stairs of voxels turn some normals
     assert float(along.mean()) < -0.9
 
 
 def test_specks_are_left_out() -> None:
     """A small tetrahedron beside a ball."""
-    ball = field_surface(_Density(50.0, 0.6), BOX, 40)
+    ball = extract_mesh(_Density(50.0, 0.6), BOX, 40).mesh
     n = len(ball.vertices)
     corners = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
     places = torch.cat([ball.vertices, 0.9 + 0.01 * torch.eye(4)[:, :3]])
-    both = Surface(places, torch.cat([ball.faces, corners + n]), torch.zeros(n + 4, 3))
-    kept = without_specks(both)
-    assert (len(kept.faces), len(kept.vertices), kept.dropped) == (len(ball.faces), n, 1)
-    assert torch.equal(kept.vertices[kept.faces], ball.vertices[ball.faces])
+    left = without_specks(Mesh(places, torch.cat([ball.faces, corners + n])))
+    assert (len(left.mesh.faces), len(left.mesh.vertices), left.dropped) == (len(ball.faces), n, 1)
+    assert torch.equal(left.mesh.vertices[left.mesh.faces], ball.vertices[ball.faces])
 
 
 def _all_around() -> list[Camera]:
@@ -122,11 +126,11 @@ def _ball(camera: Camera, radius: float) -> Rendering:
 
 def test_exact_depth_pictures_fuse_to_the_ball() -> None:
     cameras = _all_around()
-    surface = fused_surface(cameras, lambda index: _ball(cameras[index], 0.55), BOX, 48)
+    surface = fuse_depth(cameras, lambda index: _ball(cameras[index], 0.55), BOX, 48).mesh
     radii = surface.vertices.norm(dim=1)
     assert float((radii - 0.55).abs().mean()) < 0.01  # a quarter of a voxel
     assert _volume(surface) == pytest.approx(4 / 3 * math.pi * 0.55**3, rel=0.08)  # three such quarters
-    assert surface.open_edges == 0
+    assert surface.open_edges() == 0
     assert float((surface.rgb - (surface.vertices + 1) / 2).abs().mean()) < 0.03
 
 
@@ -141,11 +145,11 @@ def test_gaussians_on_a_sphere_fuse_to_the_sphere() -> None:
         with torch.no_grad():
             return renderer.render_image(field, cameras[index], Context(BOX, geometry=True))[0]
 
-    surface = fused_surface(cameras, render, BOX, 48)
+    surface = fuse_depth(cameras, render, BOX, 48).mesh
     radii = surface.vertices.norm(dim=1)
     assert 0.55 < float(radii.median()) < 0.59
     assert _volume(surface) == pytest.approx(4 / 3 * math.pi * 0.57**3, rel=0.12)
-    assert surface.open_edges < 0.02 * len(surface.faces)
+    assert surface.open_edges() < 0.02 * len(surface.faces)
     assert float((surface.rgb - (surface.vertices / 0.57 * 0.55 + 1) / 2).abs().mean()) < 0.06
 
 
@@ -156,33 +160,18 @@ def test_what_no_picture_saw_stays_open() -> None:
     rays = camera.rays()
     depth = ((-camera.position) @ axis / (rays.directions @ axis)).view(48, 48)  # the plane through the origin
     wall = Rendering(torch.full((48, 48, 3), 0.5), torch.ones(48, 48), depth)
-    surface = fused_surface([camera], lambda _: wall, BOX, 24)
+    surface = fuse_depth([camera], lambda _: wall, BOX, 24).mesh
     assert float((surface.vertices @ axis).abs().max()) < 0.02  # a quarter of a voxel
-    assert surface.open_edges > 0
+    assert surface.open_edges() > 0
     with pytest.raises(InputError, match="depth pictures"):
-        fused_surface([camera], lambda _: replace(wall, depth=torch.full((48, 48), torch.inf)), BOX, 24)
+        fuse_depth([camera], lambda _: replace(wall, depth=torch.full((48, 48), torch.inf)), BOX, 24)
 
 
 def test_lattice_covers_the_box_with_cubes() -> None:
-    lattice = Lattice.across(Bounds(torch.zeros(3), torch.tensor([2.0, 1.0, 0.5])), 8)
+    lattice = VoxelGrid.across(Bounds(torch.zeros(3), torch.tensor([2.0, 1.0, 0.5])), 8)
     assert lattice.shape == (8, 4, 2)
     centres = lattice.centres(0, len(lattice))
     assert (centres.amin(dim=0).tolist(), centres.amax(dim=0).tolist()) == ([0.125] * 3, [1.875, 0.875, 0.375])
-
-
-def test_surface_distances_in_closed_form() -> None:
-    """Two concentric spheres are as far apart as their radii; half a sphere is right but not complete."""
-    small, large = (field_surface(Sphere(1.0, radius), BOX, 48) for radius in (0.5, 0.6))
-    generator = torch.Generator().manual_seed(0)
-    inner, outer = (points_on(s.vertices, s.faces, 20_000, generator) for s in (small, large))
-    found = surface_distance(inner, outer)
-    assert (found.accuracy, found.completeness, found.chamfer) == pytest.approx((0.1, 0.1, 0.1), abs=2e-3)
-    half = surface_distance(outer[outer[:, 2] > 0], outer)
-    assert half.accuracy == 0
-    assert half.completeness > 0.1
-    assert surface_distance(outer[outer[:, 2] > 0], outer, outer[outer[:, 2] > 0]).completeness == 0
-    # Points are uniform by area: as many in the upper half as in the lower one, and a spherical zone has its height's share.
-    assert float((inner[:, 2] > 0.25).double().mean()) == pytest.approx(0.25, abs=0.015)
 
 
 @pytest.fixture(scope="module")
@@ -234,3 +223,61 @@ def test_bad_requests_get_a_sentence(runs: dict[str, Path], tmp_path: Path) -> N
     with pytest.raises(InputError, match="no level"):
         export_run(ExportRequest(runs["volumetric/hash"], "mesh", tmp_path / "a.ply", level=1e9, resolution=16))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_fitted_density_is_seen_as_a_mesh(runs: dict[str, Path], toy_folder: Path) -> None:
+    """Through the surface renderer, as a rendering beside the run, and with colours refitted, from the run and from a file."""
+    source = runs["volumetric/hash"]
+    shared = {"scene": str(toy_folder), "existing": "reuse"}
+    again = {"method": "volumetric/hash", "budget": "300steps", "overrides": (*SMALL["volumetric/hash"],), "out": str(source)}
+    variant = "surface/mesh:resolution=32:level=1.0"
+    fit_run(FitRequest(**shared, **again, render_with=(variant,)))
+    (folder,) = (source / "rendered").iterdir()
+    shown = RunFolder(folder).read_scores()
+    run = ig.load_run(source)
+    model = run.through(variant)
+    picture = model.render(run.scene.test[0].camera)
+    assert set(picture.alpha.unique().mul(9).round().tolist()) <= set(map(float, range(10)))  # opaque triangles, 9 rays each
+    native = run.scores["psnr"]
+    assert 15 < shown.quality["psnr"].mean < native  # a level of 1 makes the fog thick
+    assert shown.quality["alpha_iou"].mean > 0.7
+
+    out = source.parent / "refitted"
+    common = {**shared, "method": "surface/mesh", "budget": "60steps"}
+    settings = (f"field.source={source}", "field.resolution=32", "field.level=1.0", "field.sh_degree=1")
+    fit_run(FitRequest(**common, out=str(out), overrides=settings))
+    refitted = ig.load_run(out)
+    assert refitted.scores["psnr"] > shown.quality["psnr"].mean
+    exported = export_run(ExportRequest(out, "mesh", source.parent / "refitted.glb"))
+    assert exported.facts["surface"] == "the mesh of the field"
+    back = mesh_from_file(exported.path, run.scene)
+    field = refitted.model.field
+    torch.testing.assert_close(back.vertices, field.vertices, atol=1e-5, rtol=0)
+    # glTF is y-up: the file's second axis is the world's third.
+    torch.testing.assert_close(read_mesh(exported.path).vertices[:, 1], field.vertices[:, 2], atol=1e-5, rtol=0)
+    third = source.parent / "from-file"
+    fit_run(FitRequest(**common, out=str(third), overrides=(f"field.source={exported.path}", "field.sh_degree=1")))
+    assert ig.load_run(third).scores["psnr"] == pytest.approx(refitted.scores["psnr"], abs=0.3)
+
+
+def test_a_mesh_is_fitted_from_photographs_alone(toy_folder: Path, tmp_path: Path) -> None:
+    """The visual hull, coloured: better than the source's fog, and the same after reopening."""
+    request = FitRequest(
+        method="surface/mesh",
+        scene=str(toy_folder),
+        out=str(tmp_path / "hull"),
+        budget="40steps",
+        overrides=("field.resolution=40",),
+    )
+    run = ig.load_run(fit_run(request))
+    assert run.scores["psnr"] > 20
+    assert run.scores["alpha_iou"] > 0.85
+    assert isinstance(run.model.field, MeshField)
+    first, last = run.history[0].psnr, run.history[-1].psnr
+    assert first is not None
+    assert last is not None
+    assert last > first
+    with pytest.raises(InputError, match="is a mesh already"):
+        export_run(ExportRequest(tmp_path / "hull", "mesh", tmp_path / "a.ply", level=1.0))
+    with pytest.raises(InputError, match="no format of meshes"):
+        export_run(ExportRequest(tmp_path / "hull", "mesh", tmp_path / "a.stl"))

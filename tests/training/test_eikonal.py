@@ -1,5 +1,7 @@
 """Eikonal terms on analytic distances, whose gradients have known lengths."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -7,12 +9,12 @@ from typing_extensions import override
 
 from invgraphics.core import Context, Field, FieldValues, Quantity, Samples
 from invgraphics.errors import InputError
-from invgraphics.fields.analytic import GaussianBlob, Sphere
+from invgraphics.fields.analytic import Box, GaussianBlob, Sphere
 from invgraphics.renderers.neus import NeuSConfig
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.testing import toy_scene
-from invgraphics.training.eikonal import EikonalLoss, EikonalPenalty, foot_points
+from invgraphics.training.eikonal import CurvaturePenalty, EikonalLoss, EikonalPenalty, foot_points, laplacian
 
 
 class Stretched(Field):
@@ -70,6 +72,29 @@ def test_foot_points_lie_on_the_surface() -> None:
     assert values.gradient is not None
     foot = foot_points(position, 3 * values.sdf, 3 * values.gradient)
     torch.testing.assert_close(foot, 0.5 * torch.nn.functional.normalize(position, dim=1), rtol=1e-5, atol=1e-6)
+
+
+def test_laplacian_is_the_sum_of_principal_curvatures() -> None:
+    """2 / |x| around a ball; 0 beside a box's faces, 1 / (distance to the edge) beside an edge."""
+    generator = torch.Generator().manual_seed(3)
+    around = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=1)
+    radius = 0.4 + 0.4 * torch.rand(50, generator=generator, dtype=torch.float64)
+    curved = laplacian(Sphere(1.0, 0.5).double(), radius[:, None] * around, 1e-3)
+    torch.testing.assert_close(curved, 2 / radius, rtol=1e-5, atol=0)
+    beside = torch.tensor([[0.9, 0.1, 0.2], [0.3, 0.1, 0.2], [0.8, 0.9, 0.1]], dtype=torch.float64)
+    curved = laplacian(Box(1.0, (0.5, 0.5, 0.5)).double(), beside, 1e-3)
+    torch.testing.assert_close(curved, torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64), rtol=1e-5, atol=1e-8)
+
+
+def test_curvature_penalty_of_a_ball() -> None:
+    field, renderer = Stretched(1.5), NeuSConfig(StratifiedConfig(4)).build(toy_scene(views=2, size=4))
+    penalty = CurvaturePenalty(weight=0.1, points=400, spread=0.0, step=0.005, warmup=0.0)
+    value = penalty(field, renderer, context())
+    assert float(value.detach()) == pytest.approx(0.1 * 1.5 * 2 / 0.5, rel=1e-2)
+    value.backward()
+    assert field.factor.grad is not None
+    assert float(field.factor.grad) == pytest.approx(0.1 * 2 / 0.5, rel=1e-2)
+    assert not CurvaturePenalty(warmup=0.5)(field, renderer, replace(context(), progress=0.0)).detach()
 
 
 def test_loss_is_that_of_the_samples() -> None:

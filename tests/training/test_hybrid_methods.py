@@ -1,12 +1,15 @@
 """NeuS and VolSDF: each recipe, shrunk, learns shape and colour of a toy scene, and resumes bit by bit."""
 
 import math
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import torch
+from training_fixtures import State, resume, run_whole, same_state
 
-from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.training.fit import Fit
 
 GRID = ["field.encoding.levels=4", "field.encoding.log2_size=12", "field.encoding.finest=48"]
 MARCH = ["renderer.sampler.resolution=24", "renderer.sampler.steps_per_diagonal=96", "batches.samples=4096"]
@@ -17,6 +20,7 @@ SHRUNK = {
     "hybrid/volsdf": ["field.width=32", "renderer.beta_final=0.02", "renderer.sampler.coarse=16", "renderer.sampler.fine=12"],
 }
 BATCH = ["batches.rays=128"]
+STEPS = 120
 
 
 def _scores(fit) -> tuple[float, float]:
@@ -30,25 +34,35 @@ def _scores(fit) -> tuple[float, float]:
     return -10 * math.log10(float(torch.stack(errors).mean())), float(torch.cat(depths).mean())
 
 
-@pytest.mark.parametrize("name", SHRUNK)
-def test_learns_the_toy_scene(name: str, scene, make_fit) -> None:
-    fit = make_fit(name, scene, 120, 0, *SHRUNK[name], *BATCH)
-    before, away = _scores(fit)
-    fit.run(lambda loss: False)
-    after, depth = _scores(fit)
-    grid = name.endswith("hash")
+class Learnt(NamedTuple):
+    """A fit at its end."""
+
+    name: str
+    fit: Fit
+    before: tuple[float, float]
+    checkpoint: Path
+    final: State
+
+
+@pytest.fixture(scope="module", params=SHRUNK)
+def learnt(request: pytest.FixtureRequest, scene, make_fit, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
+    torch.manual_seed(0)
+    fit, path = _fit(request.param, scene, make_fit), tmp_path_factory.mktemp("fits") / CHECKPOINT
+    before = _scores(fit)
+    return Learnt(request.param, fit, before, path, run_whole(fit, STEPS, path))
+
+
+def _fit(name: str, scene, make_fit) -> Fit:
+    return make_fit(name, scene, STEPS, 0, *SHRUNK[name], *BATCH)
+
+
+def test_learns_the_toy_scene(learnt: Learnt) -> None:
+    (before, away), (after, depth) = learnt.before, _scores(learnt.fit)
+    grid = learnt.name.endswith("hash")
     assert after > before + (6 if grid else 2)
     assert depth < (0.09 if grid else 0.15) < away
 
 
-@pytest.mark.parametrize("name", ["hybrid/neus-hash", "hybrid/volsdf-hash"])
-def test_resumed_equals_uninterrupted(name: str, scene, make_fit, tmp_path) -> None:
-    whole, first, second = (make_fit(name, scene, 24, 0, *SHRUNK[name], *BATCH) for _ in range(3))
-    whole.run(lambda loss: False)
-    first.run(lambda loss: first.steps == 13)
-    checkpoint.save(tmp_path / CHECKPOINT, first.state())
-    torch.manual_seed(99)
-    second.load(checkpoint.load(tmp_path / CHECKPOINT), seconds=1.0)
-    second.run(lambda loss: False)
-    one, other = whole.state(), second.state()
-    assert all(torch.equal(one[part][key], other[part][key]) for part in one for key in one[part])
+@pytest.mark.parametrize("learnt", ["hybrid/neus-hash", "hybrid/volsdf-hash"], indirect=True)
+def test_resumed_equals_uninterrupted(learnt: Learnt, scene, make_fit) -> None:
+    assert same_state(resume(_fit(learnt.name, scene, make_fit), learnt.checkpoint), learnt.final)

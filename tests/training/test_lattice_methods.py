@@ -1,12 +1,15 @@
 """Factors, planes and dense grids: each recipe, shrunk, learns the toy scene from its poses, and resumes bit by bit."""
 
 import math
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import torch
+from training_fixtures import State, resume, run_whole, same_state
 
-from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.training.fit import Fit
 
 SAMPLER = [
     "renderer.sampler.resolution=24",
@@ -26,6 +29,7 @@ SHRUNK = {
     "volumetric/triplane": ["field.encoding.resolution=24", "field.encoding.features=8"],
     "volumetric/dense": ["field.encoding.resolution=33", "field.encoding.coarsest=5", "field.encoding.levels=4"],
 }
+STEPS = 300
 
 
 def _psnr(fit) -> float:
@@ -37,23 +41,31 @@ def _psnr(fit) -> float:
     return -10 * math.log10(float(torch.stack(errors).mean()))
 
 
-@pytest.mark.parametrize("name", SHRUNK)
-def test_learns_the_toy_scene(name: str, scene, make_fit) -> None:
-    fit = make_fit(name, scene, 300, 0, *SHRUNK[name], *SAMPLER, *BATCH)
+class Learnt(NamedTuple):
+    """A fit at its end."""
+
+    name: str
+    fit: Fit
+    before: float
+    checkpoint: Path
+    final: State
+
+
+@pytest.fixture(scope="module", params=SHRUNK)
+def learnt(request: pytest.FixtureRequest, scene, make_fit, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
+    torch.manual_seed(0)
+    fit, path = _fit(request.param, scene, make_fit), tmp_path_factory.mktemp("fits") / CHECKPOINT
     before = _psnr(fit)
-    fit.run(lambda loss: False)
-    after = _psnr(fit)
-    assert after > max(before + 8, 20)
+    return Learnt(request.param, fit, before, path, run_whole(fit, STEPS, path))
 
 
-@pytest.mark.parametrize("name", SHRUNK)
-def test_resumed_equals_uninterrupted(name: str, scene, make_fit, tmp_path) -> None:
-    whole, first, second = (make_fit(name, scene, 24, 0, *SHRUNK[name], *SAMPLER, *BATCH) for _ in range(3))
-    whole.run(lambda loss: False)
-    first.run(lambda loss: first.steps == 13)
-    checkpoint.save(tmp_path / CHECKPOINT, first.state())
-    torch.manual_seed(99)
-    second.load(checkpoint.load(tmp_path / CHECKPOINT), seconds=1.0)
-    second.run(lambda loss: False)
-    one, other = whole.state(), second.state()
-    assert all(torch.equal(one[part][key], other[part][key]) for part in one for key in one[part])
+def _fit(name: str, scene, make_fit) -> Fit:
+    return make_fit(name, scene, STEPS, 0, *SHRUNK[name], *SAMPLER, *BATCH)
+
+
+def test_learns_the_toy_scene(learnt: Learnt) -> None:
+    assert _psnr(learnt.fit) > max(learnt.before + 8, 20)
+
+
+def test_resumed_equals_uninterrupted(learnt: Learnt, scene, make_fit) -> None:
+    assert same_state(resume(_fit(learnt.name, scene, make_fit), learnt.checkpoint), learnt.final)

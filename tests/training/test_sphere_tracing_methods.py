@@ -1,14 +1,17 @@
 """Sphere tracing: each recipe, shrunk, learns a toy scene from pictures and masks, and resumes bit by bit; the mask loss."""
 
 import math
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import torch
 from torch.nn.functional import binary_cross_entropy
+from training_fixtures import State, resume, run_whole, same_state
 
 from invgraphics.core import Batch, Bounds, Context, Rendering, SurfaceTrace, Trace
-from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.training.fit import Fit
 from invgraphics.training.losses import MaskLoss
 
 GRIDS = [f"field.{part}.{key}" for part in ("encoding", "appearance") for key in ("levels=4", "log2_size=12", "finest=32")]
@@ -16,6 +19,7 @@ SHRUNK = {
     "sphere-tracing/hash": [*GRIDS, "renderer.final_sharpness=60", "batches.rays=256"],
     "sphere-tracing/mlp": ["field.width=32", "renderer.final_sharpness=60", "batches.rays=256"],
 }
+STEPS = 200
 
 
 def scores(fit) -> tuple[float, float, float]:
@@ -31,29 +35,38 @@ def scores(fit) -> tuple[float, float, float]:
     return psnr, float(torch.cat(depths).mean()), sum(overlaps) / len(overlaps)
 
 
-@pytest.mark.parametrize("name", SHRUNK)
-def test_finds_two_balls_from_pictures_and_masks(name: str, scene, make_fit) -> None:
+class Learnt(NamedTuple):
+    """A fit at its end."""
+
+    name: str
+    fit: Fit
+    before: tuple[float, float, float]
+    checkpoint: Path
+    final: State
+
+
+@pytest.fixture(scope="module", params=SHRUNK)
+def learnt(request: pytest.FixtureRequest, scene, make_fit, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
+    torch.manual_seed(0)
+    fit, path = _fit(request.param, scene, make_fit), tmp_path_factory.mktemp("fits") / CHECKPOINT
+    before = scores(fit)
+    return Learnt(request.param, fit, before, path, run_whole(fit, STEPS, path))
+
+
+def _fit(name: str, scene, make_fit) -> Fit:
+    return make_fit(name, scene, STEPS, 0, *SHRUNK[name])
+
+
+def test_finds_two_balls_from_pictures_and_masks(learnt: Learnt) -> None:
     """From one sphere, which has to part in two."""
-    fit = make_fit(name, scene, 200, 0, *SHRUNK[name])
-    before, _, _ = scores(fit)
-    fit.run(lambda loss: False)
-    after, depth, overlap = scores(fit)
-    assert after > max(before + 5, 18)
+    after, depth, overlap = scores(learnt.fit)
+    assert after > max(learnt.before[0] + 5, 18)
     assert depth < 0.12
     assert overlap > 0.85
 
 
-@pytest.mark.parametrize("name", SHRUNK)
-def test_resumed_equals_uninterrupted(name: str, scene, make_fit, tmp_path) -> None:
-    whole, first, second = (make_fit(name, scene, 16, 0, *SHRUNK[name]) for _ in range(3))
-    whole.run(lambda loss: False)
-    first.run(lambda loss: first.steps == 9)
-    checkpoint.save(tmp_path / CHECKPOINT, first.state())
-    torch.manual_seed(99)
-    second.load(checkpoint.load(tmp_path / CHECKPOINT), seconds=1.0)
-    second.run(lambda loss: False)
-    one, other = whole.state(), second.state()
-    assert all(torch.equal(one[part][key], other[part][key]) for part in one for key in one[part])
+def test_resumed_equals_uninterrupted(learnt: Learnt, scene, make_fit) -> None:
+    assert same_state(resume(_fit(learnt.name, scene, make_fit), learnt.checkpoint), learnt.final)
 
 
 def masked(logit: torch.Tensor, true: torch.Tensor, sharpness: float | None) -> torch.Tensor:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from shared_folders import Once
 from training_fixtures import SMALL, write_blender
 
 from invgraphics.experiments.request import FitRequest
@@ -13,20 +14,19 @@ STEPS = {"volumetric/nerf": 150, "volumetric/hash": 150, "splatting/gaussians": 
 
 
 @pytest.fixture(scope="session")
-def balls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def balls(once: Once) -> Path:
     """Two balls as a data set on disk."""
-    return write_blender(toy_scene(views=10, size=32, zoom=1.3), tmp_path_factory.mktemp("view") / "balls")
+    return once("balls", lambda folder: write_blender(toy_scene(views=10, size=32, zoom=1.3), folder / "balls")) / "balls"
 
 
 @pytest.fixture(scope="session")
-def runs(balls: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def runs(balls: Path, once: Once) -> dict[str, Path]:
     """Method -> run folder."""
-    root = tmp_path_factory.mktemp("looked-at")
-    made = {}
-    for method, steps in STEPS.items():
-        out = root / method.replace("/", "-")
-        request = FitRequest(
-            method=method, scene=str(balls), out=str(out), budget=f"{steps}steps", overrides=tuple(SMALL[method])
-        )
-        made[method] = fit_run(request)
-    return made
+
+    def fit(folder: Path) -> None:
+        for method, steps in STEPS.items():
+            out, budget = str(folder / method.replace("/", "-")), f"{steps}steps"
+            fit_run(FitRequest(method=method, scene=str(balls), out=out, budget=budget, overrides=tuple(SMALL[method])))
+
+    folder = once("looked-at", fit)
+    return {method: folder / method.replace("/", "-") for method in STEPS}

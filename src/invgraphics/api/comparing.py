@@ -15,6 +15,7 @@ from invgraphics.experiments import compare as comparing
 from invgraphics.experiments.display import table_html
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.experiments.session import FolderRun, ScoreTable
+from invgraphics.recipes.recipe import expand
 from invgraphics.report.build import build_report
 from invgraphics.report.data.comparison import Comparison, read_comparison
 from invgraphics.report.statistics.summary import summarise
@@ -91,7 +92,7 @@ class ComparisonResult:
 
 def compare(
     scene: Scene | str,
-    methods: Sequence[MethodLike],
+    methods: Sequence[MethodLike] | str,
     budget: str = "60s",
     *,
     seeds: Sequence[int] = (0,),
@@ -106,7 +107,8 @@ def compare(
 
     Args:
         scene: loaded, made in Python, or what `load_scene` opens.
-        methods: names, paths of recipes, tables, or loaded methods.
+        methods: names, paths of recipes, tables, or loaded methods; ``all``, or a pattern such as ``volumetric/*``, takes
+            those that go with the scene.
         budget: of each fit, ``60s`` or ``5000steps``.
         seeds: each method is fitted once per seed.
         out: folder of the report and its runs; ``None`` for ``reports/compare-SCENE``.
@@ -126,8 +128,13 @@ def compare(
     """
     scene = as_scene(scene)
     folder = Path("reports") / f"compare-{scene.name}" if out is None else Path(out)
-    names = [name_of(method, folder / "methods" / f"{index}.toml", budget)[0] for index, method in enumerate(methods)]
+    given = [methods] if isinstance(methods, str) else list(methods)
+    expanded, optional = expand([method for method in given if isinstance(method, str)])
+    others = [method for method in given if not isinstance(method, str)]
+    ordered = [*expanded, *others] if optional else given
+    names = [name_of(method, folder / "methods" / f"{index}.toml", budget)[0] for index, method in enumerate(ordered)]
     _, place = reopenable_scene(scene, folder)
     settings: dict[str, Any] = {"budget": budget, "device": device, "render_with": tuple(render_with), **place}
-    root, _ = comparing.compare(CompareRequest(methods=tuple(names), seeds=tuple(seeds), out=str(folder), **settings))
+    request = CompareRequest(methods=tuple(names), seeds=tuple(seeds), optional=optional, out=str(folder), **settings)
+    root, _ = comparing.compare(request)
     return ComparisonResult(root)

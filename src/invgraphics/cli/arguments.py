@@ -35,7 +35,8 @@ class Shared:
     nearest smaller one that the method has; paper holds the published values."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
     """Change one value of the recipe, for instance --set batches.rays=2048, or of the training data: data.train_views=10,
-    data.size, data.pose_noise (degrees and per cent), data.photo_noise, data.exposure (stops), data.background."""
+    data.size, data.pose_noise (degrees and per cent), data.photo_noise, data.exposure (stops), data.background,
+    data.scales (divisors of the size, [1, 2, 4, 8]), data.test_scales (more scores, of smaller pictures)."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +12,7 @@ from invgraphics.cli.arguments import Shared, parse_list, parse_seeds
 from invgraphics.cli.report import write_report
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.interruption import Terminated
-from invgraphics.recipes.recipe import presets
+from invgraphics.recipes.recipe import expand, presets
 from invgraphics.runs.folder import RUNS, RunFolder
 
 
@@ -26,7 +26,8 @@ class Compare(Shared):
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """A built-in scene (see `invgraphics list scenes`), or the path of a data set."""
     methods: Annotated[str, arg(metavar="A,B,C")]
-    """Methods with commas between them (see `invgraphics list methods`); METHOD:key=value changes a value of the recipe."""
+    """Methods with commas between them (see `invgraphics list methods`); METHOD:key=value changes a value of the recipe.
+    `all`, or a pattern such as `volumetric/*`, takes those that go with the scene."""
     seeds: Annotated[str, arg(metavar="0,1,2")] = "0"
     """Each method is fitted once per seed."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/compare-SCENE)")] = None
@@ -53,8 +54,11 @@ class Compare(Shared):
     def request(self) -> CompareRequest:
         """Convert the options to a validated request, without opening any data."""
         out = Path("reports") / f"compare-{Path(self.scene).resolve().name}" if self.out is None else self.out
-        methods, seeds = parse_list(self.methods, "--methods"), parse_seeds(self.seeds)
-        return CompareRequest(scene=self.scene, methods=methods, seeds=seeds, out=str(out), **self.settings())
+        methods, optional = expand(parse_list(self.methods, "--methods"))
+        request = CompareRequest(
+            scene=self.scene, methods=methods, seeds=parse_seeds(self.seeds), optional=optional, out=str(out), **self.settings()
+        )
+        return replace(request, asked=self.methods) if optional else request
 
 
 def _report_what_is_finished(folder: Path) -> None:

@@ -96,6 +96,9 @@ def sentences(explanation: Explanation) -> list[str]:
         f"add up to {_colour(explanation.composited.tolist())}; the renderer's picture has "
         f"{_colour(explanation.rendered.tolist())} (largest difference {difference:.1e}), the truth {_colour(pixel.true)}.",
     ]
+    if found.density is not None and len(found):
+        empty = int((found.density == 0).sum())
+        lines.append(f"{empty} of {len(found)} samples are in empty space, where the density is zero.")
     if record.dead is not None:
         lines.append(f"In the whole model, {record.dead.sentence}")
     depths = {"mean": pixel.expected, "median": pixel.median, "true": pixel.true_depth}

@@ -61,6 +61,8 @@ class List:
                 _list_protocols()
             else:
                 _list_components(kind)
+            if kind == "metrics":
+                _list_surface_metrics()
         return 0
 
 
@@ -111,6 +113,13 @@ def _list_protocols() -> None:
 
     rows = [(name, protocol.summary, protocol.source or "built in") for name, protocol in PROTOCOLS.items()]
     show_table("Protocols (for --protocol of rescore; fit and evaluate take ours)", ("name", "summary", "as read in"), rows)
+
+
+def _list_surface_metrics() -> None:
+    from invgraphics.metrics.surfaces import SURFACE_METRICS
+
+    rows = [(metric.name, metric.unit, metric.summary) for metric in SURFACE_METRICS.values()]
+    show_table("Geometry scores of distances and meshes", ("name", "unit", "definition"), rows)
 
 
 def _list_components(kind: str) -> None:

@@ -46,6 +46,10 @@ COMMANDS = {
     "locate": ("invgraphics.cli.locate:Locate", "find a photograph's camera pose by gradient descent through a fitted scene"),
     "report": ("invgraphics.cli.report:Report", "write page, tables and figures from finished runs"),
     "export": ("invgraphics.cli.export:Export", "write a run's model as a file for other programs, and report the loss"),
+    "convert": (
+        "invgraphics.cli.convert:Convert",
+        "make a run's model another kind of scene: Gaussians, a lattice, a multi-plane image",
+    ),
     "import": ("invgraphics.cli.import_file:ImportFile", "make a run of a model that was trained elsewhere, and evaluate it"),
     "bench": ("invgraphics.cli.bench:Bench", "time the kernels against the reference, the machine's limits and peers"),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -24,13 +25,17 @@ class Report:
     """Where to write."""
     public: bool = False
     """Leave out absolute paths, user names and host names; writes to FOLDER-public unless --out says otherwise."""
+    check: bool = False
+    """Write nothing: say which of these reports, or of the reports in these folders, were made by recipes that have changed."""
 
     def run(self) -> int:
-        """Write the report and print the page's path; returns exit status 0."""
+        """Write the report and print the page's path; returns exit status 0, or 1 where a check finds a stale report."""
         from invgraphics.report.data.studies import is_study
 
         if not self.folders:
             raise InputError("There is nothing to report.", "Give the folder of a comparison, of a study, or of runs.")
+        if self.check:
+            return check(self.folders)
         first, alone, out = self.folders[0], len(self.folders) == 1, self.out
         if alone and out is None and self.public:
             out = first.resolve().with_name(f"{first.resolve().name}-public")
@@ -58,6 +63,24 @@ class Report:
             print(sentence)
         print(page)
         return 0
+
+
+def check(folders: Sequence[Path]) -> int:
+    """Print which reports were made by other recipes than today's; returns 1 where some were.
+
+    Raises:
+        InputError: a folder is missing, or a record in it is broken.
+    """
+    from invgraphics.tools.recipe_check import check_recipes, summary
+
+    pages = [page.parent for folder in folders for page in sorted(folder.glob("*/index.html"))]
+    single = [folder for folder in folders if (folder / "index.html").is_file() or not any(folder.glob("*/index.html"))]
+    found = [check_recipes(folder) for folder in (*single, *pages)]
+    for one in found:
+        print(one.sentence)
+    if len(found) > 1:
+        print(summary(found))
+    return 0 if all(one.current for one in found) else 1
 
 
 def runs_in(folder: Path) -> list[Path]:

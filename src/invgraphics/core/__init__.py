@@ -11,10 +11,12 @@ from invgraphics.core.field import Encoding as Encoding
 from invgraphics.core.field import Field as Field
 from invgraphics.core.field import Gaussians as Gaussians
 from invgraphics.core.field import Quantity as Quantity
+from invgraphics.core.mesh import Mesh as Mesh
 from invgraphics.core.model import Model as Model
 from invgraphics.core.ngp import FusedNGP as FusedNGP
 from invgraphics.core.ngp import FusedSDF as FusedSDF
 from invgraphics.core.ngp import HashGrid as HashGrid
+from invgraphics.core.planes import Planes as Planes
 from invgraphics.core.rays import Rays as Rays
 from invgraphics.core.renderer import RayRenderer as RayRenderer
 from invgraphics.core.renderer import Renderer as Renderer
@@ -28,7 +30,6 @@ from invgraphics.core.rendering import Trace as Trace
 from invgraphics.core.samples import FieldValues as FieldValues
 from invgraphics.core.samples import Samples as Samples
 from invgraphics.core.scene import Batch as Batch
-from invgraphics.core.scene import Mesh as Mesh
 from invgraphics.core.scene import Points as Points
 from invgraphics.core.scene import Scene as Scene
 from invgraphics.core.scene import View as View

@@ -62,6 +62,19 @@ class Bounds:
         x = uncontract((unit * 2 - 1) * 2) if self.space == "contracted" else unit * 2 - 1
         return self.centre + x * self.half
 
+    def unit_covariance(self, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3"]:
+        """Transform covariances to the unit cube by the linearised map, J Σ Jᵀ (mip-NeRF 360, equation 9).
+
+        Args:
+            position: means, where the map is linearised; differentiable.
+            covariance: in local units squared, symmetric.
+        """
+        scaled = covariance / (self.half[:, None] * self.half)
+        if self.space == "box":
+            return scaled / 4
+        jacobian = contract_jacobian((position - self.centre) / self.half) / 4
+        return jacobian @ scaled @ jacobian
+
     def radial_scale(self, position: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m"]:
         """Contracted length per length along the radius, 1 / |x|² outside the unit ball; 1 inside it and in a box."""
         if self.space == "box":
@@ -114,6 +127,19 @@ def contract(x: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:
     squared = x.square().sum(dim=-1, keepdim=True).clamp_min(1.0)
     norm = squared.sqrt()
     return torch.where(squared > 1, (2 - 1 / norm) * (x / norm), x)
+
+
+def contract_jacobian(x: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3 3"]:
+    """Jacobian of `contract`, symmetric: with n = |x| > 1 and u = x / n, (2 - 1/n)/n across u and 1/n² along it.
+
+    On the unit sphere, where both sides of the map meet, it is the identity from either side.
+    """
+    squared = x.square().sum(dim=-1, keepdim=True).clamp_min(1.0)
+    across = 2 / squared.sqrt() - 1 / squared
+    unit = torch.where(squared > 1, x, 0.0) / squared.sqrt()
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
+    excess = (1 / squared - across) * unit
+    return across[..., None] * eye + excess[..., :, None] * unit[..., None, :]
 
 
 def uncontract(y: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:

@@ -31,6 +31,7 @@ class Quantity(Flag):
     FEATURES = auto()
     GAUSSIANS = auto()
     PLANES = auto()
+    DEPTH_MAPS = auto()
     MESH = auto()
 
     def words(self) -> str:
@@ -93,6 +94,11 @@ class Field(nn.Module, ABC):
 
     def fused_sdf(self, bounds: Bounds) -> FusedSDF | None:
         """Detached parameters of the signed distance over ``bounds`` for fused sphere tracing, where a kernel supports it."""
+        return None
+
+    @property
+    def feature_width(self) -> int | None:
+        """Number of features that `query` returns; ``None`` for fields without any."""
         return None
 
     def primitives(self, want: Quantity, ctx: Context) -> Any:

@@ -77,6 +77,11 @@ def degree_of(coefficients: int) -> int:
     return degree
 
 
+def constant(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
+    """Coefficients of degree 0 whose `colour` is ``rgb`` in every direction."""
+    return ((rgb - 0.5) / BAND_0)[:, None, :]
+
+
 def evaluate(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """The functions with coefficients ``sh`` at one unit direction each. `colour` makes radiance of it."""
     return torch.einsum("nk,nkc->nc", basis(directions, degree_of(sh.shape[1])), sh)

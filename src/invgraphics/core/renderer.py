@@ -83,6 +83,11 @@ class Renderer(_StatefulModule, ABC):
         """What `requires` names, and what the parts of this renderer need besides (a sampler's `Sampler.requires`)."""
         return self.requires
 
+    @property
+    def feature_width(self) -> int | None:
+        """Number of features that its networks take from the field; ``None`` where it takes none, or any number."""
+        return None
+
     @abstractmethod
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
         """Render every pixel of ``camera``; the rendering has shape (height, width)."""
@@ -160,11 +165,17 @@ def check(field: Field, renderer: Renderer) -> None:
     """Refuse a pair that does not fit.
 
     Raises:
-        NotComposableError: names what the renderer needs and the field lacks.
+        NotComposableError: names what the renderer needs and the field lacks, or features of which it offers another number.
     """
     missing = renderer.required & ~field.provides
     if missing:
         raise NotComposableError(
             f"{type(renderer).__name__} needs {missing.words()}, which {type(field).__name__} does not provide.",
             f"It provides {field.provides.words()}.",
+        )
+    takes, offered = renderer.feature_width, field.feature_width
+    if takes is not None and takes != offered:
+        raise NotComposableError(
+            f"{type(renderer).__name__} takes {takes} features, but {type(field).__name__} offers {offered}.",
+            f"Set renderer.features to {offered}.",
         )

@@ -136,6 +136,12 @@ class Trace:
     rays: int = 0
     surface: SurfaceTrace | None = None
 
+    @property
+    def empty_samples(self) -> float | None:
+        """Share of the samples at which the field's density is zero; ``None`` without samples or densities."""
+        density = None if self.values is None else self.values.density
+        return None if density is None or not len(density) else float((density == 0).float().mean())
+
 
 @dataclass(frozen=True, eq=False)
 class Context:

@@ -19,7 +19,7 @@ class Samples:
         ray: index of each sample's ray, non-decreasing.
         t0: where the interval begins, distance along the ray.
         t1: where it ends.
-        position: representative point, the interval's middle.
+        position: representative point, the interval's middle; of its cone it is `cone_mean`.
         direction: unit direction of the ray.
         radius: pixel footprint of the ray at distance 1.
         view: training-view index of the ray, -1 where there is none.
@@ -70,6 +70,16 @@ class Samples:
     def delta(self) -> Float[Tensor, " m"]:
         """Length of each interval."""
         return self.t1 - self.t0
+
+    @property
+    def cone_mean(self) -> Float[Tensor, "m 3"]:
+        """Mean of the cone frustum behind each sample (mip-NeRF, equation 7); the position itself for a lone point.
+
+        A frustum is wider at its far end, so that its mean is farther than the interval's middle.
+        """
+        middle, half = self.mid, self.delta / 2
+        beyond = 2 * middle * half**2 / (3 * middle**2 + half**2).clamp_min(torch.finfo(half.dtype).tiny)
+        return torch.addcmul(self.position, beyond[:, None], self.direction)
 
     @property
     def covariance(self) -> Float[Tensor, "m 3 3"]:

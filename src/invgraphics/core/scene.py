@@ -16,6 +16,8 @@ from invgraphics.core.camera import Camera
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.compositing import straight_over
 from invgraphics.core.display import contact_sheet, encode_png, figure_html
+from invgraphics.core.mesh import Mesh
+from invgraphics.core.scan import Scan
 
 Pixels = UInt8[Tensor, "h w c"] | Float[Tensor, "h w c"]
 
@@ -91,14 +93,6 @@ class Points:
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
-    """A triangle mesh, local frame."""
-
-    vertices: Float[Tensor, "v 3"]
-    faces: Tensor
-
-
-@dataclass(frozen=True, eq=False)
 class Scene:
     """Everything a fit and its evaluation may know.
 
@@ -111,6 +105,7 @@ class Scene:
         bounds: the region to describe, local frame.
         points: known surface points, if any.
         mesh: known surface, if any.
+        scan: measured points of the surface, in the data set's world, if any.
         colour: the space of the pixels, in which everything is fitted and composited.
         world_from_local: similarity from the local frame (all cameras, depths, points here) to the data set's world.
         noise_ceiling: PSNR in dB between two independent half-sample renders of the truth; ``None`` for photographs.
@@ -125,6 +120,7 @@ class Scene:
     val: tuple[View, ...] = ()
     points: Points | None = None
     mesh: Mesh | None = None
+    scan: Scan | None = None
     colour: Literal["srgb", "linear"] = "srgb"
     world_from_local: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
     noise_ceiling: float | None = None

@@ -9,6 +9,7 @@ from invgraphics.core import Model, RayRenderer, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.memory_check import check_memory
 from invgraphics.experiments.progress import Reporter
+from invgraphics.experiments.variants import as_shown
 from invgraphics.recipes.recipe import Method
 from invgraphics.recipes.schema import Recipe
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -42,11 +43,20 @@ def open_with_progress(spec: str, options: SceneOptions) -> Scene:
         return open_scene(spec, options, lambda done, total, what: reporter.show(done / max(total, 1), what))
 
 
-def build_model(method: Method, scene: Scene, seed: int, device: torch.device) -> Model:
-    """Build a method's field and renderer for a scene; initial values depend on ``seed`` only."""
+def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *, shown: bool = False) -> Model:
+    """Build a method's field and renderer for a scene; initial values depend on ``seed`` only.
+
+    Args:
+        method: what is built.
+        scene: as loaded.
+        seed: of the initial values.
+        device: where.
+        shown: whether the renderer only shows a field that another one has fitted (see `variants.as_shown`).
+    """
     check_memory(method, scene)
     torch.manual_seed(seed)
-    model = Model(method.recipe.field.build(scene), method.recipe.renderer.build(scene), scene.bounds)
+    field, renderer = method.recipe.field.build(scene), method.recipe.renderer.build(scene)
+    model = Model(as_shown(field, renderer) if shown else field, renderer, scene.bounds)
     training = method.recipe.training
     if training is not None and training.poses is not None and training.poses.optimise:
         for encoding in coarse_to_fine_encodings(model):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import open_with_progress
+from invgraphics.experiments.build import build_model, open_with_progress
 from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.identity import check_replaceable
@@ -20,9 +20,13 @@ from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
-from invgraphics.runs.comparison import ComparisonRecord, Failure, SceneFacts
+from invgraphics.recipes.table import cell_of
+from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, SceneFacts
 from invgraphics.runs.folder import RunFolder, output_folder
 from invgraphics.scenes.degrade import degrade
+
+MOST_NAMES = 6
+"""Methods that the question of a comparison names; of more it says how many there are."""
 
 
 def compare(request: CompareRequest) -> tuple[Path, int]:
@@ -43,10 +47,10 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
 
 def _compare(request: CompareRequest) -> tuple[Path, int]:
     began = time.monotonic()
-    jobs, scene = _resolve(request)
+    request, jobs, scene, refused = _resolve(request)
     folder = RunFolder(Path(request.out))
     failures: list[Failure] = []
-    summary = _summary(request, jobs, scene)
+    summary = replace(_summary(request, jobs, scene), refused=tuple(refused))
     interrupted: KeyboardInterrupt | None = None
     try:
         with closing(LocalExecutor().run(request.fits(), folder.root / "jobs")) as outcomes:
@@ -67,8 +71,11 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     return folder.root, len(failures)
 
 
-def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
+def _resolve(request: CompareRequest) -> tuple[CompareRequest, list[Job], Scene, list[Refusal]]:
     """Resolve one job per method with the first seed, and open the scene with that seed's data degradation.
+
+    Returns:
+        The request without the optional methods that do not go with the scene; its jobs; the scene; the refused methods.
 
     Raises:
         InputError: anything that could be wrong, before any time is spent.
@@ -77,21 +84,59 @@ def _resolve(request: CompareRequest) -> tuple[list[Job], Scene]:
         raise InputError("--methods is empty.", "Example: --methods volumetric/hash,splatting/gaussians.")
     if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
         raise InputError("A method or a seed is named twice.")
-    fits = request.fits()
-    jobs = [Job.of(fit) for fit in fits if fit.seed == request.seeds[0]]
+    jobs, refused = [], []
+    for fit in request.fits():
+        if fit.seed == request.seeds[0]:
+            try:
+                jobs.append(Job.of(fit))
+            except InputError as error:
+                refused.append(_refusal(request, fit.method, error))
+    if not jobs:
+        raise InputError("None of the methods can be used.", f"{refused[0].method}: {refused[0].reason}")
     methods = {job.request.method: job.method for job in jobs}
-    for fit in fits:
-        check_replaceable(Job.of(fit, methods[fit.method]))
-    scene = open_with_progress(request.scene, jobs[0].options)
-    check_variants(jobs[0].variants, [job.method for job in jobs], scene)
-    return jobs, degrade(scene, jobs[0].data, request.seeds[0])
+    for fit in request.fits():
+        if fit.method in methods:
+            check_replaceable(Job.of(fit, methods[fit.method]))
+    full = open_with_progress(request.scene, jobs[0].options)
+    scene = degrade(full, jobs[0].data, request.seeds[0])
+    jobs, unsuitable = _suitable(request, jobs, scene)
+    request = replace(request, methods=tuple(job.request.method for job in jobs))
+    check_variants(jobs[0].variants, [job.method for job in jobs], full)
+    return request, jobs, scene, [*refused, *unsuitable]
+
+
+def _suitable(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> tuple[list[Job], list[Refusal]]:
+    """Build every optional method's model, and separate the methods that refuse the scene.
+
+    Raises:
+        InputError: all of them do.
+    """
+    kept, refused = [], []
+    for job in jobs:
+        if job.request.method in request.optional:
+            try:
+                build_model(job.method, scene, request.seeds[0], job.device)
+            except InputError as error:
+                refused.append(_refusal(request, job.request.method, error))
+                continue
+        kept.append(job)
+    if not kept:
+        raise InputError("None of the methods goes with the scene.", f"{refused[0].method}: {refused[0].reason}")
+    return kept, refused
+
+
+def _refusal(request: CompareRequest, method: str, error: InputError) -> Refusal:
+    """Record of an optional method's refusal; raises the error of any other."""
+    if method not in request.optional:
+        raise error
+    return Refusal(method=method, reason=error.sentence)
 
 
 def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> ComparisonRecord:
     """Make the comparison's record, without its runs: scene, methods, protocol, baselines and environment."""
     protocol, budget = jobs[0].protocol, jobs[0].budget
     camera = scene.test[0].camera
-    names = ", ".join(request.methods)
+    names = ", ".join(request.methods) if len(request.methods) <= MOST_NAMES else f"{len(request.methods)} methods"
     methods = [job.method for job in jobs]
     notes = {protocol_note(method) for method in methods} - {""}
     baselines = baseline_scores(scene, protocol)
@@ -100,6 +145,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
         question=f"Given {budget} of optimisation each, how well do {names} show new views, at what cost?",
         methods=request.methods,
         summaries={method.name: method.recipe.summary for method in methods},
+        cells={method.name: cell_of(method.table) for method in methods},
         seeds=request.seeds,
         budget=request.budget,
         size=(camera.width, camera.height),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import subprocess
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -32,6 +33,29 @@ def code_version() -> str:
     return f"{version('invgraphics')}+{sha.hexdigest()[:12]}"
 
 
+@cache
+def commit(root: Path | None = None) -> str:
+    """Git commit of the working copy that this package lies in, ``+ changes`` where tracked files differ from it; else empty.
+
+    Args:
+        root: of the repository; ``None`` for the package's own. An installed package lies in nobody's repository.
+    """
+    root = root or Path(__file__).resolve().parents[3]
+    if not (root / ".git").exists():
+        return ""
+    head = _git(root, "rev-parse", "HEAD")
+    return f"{head} + changes" if head and _git(root, "status", "--porcelain", "--untracked-files=no") else head
+
+
+def _git(root: Path, *words: str) -> str:
+    """Output of a git command; empty where there is no git, or it fails."""
+    command = ["git", "--no-optional-locks", "-C", str(root), *words]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
 def cpu_name() -> str:
     """Name of the CPU as reported by the operating system."""
     try:
@@ -50,6 +74,7 @@ def environment(device: torch.device) -> Environment:
         packages |= {name: version(name) if find_spec(name) else None for name in CUDA_PACKAGES}
     return Environment(
         invgraphics=code_version(),
+        commit=commit(),
         python=platform.python_version(),
         torch=torch.__version__,
         platform=platform.platform(),

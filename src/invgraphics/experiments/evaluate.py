@@ -21,8 +21,10 @@ from invgraphics.errors import NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
-from invgraphics.experiments.posed import PosedEvaluation, protocol_note
+from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
 from invgraphics.experiments.progress import Reporter, warn
+from invgraphics.experiments.scaled import scaled_scores
+from invgraphics.experiments.surface_scores import surface_scores
 from invgraphics.files import write_arrays, write_picture
 from invgraphics.metrics.cost import model_bytes, parameter_count
 from invgraphics.metrics.protocols import non_finite_pixels, protocol_named, score, summarise
@@ -71,8 +73,11 @@ def evaluate(
         poses,
         keep=lambda index, picture: _save_view(folder, index, picture, scene),
     )
+    quality, skipped = scaled_scores(model, scene, protocol, folder.read(Provenance).data, refined=poses is not None)
     result = replace(
         found,
+        quality=found.quality | quality,
+        skipped=found.skipped | skipped,
         preset=method.preset,
         preset_choice=method.preset_choice,
         seed=folder.read(Provenance).seed,
@@ -125,14 +130,15 @@ def score_model(
             statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
+    surface, without = surface_scores(model, scene if poses is None else scene_in_fit_frame(poses, scene))
     return Scores(
         method=title,
         scene=scene.name,
         protocol=protocol,
         views=tuple(view.name for view in scene.test),
         cost=_model_costs(model, scene, statistics.median(seconds)),
-        quality=quality if posed is None else quality | posed.quality(),
-        skipped=skipped,
+        quality=quality | surface | ({} if posed is None else posed.quality()),
+        skipped=skipped | without,
         below_baseline=below_baseline(title, quality, statistics_of_views, scene, rules),
     )
 

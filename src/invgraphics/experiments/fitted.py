@@ -84,7 +84,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     provenance = folder.read(Provenance)
     method = replace(_method(folder, provenance), preset_choice=provenance.preset_choice)
     device = device_of("cuda" if provenance.device.startswith("cuda") and torch.cuda.is_available() else "cpu")
-    model = build_model(method, scene, provenance.seed, device)
+    model = build_model(method, scene, provenance.seed, device, shown=provenance.fitted_run is not None)
     if provenance.fitted_run is not None:
         model = replace(model, renderer=model.renderer.untrained())
     source = folder.fit(provenance)

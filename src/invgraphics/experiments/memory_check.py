@@ -13,6 +13,7 @@ from invgraphics.core.lattice import LatticeField
 from invgraphics.errors import InputError
 from invgraphics.fields.encodings.lattices import LatticeConfig
 from invgraphics.fields.gaussian import GaussianFieldConfig
+from invgraphics.fields.planes import PlanesConfig
 from invgraphics.memory import check_fits
 from invgraphics.recipes.recipe import Method
 from invgraphics.recipes.schema import Recipe
@@ -21,6 +22,8 @@ COPIES = 6
 """Of each primitive's values during a step: parameter, gradient, Adam's two moments; activated, and the gradient of that."""
 RAY_BYTES = 512
 """Of a ray of a batch: origin, direction, interval, colours and their gradients."""
+TEXEL_BYTES = 16 * COPIES
+"""Of a texel of a multi-plane image: colour and opacity, in as many copies."""
 SAMPLE_BYTES = 32
 """Of a sample: its ray, interval, position and density."""
 TRAINED_COPIES = 4
@@ -47,6 +50,8 @@ def check_memory(method: Method, scene: Scene) -> None:
     check_fits(getattr(sampler, "state_bytes", 0), what, "Choose a lower resolution or fewer cells in renderer.sampler.")
     if isinstance(recipe.field, GaussianFieldConfig):
         _check_gaussians(recipe.field, method.name, scene)
+    elif isinstance(recipe.field, PlanesConfig):
+        _check_planes(recipe.field, method.name, scene)
     else:
         _check_network(recipe, method.name, scene, rays * on_each)
 
@@ -78,6 +83,14 @@ def _check_network(recipe: Recipe, name: str, scene: Scene, on_rays: int) -> Non
         check_fits(needed, what, "Choose a lower 'resolution' in the hooks.")
 
 
+def _check_planes(config: PlanesConfig, name: str, scene: Scene) -> None:
+    """Check that a multi-plane image of at least the pictures' size fits."""
+    pixels = max(view.camera.width * view.camera.height for view in scene.train)
+    texels = round(config.count * pixels * config.texels**2)
+    what = f"The field of {name} with {texels:,} texels or more"
+    check_fits(texels * TEXEL_BYTES, what, "Choose a lower field.count or field.texels.")
+
+
 def _resolutions(hook: Any) -> tuple[int, ...]:
     """Vertices along an edge to which a hook resizes lattices during the fit."""
     return (getattr(hook, "resolution", 0), *getattr(hook, "resolutions", ()))
@@ -96,6 +109,8 @@ def _build(config: Any, name: str, scene: Scene) -> nn.Module | None:
     try:
         with torch.device("meta"):
             return config.build(scene)
+    except InputError:
+        return None  # it does not go with the scene, and says so where it is built
     except (RuntimeError, OverflowError, TypeError) as error:
         if "overflow" not in str(error).lower():
             return None  # it says itself what it cannot do

@@ -75,7 +75,7 @@ def scene_in_fit_frame(poses: Poses, scene: Scene) -> Scene:
         val=tuple(moved(view, transform_camera(view.camera, similarity)) for view in scene.val),
         test=tuple(moved(view, transform_camera(view.camera, similarity)) for view in scene.test),
         points=None if points is None else replace(points, position=similarity.points(points.position).to(points.position)),
-        mesh=None if mesh is None else replace(mesh, vertices=similarity.points(mesh.vertices).to(mesh.vertices)),
+        mesh=None if mesh is None else mesh.transformed(similarity.matrix),
         world_from_local=(scene.world_from_local.double() @ back).to(scene.world_from_local),
     )
 

@@ -7,7 +7,7 @@ the pictures of one fit differ in (`invgraphics.runs.renderings`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def check_variants(variants: Sequence[RendererVariant], methods: Iterable[Method
     for method in methods if variants else ():
         for variant in variants:
             try:
-                model = build_model(with_renderer(method, variant), scene, 0, torch.device("cpu"))
+                model = build_model(with_renderer(method, variant), scene, 0, torch.device("cpu"), shown=True)
                 if variant.table != method.table["renderer"]:
                     model.renderer.untrained()
             except InputError as error:
@@ -136,21 +136,30 @@ def _identity(folder: RunFolder, variants: Sequence[RendererVariant], method: Me
     return sha256_of([folder.identity, *([variant.name, variant.digest] for variant in _with_own(variants, method))])
 
 
-def _pictures(run: Path, scene: Scene) -> list[Float[ndarray, "h w 3"]]:
+@dataclass(frozen=True, eq=False)
+class _Pictured:
+    """A saved prediction: colour over the background, and depth, which is not finite where no surface is shown."""
+
+    colour: Float[ndarray, "h w 3"]
+    depth: Float[ndarray, "h w"]
+
+
+def _pictures(run: Path, scene: Scene) -> list[_Pictured]:
     """Composite saved predictions over the scene's background, in its colour space, without rounding to 8 bits."""
     background = scene.background.numpy()
     pictures = []
     for index in range(len(scene.test)):
         arrays = read_arrays(RunFolder(run).arrays(index))
         clear = 1 - arrays["alpha"].astype(np.float64)[..., None]
-        pictures.append((arrays["rgb"].astype(np.float64) + clear * background).clip(0, 1))
+        colour = (arrays["rgb"].astype(np.float64) + clear * background).clip(0, 1)
+        pictures.append(_Pictured(colour, np.where(clear[..., 0] <= 0.5, arrays["depth"].astype(np.float64), np.nan)))
     return pictures
 
 
-def _difference(
-    renderers: tuple[str, str], one: Sequence[Float[ndarray, "h w 3"]], other: Sequence[Float[ndarray, "h w 3"]]
-) -> Difference:
-    """Colour difference per view between pictures of one fit by two renderers."""
-    gaps = [a - b for a, b in zip(one, other, strict=True)]
+def _difference(renderers: tuple[str, str], one: Sequence[_Pictured], other: Sequence[_Pictured]) -> Difference:
+    """Differences of colour and depth per view between pictures of one fit by two renderers."""
+    gaps = [a.colour - b.colour for a, b in zip(one, other, strict=True)]
+    depths = [np.abs(a.depth - b.depth) for a, b in zip(one, other, strict=True)]
+    depth = tuple(float(np.median(gap[np.isfinite(gap)])) for gap in depths if np.isfinite(gap).any())
     rmse, largest = [float(np.sqrt((gap**2).mean())) for gap in gaps], [float(np.abs(gap).max()) for gap in gaps]
-    return Difference(renderers=renderers, rmse=tuple(rmse), largest=tuple(largest))
+    return Difference(renderers=renderers, rmse=tuple(rmse), largest=tuple(largest), depth=depth)

@@ -117,10 +117,14 @@ class CompareRequest(Settings):
     Attributes:
         methods: in the order of the report.
         seeds: each method is fitted once per seed.
+        optional: methods that are left out, with the reason, where they do not go with the scene; others are an error.
+        asked: the methods as they were asked for, patterns included; empty for ``methods`` themselves.
     """
 
     methods: tuple[str, ...]
     seeds: tuple[int, ...] = (0,)
+    optional: frozenset[str] = frozenset()
+    asked: str = ""
 
     def fits(self) -> list[FitRequest]:
         """List the fit requests, one per method and seed."""
@@ -138,7 +142,7 @@ class CompareRequest(Settings):
 
     def shell(self) -> str:
         """Shell command that repeats this comparison."""
-        chosen = ["--methods", ",".join(self.methods), "--seeds", ",".join(map(str, self.seeds))]
+        chosen = ["--methods", self.asked or ",".join(self.methods), "--seeds", ",".join(map(str, self.seeds))]
         return shlex.join(["invgraphics", "compare", self.scene, *chosen, *self.flags()])
 
 

@@ -44,7 +44,7 @@ from invgraphics.runs.folder import TRUTH, RunFolder
 from invgraphics.runs.provenance import LoadAverage, Options, Provenance
 from invgraphics.runs.schema import write_json
 from invgraphics.scenes.degrade import degrade
-from invgraphics.scenes.open import selection_notes
+from invgraphics.scenes.open import selection_notes, space_note
 from invgraphics.tables import read_json
 from invgraphics.training.fit import Fit
 
@@ -158,7 +158,8 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     scene = fit.plan.scene
-    return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{selection_notes(scene)}"
+    notes = selection_notes(scene) + space_note(scene)
+    return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{notes}"
 
 
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:

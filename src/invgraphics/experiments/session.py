@@ -20,7 +20,7 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.run import prepare, warm_up
-from invgraphics.experiments.variants import variant_named, with_renderer
+from invgraphics.experiments.variants import as_shown, variant_named, with_renderer
 from invgraphics.interruption import Terminated
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
@@ -135,7 +135,9 @@ class FittedRun(ABC):
         return ScoreTable(score_model(self.model, self.scene, protocol, self.method.name, self.poses))
 
     def through(self, renderer: str) -> Model:
-        """Model of the fitted field with the renderer of another method.
+        """Model of the fitted field with the renderer of another method; with its own, as it was fitted.
+
+        Another renderer has constants in place of learnt state: an occupancy grid is full, a width the one at a fit's end.
 
         Args:
             renderer: a method's name; settings of its renderer may follow, ``gaussian-volume/exact:steps=8``.
@@ -145,9 +147,10 @@ class FittedRun(ABC):
         """
         variant = variant_named(renderer)
         check_variants([variant], [self.method], self.scene)
-        other = with_renderer(self.method, variant).recipe.renderer.build(self.scene)
-        other = other if variant.table == self.method.table["renderer"] else other.untrained()
-        return replace(self.model, renderer=other.to(self.model.device))
+        if variant.table == self.method.table["renderer"]:
+            return self.model
+        other = with_renderer(self.method, variant).recipe.renderer.build(self.scene).untrained().to(self.model.device)
+        return replace(self.model, field=as_shown(self.model.field, other), renderer=other)
 
     def __repr__(self) -> str:
         last = self.history[-1] if self.history else Moment(step=0, seconds=0.0)

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import torch
 
-from invgraphics.core import RayRenderer
+from invgraphics.core import Field, RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.memory_check import COPIES, RAY_BYTES
+from invgraphics.experiments.mesh_files import mesh_from_file
+from invgraphics.fields.mesh import MeshFieldConfig
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder, check_run
@@ -42,6 +44,8 @@ def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:
     source = getattr(config, "source", "")
     if not source:
         return plan
+    if isinstance(config, MeshFieldConfig) and Path(source).is_file():
+        return _with_field(plan, config.from_mesh(mesh_from_file(Path(source), plan.scene), plan.scene))
     check_run(Path(source))
     folder = RunFolder(Path(source))
     shown = folder.read(Provenance).scene
@@ -49,8 +53,11 @@ def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:
         raise InputError(f"field.source: {source} is a run on '{shown}', not on '{scene_spec}'.")
     source_field = load_fitted(folder, plan.scene).model.field
     torch.manual_seed(plan.seed)  # loading the source has drawn its own initial values
-    field = config.converted(source_field, plan.scene).to(plan.device)
-    return replace(plan, model=replace(plan.model, field=field))
+    return _with_field(plan, config.converted(source_field, plan.scene))
+
+
+def _with_field(plan: Plan, field: Field) -> Plan:
+    return replace(plan, model=replace(plan.model, field=field.to(plan.device)))
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,10 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+from invgraphics.core import Field, Quantity, Renderer
+from invgraphics.fields.mesh import ExtractedMesh
 from invgraphics.recipes.recipe import Method, load_method, resolve
+from invgraphics.renderers.surface import Surface
 from invgraphics.text import sha256_of, slug
 
 _SETTING = r":(?=[\w.]+=)"
@@ -51,3 +54,16 @@ def with_renderer(method: Method, variant: RendererVariant) -> Method:
     """Replace a method's renderer."""
     name = f"{method.name} rendered with {variant.name}"
     return resolve(name, method.preset, method.table | {"renderer": variant.table})
+
+
+def as_shown(field: Field, renderer: Renderer) -> Field:
+    """A fitted field as a renderer that did not fit it sees it: as the mesh of its surface, where the renderer needs one.
+
+    Args:
+        field: with a mesh, or with density or signed distance and radiance, it can be seen as a mesh.
+        renderer: whose settings say how fine the mesh is.
+    """
+    extractable = Quantity.RADIANCE in field.provides and (Quantity.SDF | Quantity.DENSITY) & field.provides
+    if isinstance(renderer, Surface) and Quantity.MESH not in field.provides and extractable:
+        return ExtractedMesh(field, renderer.config.resolution, renderer.config.level)
+    return field

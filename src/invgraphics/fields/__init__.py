@@ -6,7 +6,12 @@ from invgraphics.lazy import submodules
 
 FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
+    "density": "invgraphics.fields.density_field:DensityFieldConfig",
+    "features": "invgraphics.fields.features:FeatureFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
+    "mesh": "invgraphics.fields.mesh:MeshFieldConfig",
+    "planes": "invgraphics.fields.planes:PlanesConfig",
+    "depth_maps": "invgraphics.fields.depth_maps:DepthMapsConfig",
 }
 
 if not TYPE_CHECKING:

@@ -42,9 +42,7 @@ def visible_points(field: Field, scene: Scene, count: int) -> Points:
     Raises:
         InputError: the field has no density and radiance, or is empty.
     """
-    if Quantity.DENSITY | Quantity.RADIANCE not in field.provides:
-        remedy = "Any field with density and radiance can be turned into Gaussians."
-        raise InputError(f"{type(field).__name__} provides {field.provides.words()}, not density and radiance.", remedy)
+    require_density(field)
     device = next((parameter.device for parameter in field.parameters()), torch.device("cpu"))
     parts, found = [], 0
     for rays in _random_rays(scene, MAX_RAYS_PER_POINT * count):
@@ -59,6 +57,17 @@ def visible_points(field: Field, scene: Scene, count: int) -> Points:
     return Points(position, rgb)
 
 
+def require_density(field: Field) -> None:
+    """Refuse a field without density and radiance.
+
+    Raises:
+        InputError: it has none; the sentence names what it has.
+    """
+    if Quantity.DENSITY | Quantity.RADIANCE not in field.provides:
+        remedy = "Any field with density and radiance can be converted."
+        raise InputError(f"{type(field).__name__} provides {field.provides.words()}, not density and radiance.", remedy)
+
+
 def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
     """Generate batches of rays through random pixels, each batch of one random training view."""
     for _ in range(-(-most // RAYS)):
@@ -69,15 +78,9 @@ def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
 
 def _sample_surface_points(field: Field, rays: Rays, bounds: Bounds) -> Points:
     """Sample at most one point per ray by its rendering weights; rays pass through with probability 1 - alpha."""
-    rays = bounds.clip(rays)
-    edges = _edges(rays, bounds)
-    index = torch.arange(len(rays), device=edges.device).repeat_interleave(SAMPLES)
-    samples = Samples.on(rays, index, edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1))
-    density = field.query(samples, Quantity.DENSITY).density
-    assert density is not None
-    weights, _, _ = kernels.composite(density * samples.delta, density[:, None], index, len(rays))
+    samples, weights = sample_weights(field, rays, bounds)
     # Inverse of the cumulated weight; a draw beyond a ray's alpha goes through.
-    cumulated = weights.view(len(rays), SAMPLES).cumsum(dim=1)
+    cumulated = weights.cumsum(dim=1)
     draw = torch.rand(len(rays), 1).to(cumulated)
     hit = (draw < cumulated[:, -1:])[:, 0].nonzero()[:, 0]
     chosen = samples[hit * SAMPLES + torch.searchsorted(cumulated[hit], draw[hit], right=True)[:, 0]]
@@ -85,6 +88,18 @@ def _sample_surface_points(field: Field, rays: Rays, bounds: Bounds) -> Points:
     assert radiance is not None
     jitter = (torch.rand(len(chosen), 1).to(cumulated) - 0.5) * chosen.delta[:, None]
     return Points(chosen.position + jitter * chosen.direction, radiance)
+
+
+def sample_weights(field: Field, rays: Rays, bounds: Bounds) -> tuple[Samples, Float[Tensor, "n samples"]]:
+    """Rendering weights of `SAMPLES` intervals along each ray, and the samples that they belong to, packed."""
+    rays = bounds.clip(rays)
+    edges = _edges(rays, bounds)
+    index = torch.arange(len(rays), device=edges.device).repeat_interleave(SAMPLES)
+    samples = Samples.on(rays, index, edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1))
+    density = field.query(samples, Quantity.DENSITY).density
+    assert density is not None
+    weights, _, _ = kernels.composite(density * samples.delta, density[:, None], index, len(rays))
+    return samples, weights.view(len(rays), SAMPLES)
 
 
 def _edges(rays: Rays, bounds: Bounds) -> Float[Tensor, "n samples_plus_1"]:

@@ -16,6 +16,7 @@ from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Points, Scene
 from invgraphics.errors import NotComposableError
 from invgraphics.fields.convert import visible_points
+from invgraphics.fields.gaussian_density import query_density
 from invgraphics.fields.starting import backdrop_points, depth_points, random_points, scene_points, starting_scales
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
@@ -122,7 +123,7 @@ class GaussianField(Field):
         isotropic: whether all three axes of a Gaussian are kept equal (their mean log-scale counts).
     """
 
-    provides = Quantity.GAUSSIANS
+    provides = Quantity.GAUSSIANS | Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL
     means: Tensor
     quaternions: Tensor
     log_scales: Tensor
@@ -157,8 +158,14 @@ class GaussianField(Field):
         self.sh_active.fill_(degree)
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
-        """Refuse pointwise queries: this field has primitives only."""
-        raise NotComposableError(f"GaussianField has no {want.words()} at points.", "It provides gaussians.")
+        """The Gaussians as one density in space, by the ``physical`` reading of their opacities (`query_density`).
+
+        Raises:
+            NotComposableError: something else than density, radiance and normal is wanted.
+        """
+        if lacking := want & ~self.provides:
+            raise NotComposableError(f"GaussianField has no {lacking.words()} at points.")
+        return query_density(self._smoothed(self._gaussians(harmonics.count(self.active_degree))), samples, want)
 
     def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
         """The activated Gaussians, smoothed, with the active bands of their colour."""

@@ -11,9 +11,9 @@ Densities are per local length unit, signed distances in local length units, wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -30,9 +30,9 @@ from invgraphics.core.ngp import FusedNGP, FusedSDF
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
 from invgraphics.fields import heads
-from invgraphics.fields.covariance import unit_covariance
 from invgraphics.fields.density import DensityActivation
-from invgraphics.fields.encodings.lattices import LatticeConfig, LatticeFeatures, crop_lattices
+from invgraphics.fields.encoded import build_encoding, encode_samples
+from invgraphics.fields.encodings.lattices import LatticeFeatures, crop_lattices
 from invgraphics.fields.fused import FieldParts, fused_parts, sdf_parts
 from invgraphics.fields.geometry import chunks, query_geometry
 from invgraphics.fields.mlp import Mlp
@@ -88,8 +88,8 @@ class NeuralField(Field):
         self.register_buffer("lo", bounds.lo.clone())
         self.register_buffer("hi", bounds.hi.clone())
         self._half = float(bounds.half.mean())  # at the start: no crop changes densities or distances
-        self.encoding = _build_encoding(config.encoding, bounds)
-        self.appearance = None if config.appearance is None else _build_encoding(config.appearance, bounds)
+        self.encoding = build_encoding(config.encoding, bounds)
+        self.appearance = None if config.appearance is None else build_encoding(config.appearance, bounds)
         self.density_activation = DensityActivation(
             config.density_activation, config.density_bias, config.density_interpolation
         )
@@ -107,6 +107,7 @@ class NeuralField(Field):
         without = Quantity.NONE if self.appearance is None else Quantity.FEATURES
         self.provides = _POINTWISE[config.geometry] & ~without
         self._needs_geometry_for_colour = handed > 0 or self.appearance is None
+        self._features_handed_on = handed
         if config.geometry == "sdf":
             self.geometry_net.initialise_as_sphere(INITIAL_RADIUS * float(bounds.half.min()) / self._half)
 
@@ -114,6 +115,11 @@ class NeuralField(Field):
     def bounds(self) -> Bounds:
         """The region this field describes."""
         return Bounds(self.lo, self.hi, self._space, self._near)
+
+    @property
+    @override
+    def feature_width(self) -> int | None:
+        return self._features_handed_on if Quantity.FEATURES in self.provides else None
 
     def lattice_encodings(self) -> dict[Role, LatticeEncoding]:
         """Its encodings that are lattices, by role; one that colour shares is geometry's."""
@@ -205,7 +211,7 @@ class NeuralField(Field):
         unit = self.bounds.to_unit(position)
         if self.density_activation.interpolation != "post":
             return self._encode_activated(unit)
-        features = self._features(self.encoding, samples, position, unit)
+        features = encode_samples(self.encoding, self.bounds, replace(samples, position=position), unit)
         if self.config.geometry == "density":
             return features
         return torch.cat([self._coordinates(unit), features], dim=1)
@@ -226,11 +232,7 @@ class NeuralField(Field):
     def _appearance(self, samples: Samples) -> Float[Tensor, "m f"] | None:
         if self.appearance is None:
             return None
-        return self._features(self.appearance, samples, samples.position, self.bounds.to_unit(samples.position))
-
-    def _features(self, encoding: Encoding, samples: Samples, position: Tensor, unit: Tensor) -> Float[Tensor, "m f"]:
-        covariance = unit_covariance(self.bounds, position, samples.covariance) if encoding.needs_covariance else None
-        return encoding(unit, covariance)
+        return encode_samples(self.appearance, self.bounds, samples, self.bounds.to_unit(samples.position))
 
     def _geometry(self, features: Float[Tensor, "m f"], with_features: bool) -> Float[Tensor, "m o"]:
         """Raw geometry, and behind it the features that are handed on."""
@@ -272,7 +274,3 @@ class NeuralField(Field):
         if self._density_scale != 1:
             density = density * self._density_scale
         return torch.where(self.bounds.contains(position), density, torch.zeros_like(density))
-
-
-def _build_encoding(config: Any, bounds: Bounds) -> Encoding:
-    return config.build(bounds.half.tolist()) if isinstance(config, LatticeConfig) else config.build()

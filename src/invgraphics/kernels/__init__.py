@@ -17,14 +17,16 @@ from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.core.rays import Rays
+from invgraphics.kernels import types
 from invgraphics.kernels.dispatch import choose
 from invgraphics.kernels.dispatch import compiled as compiled
 from invgraphics.kernels.dispatch import in_use as in_use
 from invgraphics.kernels.dispatch import use as use
 from invgraphics.kernels.dispatch import using as using
 from invgraphics.kernels.dispatch import warm_up as warm_up
+from invgraphics.kernels.meshes import mesh_interpolate as mesh_interpolate
+from invgraphics.kernels.meshes import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.tracing import sdf_trace as sdf_trace
-from invgraphics.kernels.types import AdamStep, Bins, Footprints, March, MarchSteps
 
 
 def hash_encode(
@@ -73,7 +75,7 @@ def adam_rows(
     values: Float[Tensor, "*rows c"],
     gradient: Float[Tensor, "*rows c"],
     moments: tuple[Float[Tensor, "*rows c"], Float[Tensor, "*rows c"]],
-    step: AdamStep,
+    step: types.AdamStep,
     rates: Float[Tensor, "*rows"] | None = None,
 ) -> None:
     """Adam step in place, on the entries with a gradient only (masked Adam of DVGO, Sun et al. 2022, `lib/cuda/adam_upd`).
@@ -94,8 +96,8 @@ def adam_rows(
 
 
 def ray_march(
-    rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: MarchSteps, start: Float[Tensor, " n"]
-) -> March:
+    rays: Rays, occupied: Bool[Tensor, "r r r"], bounds: Bounds, steps: types.MarchSteps, start: Float[Tensor, " n"]
+) -> types.March:
     """Occupancy-grid ray marching: the intervals whose midpoint lies in an occupied cell of the unit cube.
 
     Args:
@@ -115,11 +117,11 @@ def ngp_march(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
-    steps: MarchSteps,
+    steps: types.MarchSteps,
     field: ngp.FusedNGP,
     start: Float[Tensor, " n"],
     min_transmittance: float,
-) -> March:
+) -> types.March:
     """`ray_march` with early ray termination: densities of the field are evaluated and composited inside the march.
 
     Args:
@@ -141,7 +143,7 @@ def ngp_render(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
-    steps: MarchSteps,
+    steps: types.MarchSteps,
     field: ngp.FusedNGP,
     min_transmittance: float = 0.0,
     max_error: float = 0.0,
@@ -170,11 +172,11 @@ def lattice_march(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
-    steps: MarchSteps,
+    steps: types.MarchSteps,
     field: fused.FusedLattice,
     start: Float[Tensor, " n"],
     min_transmittance: float,
-) -> March:
+) -> types.March:
     """`ngp_march` for a field over lattices.
 
     Arguments and result as there; appearance and networks of colour are not looked at.
@@ -186,7 +188,7 @@ def lattice_render(
     rays: Rays,
     occupied: Bool[Tensor, "r r r"],
     bounds: Bounds,
-    steps: MarchSteps,
+    steps: types.MarchSteps,
     field: fused.FusedLattice,
     min_transmittance: float = 0.0,
     max_error: float = 0.0,
@@ -218,7 +220,7 @@ def composite(
 
 def splat_project(
     gaussians: Gaussians, camera: Camera, dilation: float = 0.3, antialiased: bool = False
-) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+) -> tuple[types.Footprints, Float[Tensor, "n 3"]]:
     """EWA projection of 3D Gaussians (Zwicker et al. 2001; 3DGS §4) and their colours towards the camera.
 
     Args:
@@ -233,7 +235,9 @@ def splat_project(
     return choose("splat_project", gaussians.means)(gaussians, camera, dilation, antialiased)
 
 
-def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 0.5) -> tuple[Footprints, Float[Tensor, "n 3"]]:
+def splat_project_discs(
+    gaussians: Gaussians, camera: Camera, dilation: float = 0.5
+) -> tuple[types.Footprints, Float[Tensor, "n 3"]]:
     """Flat discs instead of ellipsoids (2DGS, Huang et al. 2024, §4.2): each is spanned by its two longest axes.
 
     Args:
@@ -247,13 +251,13 @@ def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 
     return choose("splat_project_discs", gaussians.means)(gaussians, camera, dilation)
 
 
-def splat_bin(footprints: Footprints, width: int, height: int, tile: int) -> Bins:
+def splat_bin(footprints: types.Footprints, width: int, height: int, tile: int) -> types.Bins:
     """Tile intersection and depth sort: per tile, front to back, the footprints whose square overlaps it. No gradient."""
     return choose("splat_bin", footprints.means2d)(footprints, width, height, tile)
 
 
 def splat_rasterise(
-    footprints: Footprints,
+    footprints: types.Footprints,
     features: Float[Tensor, "n c"],
     width: int,
     height: int,
@@ -278,7 +282,7 @@ def splat_rasterise(
     return choose("splat_rasterise", footprints.means2d)(footprints, features, width, height, tile, max_grad_splats)
 
 
-def splat_median(footprints: Footprints, width: int, height: int, tile: int | None = None) -> Float[Tensor, "h w"]:
+def splat_median(footprints: types.Footprints, width: int, height: int, tile: int | None = None) -> Float[Tensor, "h w"]:
     """Median depth: distance along each pixel's ray of the footprint where transmittance falls to 1/2; inf where it does not.
 
     Not differentiable. Arguments as in `splat_rasterise`.

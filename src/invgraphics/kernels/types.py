@@ -178,3 +178,18 @@ class Tracing:
     low: Float[Tensor, " n"]
     steps: Int[Tensor, " n"]
     converged: Bool[Tensor, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """The nearest triangle at each pixel's centre.
+
+    Attributes:
+        face: its index, -1 where there is none.
+        barycentric: weights of its corners at the hit in space (perspective-correct), sum 1; zero where there is none.
+        depth: distance of the hit along the pixel's unit ray, inf where there is none.
+    """
+
+    face: Int[Tensor, "h w"]
+    barycentric: Float[Tensor, "h w 3"]
+    depth: Float[Tensor, "h w"]

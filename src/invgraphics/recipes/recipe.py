@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -66,6 +67,31 @@ def methods() -> dict[str, str]:
     for name in plugins.names("recipes"):
         found.setdefault(name, str(_parse(_foreign_text(name), name).get("summary", "")))
     return found
+
+
+def expand(names: Sequence[str]) -> tuple[tuple[str, ...], frozenset[str]]:
+    """Replace patterns among methods' names by the known methods that match them.
+
+    Args:
+        names: methods, ``all`` for every known one, or patterns such as ``volumetric/*``; a method named twice stays once.
+
+    Returns:
+        The methods' names in order, and those of them that only a pattern names.
+
+    Raises:
+        InputError: a pattern matches no method.
+    """
+    found: dict[str, bool] = {}
+    for name in names:
+        if name != "all" and "*" not in name:
+            found[name] = False
+            continue
+        matching = [known for known in methods() if name == "all" or fnmatch.fnmatchcase(known, name)]
+        if not matching:
+            raise InputError(f"No method matches '{name}'.", f"Known methods: {', '.join(methods())}.")
+        for known in matching:
+            found.setdefault(known, True)
+    return tuple(found), frozenset(name for name, by_pattern in found.items() if by_pattern)
 
 
 def presets(name: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from invgraphics import plugins
@@ -12,11 +13,15 @@ def matrix() -> tuple[list[str], list[str], dict[tuple[str, str], list[str]]]:
     """Build the matrix of methods: fields as rows, renderers as columns, methods in each cell in the order of `methods`."""
     cells: dict[tuple[str, str], list[str]] = {}
     for name in methods():
-        table = source(name)
-        cells.setdefault((_field_title(table["field"]), _title("renderers", table["renderer"])), []).append(name)
+        cells.setdefault(cell_of(source(name)), []).append(name)
     rows = list(dict.fromkeys(row for row, _ in cells))
     columns = list(dict.fromkeys(column for _, column in cells))
     return rows, columns, cells
+
+
+def cell_of(table: Mapping[str, Any]) -> tuple[str, str]:
+    """Titles of a recipe's field and renderer, the row and the column of its cell in the matrix."""
+    return _field_title(table["field"]), _title("renderers", table["renderer"])
 
 
 def markdown() -> str:

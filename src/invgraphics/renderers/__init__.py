@@ -9,15 +9,21 @@ RENDERERS = {
     "volsdf": "invgraphics.renderers.volsdf:VolSDFConfig",
     "neus": "invgraphics.renderers.neus:NeuSConfig",
     "splatting": "invgraphics.renderers.splatting:SplattingConfig",
-    "gaussian_exact": "invgraphics.renderers.gaussian_volume:GaussianExactConfig",
+    "gaussian_exact": "invgraphics.renderers.gaussians.volume:GaussianExactConfig",
     "sphere_tracing": "invgraphics.renderers.sphere_tracing:SphereTracingConfig",
-    "gaussian_sorted": "invgraphics.renderers.gaussian_volume:GaussianSortedConfig",
+    "surface": "invgraphics.renderers.surface:SurfaceConfig",
+    "planes": "invgraphics.renderers.planes:PlanesConfig",
+    "depth_warp": "invgraphics.renderers.depth_warp:DepthWarpConfig",
+    "gaussian_sorted": "invgraphics.renderers.gaussians.volume:GaussianSortedConfig",
+    "srn": "invgraphics.renderers.srn:SRNConfig",
+    "ray_attention": "invgraphics.renderers.ray_attention:RayAttentionConfig",
 }
 
 SAMPLERS = {
     "stratified": "invgraphics.renderers.samplers:StratifiedConfig",
     "hierarchical": "invgraphics.renderers.samplers:HierarchicalConfig",
     "occupancy": "invgraphics.renderers.occupancy:OccupancyConfig",
+    "proposals": "invgraphics.renderers.proposals:ProposalsConfig",
     "error_bounded": "invgraphics.renderers.error_bounded:ErrorBoundedConfig",
     "up_sampling": "invgraphics.renderers.up_sampling:UpSamplingConfig",
 }

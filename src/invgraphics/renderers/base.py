@@ -1,4 +1,4 @@
-"""Normalisation of a pixel's weighted sums to colour, alpha, depth and normal."""
+"""Normalisation of a pixel's weighted sums to colour, alpha, depth and normal, and normals of a depth map."""
 
 from __future__ import annotations
 
@@ -39,3 +39,25 @@ def to_rendering(
         unit = torch.where((unit * directions).sum(dim=-1, keepdim=True) > 0, -unit, unit)
         normal = torch.where(seen[..., None], unit, 0.0)
     return Rendering(rgb, alpha, depth, normal)
+
+
+def normals_from_depth(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Normals of a depth map by central differences of its points, one-sided where a neighbour is empty.
+
+    A pixel without a neighbour in one direction gets its own viewing direction, reversed.
+    """
+    points = depth[..., None] * directions
+    along_x, along_y = _difference(points, seen, 1), _difference(points, seen, 0)
+    normal = normalize(torch.linalg.cross(along_x, along_y), dim=-1)
+    alone = normal.square().sum(dim=-1, keepdim=True) < 0.5  # of a unit vector or zero
+    return torch.where(alone, -directions, normal)
+
+
+def _difference(points: Float[Tensor, "h w 3"], seen: Tensor, axis: int) -> Float[Tensor, "h w 3"]:
+    """Difference to the next point plus that from the previous one, without unseen neighbours."""
+    last = points.shape[axis] - 1
+    step = points.narrow(axis, 1, last) - points.narrow(axis, 0, last)
+    both = seen.narrow(axis, 1, last) & seen.narrow(axis, 0, last)
+    step = torch.where(both[..., None], step, 0.0)
+    none = torch.zeros_like(points.narrow(axis, 0, 1))
+    return torch.cat([step, none], dim=axis) + torch.cat([none, step], dim=axis)

@@ -20,6 +20,9 @@ from invgraphics.core import Field, FieldValues, Quantity, Samples
 Slopes = Literal["gradient", "neighbours", "steepest"]
 """Where the derivative of the distance along a ray comes from."""
 
+_SHORT = 1e-3
+"""Change of the distance over an interval, over β, below which the density at its middle is as good as its mean."""
+
 
 def laplace_density(sdf: Float[Tensor, "*m"], beta: Float[Tensor, "*#m"]) -> Float[Tensor, "*m"]:
     """Density Ψ(-sdf) / β with the CDF Ψ of Laplace's distribution of zero mean and scale β (VolSDF, equations 2 and 3).
@@ -28,6 +31,32 @@ def laplace_density(sdf: Float[Tensor, "*m"], beta: Float[Tensor, "*#m"]) -> Flo
     """
     tail = 0.5 * torch.exp(-sdf.abs() / beta)
     return torch.where(sdf > 0, tail, 1 - tail) / beta
+
+
+def laplace_optical_depth(
+    sdf: Float[Tensor, "*m"], slope: Float[Tensor, "*m"], delta: Float[Tensor, "*m"], beta: Float[Tensor, ""]
+) -> Float[Tensor, "*m"]:
+    """Integral of `laplace_density` over intervals, along which the distance is taken as linear.
+
+    A density at one point of an interval much longer than β says nothing of the rest: the surface would move back to the
+    first point inside, by half an interval in the mean.
+
+    Args:
+        sdf: in the middle of each interval.
+        slope: its derivative along the ray there.
+        delta: length of each interval.
+        beta: β of Laplace's distribution.
+    """
+    change = slope * delta
+    short = change.abs() < _SHORT * beta
+    drop = torch.where(short, 1.0, change) / 2
+    mean = (_laplace_tail(sdf - drop, beta) - _laplace_tail(sdf + drop, beta)) / (2 * drop)
+    return delta * torch.where(short, laplace_density(sdf, beta), mean)
+
+
+def _laplace_tail(sdf: Float[Tensor, "*m"], beta: Float[Tensor, ""]) -> Float[Tensor, "*m"]:
+    """Integral of `laplace_density` from a distance to infinity."""
+    return 0.5 * torch.exp(-sdf.abs() / beta) + (-sdf).clamp_min(0) / beta
 
 
 def logistic_density(sdf: Float[Tensor, "*m"], slope: Float[Tensor, "*m"], sharpness: Float[Tensor, ""]) -> Float[Tensor, "*m"]:
@@ -62,25 +91,41 @@ def section_optical_depth(
 class DistanceDensity(Field):
     """A field of signed distances seen as one of densities, for samplers and for quadrature; it lives as long as a rendering.
 
-    Attributes:
+    Args:
         field: with a signed distance.
         beta: width of the density, local units: β of Laplace's distribution, 1 / s of the logistic one.
+        slopes: how the distance changes along a ray: by the field's ``gradient``; outside the graph by differences of
+            ``neighbours``, which cost no gradient, for searches in training; for points on no rays the ``steepest`` there is.
     """
 
-    def __init__(self, field: Field, beta: Float[Tensor, ""]) -> None:
+    def __init__(self, field: Field, beta: Float[Tensor, ""], slopes: Slopes = "gradient") -> None:
         super().__init__()
         self.field = field
         self.beta = beta
+        self._slopes: Slopes = slopes
         self.provides = field.provides | Quantity.DENSITY
 
     @property
-    @abstractmethod
+    def slopes(self) -> Slopes:
+        """Where slopes come from now: in the graph from the gradient."""
+        return "gradient" if self._slopes == "neighbours" and torch.is_grad_enabled() else self._slopes
+
+    @property
     def needs(self) -> Quantity:
         """What the density is made from."""
+        return Quantity.SDF | Quantity.GRADIENT if self.slopes == "gradient" else Quantity.SDF
 
     @abstractmethod
     def density_of(self, values: FieldValues, samples: Samples) -> Float[Tensor, " m"]:
         """Density from the values of `needs`, per local length unit."""
+
+    def slope(self, values: FieldValues, samples: Samples) -> Float[Tensor, " m"]:
+        """Derivative of the distance along the ray at each sample, from the values of `needs`."""
+        assert values.sdf is not None
+        if self.slopes == "neighbours":
+            return neighbour_slopes(values.sdf, samples)
+        assert values.gradient is not None
+        return (values.gradient * samples.direction).sum(dim=1)
 
     @override
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
@@ -92,17 +137,26 @@ class DistanceDensity(Field):
 
 
 class LaplaceDensity(DistanceDensity):
-    """VolSDF's density."""
+    """VolSDF's density.
 
-    @property
-    @override
-    def needs(self) -> Quantity:
-        return Quantity.SDF
+    Args:
+        field: with a signed distance.
+        beta: β, local units.
+        slopes: as of `DistanceDensity`; ``None``: the density at the samples.
+    """
+
+    def __init__(self, field: Field, beta: Float[Tensor, ""], slopes: Slopes | None = None) -> None:
+        super().__init__(field, beta, slopes or "steepest")
 
     @override
     def density_of(self, values: FieldValues, samples: Samples) -> Float[Tensor, " m"]:
         assert values.sdf is not None
-        return laplace_density(values.sdf, self.beta)
+        if self.slopes == "steepest":
+            return laplace_density(values.sdf, self.beta)
+        delta = samples.delta
+        there = delta > 0
+        mean = laplace_optical_depth(values.sdf, self.slope(values, samples), delta, self.beta) / torch.where(there, delta, 1.0)
+        return torch.where(there, mean, laplace_density(values.sdf, self.beta))
 
 
 class LogisticDensity(DistanceDensity):
@@ -111,37 +165,22 @@ class LogisticDensity(DistanceDensity):
     Args:
         field: with a signed distance.
         beta: 1 / s, local units.
-        slopes: how the distance changes along a ray: by the field's ``gradient``; outside the graph by differences of
-            ``neighbours``, which cost no gradient, for searches in training; for points on no rays the ``steepest`` there is.
+        slopes: as of `DistanceDensity`.
         anneal: from 1 on the slope is that along the ray; at 0 it is halved towards -1, so that a ray sees surfaces that it
             leaves, too (NeuS's ``cos_anneal_ratio``).
     """
 
     def __init__(self, field: Field, beta: Float[Tensor, ""], slopes: Slopes = "gradient", anneal: float = 1.0) -> None:
-        super().__init__(field, beta)
-        self.slopes: Slopes = slopes
+        super().__init__(field, beta, slopes)
         self.anneal = anneal
-
-    @property
-    @override
-    def needs(self) -> Quantity:
-        return Quantity.SDF | Quantity.GRADIENT if self._slopes == "gradient" else Quantity.SDF
-
-    @property
-    def _slopes(self) -> Slopes:
-        return "gradient" if self.slopes == "neighbours" and torch.is_grad_enabled() else self.slopes
 
     @override
     def density_of(self, values: FieldValues, samples: Samples) -> Float[Tensor, " m"]:
         assert values.sdf is not None
         sharpness = 1 / self.beta
-        if self._slopes == "steepest":
+        if self.slopes == "steepest":
             return logistic_density(values.sdf, values.sdf.new_full((), -1.0), sharpness)
-        if self._slopes == "neighbours":
-            slope = neighbour_slopes(values.sdf, samples)
-        else:
-            assert values.gradient is not None
-            slope = (values.gradient * samples.direction).sum(dim=1)
+        slope = self.slope(values, samples)
         if self.anneal < 1:
             slope = torch.lerp(-(0.5 - slope / 2).clamp_min(0), slope.clamp_max(0), self.anneal)
         delta = samples.delta

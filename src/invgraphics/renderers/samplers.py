@@ -165,9 +165,13 @@ def strata(rays: Rays, count: int, ctx: Context, knee: Float[Tensor, "k 1"] | No
     return torch.lerp(near[:, None], far[:, None], fraction / count)
 
 
-def quantiles(rays: int, count: int, ctx: Context, like: Tensor) -> Float[Tensor, "k count"]:
-    """Stratified quantiles: one in each of ``count`` equal parts of [0, 1], the middle, or random in training."""
-    within = uniform((rays, count), ctx, like) if ctx.training else like.new_full((rays, count), 0.5)
+def quantiles(rays: int, count: int, ctx: Context, like: Tensor, *, per_ray: bool = False) -> Float[Tensor, "k count"]:
+    """Stratified quantiles: one in each of ``count`` equal parts of [0, 1], the middle, or random in training.
+
+    With ``per_ray`` all of a ray's are at the same place in their parts.
+    """
+    shape = (rays, 1 if per_ray else count)
+    within = uniform(shape, ctx, like) if ctx.training else like.new_full(shape, 0.5)
     return (torch.arange(count, dtype=like.dtype, device=like.device) + within) / count
 
 

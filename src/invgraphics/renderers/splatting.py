@@ -28,8 +28,8 @@ from invgraphics.core import (
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.kernels.reference.splat_raster import blending_weights, responses_at, visible_alphas
 from invgraphics.kernels.types import Footprints
-from invgraphics.renderers.base import MIN_SURFACE_ALPHA, to_rendering
-from invgraphics.renderers.gaussian_profile import density_profile
+from invgraphics.renderers.base import MIN_SURFACE_ALPHA, normals_from_depth, to_rendering
+from invgraphics.renderers.gaussians.profile import density_profile
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class Splatting(Renderer):
             return to_rendering(sums[..., :3], alpha, distance, None, far)
         normal, directions = sums[..., 6:], camera.rays().directions.view(*alpha.shape, 3)
         if self.config.normals == "depth":
-            normal = _normals_from_depth(distance / alpha.clamp_min(MIN_SURFACE_ALPHA), alpha >= MIN_SURFACE_ALPHA, directions)
+            normal = normals_from_depth(distance / alpha.clamp_min(MIN_SURFACE_ALPHA), alpha >= MIN_SURFACE_ALPHA, directions)
         return to_rendering(sums[..., :3], alpha, distance, normal, far, directions)
 
 
@@ -190,27 +190,3 @@ def _normals(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
     normal = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
     away = (normal * (gaussians.means - camera.position)).sum(dim=1, keepdim=True) > 0
     return torch.where(away, -normal, normal)
-
-
-def _normals_from_depth(
-    depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]
-) -> Float[Tensor, "h w 3"]:
-    """Normals of a depth map by central differences of its points, one-sided where a neighbour is empty.
-
-    A pixel without a neighbour in one direction gets its own viewing direction, reversed.
-    """
-    points = depth[..., None] * directions
-    along_x, along_y = _difference(points, seen, 1), _difference(points, seen, 0)
-    normal = torch.nn.functional.normalize(torch.linalg.cross(along_x, along_y), dim=-1)
-    alone = normal.square().sum(dim=-1, keepdim=True) < 0.5  # of a unit vector or zero
-    return torch.where(alone, -directions, normal)
-
-
-def _difference(points: Float[Tensor, "h w 3"], seen: Tensor, axis: int) -> Float[Tensor, "h w 3"]:
-    """Difference to the next point plus that from the previous one, without unseen neighbours."""
-    last = points.shape[axis] - 1
-    step = points.narrow(axis, 1, last) - points.narrow(axis, 0, last)
-    both = seen.narrow(axis, 1, last) & seen.narrow(axis, 0, last)
-    step = torch.where(both[..., None], step, 0.0)
-    none = torch.zeros_like(points.narrow(axis, 0, 1))
-    return torch.cat([step, none], dim=axis) + torch.cat([none, step], dim=axis)

@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.config import Slot
-from invgraphics.core import Context, Field, Scene
+from invgraphics.core import Context, Field, Quantity, Scene
 from invgraphics.renderers.distance_density import LaplaceDensity
 from invgraphics.renderers.error_bounded import ErrorBoundedConfig
 from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, make_volumetric
@@ -27,6 +27,8 @@ class VolSDFConfig:
         beta_final: β at the end where it is scheduled; stands in for a learnt one that the field was not fitted with.
         beta_min: least β (VolSDF: 1e-4).
         change: whether β is ``learnt``, ``scheduled`` log-linearly over the fit, or ``held``.
+        sections: take the density's mean over each interval, along which the distance is linear, instead of the density at its
+            middle (VolSDF): for even steps, which are longer than a small β.
         gradient_reach: as of volume rendering.
         weight_threshold: in training, samples that weigh no more than this by the sampler's own densities, where it
             has some (``occupancy``), are left out; 0 keeps all.
@@ -39,6 +41,7 @@ class VolSDFConfig:
     beta_final: float = 0.002
     beta_min: float = 1e-4
     change: Change = "learnt"
+    sections: bool = False
     gradient_reach: float = 0.0
     weight_threshold: float = 0.0
 
@@ -72,9 +75,15 @@ class VolSDF(Hybrid):
         super().__init__(config, renderer)
         self.config = config
 
+    @property
+    @override
+    def required(self) -> Quantity:
+        return super().required | (Quantity.GRADIENT if self.config.sections else Quantity.NONE)
+
     @override
     def density(self, field: Field, ctx: Context, *, on_rays: bool = True) -> LaplaceDensity:
-        return LaplaceDensity(field, self.beta(ctx))
+        slopes = None if not (self.config.sections and on_rays) else "neighbours" if ctx.training else "gradient"
+        return LaplaceDensity(field, self.beta(ctx), slopes)
 
     @override
     def untrained(self) -> VolSDF:

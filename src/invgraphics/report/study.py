@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.report.data.assets import Folder, writing
 from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.data.factors import METHOD
 from invgraphics.report.data.redact import check_runs_outside, redactor_for
 from invgraphics.report.data.studies import Study, read_study, scene_comparisons
 from invgraphics.report.figures.analyses import draw_analyses
@@ -18,9 +19,13 @@ from invgraphics.report.pages.parts import draw_contrasts, draw_part
 from invgraphics.report.pages.study import StudyPage, write_study_html, write_study_markdown
 from invgraphics.report.pages.tables import effects_caption, write_latex, write_latex_effects
 from invgraphics.report.pages.verdicts import write_verdict_report
-from invgraphics.report.statistics.effects import effects_on
+from invgraphics.report.statistics.cross_render import cross_effects
+from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
+from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.rules import headline, judge
-from invgraphics.report.statistics.summary import quality_columns, table_columns, value_of
+from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.summary import quality_columns, table_columns
+from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity
 from invgraphics.text import file_name
 
@@ -75,30 +80,47 @@ def study_sentences(folder: Path) -> list[str]:
     study = read_study(folder)
     if study.report == "verdicts":
         return headline(judge(study.cells, study.known))
-    quantities = _quantities(scene_comparisons(study))
-    return [effect.sentence for effect in effects_on(quantities[0], study.factors, study.observations())] if quantities else []
+    quantities = _quantities(study, scene_comparisons(study))
+    return [effect_sentence(effect) for effect in headline_effects(study, quantities[0])] if quantities else []
+
+
+def headline_effects(study: Study, quantity: Quantity, clean: Callable[[str], str] = str) -> list[Effect]:
+    """The effects that answer a study's question: of approximations on the same fits where it names some, then of levels."""
+    crossed = cross_effects(study.observations(), study.approximations, clean)
+    return [*crossed, *effects_of(study_contrasts(study), quantity, study.observations(), study.lost())]
+
+
+def study_contrasts(study: Study) -> list[Contrast]:
+    """The comparisons that a study's question asks for."""
+    among = study.methods if study.each == METHOD else ()
+    among = among or next((factor.levels for factor in study.factors if factor.path == study.each), ())
+    return contrasts_of(study.factors, study.each if among else "", study.interactions, among)
 
 
 def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
     comparisons = scene_comparisons(study)
     keys = _keys([comparison.scene for comparison in comparisons])
+    shown = [replace(comparison, shown=shown_variants(comparison)) for comparison in comparisons]
     parts = tuple(
-        draw_part(replace(comparison, shown=shown_variants(comparison)), replace(folder, part=key), study.approximations)
-        for key, comparison in zip(keys, comparisons, strict=True)
+        draw_part(comparison, replace(folder, part=key), study.approximations, len(comparisons))
+        for key, comparison in zip(keys, shown, strict=True)
     )
     observations = study.observations()
-    quantities = _quantities(comparisons)
-    contrasts = draw_contrasts(quantities, study.factors, observations, folder)
+    quantities = _quantities(study, comparisons)
+    contrasts = draw_contrasts(quantities, study_contrasts(study), observations, study.lost(), folder)
+    clean = folder.redactor.text if folder.redactor is not None else str
+    crossed = cross_effects(observations, study.approximations, clean)
     heat = draw_heat_maps(study.factors, quantities[0], observations, folder.figures) if quantities else []
     analyses = draw_analyses(root, study.analyses, folder.figures)
-    return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None, analyses)
+    return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None, analyses, crossed)
 
 
-def _quantities(comparisons: Sequence[Comparison]) -> list[Quantity]:
-    """Union of the columns of all scenes' tables, quality first; empty without a quality metric."""
+def _quantities(study: Study, comparisons: Sequence[Comparison]) -> list[Quantity]:
+    """Union of the columns of all scenes' tables, quality first, with the study's margins; empty without a quality metric."""
     columns = [column for comparison in comparisons for column in table_columns(comparison)]
     found = {column.key: column for column in reversed(columns)}
-    unique = [found[key] for key in dict.fromkeys(column.key for column in columns)]
+    keys = dict.fromkeys(column.key for column in columns)
+    unique = [replace(found[key], margin=study.margins.get(key, found[key].margin)) for key in keys]
     quality = [column for column in unique if column.group != "cost"]
     return [*quality, *(column for column in unique if column.group == "cost")] if quality else []
 

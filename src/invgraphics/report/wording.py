@@ -28,6 +28,8 @@ class Quantity:
         group: what it measures: ``image``, ``geometry`` or ``cost``; the first two are quality.
         scale: the stored value is multiplied by this before it is written.
         decimals: digits after the point; ``None`` means three significant digits.
+        margin: differences below this, in stored units, are of no interest: the margin of equivalence tests, stated before
+            anything is measured; ``None`` where none is.
     """
 
     key: str
@@ -37,6 +39,7 @@ class Quantity:
     group: Group
     scale: float = 1.0
     decimals: int | None = None
+    margin: float | None = None
 
     @property
     def arrow(self) -> str:
@@ -81,11 +84,22 @@ _NAMES: dict[str, tuple[str, int]] = {
     "depth_rmse_smooth": ("Depth RMSE off edges", 3),
     "normal_deg": ("Normal error", 1),
     "alpha_iou": ("Alpha IoU", 3),
+    "chamfer": ("Chamfer", 4),
+    "surface_accuracy": ("Surface accuracy", 4),
+    "surface_completeness": ("Surface completeness", 4),
+    "f_score": ("F-score, 1%", 3),
+    "normal_consistency": ("Normal consistency", 3),
     "pose_rotation_deg": ("Pose rotation, median", 2),
     "pose_translation_percent": ("Pose position, median", 2),
 }
 
-_GEOMETRY = ("depth_", "normal_", "alpha_", "pose_")
+SCALED = "_at_1_"
+"""Between a metric's name and the divisor of the test views' size, where it is of smaller pictures."""
+
+MARGINS = {"psnr": 0.2, "ssim": 0.005, "ms_ssim": 0.005, "flip": 0.005, "lpips": 0.01}
+"""Metric -> difference below which methods count as equal, where a study states no other: about what nobody sees."""
+
+_GEOMETRY = ("depth_", "normal_", "alpha_", "pose_", "chamfer", "surface_", "f_score")
 
 _UNITS = {"deg": "°", "degrees": "°", "degree": "°", "world units": "units"}
 
@@ -109,16 +123,20 @@ TIMES = ("fit_seconds", "render_seconds_per_view", "render_fps")
 
 
 def metric_label(key: str) -> str:
-    """Display name of a metric; an unknown key with spaces for underscores."""
-    return _NAMES[key][0] if key in _NAMES else key.replace("_", " ")
+    """Display name of a metric, also at 1/n of the test views' size; an unknown key with spaces for underscores."""
+    name, scaled, divisor = key.partition(SCALED)
+    label = _NAMES[name][0] if name in _NAMES else name.replace("_", " ")
+    return f"{label} at 1/{divisor}" if scaled else label
 
 
 def quality_quantity(key: str, score: Score) -> Quantity:
     """Quantity of a quality metric, with unit and direction from its stored score."""
-    decimals = _NAMES[key][1] if key in _NAMES else None
+    name = key.partition(SCALED)[0]
+    decimals = _NAMES[name][1] if name in _NAMES else None
     better: Direction = "higher" if score.higher_is_better else "lower"
     group: Group = "geometry" if key.startswith(_GEOMETRY) else "image"
-    return Quantity(key, metric_label(key), _UNITS.get(score.unit, score.unit), better, group, decimals=decimals)
+    unit = _UNITS.get(score.unit, score.unit)
+    return Quantity(key, metric_label(key), unit, better, group, decimals=decimals, margin=MARGINS.get(name))
 
 
 def significant_decimals(value: float, digits: int = 3) -> int:

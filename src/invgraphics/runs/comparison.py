@@ -21,6 +21,14 @@ class Failure:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """A method that a comparison left out, because it does not go with the scene, and why."""
+
+    method: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class SceneFacts:
     """Facts about a scene: numbers of views, colour space, background and bounds.
 
@@ -52,6 +60,8 @@ class ComparisonRecord(Record):
         question: that the comparison answers, one sentence.
         methods: in the order of the report.
         summaries: method -> what it is, one line.
+        cells: method -> titles of its field and of its renderer, the row and the column of the table of methods.
+        refused: methods that a pattern named and that do not go with the scene.
         seeds: each method is fitted once per seed.
         budget: of every fit, ``60s`` or ``5000steps``.
         size: width and height of the test pictures, px.
@@ -78,6 +88,8 @@ class ComparisonRecord(Record):
     question: str = ""
     methods: tuple[str, ...]
     summaries: dict[str, str] = field(default_factory=dict)
+    cells: dict[str, tuple[str, str]] = field(default_factory=dict)
+    refused: tuple[Refusal, ...] = ()
     seeds: tuple[int, ...] = ()
     budget: str = ""
     size: tuple[int, int] | None = None

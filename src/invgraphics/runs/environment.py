@@ -14,6 +14,7 @@ class Environment(Record):
 
     Attributes:
         invgraphics: version, and hash of the sources.
+        commit: of the working copy; ``+ changes`` where tracked files differ from it; empty outside a repository.
         python: version.
         torch: version.
         platform: operating system and architecture.
@@ -35,6 +36,7 @@ class Environment(Record):
     FILE: ClassVar[str] = "environment.json"
 
     invgraphics: str = ""
+    commit: str = ""
     python: str = ""
     torch: str = ""
     platform: str = ""

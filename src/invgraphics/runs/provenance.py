@@ -62,6 +62,29 @@ class ImportedFile:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ConvertedRun:
+    """Origin of a converted model: the run that it was made of, and what the conversion cost.
+
+    Attributes:
+        run: folder of that run, as given.
+        cell_sha256: its identity; empty where it has none.
+        method: that fitted it.
+        to: what it was converted to.
+        hub: what the conversion went through, in words.
+        native_psnr: of that run on the test views, dB; ``None`` where unknown.
+        converted_psnr: of the converted model before its refit, dB.
+    """
+
+    run: str
+    cell_sha256: str
+    method: str
+    to: str
+    hub: str
+    native_psnr: float | None = None
+    converted_psnr: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Provenance(Record):
     """Provenance of a run: request, identity, and hashes of recipe, code and data.
 
@@ -93,6 +116,7 @@ class Provenance(Record):
         threads: of the process; written after the fit.
         load_average: of the machine; written after the fit.
         imported: the file, of a model that was fitted elsewhere.
+        converted: the run, of a model that was converted from another parameterisation; the fit then is the refit.
         fitted_run: of a rendering: folder of the fit, relative.
         fitted_by: of a rendering: the method that fitted.
         rendered_by: of a rendering: the renderer, as it was named.
@@ -128,6 +152,7 @@ class Provenance(Record):
     threads: int | None = None
     load_average: LoadAverage | None = None
     imported: ImportedFile | None = None
+    converted: ConvertedRun | None = None
     fitted_run: str | None = None
     fitted_by: str | None = None
     rendered_by: str | None = None

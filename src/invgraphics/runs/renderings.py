@@ -1,4 +1,4 @@
-"""``renderings.json``: one fitted field by several renderers, and the colour differences of their pictures."""
+"""``renderings.json``: one fitted field by several renderers, and the differences of their pictures."""
 
 from __future__ import annotations
 
@@ -21,17 +21,19 @@ class Rendering:
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Colour difference between unrounded pictures of one fit by two renderers, over the scene's background, in [0, 1].
+    """Difference between unrounded pictures of one fit by two renderers, colours in [0, 1] over the scene's background.
 
     Attributes:
         renderers: as they were named.
         rmse: per test view, root of the mean square over pixels and channels.
         largest: per test view, largest absolute difference.
+        depth: median absolute difference of depth, world units, of every test view in which both show a surface (alpha >= 0.5).
     """
 
     renderers: tuple[str, str]
     rmse: tuple[float, ...]
     largest: tuple[float, ...] = ()
+    depth: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

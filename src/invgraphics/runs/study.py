@@ -104,6 +104,9 @@ class StudyRecord(Record):
         report: what the page is about, ``effects`` or ``verdicts``.
         approximations: pairs of renderers that are compared on every fit.
         known: red verdicts whose causes are known.
+        each: factor that the question asks about level by level (``method``); empty where the mean answers it.
+        interactions: pairs of factors whose interaction is the question.
+        margins: metric -> difference that is of no interest, stated before anything ran.
         protocol: how scores were made: ``name``, ``summary`` and further facts.
         command: makes the study again.
         environment: machine and versions.
@@ -129,6 +132,9 @@ class StudyRecord(Record):
     report: Literal["effects", "verdicts"] = "effects"
     approximations: tuple[Approximation, ...] = ()
     known: tuple[KnownDeviation, ...] = ()
+    each: str = ""
+    interactions: tuple[tuple[str, str], ...] = ()
+    margins: dict[str, float] = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
     command: str = ""
     environment: Environment = field(default_factory=Environment)

@@ -40,7 +40,10 @@ class Colmap:
         model = find_model(path)
         folder = model.images or path
         photos, notes = existing_photos([_photo(image, folder) for image in model.registered], model.folder)
-        notes |= {"loader": "colmap", "points": f"{model.reconstruction.num_points3D()} from SfM"} | pose_notes(path)
+        notes |= {
+            "loader": "colmap",
+            "points": f"{model.reconstruction.num_points3D()} from SfM on all photographs, those that are scored too",
+        } | pose_notes(path)
         notes |= {"model": model.note} if model.note else {}
         poses = torch.stack([photo.camera.cam_to_world for photo in photos])
         frame = contracted_frame(poses, _points(model.reconstruction))

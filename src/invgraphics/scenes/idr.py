@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from invgraphics.arrays import read_arrays
 from invgraphics.core import Bounds, Camera, Scene
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
+from invgraphics.scenes.dtu import find_scan
 from invgraphics.scenes.images import Photo, image_files, image_size
 from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth, pose
 
@@ -26,7 +28,7 @@ class Idr:
 
     The local frame is the one in which the subject fills the unit sphere, bounds are ±1. With masks these are the coverage and
     the scene is a box; without, the surroundings are part of the picture and the scene is contracted. Every eighth
-    photograph by name is scored.
+    photograph by name is scored. A reference scan of DTU beside the cameras scores surfaces (see `scenes.dtu`).
     """
 
     def matches(self, path: Path) -> bool:
@@ -54,8 +56,10 @@ class Idr:
             for index, (file, camera) in enumerate(zip(files, cameras, strict=True))
         ]
         bounds = Bounds(-torch.ones(3), torch.ones(3), "box" if masks else "contracted", NEAR)
-        notes = {"loader": "idr", "cameras": source.name}
-        return compose(path.resolve().name, every_eighth(photos), Frame(bounds, world_from_local), options, notes)
+        scan, lacks = find_scan(path if path.is_dir() else path.parent)
+        notes = {"loader": "idr", "cameras": source.name, "reference_scan": lacks.lstrip("; ") or "with mask and plane"}
+        scene = compose(path.resolve().name, every_eighth(photos), Frame(bounds, world_from_local), options, notes)
+        return replace(scene, scan=scan)
 
 
 def _source(path: Path) -> Path | None:

@@ -27,6 +27,7 @@ __all__ = [
     "open_scene",
     "selection_notes",
     "source_of",
+    "space_note",
     "validate",
 ]
 
@@ -147,6 +148,18 @@ def is_rendered(spec: str) -> bool:
 def selection_notes(scene: Scene) -> str:
     """Format the scene's notes on the chosen model and on missing photographs, a line each; mostly empty."""
     return "".join(f"\n  {key}: {scene.notes[key]}" for key in ("model", "missing") if key in scene.notes)
+
+
+def space_note(scene: Scene) -> str:
+    """Describe the bounds that were chosen for a scene without end, on a line; empty for a scene in a box."""
+    if scene.bounds.space == "box":
+        return ""
+    half, near = float(scene.bounds.half.max()), scene.bounds.near
+    source = f"three quarters of {len(scene.points):,} known points" if scene.points else "the cameras: no points are known"
+    return (
+        f"\n  space: endless, contracted around a box of half-edge {half:.2g} (from {source}); no sample nearer than {near:.2g}"
+        " to a camera, where the farthest camera is at 1"
+    )
 
 
 def _built_in() -> tuple[str, ...]:

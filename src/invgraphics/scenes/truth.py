@@ -21,6 +21,9 @@ from invgraphics.scenes.mitsuba import cache, ply
 LINEAR_RESIZE = "area average of linear light"
 """The filter from a larger rendering to the folder's pictures, see `invgraphics.scenes.mitsuba.average`."""
 
+POINTS = "exact surface points that the training views see, with true colours: better than any method could find"
+"""What a rendered scene's points are, in its notes."""
+
 _DAMAGED = "Make the scene again: `invgraphics make-scene`."
 
 
@@ -56,6 +59,8 @@ class Truth:
             )
             for split, count in wanted.items()
         }
+        # Points are made from the depth of all training views: of fewer, they know too much.
+        points = _points(path / "points.npz") if len(views["train"]) == len(truth["cameras"]["train"]) else None
         bounds = Bounds(torch.tensor(truth["bounds"]["lo"]), torch.tensor(truth["bounds"]["hi"]))
         return Scene(
             name=truth["name"],
@@ -64,10 +69,10 @@ class Truth:
             test=views["test"],
             background=torch.tensor(truth["background"] or [0.0, 0.0, 0.0]),
             bounds=bounds,
-            points=_points(path / "points.npz"),
+            points=points,
             mesh=_mesh(path / "mesh.ply"),
             noise_ceiling=truth["noise_ceiling"],
-            notes=_notes(truth, views["train"][0]),
+            notes=_notes(truth, views["train"][0]) | ({"points": POINTS} if points is not None else {}),
         )
 
 

@@ -16,6 +16,7 @@ from invgraphics.runs.analysis import Analysis, analysis_path
 
 ANALYSES = {
     "affine-projection": "invgraphics.studies.approximations:affine_projection",
+    "depth-over-width": "invgraphics.studies.surfaces:depth_over_width",
     "field-of-view": "invgraphics.studies.approximations:field_of_view",
     "sorting-by-centre": "invgraphics.studies.approximations:sorting_by_centre",
     "opacity-convention": "invgraphics.studies.approximations:opacity_convention",

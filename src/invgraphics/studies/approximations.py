@@ -14,8 +14,8 @@ from torch import Tensor
 from invgraphics.core import Bounds, Camera, Gaussians, Model, Renderer, harmonics
 from invgraphics.core.transforms import look_at
 from invgraphics.fields.gaussian import GaussianField
-from invgraphics.renderers.gaussian_rays import Opacity
-from invgraphics.renderers.gaussian_volume import GaussianExact, GaussianExactConfig, GaussianSorted, GaussianSortedConfig
+from invgraphics.kernels.extinction import Opacity
+from invgraphics.renderers.gaussians.volume import GaussianExact, GaussianExactConfig, GaussianSorted, GaussianSortedConfig
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.runs.analysis import Analysis, Curve
 

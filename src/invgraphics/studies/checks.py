@@ -72,6 +72,7 @@ def checked(study: Study, where: str) -> Study:
             raise InputError(
                 f"{where}: '{twice[0]}' is set by two entries for {method}.", "Let their scopes exclude each other."
             )
+    _check_questions(study, where)
     check_analyses(study.analyses, where)
     for name in (name for pair in study.approximations for name in (pair.exact, pair.approximate)):
         if name not in study.render_with:
@@ -81,6 +82,22 @@ def checked(study: Study, where: str) -> Study:
     if any(seed < 0 for seed in study.seeds) or (views != "all" and views < 1):
         raise InputError(f"{where}: seeds must be 0 or more, and 'test_views' 1 or more or 'all'.")
     return study
+
+
+def _check_questions(study: Study, where: str) -> None:
+    """Check that what the report is to answer exists: factors of ``each`` and ``interactions``, and positive margins."""
+    known = {"method", *study.factors}
+    for name in [study.each] * bool(study.each) + [name for pair in study.interactions for name in pair]:
+        if name not in known:
+            raise InputError(
+                f"{where}: the question names '{name}', which is no factor.", f"Expected: {', '.join(sorted(known))}."
+            )
+    for first, second in study.interactions:
+        if first == second:
+            raise InputError(f"{where}: '{first}' cannot interact with itself.")
+    for metric, margin in study.margins.items():
+        if not 0 < margin < math.inf:
+            raise InputError(f"{where}: the margin of '{metric}' cannot be {margin}.", "Expected: a positive difference.")
 
 
 def _check_count(study: Study, where: str) -> None:

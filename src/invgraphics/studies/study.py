@@ -59,6 +59,10 @@ class Study:
         approximations: pairs of these renderers whose pictures of the same fit are compared.
         analyses: computations beside the fits (see `invgraphics.studies.analyses`).
         known: for ``verdicts``: what is known to deviate, and why.
+        each: factor (or ``method``) that the question asks about level by level; the report then answers for each.
+        interactions: pairs of factors whose interaction is the question; the report tests it first.
+        margins: metric -> difference, in its stored unit, below which levels count as equal (the report's equivalence tests);
+            others have the margins of `invgraphics.report.wording.MARGINS`.
     """
 
     question: str
@@ -80,6 +84,9 @@ class Study:
     approximations: tuple[Approximation, ...] = ()
     analyses: tuple[str, ...] = ()
     known: tuple[KnownDeviation, ...] = ()
+    each: str = ""
+    interactions: tuple[tuple[str, str], ...] = ()
+    margins: dict[str, float] = default(default_factory=dict)
 
     def points(self) -> list[Levels]:
         """List the design's combinations of levels, in the order of the factors; at least the base."""

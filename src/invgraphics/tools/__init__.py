@@ -10,6 +10,7 @@ EXPORTERS = {
     "splat": _GAUSSIANS,
     "spz": _GAUSSIANS,
     "mesh": "invgraphics.tools.mesh:export_mesh",
+    "mpi": "invgraphics.tools.mpi:export_mpi",
 }
 """What a run's model can be exported to, and the function that does it (see `invgraphics.tools.export`)."""
 

@@ -22,6 +22,8 @@ from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_fil
 
 RESOLUTION, RESOLUTIONS = 192, (8, 512)
 """Voxels along a mesh's longest edge: usual, fewest and most (for which fused pictures take 6 GB of memory)."""
+PLANES = 2, 512
+"""Fewest and most planes of a multi-plane image."""
 
 
 @dataclass(frozen=True)
@@ -33,23 +35,30 @@ class ExportRequest:
         to: a name in `invgraphics.tools.EXPORTERS`.
         out: the file.
         scene: another copy of the run's scene.
-        world: how the axes of the data set's world point, for formats that want certain axes.
+        world: how the axes of the data set's world point, for formats that want certain axes; ``None`` for the
+            format's default.
         level: density or signed distance of a mesh's surface; ``None`` for the default.
         resolution: voxels along the longest edge that a mesh is made from.
         sh_degree: degree of the spherical harmonics that are written, zeros where the run has fewer bands; ``None`` for what
             readers of the format expect: 3 for PLY, elsewhere the run's own.
+        planes: number of planes that a density is sliced into.
+        view: training view whose camera is the reference of a multi-plane image; ``None`` for the mean of all.
     """
 
     run: Path
     to: str
     out: Path
     scene: str | None = None
-    world: str = WORLD
+    world: str | None = None
     level: float | None = None
     resolution: int = RESOLUTION
     sh_degree: int | None = None
+    planes: int = 32
+    view: str | None = None
 
     def __post_init__(self) -> None:
+        if not PLANES[0] <= self.planes <= PLANES[1]:
+            raise InputError(f"--planes cannot be {self.planes}.", f"Expected {PLANES[0]} to {PLANES[1]}.")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= harmonics.MAX_DEGREE:
             raise InputError(f"--sh-degree cannot be {self.sh_degree}.", f"Expected 0 to {harmonics.MAX_DEGREE}.")
         low, high = RESOLUTIONS
@@ -112,7 +121,8 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     scene = fitted.scene
     axes = plugins.load("formats", request.to).axes
     local = on_cpu(fitted.model.gaussians())
-    placed = on_cpu(transform_gaussians(local, file_from_local(scene, axes, request.world).float()))
+    world = request.world or WORLD
+    placed = on_cpu(transform_gaussians(local, file_from_local(scene, axes, world).float()))
     expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
     placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
     shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
@@ -121,7 +131,7 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)))
 
     _, written = read_gaussians(request.out)
-    back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, request.world).float())
+    back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, world).float())
     loss = psnr_between(local, on_device(back, fitted.model.device), fitted)
     degree = harmonics.degree_of(written.gaussians.sh.shape[1])
     had = harmonics.degree_of(local.sh.shape[1])

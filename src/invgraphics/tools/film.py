@@ -19,7 +19,7 @@ from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
 from invgraphics.files import replacing
-from invgraphics.renderers.ellipsoids import draw_ellipsoids
+from invgraphics.renderers.gaussians.ellipsoids import draw_ellipsoids
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder, output_file
 from invgraphics.tools.camera_path import CameraPath, read_camera_path

@@ -4,67 +4,86 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
-
-from invgraphics.core import Quantity, Rendering, Scene
+from invgraphics.core import Mesh, Quantity, Rendering
+from invgraphics.core.colour import linear_to_srgb
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted
+from invgraphics.experiments.mesh_files import UP
 from invgraphics.experiments.progress import Reporter
-from invgraphics.fields.starting import depth_points
-from invgraphics.formats.mesh_ply import write_mesh
-from invgraphics.metrics.surfaces import points_on, surface_distance
+from invgraphics.experiments.surface_scores import mesh_scores
+from invgraphics.fields.depth_fusion import TRUNCATION, fuse_depth
+from invgraphics.fields.isosurface import Extracted, default_level, extract_mesh, with_attributes
+from invgraphics.formats.mesh import AXES, check_suffix, write_mesh
 from invgraphics.tools.export import Exported, ExportRequest
-from invgraphics.tools.surface_extraction import TRUNCATION, Surface, default_level, field_surface, fused_surface
+from invgraphics.tools.file_frames import file_from_local
 
 MOST_PICTURES = 64
 """Training views whose depth is fused, evenly spaced; more cost time and add little."""
-POINTS = 200_000
-"""Points on either surface that are compared."""
 
 
 def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
-    """Write the model's surface as a triangle mesh with vertex colours, in world coordinates.
+    """Write the model's surface as a triangle mesh with vertex colours: GLB, PLY or OBJ, by the file's name.
 
-    A field of densities is cut at a level by marching cubes; of anything else, depth pictures are fused.
+    A mesh is written as it is; a density or a distance is cut at a level by marching cubes, unless it is seen as Gaussians; of
+    anything else, depth pictures are fused. PLY and OBJ hold the data set's world, GLB is y-up.
 
     Raises:
         InputError: the model shows no surface, or the file cannot be written.
     """
-    scene = fitted.scene
-    if Quantity.SDF in fitted.model.field.provides or Quantity.DENSITY in fitted.model.field.provides:
-        surface, how = _marching_cubes(fitted, request)
+    suffix, scene, provides = check_suffix(request.out), fitted.scene, fitted.model.field.provides
+    if Quantity.MESH in provides:
+        extracted, how = _own_mesh(fitted, request)
+    elif (Quantity.SDF | Quantity.DENSITY) & provides and Quantity.GAUSSIANS not in fitted.model.renderer.requires:
+        extracted, how = _marching_cubes(fitted, request)
     else:
-        surface, how = _fuse_depth(fitted, request)
-    if not len(surface.faces):
-        raise InputError(f"The model of '{request.run}' has no surface in the scene's bounds.", "Fit it for longer.")
-    similarity = scene.world_from_local.cpu()
-    world = surface.vertices @ similarity[:3, :3].T + similarity[:3, 3]
-    note = f"invgraphics: {fitted.method.name} on {scene.name}, in the data set's world; {how}"
-    write_mesh(request.out, world.numpy(), surface.faces.numpy(), display(surface.rgb, scene).numpy(), (note,))
+        extracted, how = _fuse_depth(fitted, request)
+    mesh = extracted.mesh.to("cpu")
+    if not len(mesh.faces) or mesh.rgb is None:
+        raise InputError(f"The model of '{request.run}' has no coloured surface in the scene's bounds.", "Fit it for longer.")
+    axes = AXES.get(suffix)
+    world = (request.world or UP) if axes else UP
+    note = f"invgraphics: {fitted.method.name} on {scene.name}, in {_frame(axes)}; {how}"
+    rgb = linear_to_srgb(mesh.rgb) if scene.colour == "linear" else mesh.rgb
+    write_mesh(request.out, mesh.transformed(file_from_local(scene, axes, world)), rgb.clamp(0, 1), (note,))
+    open_edges = mesh.open_edges()
     facts = {
-        "vertices": f"{len(surface.vertices):,}",
-        "triangles": f"{len(surface.faces):,}",
+        "vertices": f"{len(mesh.vertices):,}",
+        "triangles": f"{len(mesh.faces):,}",
         "bytes": str(request.out.stat().st_size),
         "surface": how,
-        "open edges": f"{surface.open_edges:,}" if surface.open_edges else "none: the surface is closed",
-        "small pieces left out": str(surface.dropped),
-        "axes": "the data set's world",
+        "open edges": f"{open_edges:,}" if open_edges else "none: the surface is closed",
+        "small pieces left out": str(extracted.dropped),
+        "colours": "the mean over all directions" if mesh.sh is not None and mesh.sh.shape[1] > 1 else "as seen from outside",
+        "axes": _frame(axes) + (f" (the world is {world})" if axes else ""),
     }
-    return Exported(request.out, facts | _truth_distances(surface, scene))
+    return Exported(request.out, facts | _truth_distances(mesh, fitted))
 
 
-def _marching_cubes(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
+def _frame(axes: str | None) -> str:
+    return "the data set's world" if axes is None else "glTF's axes, +y up"
+
+
+def _own_mesh(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
+    """The field's mesh as it is."""
+    if request.level is not None:
+        raise InputError(f"The model of '{request.run}' is a mesh already.", "Leave --level out.")
+    mesh: Mesh = fitted.model.field.primitives(Quantity.MESH, fitted.model.context())
+    if mesh.sh is None:
+        mesh = with_attributes(mesh, fitted.model.field)
+    return Extracted(mesh), "the mesh of the field"
+
+
+def _marching_cubes(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
     """Extract the surface by marching cubes; also names the method in words."""
     bounds = fitted.model.bounds
-    surface = field_surface(fitted.model.field, bounds, request.resolution, request.level)
+    extracted = extract_mesh(fitted.model.field, bounds, request.resolution, request.level)
     if Quantity.SDF in fitted.model.field.provides:
-        return surface, f"signed distance {request.level or 0:g}, {request.resolution} voxels along the longest edge"
+        return extracted, f"signed distance {request.level or 0:g}, {request.resolution} voxels along the longest edge"
     level = default_level(bounds) if request.level is None else request.level
-    return surface, f"density {level:.3g} per local unit, {request.resolution} voxels along the longest edge"
+    return extracted, f"density {level:.3g} per local unit, {request.resolution} voxels along the longest edge"
 
 
-def _fuse_depth(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
+def _fuse_depth(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
     """Extract the surface by fusion of the training views' depth maps (median depth, where the renderer has it)."""
     if request.level is not None:
         remedy = "Leave --level out: its depth pictures are fused."
@@ -80,27 +99,13 @@ def _fuse_depth(fitted: Fitted, request: ExportRequest) -> tuple[Surface, str]:
             reporter.show((index + 1) / count, f"view {index + 1} of {count}")
             return model.render(cameras[index])
 
-        surface = fused_surface(cameras, render, scene.bounds, request.resolution)
+        extracted = fuse_depth(cameras, render, scene.bounds, request.resolution)
     kind = model.renderer.depth_kind
     how = f"{kind} depth of {count} training views, {request.resolution} voxels along the longest edge, band of {TRUNCATION:g}"
-    return surface, how
+    return extracted, how
 
 
-def _truth_distances(surface: Surface, scene: Scene) -> dict[str, str]:
-    """Distances between the mesh and the true surface, in world units; empty where that is unknown.
-
-    Completeness is measured on points of the training views' true depth only: the inside of objects is unobservable.
-    """
-    if scene.mesh is None or not any(view.depth is not None for view in scene.train):
-        return {}
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        seen = depth_points(scene, POINTS).position
-    generator = torch.Generator().manual_seed(0)
-    ours = points_on(surface.vertices, surface.faces, POINTS, generator)
-    true = torch.cat([points_on(scene.mesh.vertices, scene.mesh.faces, POINTS, generator), seen])
-    found = surface_distance(ours, true, seen)
-    return {
-        "mean distance to the truth": f"{found.accuracy * scene.scale:.4g} world units",
-        "mean distance from the truth seen": f"{found.completeness * scene.scale:.4g} world units",
-    }
+def _truth_distances(mesh: Mesh, fitted: Fitted) -> dict[str, str]:
+    """The geometry scores of the mesh in words; empty where the true surface is unknown."""
+    quality, _ = mesh_scores(mesh, fitted.scene)
+    return {name.replace("_", " "): f"{score.mean:.4g} {score.unit}".strip() for name, score in quality.items()}

@@ -8,9 +8,10 @@ LOSSES = {
     "photometric": "invgraphics.training.losses:PhotometricLoss",
     "coarse": "invgraphics.training.losses:CoarseLoss",
     "ssim": "invgraphics.training.losses:SsimLoss",
-    "opacity": "invgraphics.training.splat_losses:OpacityLoss",
-    "scale": "invgraphics.training.splat_losses:ScaleLoss",
+    "opacity": "invgraphics.training.losses:OpacityLoss",
+    "scale": "invgraphics.training.losses:ScaleLoss",
     "distortion": "invgraphics.training.losses:DistortionLoss",
+    "interlevel": "invgraphics.training.interlevel:InterlevelLoss",
     "background_entropy": "invgraphics.training.losses:BackgroundEntropyLoss",
     "point_colour": "invgraphics.training.losses:PointColourLoss",
     "eikonal": "invgraphics.training.eikonal:EikonalLoss",
@@ -21,6 +22,7 @@ PENALTIES = {
     "total_variation": "invgraphics.training.penalties:TotalVariationPenalty",
     "l1": "invgraphics.training.penalties:L1Penalty",
     "sparsity": "invgraphics.training.penalties:SparsityPenalty",
+    "curvature": "invgraphics.training.eikonal:CurvaturePenalty",
     "eikonal": "invgraphics.training.eikonal:EikonalPenalty",
 }
 

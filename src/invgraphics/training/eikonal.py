@@ -1,4 +1,4 @@
-"""Eikonal terms: the gradient of a signed distance has length 1 (Gropp et al. 2020, IGR, equation 2)."""
+"""Regularisers of a signed distance: a gradient of length 1 (Gropp et al. 2020, IGR, equation 2), and little curvature."""
 
 from __future__ import annotations
 
@@ -47,8 +47,7 @@ class EikonalPenalty:
         Raises:
             InputError: the field has no signed distance.
         """
-        if Quantity.GRADIENT not in field.provides:
-            raise InputError(f"The penalty '{self.name}' needs a signed distance, which {type(field).__name__} does not have.")
+        _check_distance(self.name, field)
         lo, hi = ctx.bounds.lo, ctx.bounds.hi
         position = torch.lerp(lo, hi, uniform((self.points, 3), ctx, like=lo))
         values = field.query(Samples.at(position), Quantity.SDF | Quantity.GRADIENT)
@@ -56,16 +55,59 @@ class EikonalPenalty:
         assert values.gradient is not None
         gradient = values.gradient
         if self.near:
-            with torch.no_grad():
-                kept = slice(self.near)
-                feet = foot_points(position[kept], values.sdf[kept], gradient[kept])
-                # Sums of three uniform numbers are as good as normal ones, and come from the context's generator.
-                noise = 2 * uniform((3, self.near, 3), ctx, like=lo).sum(dim=0) - 3
-                feet = (feet + self.spread * ctx.bounds.half.mean() * noise).clamp(lo, hi)
+            kept = slice(self.near)
+            feet = near_surface(position[kept], values.sdf[kept], gradient[kept], self.spread, ctx)
             near = field.query(Samples.at(feet), Quantity.GRADIENT).gradient
             assert near is not None
             gradient = torch.cat([gradient, near])
         return self.weight * eikonal_residual(gradient).mean()
+
+
+@dataclass(frozen=True)
+class CurvaturePenalty:
+    """Mean |∇²f| near the surface: of a distance, the sum of the principal curvatures (Neuralangelo, Li et al. 2023, §3.3).
+
+    The Laplacian is one of central differences: what is finer than their distance counts by its mean. Points near the surface
+    are those of `EikonalPenalty`.
+
+    Attributes:
+        weight: factor (Neuralangelo: 5e-4), for curvatures per half-extent of the box.
+        points: number of points a step.
+        spread: standard deviation of these about the surface, in half-extents of the box.
+        step: distance of the differences, in half-extents of the box (Neuralangelo: a cell of its finest level).
+        warmup: progress over which the weight grows from 0 (Neuralangelo: 0.01): the sphere at the start is bent, too.
+    """
+
+    name: ClassVar[str] = "curvature"
+
+    weight: float = 5e-4
+    points: int = 512
+    spread: float = 0.02
+    step: float = 0.01
+    warmup: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or self.spread < 0 or self.warmup < 0:
+            raise ValueError("'weight', 'spread' and 'warmup' must not be negative.")
+        if self.points < 1 or self.step <= 0:
+            raise ValueError("'points' must be at least 1, and 'step' above 0.")
+
+    def __call__(self, field: Field, renderer: Renderer, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean.
+
+        Raises:
+            InputError: the field has no signed distance.
+        """
+        _check_distance(self.name, field)
+        lo, hi, half = ctx.bounds.lo, ctx.bounds.hi, ctx.bounds.half.mean()
+        position = torch.lerp(lo, hi, uniform((self.points, 3), ctx, like=lo))
+        with torch.no_grad():
+            values = field.query(Samples.at(position), Quantity.SDF | Quantity.GRADIENT)
+        assert values.sdf is not None
+        assert values.gradient is not None
+        near = near_surface(position, values.sdf, values.gradient, self.spread, ctx)
+        weight = self.weight * min(1.0, ctx.progress / self.warmup if self.warmup else 1.0)
+        return weight * (laplacian(field, near, float(self.step * half)) * half).abs().mean()
 
 
 @dataclass(frozen=True)
@@ -96,6 +138,38 @@ class EikonalLoss:
 def eikonal_residual(gradient: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     """(|∇f| - 1)²."""
     return (gradient.norm(dim=1) - 1).square()
+
+
+def laplacian(field: Field, position: Float[Tensor, "m 3"], step: float) -> Float[Tensor, " m"]:
+    """Laplacian of the signed distance by central differences over ``step``, per local length; it is in the graph.
+
+    Args:
+        field: with a signed distance.
+        position: of m points.
+        step: distance of the differences, local units.
+    """
+    shift = step * torch.eye(3, dtype=position.dtype, device=position.device)
+    places = torch.stack([position, *(position + sign * axis for axis in shift for sign in (1, -1))])
+    values = field.query(Samples.at(places.flatten(0, 1)), Quantity.SDF).sdf
+    assert values is not None
+    middle, *around = values.view(7, -1)
+    return (torch.stack(around).sum(dim=0) - 6 * middle) / step**2
+
+
+@torch.no_grad()
+def near_surface(
+    position: Float[Tensor, "m 3"], sdf: Float[Tensor, " m"], gradient: Float[Tensor, "m 3"], spread: float, ctx: Context
+) -> Float[Tensor, "m 3"]:
+    """Feet of points on the surface, moved at random by ``spread`` half-extents of the box, inside it."""
+    lo, hi = ctx.bounds.lo, ctx.bounds.hi
+    # Sums of three uniform numbers are as good as normal ones, and come from the context's generator.
+    noise = 2 * uniform((3, *position.shape), ctx, like=lo).sum(dim=0) - 3
+    return (foot_points(position, sdf, gradient) + spread * ctx.bounds.half.mean() * noise).clamp(lo, hi)
+
+
+def _check_distance(name: str, field: Field) -> None:
+    if Quantity.GRADIENT not in field.provides:
+        raise InputError(f"The penalty '{name}' needs a signed distance, which {type(field).__name__} does not have.")
 
 
 def foot_points(

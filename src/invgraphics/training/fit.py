@@ -90,6 +90,7 @@ class Fit:
             for name, parameter in module.named_parameters()
             if parameter.requires_grad
         }
+        self._trainable = bool(parameters)
         return Optimiser(self.plan.optimiser, parameters, self.plan.scene.extent)
 
     @property
@@ -99,8 +100,8 @@ class Fit:
 
     @property
     def progress(self) -> float:
-        """Share of the budget that is spent."""
-        return self.plan.budget.progress(self.seconds, self.steps)
+        """Share of the budget that is spent; 1 where there is nothing to fit."""
+        return self.plan.budget.progress(self.seconds, self.steps) if self._trainable else 1.0
 
     def context(self) -> Context:
         """Context of the next training step."""

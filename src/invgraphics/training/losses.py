@@ -19,16 +19,21 @@ Loss = Callable[[Rendering, Trace, Batch, Context], Tensor]
 """A term of the objective. The rendering's ``rgb`` is in front of ``batch.background`` already, composited once per step by
 `invgraphics.training.fit.Fit`; its ``alpha`` is still that of the scene alone."""
 
-Distance = Literal["mse", "l1", "huber"]
+Distance = Literal["mse", "l1", "huber", "charbonnier"]
+
+CHARBONNIER = 0.001
+"""Rounding of the charbonnier distance, in colour (mip-NeRF 360)."""
 
 
 def distance(kind: Distance, prediction: Float[Tensor, "*p 3"], target: Float[Tensor, "*p 3"]) -> Float[Tensor, ""]:
-    """Mean over pixels and channels of the squared, absolute or Huber (delta 0.1, as Instant-NGP) difference."""
+    """Mean over pixels and channels of the squared, absolute, Huber (delta 0.1, as Instant-NGP) or Charbonnier difference."""
     difference = prediction - target
     if kind == "mse":
         return difference.square().mean()
     if kind == "l1":
         return difference.abs().mean()
+    if kind == "charbonnier":
+        return (difference.square() + CHARBONNIER**2).sqrt().mean()
     return torch.nn.functional.huber_loss(prediction, target, delta=0.1) * 10
 
 
@@ -38,7 +43,7 @@ class PhotometricLoss:
 
     Attributes:
         weight: factor.
-        distance: ``mse`` (NeRF), ``l1`` (3DGS) or ``huber`` (Instant-NGP).
+        distance: ``mse`` (NeRF), ``l1`` (3DGS), ``huber`` (Instant-NGP) or ``charbonnier`` (mip-NeRF 360).
     """
 
     weight: float = 1.0
@@ -175,6 +180,40 @@ class MaskLoss:
         met = torch.nonzero(logit.isfinite())[:, 0]
         entropy = torch.nn.functional.binary_cross_entropy_with_logits(logit[met], batch.alpha[met], reduction="sum")
         return self.weight / sharpness * entropy / max(len(logit), 1)
+
+
+@dataclass(frozen=True)
+class OpacityLoss:
+    """Mean opacity of all Gaussians: those that no photograph needs fade, and can be relocated (3DGS-MCMC).
+
+    Attributes:
+        weight: factor.
+    """
+
+    weight: float = 0.01
+
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean; 0 for renderers without Gaussians on a screen."""
+        if trace.screen is None or trace.screen.opacities is None or trace.screen.opacities.numel() == 0:
+            return batch.target.new_zeros(())
+        return self.weight * trace.screen.opacities.mean()
+
+
+@dataclass(frozen=True)
+class ScaleLoss:
+    """Mean standard deviation of all Gaussians along their axes, in local units (3DGS-MCMC, Kheradmand et al. 2024).
+
+    Attributes:
+        weight: factor.
+    """
+
+    weight: float = 0.01
+
+    def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean; 0 for renderers without Gaussians on a screen."""
+        if trace.screen is None or trace.screen.scales is None or trace.screen.scales.numel() == 0:
+            return batch.target.new_zeros(())
+        return self.weight * trace.screen.scales.mean()
 
 
 def normalised_distance(t: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:

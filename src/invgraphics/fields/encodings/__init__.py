@@ -6,6 +6,7 @@ from invgraphics.lazy import submodules
 
 ENCODINGS = {
     "frequency": "invgraphics.fields.encodings.frequency:FrequencyConfig",
+    "integrated": "invgraphics.fields.encodings.integrated:IntegratedConfig",
     "hash": "invgraphics.fields.encodings.hash:HashConfig",
     "voxels": "invgraphics.fields.encodings.voxels:VoxelsConfig",
     "sparse_voxels": "invgraphics.fields.encodings.sparse:SparseVoxelsConfig",

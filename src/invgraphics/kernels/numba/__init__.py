@@ -10,6 +10,8 @@ from invgraphics.kernels.numba.fused.march import lattice_march as lattice_march
 from invgraphics.kernels.numba.fused.render import lattice_render as lattice_render
 from invgraphics.kernels.numba.hash.encode import hash_encode as hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode as lattice_encode
+from invgraphics.kernels.numba.mesh.interpolate import mesh_interpolate as mesh_interpolate
+from invgraphics.kernels.numba.mesh.rasterise import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.numba.ngp.march import ngp_march as ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render as ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace as sdf_trace

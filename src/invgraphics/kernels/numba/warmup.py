@@ -19,6 +19,8 @@ from invgraphics.kernels.numba.fused.march import lattice_march
 from invgraphics.kernels.numba.fused.render import lattice_render
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
+from invgraphics.kernels.numba.mesh.interpolate import mesh_interpolate
+from invgraphics.kernels.numba.mesh.rasterise import mesh_rasterise
 from invgraphics.kernels.numba.ngp.march import ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace
@@ -40,7 +42,7 @@ def warm_up() -> float:
 
 
 def splats() -> None:
-    """Compile the kernels of Gaussian splatting."""
+    """Compile the kernels of Gaussian splatting and of meshes."""
     pose = torch.eye(4).requires_grad_()
     camera = Camera(pose, torch.full((2,), 8.0), torch.full((2,), 4.0), 8, 8)
     shapes = ((4, 3), (4, 4), (4, 3), (4,), (4, 1, 3))
@@ -53,6 +55,10 @@ def splats() -> None:
         for max_grad_splats in (0, 1):
             image, alpha = splat_rasterise(replace(footprints, absgrad=absgrad), rgb, 8, 8, max_grad_splats=max_grad_splats)
             (image.sum() + alpha.sum()).backward(retain_graph=True)
+    corners = torch.eye(3)
+    fragments = mesh_rasterise(corners, torch.tensor([[0, 1, 2]]), camera)
+    fragments = replace(fragments, barycentric=fragments.barycentric.requires_grad_())
+    mesh_interpolate(fragments, torch.tensor([[0, 1, 2]]), corners.requires_grad_()).sum().backward()
 
 
 def samples() -> None:

@@ -7,6 +7,8 @@ from invgraphics.kernels.reference.fused import lattice_render as lattice_render
 from invgraphics.kernels.reference.hash import hash_encode as hash_encode
 from invgraphics.kernels.reference.lattice import lattice_encode as lattice_encode
 from invgraphics.kernels.reference.march import ray_march as ray_march
+from invgraphics.kernels.reference.mesh import mesh_interpolate as mesh_interpolate
+from invgraphics.kernels.reference.mesh import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.reference.ngp import ngp_march as ngp_march
 from invgraphics.kernels.reference.ngp import ngp_render as ngp_render
 from invgraphics.kernels.reference.splat_discs import splat_project_discs as splat_project_discs

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.runs.comparison import ComparisonRecord, Failure, SceneFacts
+from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, SceneFacts
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.inside import inside
@@ -36,6 +36,8 @@ class Comparison:
         scene_info: what is known about the scene.
         environment: machine and versions.
         wall_seconds: duration of the whole command.
+        cells: method -> titles of its field and of its renderer.
+        refused: methods that were left out, because they do not go with the scene.
         shown: methods that get pictures and curves; empty for all.
     """
 
@@ -55,6 +57,8 @@ class Comparison:
     scene_info: SceneFacts = field(default_factory=SceneFacts)
     environment: Environment = field(default_factory=Environment)
     wall_seconds: float | None = None
+    cells: dict[str, tuple[str, str]] = field(default_factory=dict)
+    refused: tuple[Refusal, ...] = ()
     shown: tuple[str, ...] = ()
 
     @property
@@ -102,6 +106,8 @@ def read_comparison(folder: Path) -> Comparison:
         scene_info=record.scene_info,
         environment=record.environment,
         wall_seconds=record.wall_seconds,
+        cells=record.cells,
+        refused=record.refused,
     )
 
 

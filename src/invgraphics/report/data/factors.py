@@ -49,6 +49,14 @@ class Observation:
 
 
 @dataclass(frozen=True)
+class Lost:
+    """A fit that failed, with its scene and its level of every factor; it has no scores, and that must not help its method."""
+
+    scene: str
+    levels: dict[str, str]
+
+
+@dataclass(frozen=True)
 class StudyCell:
     """One cell of a study: scene, method, seed and factor levels, with status and run.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Factor, Observation, StudyCell, level_text
+from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation, StudyCell, level_text
 from invgraphics.report.data.variants import find_factors, variant_name
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.environment import Environment
@@ -44,6 +44,9 @@ class Study:
         analyses: names of the computations beside the fits.
         report: what its page is about: ``effects`` or ``verdicts``.
         known: red verdicts whose causes are known.
+        each: factor that the question asks about level by level; empty where the mean answers it.
+        interactions: pairs of factors whose interaction is the question.
+        margins: metric -> difference that is of no interest.
     """
 
     name: str
@@ -65,6 +68,9 @@ class Study:
     analyses: tuple[str, ...] = ()
     report: str = "effects"
     known: tuple[KnownDeviation, ...] = ()
+    each: str = ""
+    interactions: tuple[tuple[str, str], ...] = ()
+    margins: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def variants(self) -> tuple[str, ...]:
@@ -83,6 +89,10 @@ class Study:
     def observations(self) -> tuple[Observation, ...]:
         """Finished runs with their factor levels."""
         return tuple(Observation(cell.run, cell.scene, cell.levels) for cell in self.cells if cell.run is not None)
+
+    def lost(self) -> tuple[Lost, ...]:
+        """Failed fits with their factor levels."""
+        return tuple(Lost(cell.scene, cell.levels) for cell in self.failures)
 
 
 def is_study(folder: Path) -> bool:
@@ -124,6 +134,9 @@ def read_study(folder: Path) -> Study:
         analyses=record.analyses,
         report=record.report,
         known=record.known,
+        each=record.each,
+        interactions=record.interactions,
+        margins=record.margins,
     )
 
 

@@ -28,12 +28,31 @@ def find_factors(declared: Mapping[str, Any], base: Mapping[str, str], cells: Se
     return tuple(factors)
 
 
+BASE = "base"
+"""The variant with every factor at its reference level, where all have one method."""
+
+
 def variant_name(cell: StudyCell, factors: Sequence[Factor]) -> str:
-    """Display name of a cell's method and levels, factor paths shortened; factors of other methods are left out."""
+    """Display name of a cell: its method, and in words what differs from the base; factors of other methods are left out."""
     names = short_names([factor.path for factor in factors])
-    own = [f.path for f in factors if f.path != METHOD and f.path in cell.levels and _concerns(f.path, cell.method)]
+    own = [f for f in factors if f.path != METHOD and f.path in cell.levels and _concerns(f.path, cell.method)]
+    changed = [level_words(names[f.path], cell.levels[f.path]) for f in own if cell.levels[f.path] != f.reference]
     parts = [cell.method] if any(factor.path == METHOD for factor in factors) else []
-    return ", ".join([*parts, *(f"{names[path]} {cell.levels[path]}" for path in own)]) or cell.method
+    return ", ".join([*parts, *changed]) or (BASE if own else cell.method)
+
+
+def base_words(factors: Sequence[Factor]) -> str:
+    """The base in words: the reference level of every factor but the method."""
+    names = short_names([factor.path for factor in factors])
+    return ", ".join(level_words(names[factor.path], factor.reference) for factor in factors if factor.path != METHOD)
+
+
+def level_words(name: str, level: str) -> str:
+    """A factor's level in words: ``train_views 20``; of a switch ``clone`` or ``no clone``."""
+    if level in ("true", "false"):
+        words = name.rpartition(".")[2].rpartition(":")[2].replace("_", " ")
+        return words if level == "true" else f"no {words}"
+    return f"{name} {level}"
 
 
 def _concerns(path: str, method: str) -> bool:

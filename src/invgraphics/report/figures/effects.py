@@ -5,15 +5,17 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from invgraphics.report.data.factors import METHOD, Factor, Observation
-from invgraphics.report.figures.style import INK, MUTED, Figure, canvas, save, series_style
+from invgraphics.report.figures.style import INK, MUTED, PAGE, Figure, canvas, save, series_style
 from invgraphics.report.statistics.effects import Effect
-from invgraphics.report.statistics.summary import value_of
+from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity
 from invgraphics.text import file_name
 
@@ -21,8 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDE, NARROW = 860.0, 400.0
-ROW, FRAME = 50.0, 86.0
-"""Heights in CSS pixels: of a comparison, and of title, axis and margins together."""
+ROW, FRAME, LINE = 50.0, 86.0, 16.0
+"""Heights in CSS pixels: of a comparison, of title, axis and margins together, and of a further line of text."""
+LETTER, WIDE_LETTERS = 7.2, 80
+"""Width of a letter in CSS pixels; and letters of a line from which on numbers stand beside a label."""
 
 HEAT_COLOURS = "viridis"
 MOST_HEAT_MAPS = 6
@@ -31,39 +35,53 @@ ON_DARK, ON_LIGHT = "#fdfdfd", "#101214"
 
 
 def draw_intervals(effects: Sequence[Effect], folder: Path) -> Figure | None:
-    """Interval plot of effects, one per row: mean difference, interval, and means per scene or method as small marks."""
+    """Interval plot of effects, one per row: mean, interval for these scenes (thick) and for scenes like these (thin).
+
+    Below each bar stand the means of single scenes as numbers, which a line of the plot names.
+    """
     shown = [effect for effect in effects if math.isfinite(effect.estimate.mean)]
     if not shown:
         return None
     quantity = shown[0].quantity
-    title = f"Paired differences in {quantity.label}"
+    title = f"Differences in {quantity.label}"
     wide = _draw_intervals(shown, title, folder / f"effects-{file_name(quantity.key)}", WIDE)
     narrow = _draw_intervals(shown, title, folder / f"effects-{file_name(quantity.key)}-narrow", NARROW)
-    return Figure(wide, narrow, title, " ".join(effect.sentence for effect in shown))
+    return Figure(wide, narrow, title, " ".join(map(effect_sentence, shown)))
 
 
 def _draw_intervals(effects: Sequence[Effect], title: str, stem: Path, width: float) -> Path:
     quantity = effects[0].quantity
-    with canvas(width, FRAME + ROW * len(effects)) as (figure, axes):
+    parts = list(dict.fromkeys(name for effect in effects for name in _parts(effect)))
+    key = textwrap.wrap(", ".join(f"{i} {name}" for i, name in enumerate(parts, 1)), round(width / LETTER))
+    lines = max(len(_label(effect, round(width / LETTER))) for effect in effects)
+    with canvas(width, FRAME + (ROW + LINE * (lines - 1)) * len(effects) + LINE * len(key)) as (figure, axes):
         axes.axvline(0, color=INK.light, linewidth=1.1, zorder=1)
         colours = {path: i for i, path in enumerate(dict.fromkeys(effect.factor for effect in effects))}
-        for line, effect in enumerate(effects):
-            _draw_row(axes, line, effect, colours[effect.factor], width == NARROW)
         axes.set_ylim(len(effects) - 0.4, -0.75)
         axes.set_xlim(*_limits(effects))
+        for line, effect in enumerate(effects):
+            _draw_row(axes, line, effect, (colours[effect.factor], parts), round(width / LETTER))
         axes.set_yticks([])
         axes.spines["left"].set_visible(False)
         unit = f" ({quantity.unit})" if quantity.unit else ""
         direction = {"higher": "right is better", "lower": "left is better", "none": ""}[quantity.better]
-        axes.set_xlabel(f"difference in {quantity.label}{unit}" + (f", {direction}" if direction else ""))
+        words = f"difference in {quantity.label}{unit}" + (f", {direction}" if direction else "")
+        axes.set_xlabel("\n".join([words, *key]))
         axes.set_title(title)
         return save(figure, stem)
+
+
+def _parts(effect: Effect) -> dict[str, float]:
+    """Mean of each scene, or of each method where there is one scene."""
+    scenes = {name: one.estimate.mean for name, one in effect.by_scene.items()}
+    return scenes or {name: one.mean for name, one in effect.by_method.items()}
 
 
 def _limits(effects: Sequence[Effect]) -> tuple[float, float]:
     """Axis limits of an interval plot: all means and zero, and intervals unless far wider than others (two seeds)."""
     scale = effects[0].quantity.scale
     means = [effect.estimate.mean * scale for effect in effects]
+    means += [mean * scale for effect in effects for mean in _parts(effect).values()]
     reach = max([abs(mean) for mean in means] + [1e-12])
     halves = sorted(effect.estimate.half_width * scale for effect in effects)
     room = min(halves[-1], max(2 * reach, 3 * statistics.median(halves)))
@@ -72,21 +90,49 @@ def _limits(effects: Sequence[Effect]) -> tuple[float, float]:
     return low - pad, high + pad
 
 
-def _draw_row(axes: Axes, line: int, effect: Effect, colour: int, narrow: bool) -> None:
-    look, scale = series_style(colour), effect.quantity.scale
-    value = effect.estimate
-    parts = effect.by_scene or effect.by_method
-    small: dict[str, Any] = {"markersize": 7, "markeredgewidth": 1.4, "color": MUTED.light, "zorder": 2}
-    axes.plot([part.mean * scale for part in parts.values()], [line + 0.2] * len(parts), "|", **small)
-    axes.plot([value.low * scale, value.high * scale], [line, line], color=look.colour, linewidth=2.6, zorder=3)
-    filled: dict[str, Any] = {} if effect.found else {"markerfacecolor": "none", "markeredgewidth": 1.8}
-    axes.plot(value.mean * scale, line, look.marker, color=look.colour, markersize=9, zorder=4, **filled)
+def _draw_row(axes: Axes, line: int, effect: Effect, look: tuple[int, Sequence[str]], letters: int) -> None:
+    """One effect: label and numbers above its bar, on the page's colour so that no line runs through them."""
+    colour, order = look
+    style, scale, value = series_style(colour), effect.quantity.scale, effect.estimate
+    small: dict[str, Any] = {"color": MUTED.light, "fontsize": 9.5, "ha": "center", "va": "top", "zorder": 2}
+    low, high = axes.get_xlim()
+    for where, names in _clusters(_parts(effect), 2.5 * (high - low) / letters / scale):
+        axes.text(where * scale, line + 0.1, " ".join(str(order.index(name) + 1) for name in names), clip_on=True, **small)
+    if effect.across is not None:
+        ends = [effect.across.low * scale, effect.across.high * scale]
+        axes.plot(ends, [line, line], color=style.colour, linewidth=0.9, zorder=3)
+    axes.plot([value.low * scale, value.high * scale], [line, line], color=style.colour, linewidth=3.2, zorder=3)
+    filled: dict[str, Any] = {} if effect.found else {"markerfacecolor": PAGE.light, "markeredgewidth": 1.8}
+    axes.plot(value.mean * scale, line, style.marker, color=style.colour, markersize=9, zorder=4, **filled)
     unit = f" {effect.quantity.unit}" if effect.quantity.unit else ""
     text = f"{effect.text(value.mean)}{unit} {effect.interval}".rstrip()
-    place: dict[str, Any] = {"xycoords": axes.get_yaxis_transform(), "textcoords": "offset points", "va": "bottom"}
-    axes.annotate(effect.label, (0, line), (2, 7), color=INK.light, fontsize=11.5, **place)
-    if not narrow:
-        axes.annotate(text, (1, line), (-2, 7), color=look.colour, fontsize=11.5, ha="right", **place)
+    ground: dict[str, Any] = {"facecolor": PAGE.light, "edgecolor": "none", "pad": 1.0}
+    place: dict[str, Any] = {
+        "xycoords": axes.get_yaxis_transform(),
+        "textcoords": "offset points",
+        "va": "bottom",
+        "bbox": ground,
+    }
+    label = "\n".join(_label(effect, letters))
+    axes.annotate(label, (0, line), (2, 7), color=INK.light, fontsize=11.5, zorder=5, **place)
+    if letters >= WIDE_LETTERS:
+        axes.annotate(text, (1, line), (-2, 7), color=style.colour, fontsize=11.5, ha="right", zorder=5, **place)
+
+
+def _clusters(means: Mapping[str, float], gap: float) -> list[tuple[float, list[str]]]:
+    """Group names whose means are closer than ``gap`` to the first of their group: (place, names), from left to right."""
+    groups: list[tuple[float, list[str]]] = []
+    for name, mean in sorted(means.items(), key=lambda item: item[1]):
+        if groups and mean - groups[-1][0] < gap:
+            groups[-1][1].append(name)
+        else:
+            groups.append((mean, [name]))
+    return groups
+
+
+def _label(effect: Effect, letters: int) -> list[str]:
+    """Lines of an effect's label; numbers stand beside it where the plot is wide."""
+    return textwrap.wrap(effect.label, letters - 34 if letters >= WIDE_LETTERS else letters - 4)
 
 
 @dataclass(frozen=True)

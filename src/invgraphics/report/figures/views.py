@@ -25,6 +25,12 @@ ERROR_COLOURS, DEPTH_COLOURS = "magma", "viridis_r"
 EVENLY_SPACED = 4
 
 
+SPLAT_DEPTH = "Of volumes and splats it is a mean over all that a pixel sees: at edges and in haze it lies between surfaces."
+SPLAT_NORMALS = "A splat's is its shortest axis, so that round or few splats look faceted or noisy where the picture is right."
+ERRORS = "Black is no error; thin bright lines are edges that are a fraction of a pixel off."
+"""What a reader of the maps may wonder about."""
+
+
 @dataclass(frozen=True)
 class Picture:
     """A picture or map of a test view with caption, or the reason why there is none.
@@ -32,13 +38,11 @@ class Picture:
     Attributes:
         url: relative link; empty where there is no picture.
         caption: its score in words; empty where there is none.
-        best: no other method's score on this view is better.
         missing: why there is no picture.
     """
 
     url: str = ""
     caption: str = ""
-    best: bool = False
     missing: str = ""
 
 
@@ -160,26 +164,15 @@ def _any(layer: Layer) -> bool:
 
 
 def _captioned(shown: Sequence[_Shown], pictures: Sequence[Picture], keys: Sequence[str], index: int) -> list[Picture]:
-    """Add each run's scores on the view; the first key that exists decides which one is marked best."""
+    """Add each run's scores on the view; none is marked, since a single picture tells nothing from chance."""
     captions: list[list[str]] = [[] for _ in shown]
-    marked: list[bool] = [False] * len(shown)
-    decided = False
     for key in keys:
         values = [_view_score(one.run, key, index) for one in shown]
-        known = [value for value in values if value is not None]
-        if not known:
-            continue
-        quantity = quality_quantity(key, next(one.run.scores.quality[key] for one in shown if key in one.run.scores.quality))
-        best = quantity.text(min(known, key=quantity.sort_key))
+        quantities = [quality_quantity(key, one.run.scores.quality[key]) for one in shown if key in one.run.scores.quality]
         for i, value in enumerate(values):
             if value is not None:
-                captions[i].append(f"{quantity.label} {quantity.text(value)}{_unit(quantity)}")
-                marked[i] = marked[i] or (not decided and len(known) > 1 and quantity.text(value) == best)
-        decided = True
-    return [
-        replace(picture, caption=" · ".join(caption), best=best)
-        for picture, caption, best in zip(pictures, captions, marked, strict=True)
-    ]
+                captions[i].append(f"{quantities[0].label} {quantities[0].text(value)}{_unit(quantities[0])}")
+    return [replace(picture, caption=" · ".join(caption)) for picture, caption in zip(pictures, captions, strict=True)]
 
 
 def _unit(quantity: Quantity) -> str:
@@ -232,10 +225,13 @@ def _error_layer(shown: Sequence[_Shown], truth: UInt8[ndarray, "h w 3"], index:
         means.append(float(error.mean()))
     if has_flip():
         pictures = _captioned(shown, pictures, ("flip",), index)
-        title, note = "FLIP error", "Visible difference when flipping between truth and method, at 67 pixels per degree."
+        title, note = (
+            "FLIP error",
+            f"Visible difference when flipping between truth and method, at 67 pixels per degree. {ERRORS}",
+        )
     else:
         pictures = [replace(picture, caption=f"mean {mean:.3f}") for picture, mean in zip(pictures, means, strict=True)]
-        title, note = "Absolute error", "Mean absolute difference of the colour channels; flip-evaluator is not installed."
+        title, note = "Absolute error", f"Mean absolute difference of the colour channels. {ERRORS}"
     no_truth = Picture(missing="truth has no error")
     return Layer("error", title, note, gradient(ERROR_COLOURS), "0", "1", no_truth, _with_methods(shown, pictures))
 
@@ -260,7 +256,7 @@ def _depth_layer(shown: Sequence[_Shown], truth: Arrays, index: int, folder: Fol
     def save(arrays: Arrays, mask: Bool[ndarray, "h w"], path: Path) -> None:
         save_scalar(path, (arrays["depth"] - low) / span, mask, DEPTH_COLOURS)
 
-    note = "Distance along the ray in world units, one range for all; blank where opacity is below one half."
+    note = f"Distance along the ray in world units, one range for all; blank where opacity is below one half. {SPLAT_DEPTH}"
     bar = gradient(DEPTH_COLOURS)
     truth_picture, pictures = _maps(shown, truth, "depth", (folder, target), save)
     methods = _with_methods(shown, _captioned(shown, pictures, ("depth_abs_rel",), index))
@@ -271,7 +267,7 @@ def _normal_layer(shown: Sequence[_Shown], truth: Arrays, index: int, folder: Fo
     def save(arrays: Arrays, mask: Bool[ndarray, "h w"], path: Path) -> None:
         save_normals(path, arrays["normal"], mask)
 
-    note = "x, y, z in the scene's local frame as red, green, blue; blank where opacity is below one half."
+    note = f"x, y, z in the scene's local frame as red, green, blue; blank where opacity is below one half. {SPLAT_NORMALS}"
     truth_picture, pictures = _maps(shown, truth, "normal", (folder, target), save)
     methods = _with_methods(shown, _captioned(shown, pictures, ("normal_deg",), index))
     return Layer("normal", "Normals", note, "", "", "", truth_picture, methods)

@@ -10,6 +10,7 @@ from invgraphics.report.data.assets import Folder
 from invgraphics.report.figures.style import SERIES, Figure
 from invgraphics.report.figures.views import has_flip
 from invgraphics.report.pages import facts
+from invgraphics.report.pages.matrix import Matrix, method_matrix
 from invgraphics.report.pages.parts import Contrasts, Part
 from invgraphics.report.pages.tables import escape_markdown, markdown_effects, markdown_table
 from invgraphics.report.statistics.cross_render import CrossTable
@@ -34,11 +35,12 @@ def render(template: str, context: Mapping[str, Any], folder: Folder) -> None:
 
 def write_html(part: Part, contrasts: Contrasts, folder: Folder) -> None:
     """Write the page of a comparison."""
-    comparison = part.comparison
+    comparison, matrix = part.comparison, method_matrix(part)
     context: dict[str, Any] = {
         "comparison": comparison,
         "part": part,
         "contrasts": contrasts,
+        "matrix": matrix,
         "environment": comparison.environment,
         "protocol_facts": facts.protocol_facts(comparison),
         "scene_facts": facts.scene_facts(comparison),
@@ -64,11 +66,12 @@ def write_markdown(part: Part, contrasts: Contrasts, folder: Folder) -> None:
         f"Scene **{text(comparison.scene)}**. {text(settings)}." + (f" Protocol: {text(str(stated))}." if stated else ""),
     ]
     parts += ["", "## Summary", "", *markdown_part(part)]
+    parts += markdown_matrix(method_matrix(part))
     if comparison.failures:
         parts += ["## Failures", ""]
         parts += [f"- {text(cell.method)}, seed {cell.seed}: {text(cell.error)}" for cell in comparison.failures]
     if contrasts.tables:
-        parts += ["", "## Differences between methods", "", *(f"- {text(effect.sentence)}" for effect in contrasts.first)]
+        parts += ["", "## Differences between methods", "", *(f"- {text(one)}" for one in contrasts.sentences)]
         parts += ["", markdown_effects(contrasts.first)]
     parts += markdown_figures([*([contrasts.figure] if contrasts.figure else []), *part.drawn.figures], folder)
     parts += ["", "## Provenance", "", *(f"- {text(name)}: {text(value)}" for name, value in facts.shared_facts(comparison))]
@@ -82,6 +85,20 @@ def markdown_part(part: Part) -> list[str]:
     for why, labels in part.summary.skipped.items():
         lines.append(f"Not computed: {escape_markdown(listing(labels))} ({escape_markdown(why)}).")
     return lines + markdown_cross_table(part.cross_table)
+
+
+def markdown_matrix(matrix: Matrix | None) -> list[str]:
+    """Table of methods, field by renderer, in Markdown below a heading, and the methods left out; empty without one."""
+    if matrix is None:
+        return []
+    text, quantity = escape_markdown, matrix.quantity
+    lines = ["## The table", "", f"{text(quantity.heading)} of each method, field by renderer.", ""]
+    lines += [f"| field | {' | '.join(map(text, matrix.columns))} |", "|---" * (1 + len(matrix.columns)) + "|"]
+    for field, cells in matrix.rows:
+        entries = [", ".join(f"{text(entry.method)} {entry.score or '(failed)'}" for entry in cell) for cell in cells]
+        lines.append(f"| {text(field)} | {' | '.join(entries)} |")
+    left_out = [f"- {text(one.method)}: {text(one.reason)}" for one in matrix.refused]
+    return [*lines, "", *(["Left out:", "", *left_out, ""] if left_out else [])]
 
 
 def markdown_cross_table(crossed: CrossTable | None) -> list[str]:
@@ -99,9 +116,13 @@ def markdown_cross_table(crossed: CrossTable | None) -> list[str]:
         lines.append(f"| {text(row.method)} | {' | '.join(cells)} |")
     if crossed.steps:
         names = " | ".join(text(row.method) for row in crossed.rows)
-        lines += ["", "Image difference that one approximation makes, dB.", ""]
+        lines += ["", "Image difference that one approximation makes, dB", ""]
+        lines[-2] += ", and median difference of depth, units of the scene." if crossed.shows_depth else "."
         lines += [f"| approximation | {names} |", "|---" * (1 + len(crossed.rows)) + "|"]
-        lines += [f"| {text(step.name)} | {' | '.join(step.differences)} |" for step in crossed.steps]
+        for step in crossed.steps:
+            pairs = zip(step.differences, step.depths, strict=True)
+            cells = [f"{value}, {depth}" if depth else value for value, depth in pairs]
+            lines.append(f"| {text(step.name)} | {' | '.join(cells)} |")
     return lines
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -60,6 +61,8 @@ def protocol_facts(comparison: Comparison) -> Facts:
         facts["test views"] = str(len(comparison.runs[0].scores.views))
         facts["seeds"] = ", ".join(str(seed) for seed in sorted({run.seed for run in comparison.runs}))
     facts |= preset_facts(comparison.runs, comparison.preset)
+    if start := start_fact(comparison.runs):
+        facts["points to start from"] = start
     return (*facts.items(), *_scoring_facts(comparison.protocol))
 
 
@@ -92,6 +95,18 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
         presets += f", {choices.pop()}" if len(choices) == 1 else ", chosen from each fit's budget"
     scenes = _grouped([(_text(run.provenance.preset_chosen_on), run.method) for run in runs])
     return {name: text for name, text in (("preset", presets), ("preset chosen on", scenes)) if text}
+
+
+def start_fact(runs: Sequence[Run]) -> str:
+    """What the fits' fields may start from, by scene where scenes differ; empty where no run says."""
+    pairs = [(_start(run), run.scores.scene) for run in runs]
+    return "" if all(not start for start, _ in pairs) else _grouped([(start or "none", scene) for start, scene in pairs])
+
+
+def _start(run: Run) -> str:
+    """Points of a run's scene in words, without their number, which differs between seeds."""
+    words = run.provenance.notes.get("points", "")
+    return re.sub(r"^[\d,]+ (points )?", "", words)
 
 
 def _grouped(pairs: Sequence[tuple[str, str]]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Factor, Observation
+from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
 from invgraphics.report.figures.curves import draw_curves
 from invgraphics.report.figures.distributions import draw_distributions
 from invgraphics.report.figures.effects import draw_intervals
@@ -15,8 +15,11 @@ from invgraphics.report.figures.style import Figure
 from invgraphics.report.figures.tradeoffs import draw_tradeoffs
 from invgraphics.report.figures.views import ViewPage, draw_views, publish_truth
 from invgraphics.report.statistics.cross_render import CrossTable, cross_table
-from invgraphics.report.statistics.effects import Effect, effects_on
-from invgraphics.report.statistics.summary import Row, Summary, TimeToQuality, quality_columns, summarise, time_to_quality
+from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
+from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.summary import Row, Summary, quality_columns, summarise
+from invgraphics.report.statistics.time_to_quality import TimeToQuality, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import Quantity
 from invgraphics.runs.study import Approximation
@@ -73,6 +76,11 @@ class Contrasts:
         """Effects on the first metric."""
         return self.tables[0][1] if self.tables else []
 
+    @property
+    def sentences(self) -> list[str]:
+        """Effects on the first metric in words."""
+        return list(map(effect_sentence, self.first))
+
 
 @dataclass(frozen=True)
 class Part:
@@ -128,18 +136,19 @@ class Part:
         return f"{self.key}-{name}" if self.key else name
 
 
-def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[Approximation] = ()) -> Part:
+def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[Approximation] = (), tables: int = 1) -> Part:
     """Summarise a scene, derive its verdict, and draw its plots and pictures below ``folder.figures``.
 
     Args:
         comparison: the scene's runs.
         folder: where to write.
         approximations: pairs of renderers that a study compares on every fit.
+        tables: tables of the page, over which tests are corrected.
 
     Raises:
         InputError: a picture or an array is missing or broken.
     """
-    summary = summarise(comparison)
+    summary = summarise(comparison, tables)
     drawn = Drawn(
         views=draw_views(comparison, folder),  # first, because it reads the files that may be broken
         curves=draw_curves(comparison, summary, folder.figures),
@@ -159,10 +168,14 @@ def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[A
 
 
 def draw_contrasts(
-    quantities: Sequence[Quantity], factors: Sequence[Factor], runs: Sequence[Observation], folder: Folder
+    quantities: Sequence[Quantity],
+    contrasts: Sequence[Contrast],
+    runs: Sequence[Observation],
+    lost: Sequence[Lost],
+    folder: Folder,
 ) -> Contrasts:
-    """Estimate effects of the factors' levels on every metric; interval plot of the first."""
-    tables = tuple((quantity, found) for quantity in quantities if (found := effects_on(quantity, factors, runs)))
+    """Estimate contrasts in every metric; interval plot of the first."""
+    tables = tuple((quantity, found) for quantity in quantities if (found := effects_of(contrasts, quantity, runs, lost)))
     return Contrasts(tables, draw_intervals(tables[0][1], folder.figures) if tables else None)
 
 
@@ -172,7 +185,9 @@ def method_contrasts(comparison: Comparison, folder: Folder) -> Contrasts:
     if len(methods) < 2 or len({run.seed for run in comparison.runs}) < 2:
         return Contrasts((), None)
     runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
-    return draw_contrasts(quality_columns(comparison), [Factor(METHOD, methods, methods[0])], runs, folder)
+    lost = [Lost(comparison.scene, {METHOD: failure.method}) for failure in comparison.failures]
+    pairs = contrasts_of([Factor(METHOD, methods, methods[0])])
+    return draw_contrasts(quality_columns(comparison), pairs, runs, lost, folder)
 
 
 def _thumbnails(comparison: Comparison, drawn: Drawn, folder: Folder) -> list[Thumbnail]:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from invgraphics.files import write_text
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.factors import METHOD, StudyCell
 from invgraphics.report.data.studies import Study
+from invgraphics.report.data.variants import base_words
 from invgraphics.report.figures.analyses import AnalysisPart
 from invgraphics.report.figures.style import Figure
 from invgraphics.report.pages import facts
 from invgraphics.report.pages.comparison import markdown_commands, markdown_figures, markdown_part, render
 from invgraphics.report.pages.parts import Contrasts, Part
 from invgraphics.report.pages.tables import escape_markdown, markdown_effects
-from invgraphics.report.statistics.intervals import CONFIDENCE, ENOUGH, RESAMPLES
-from invgraphics.report.statistics.summary import value_of
+from invgraphics.report.statistics.effects import Effect
+from invgraphics.report.statistics.intervals import CONFIDENCE, POWER
+from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity, budget_words, listing
 from invgraphics.text import duration
 
@@ -38,6 +42,7 @@ class StudyPage:
         heat: heat maps of pairs of factors.
         quantity: the metric that sentences, plots and the matrix are about; ``None`` where nothing ran.
         analyses: computations beside the fits.
+        crossed: what approximations do to the scores of the same fits; empty where a study compares none.
     """
 
     study: Study
@@ -46,12 +51,13 @@ class StudyPage:
     heat: list[Figure]
     quantity: Quantity | None
     analyses: list[AnalysisPart]
+    crossed: list[Effect] = field(default_factory=list)
 
     @property
     def headline(self) -> list[str]:
-        """Unfinished cells, a sentence per pair of levels, and the population of the intervals."""
-        effects = self.contrasts.first
-        return [*_progress(self.study), *(effect.sentence for effect in effects), *_scope(self)]
+        """Unfinished cells, a sentence per comparison that the question asks for, and the population of the intervals."""
+        effects = [*self.crossed, *self.contrasts.first]
+        return [*_progress(self.study), *map(effect_sentence, effects), *_scope(self)]
 
 
 @dataclass(frozen=True)
@@ -84,14 +90,28 @@ def write_study_html(page: StudyPage, folder: Folder) -> None:
         "facts_of_study": study_facts(study),
         "matrix": _matrix(page, folder),
         "failures": [(index, cell) for index, cell in enumerate(study.cells) if cell.status == "failed"],
-        "design": DESIGNS.get(study.design, study.design),
+        "design": design_words(study),
         "machine": facts.plain_facts(study.environment.facts()),
         "cells": {
             part.key: facts.reproduction(part.comparison, Folder(folder.root, part.key, folder.redactor)) for part in page.parts
         },
-        "rules": {"enough": ENOUGH, "resamples": RESAMPLES, "percent": f"{100 * CONFIDENCE:g}"},
+        "rules": {"percent": f"{100 * CONFIDENCE:g}", "power": f"{100 * POWER:g}", "margins": _margins(page)},
     }
     render("study.html", context, folder)
+
+
+def design_words(study: Study) -> str:
+    """The design in words: a full factorial where every combination of levels was planned, whatever the study calls itself."""
+    factors = [factor for factor in study.factors if ":" not in factor.path]
+    combined = {tuple(cell.levels.get(factor.path) for factor in factors) for cell in study.cells}
+    full = len(factors) == len(study.factors) and len(combined) == math.prod(len(factor.levels) for factor in factors)
+    return DESIGNS["factorial" if full and factors else study.design]
+
+
+def _margins(page: StudyPage) -> str:
+    """Margins of the equivalence tests in words."""
+    known = [(one, one.margin) for one, _ in page.contrasts.tables if one.margin is not None]
+    return listing(f"{one.text(margin)}{f' {one.unit}' if one.unit else ''} of {one.label}" for one, margin in known)
 
 
 def study_facts(study: Study) -> facts.Facts:
@@ -99,11 +119,13 @@ def study_facts(study: Study) -> facts.Facts:
     entries = {
         "scenes": listing(study.scenes),
         "methods": listing(study.methods),
+        "base, from which variants are named by what differs": base_words(study.factors),
         "seeds": ", ".join(map(str, study.seeds)),
         "cells": _counted(study),
         "budget per fit": budget_words(study.budget),
         **facts.preset_facts([replace(cell.run, method=cell.method) for cell in study.cells if cell.run], study.preset),
         "picture size": study.size,
+        "points to start from": facts.start_fact([cell.run for cell in study.cells if cell.run]),
     }
     return tuple((name, value) for name, value in entries.items() if value)
 
@@ -128,14 +150,14 @@ def _progress(study: Study) -> list[str]:
 
 
 def _scope(page: StudyPage) -> list[str]:
-    """Sentence on the population that the intervals generalise to."""
-    estimates = [effect.estimate for effect in page.contrasts.first if effect.estimate.unit != "none"]
-    if not estimates:
+    """Sentence on the populations that the intervals generalise to."""
+    effects = [effect for effect in [*page.crossed, *page.contrasts.first] if effect.claim.unit != "none"]
+    if not effects:
         return []
-    if any(estimate.unit == "scene" for estimate in estimates):
-        return ["The unit is the scene: intervals hold for scenes like these."]
-    scenes = "this scene" if max(estimate.scenes for estimate in estimates) == 1 else "these scenes, each counted equally"
-    return [f"The unit is the seed: intervals hold for new fits on {scenes}, not of other scenes."]
+    if all(effect.across is None for effect in effects):
+        return ["The unit is the seed: intervals hold for new fits on this scene, and say nothing of other scenes."]
+    words = "Two intervals answer two questions: for new fits on these scenes, each counted equally (the unit is the seed); "
+    return [f"{words}and for other scenes like these (the unit is the scene), on which a verdict rests."]
 
 
 def _matrix(page: StudyPage, folder: Folder) -> list[MatrixRow]:
@@ -169,7 +191,7 @@ def write_study_markdown(page: StudyPage, folder: Folder) -> None:
     """Write ``index.md``, the page in Markdown for a repository."""
     study, text = page.study, escape_markdown
     lines = [f"# {text(study.question or study.name)}", "", *(f"- {text(sentence)}" for sentence in page.headline)]
-    lines += ["", "## Design", "", f"{text(DESIGNS.get(study.design, study.design))}.", ""]
+    lines += ["", "## Design", "", f"{text(design_words(study))}.", ""]
     lines += [f"- {text(name)}: {text(value)}" for name, value in study_facts(study)]
     lines += [f"- {text(_factor_word(factor.path))}: {text(', '.join(factor.levels))}" for factor in study.factors]
     if page.contrasts.tables:

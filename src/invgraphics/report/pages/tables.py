@@ -77,7 +77,7 @@ def write_latex(comparison: Comparison, summary: Summary, path: Path) -> None:
     budget = f", {budget_words(comparison.budget)} each" if comparison.budget else ""
     views = f"{len(comparison.runs[0].scores.views)} test views" if comparison.runs else "no test views"
     protocol = str(comparison.protocol.get("name", "default"))
-    caption = f"Scene {comparison.scene}{budget}; {views}, protocol {protocol}. Best values are bold."
+    caption = f"Scene {comparison.scene}{budget}; {views}, protocol {protocol}. Bold: leads all others by more than chance."
     lines = [
         "% Needs \\usepackage{booktabs}.",
         "\\begin{table}",
@@ -115,7 +115,7 @@ def _latex_cell(cell: Cell) -> str:
     return f"{text}\\textsuperscript{{{cell.note}}}" if cell.note else text
 
 
-EFFECT_HEADS = ("Factor", "Levels", "Difference", "95% interval", "p (Holm)", "Based on")
+EFFECT_HEADS = ("Factor", "Levels", "Difference", "95%, these scenes", "95%, scenes like these", "p (Holm)", "Based on")
 
 
 def effect_cells(effect: Effect) -> list[str]:
@@ -123,12 +123,17 @@ def effect_cells(effect: Effect) -> list[str]:
     unit = f" {effect.quantity.unit}" if effect.quantity.unit else ""
     corrected = "" if effect.adjusted is None else f"{effect.adjusted:.2g}"
     mean = f"{effect.text(effect.estimate.mean)}{unit}"
-    return [effect.factor, f"{effect.after} − {effect.before}", mean, effect.interval, corrected, effect.estimate.size]
+    where = ", ".join([*effect.contrast.where.values(), effect.contrast.name or effect.factor])
+    levels = f"{effect.after} − {effect.before}"
+    if effect.contrast.against is not None:
+        factor, low, high = effect.contrast.against
+        levels += f", at {factor} {high} − {low}"
+    return [where, levels, mean, effect.interval, effect.across_interval, corrected, effect.estimate.size]
 
 
 def markdown_effects(effects: list[Effect]) -> str:
     """Effects as a Markdown table; significant differences are bold."""
-    lines = [_line(list(EFFECT_HEADS)), _line(["---", "---", "---:", "---:", "---:", "---"])]
+    lines = [_line(list(EFFECT_HEADS)), _line(["---", "---", "---:", "---:", "---:", "---:", "---"])]
     for effect in effects:
         cells = [escape_markdown(text) for text in effect_cells(effect)]
         cells[2] = f"**{cells[2]}**" if effect.found else cells[2]
@@ -140,7 +145,7 @@ def effects_caption(effects: list[Effect]) -> str:
     """Caption of a table of effects: quantity, interval, and family of Holm's correction."""
     quantity, family = effects[0].quantity, effects[0].comparisons
     unit = f" ({quantity.unit})" if quantity.unit else ""
-    text = f"Paired differences in {quantity.label}{unit} with 95% intervals."
+    text = f"Differences in {quantity.label}{unit} with 95% intervals, for new fits on these scenes and for scenes like these."
     return f"{text} Bold: significant at a family-wise 5% (Holm's correction over {family} comparisons)."
 
 
@@ -151,7 +156,7 @@ def write_latex_effects(effects: list[Effect], caption: str, path: Path) -> None
         "\\begin{table}",
         "  \\centering",
         f"  \\caption{{{escape_latex(caption)}}}",
-        "  \\begin{tabular}{llrrrl}",
+        "  \\begin{tabular}{llrrrrl}",
         "    \\toprule",
         _latex_line([escape_latex(head) for head in EFFECT_HEADS]),
         "    \\midrule",

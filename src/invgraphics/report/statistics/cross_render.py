@@ -9,16 +9,22 @@ from dataclasses import dataclass, replace
 
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.statistics.summary import quality_columns, value_of
-from invgraphics.report.wording import Quantity
+from invgraphics.report.data.factors import Observation
+from invgraphics.report.statistics.effects import Effect, effects_of
+from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.summary import quality_columns
+from invgraphics.report.statistics.values import value_of
+from invgraphics.report.wording import Quantity, quality_quantity
 from invgraphics.runs.inside import inside
-from invgraphics.runs.renderings import OWN, Renderings
+from invgraphics.runs.renderings import OWN, Difference, Renderings
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.study import Approximation
 from invgraphics.text import file_name
 
 IDENTICAL = 90.0
 """Pictures closer than this many dB are called the same: they are kept as float16, whose rounding alone is above 75 dB."""
+RENDERER = "renderer"
+"""The renderer that shows a fit, as a factor."""
 SHOWN_VIEW = 0
 """The test view that is shown through every renderer."""
 
@@ -30,12 +36,12 @@ class CrossRendered:
     Attributes:
         fit: the run, whose own renderer is the first of ``seen``.
         seen: renderer -> the run that shows the fit with it.
-        differences: two renderers -> root mean square per view between their pictures, colours in [0, 1].
+        differences: two renderers -> how far their pictures and depths are apart.
     """
 
     fit: Run
     seen: dict[str, Run]
-    differences: dict[frozenset[str], tuple[float, ...]]
+    differences: dict[frozenset[str], Difference]
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class CrossCell:
         text: its score against the truth.
         difference: of its picture from the fitting renderer's, PSNR in dB; empty for that renderer itself.
         own: whether this is the fitting renderer.
-        best: whether no renderer shows this fit better.
+        best: whether this renderer shows the fits better than all others, by more than chance.
         picture: a test view; empty where there is none.
     """
 
@@ -68,12 +74,18 @@ class CrossRow:
 
 @dataclass(frozen=True)
 class StepRow:
-    """An approximation: the renderers without and with it, and the PSNR between their pictures for each method, dB."""
+    """An approximation: the renderers without and with it, and for each method how far their pictures are apart.
+
+    Attributes:
+        differences: PSNR between their pictures, dB.
+        depths: median difference of depth, world units; empty where a fit has none.
+    """
 
     name: str
     exact: str
     approximate: str
     differences: tuple[str, ...]
+    depths: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -94,6 +106,11 @@ class CrossTable:
     steps: tuple[StepRow, ...]
     seeds: int
 
+    @property
+    def shows_depth(self) -> bool:
+        """Whether differences of depth are known."""
+        return any(any(step.depths) for step in self.steps)
+
 
 def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendered | None:
     """Read the renderings of a fit by several renderers; ``None`` where there are none.
@@ -112,7 +129,7 @@ def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendere
         clean(one.renderer): run if one.run == OWN else read_run(inside(run.folder, one.run), run.scores.protocol)
         for one in record.renderings
     }
-    differences = {frozenset(clean(name) for name in one.renderers): one.rmse for one in record.differences}
+    differences = {frozenset(clean(name) for name in one.renderers): one for one in record.differences}
     return CrossRendered(run, seen, differences)
 
 
@@ -132,11 +149,40 @@ def cross_table(comparison: Comparison, approximations: Sequence[Approximation],
             rows.append(CrossRow(method, series, _mark_best(own, renderers, cells, columns[0])))
     groups = [[fit for fit in fits if fit.fit.method == row.method] for row in rows]
     steps = tuple(
-        StepRow(pair.name, exact, other, tuple(_decibels(group, frozenset((exact, other))) for group in groups))
+        StepRow(
+            pair.name,
+            exact,
+            other,
+            tuple(_decibels(group, frozenset((exact, other))) for group in groups),
+            tuple(_depth_gap(group, frozenset((exact, other))) for group in groups),
+        )
         for pair in approximations
         for exact, other in [(clean(pair.exact), clean(pair.approximate))]
     )
     return CrossTable(columns[0], renderers, tuple(rows), steps, max(map(len, groups)))
+
+
+def cross_effects(
+    observations: Sequence[Observation], approximations: Sequence[Approximation], clean: Callable[[str], str] = str
+) -> list[Effect]:
+    """What each approximation does to the score of the *same* fits: paired by fit, averaged over what made them.
+
+    Args:
+        observations: the fits of a study.
+        approximations: pairs of renderers.
+        clean: makes names public.
+    """
+    shown = []
+    for one in observations:
+        if (crossed := read_renderings(one.run, clean)) is not None:
+            seen = ((name, replace(run, seed=one.run.seed)) for name, run in crossed.seen.items())
+            shown += [Observation(run, one.scene, {**one.levels, RENDERER: name}) for name, run in seen]
+    score = next((run.run.scores.quality["psnr"] for run in shown if "psnr" in run.run.scores.quality), None)
+    if score is None:
+        return []
+    pairs = [(pair.name, clean(pair.exact), clean(pair.approximate)) for pair in approximations]
+    contrasts = [Contrast(RENDERER, exact, other, name=f"{name} ({other} instead of {exact})") for name, exact, other in pairs]
+    return effects_of(contrasts, quality_quantity("psnr", score), shown)
 
 
 def _score(fits: Sequence[CrossRendered], name: str, quantity: Quantity) -> float | None:
@@ -160,13 +206,21 @@ def _cell(fits: Sequence[CrossRendered], name: str, quantity: Quantity, folder: 
 def _mark_best(
     fits: Sequence[CrossRendered], renderers: Sequence[str], cells: Sequence[CrossCell | None], quantity: Quantity
 ) -> tuple[CrossCell | None, ...]:
+    """Mark the renderer that shows these fits better than every other one by more than chance, paired by fit."""
     scores = {
-        cell.text: quantity.sort_key(_score(fits, name, quantity) or 0.0)
+        name: quantity.sort_key(_score(fits, name, quantity) or 0.0)
         for name, cell in zip(renderers, cells, strict=True)
         if cell
     }
-    best = min(scores, key=lambda text: scores[text]) if len(scores) > 1 else None
-    return tuple(cell and replace(cell, best=cell.text == best) for cell in cells)
+    if len(scores) < 2:
+        return tuple(cells)
+    best = min(scores, key=lambda name: scores[name])
+    shown = [
+        Observation(replace(run, seed=fit.fit.seed), "", {RENDERER: name}) for fit in fits for name, run in fit.seen.items()
+    ]
+    effects = [effects_of([Contrast(RENDERER, other, best)], quantity, shown) for other in scores if other != best]
+    leads = all(found and found[0].found and found[0].better > 0 for found in effects)
+    return tuple(cell and replace(cell, best=leads and name == best) for name, cell in zip(renderers, cells, strict=True))
 
 
 def _decibels(fits: Sequence[CrossRendered], pair: frozenset[str] | None, name: str = "") -> str:
@@ -176,9 +230,15 @@ def _decibels(fits: Sequence[CrossRendered], pair: frozenset[str] | None, name: 
         own = next(iter(fit.seen))
         wanted = frozenset((own, name)) if pair is None else pair
         if wanted <= set(fit.seen):
-            squares += [value**2 for value in fit.differences.get(wanted, ())]
+            squares += [value**2 for value in fit.differences[wanted].rmse] if wanted in fit.differences else []
     if not squares:
         return "–"
     mean = statistics.fmean(squares)
     decibels = math.inf if mean == 0 else -10 * math.log10(mean)
     return "same" if decibels > IDENTICAL else f"{decibels:.1f}"
+
+
+def _depth_gap(fits: Sequence[CrossRendered], pair: frozenset[str]) -> str:
+    """Median difference of depth between two renderers, mean over views and fits."""
+    gaps = [gap for fit in fits if pair in fit.differences for gap in fit.differences[pair].depth]
+    return f"{statistics.fmean(gaps):.2g}" if gaps else ""

@@ -1,68 +1,137 @@
-"""Effects of factor levels: paired differences with intervals, Holm-corrected over all comparisons."""
+"""Effects of factor levels: differences with intervals over seeds and over scenes, corrected over all comparisons."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Literal
 
-import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
-
-from invgraphics.report.data.factors import METHOD, Factor, Observation
-from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, estimate, holm
-from invgraphics.report.statistics.summary import value_of
+from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
+from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, holm, over_scenes, over_seeds
+from invgraphics.report.statistics.pairing import Contrast, Sample, sample
 from invgraphics.report.wording import Quantity, significant_decimals
 
 ALPHA = 1 - CONFIDENCE
 """Family-wise error rate of a study."""
 
+Verdict = Literal["higher", "lower", "undecided", "untested"]
+"""Of one scene: sign of a significant difference, none, or no test because there is a single fit."""
+
+
+@dataclass(frozen=True)
+class SceneEffect:
+    """The same difference on one scene alone, with its p-value after Holm's correction over all scenes and comparisons."""
+
+    estimate: Estimate
+    adjusted: float | None
+
+    @property
+    def verdict(self) -> Verdict:
+        """Sign of the difference, where it is significant."""
+        if self.adjusted is None:
+            return "untested"
+        if self.adjusted > ALPHA:
+            return "undecided"
+        return "higher" if self.estimate.mean > 0 else "lower"
+
 
 @dataclass(frozen=True)
 class Effect:
-    """A paired difference, level ``after`` minus level ``before``, same scene, seed, view and other factors.
+    """A difference, level ``after`` minus level ``before``, on the same scenes, views and other levels.
 
     Attributes:
-        factor: dotted path, or ``method``.
-        before: level that is subtracted.
-        after: level that it is subtracted from.
-        quantity: what is compared.
-        estimate: over all pairs, in stored units.
-        adjusted: p-value after Holm's correction over the comparisons of this quantity; ``None`` without an interval.
+        contrast: what is compared.
+        quantity: in which.
+        estimate: over new fits on these scenes, each counted equally, in stored units.
+        across: over scenes as a sample of scenes; ``None`` for one scene.
+        adjusted: p-value of `claim` after Holm's correction over the comparisons of this quantity; ``None`` without one.
+        equivalence: p-value of the equivalence test of `claim` within the quantity's margin, corrected likewise; ``None``
+            without a margin.
         comparisons: size of that family.
-        pairs: pairs of runs.
-        by_scene: scene -> the same for that scene alone.
+        pairs: fits compared.
+        by_scene: scene -> the same for that scene alone; empty for one scene.
         by_method: method -> the same for that method alone; empty where the method is the factor or there is only one.
+        lost: diverged or failed fits of (before, after).
+        silent: scenes where one side has no number at all.
         truths_differ: some pairs were scored against different pictures, because the factor changes the truth.
     """
 
-    factor: str
-    before: str
-    after: str
+    contrast: Contrast
     quantity: Quantity
     estimate: Estimate
+    across: Estimate | None
     adjusted: float | None
     comparisons: int
     pairs: int
-    by_scene: dict[str, Estimate]
-    by_method: dict[str, Estimate]
-    truths_differ: bool
+    by_scene: Mapping[str, SceneEffect]
+    by_method: Mapping[str, Estimate]
+    equivalence: float | None = None
+    lost: tuple[int, int] = (0, 0)
+    silent: tuple[str, ...] = ()
+    truths_differ: bool = False
+
+    @property
+    def claim(self) -> Estimate:
+        """The estimate that a verdict rests on: over scenes where there are several, else over seeds."""
+        return self.estimate if self.across is None else self.across
+
+    @property
+    def better(self) -> int:
+        """1 where ``after`` is better, -1 where ``before`` is, 0 where neither direction is or there is no difference."""
+        if self.quantity.better == "none" or self.claim.mean == 0:
+            return 0
+        return 1 if (self.claim.mean > 0) == (self.quantity.better == "higher") else -1
+
+    @property
+    def flattered(self) -> bool:
+        """Whether the side that looks better lost more fits than the other: its mean is over those that went well."""
+        before, after = self.lost
+        return (self.better > 0 and after > before) or (self.better < 0 and before > after)
 
     @property
     def found(self) -> bool:
-        """Whether the difference is significant after Holm's correction."""
-        return self.adjusted is not None and self.adjusted <= ALPHA
+        """Whether the difference is significant after Holm's correction, and not due to fits that dropped out."""
+        return self.adjusted is not None and self.adjusted <= ALPHA and not self.flattered
 
     @property
     def uncorrected(self) -> bool:
         """Whether the difference is significant before correction only."""
-        return not self.found and self.estimate.p is not None and self.estimate.p <= ALPHA
+        return not self.found and self.claim.p is not None and self.claim.p <= ALPHA and not self.flattered
+
+    @property
+    def equivalent(self) -> bool:
+        """Whether the difference lies within the margin after Holm's correction, with no scene that contradicts it."""
+        contradicted = any(one.verdict in ("higher", "lower") for one in self.by_scene.values())
+        return self.equivalence is not None and self.equivalence <= ALPHA and not contradicted and self.lost == (0, 0)
+
+    @property
+    def detectable(self) -> float | None:
+        """Effect that a repetition would find with 80 % power after correction, in stored units."""
+        return self.claim.detectable(self.comparisons)
+
+    def scenes(self, verdict: Verdict) -> list[str]:
+        """Scenes with a verdict."""
+        return [scene for scene, one in self.by_scene.items() if one.verdict == verdict]
+
+    @property
+    def factor(self) -> str:
+        """The factor whose levels are compared."""
+        return self.contrast.factor
+
+    @property
+    def before(self) -> str:
+        """The level that is subtracted."""
+        return self.contrast.before
+
+    @property
+    def after(self) -> str:
+        """The level that it is subtracted from."""
+        return self.contrast.after
 
     @property
     def label(self) -> str:
-        """The contrast of the two levels in words."""
-        return contrast_words(self.factor, self.before, self.after)
+        """The contrast in words."""
+        return self.contrast.label
 
     def text(self, value: float) -> str:
         """A difference with the digits of this effect, without its unit."""
@@ -71,156 +140,110 @@ class Effect:
         digits = significant_decimals(size) if self.quantity.decimals is None else self.quantity.decimals
         return f"{value * scale:,.{digits}f}".replace("-", "−")
 
+    def bounds(self, value: Estimate | None) -> str:
+        """A confidence interval as text; empty where there is none."""
+        return "" if value is None or value.unit == "none" else f"[{self.text(value.low)}, {self.text(value.high)}]"
+
     @property
     def interval(self) -> str:
-        """The confidence interval as text; empty where there is none."""
-        if self.estimate.unit == "none":
-            return ""
-        return f"[{self.text(self.estimate.low)}, {self.text(self.estimate.high)}]"
+        """The interval for new fits on these scenes as text; empty where there is none."""
+        return self.bounds(self.estimate)
 
     @property
-    def sentence(self) -> str:
-        """The effect in a sentence: difference, interval, sample size and significance."""
-        return _sentence(self)
+    def across_interval(self) -> str:
+        """The interval for other scenes like these as text; empty where there is none."""
+        return self.bounds(self.across)
 
 
-def contrast_words(factor: str, before: str, after: str) -> str:
-    """Contrast of two levels in words: ``data.train_views 20 instead of 40``."""
-    return f"{after} instead of {before}" if factor == METHOD else f"{factor} {after} instead of {before}"
+def contrasts_of(
+    factors: Sequence[Factor], each: str = "", interactions: Sequence[Sequence[str]] = (), among: Sequence[str] = ()
+) -> list[Contrast]:
+    """The comparisons of a study: interactions that it asks about first, then pairs of levels.
+
+    Args:
+        factors: of the study.
+        each: factor whose levels are answered one by one, for questions that say "each"; empty for the mean over them.
+        interactions: pairs of factors whose interaction is the question: of the outermost levels of both.
+        among: levels of ``each``.
+    """
+    by_path = {factor.path: factor for factor in factors}
+    found = [
+        Contrast(one.path, one.levels[0], one.levels[-1], against=(two.path, two.levels[0], two.levels[-1]))
+        for first, second in interactions
+        if (one := by_path.get(first)) is not None and (two := by_path.get(second)) is not None
+    ]
+    for factor in factors:
+        places = [{each: level} for level in among] if each and factor.path != each else [{}]
+        found += [Contrast(factor.path, *levels, where=where) for where in places for levels in factor.pairs()]
+    return found
 
 
-def effects_on(quantity: Quantity, factors: Sequence[Factor], observations: Sequence[Observation]) -> list[Effect]:
-    """Paired effects of all compared levels on one quantity, corrected as one family (Holm 1979).
+def effects_on(
+    quantity: Quantity, factors: Sequence[Factor], observations: Sequence[Observation], lost: Iterable[Lost] = ()
+) -> list[Effect]:
+    """Effects of all compared levels on one quantity, corrected as one family (Holm 1979).
 
     Pairs of levels that no two runs share are left out.
     """
-    found = []
-    for factor in factors:
-        for before, after in factor.pairs():
-            effect = _effect(quantity, factor.path, (before, after), observations)
-            if effect is not None:
-                found.append(effect)
-    adjusted = holm([effect.estimate.p for effect in found])
+    return effects_of(contrasts_of(factors), quantity, observations, lost)
+
+
+def effects_of(
+    contrasts: Sequence[Contrast], quantity: Quantity, observations: Sequence[Observation], lost: Iterable[Lost] = ()
+) -> list[Effect]:
+    """Effects of given contrasts on one quantity, corrected as one family (Holm 1979)."""
+    failed = tuple(lost)
+    found = [
+        effect
+        for contrast in contrasts
+        if (effect := _effect(contrast, quantity, sample(contrast, quantity, observations, failed), observations)) is not None
+    ]
+    adjusted = holm([effect.claim.p for effect in found])
+    margin = quantity.margin
+    same = holm([None if margin is None else effect.claim.equivalence(margin) for effect in found])
+    scenes = iter(holm([one.estimate.p for effect in found for one in effect.by_scene.values()]))
     family = sum(p is not None for p in adjusted)
-    return [replace(effect, adjusted=p, comparisons=family) for effect, p in zip(found, adjusted, strict=True)]
+    return [
+        replace(
+            effect,
+            adjusted=p,
+            equivalence=within,
+            comparisons=family,
+            by_scene={scene: replace(one, adjusted=next(scenes)) for scene, one in effect.by_scene.items()},
+        )
+        for effect, p, within in zip(found, adjusted, same, strict=True)
+    ]
 
 
-Pair = tuple[Observation, Observation]
-
-
-def matched_pairs(path: str, before: str, after: str, observations: Sequence[Observation]) -> list[Pair]:
-    """Pairs of runs that differ in one factor only: same scene, same seed, same other levels."""
-    sides: dict[str, dict[tuple[Any, ...], Observation]] = {before: {}, after: {}}
-    for observation in observations:
-        level = observation.levels.get(path)
-        if level in sides:
-            others = tuple(sorted((key, value) for key, value in observation.levels.items() if key != path))
-            sides[level][(observation.scene, observation.run.seed, others)] = observation
-    return [(one, sides[after][key]) for key, one in sides[before].items() if key in sides[after]]
-
-
-def _effect(quantity: Quantity, path: str, levels: tuple[str, str], observations: Sequence[Observation]) -> Effect | None:
-    pairs = matched_pairs(path, *levels, observations)
-    differences = [(pair, found) for pair in pairs if (found := _difference(pair, quantity)) is not None]
-    whole = estimate(_nest(differences))
+def _effect(contrast: Contrast, quantity: Quantity, values: Sample, observations: Sequence[Observation]) -> Effect | None:
+    groups = list(values.scenes.values())
+    whole = over_seeds(groups)
     if whole is None:
         return None
-    scenes = dict.fromkeys(pair[0].scene for pair, _ in differences)
-    methods = dict.fromkeys(pair[0].levels.get(METHOD, "") for pair, _ in differences)
-    by_scene = {scene: estimate(_nest([d for d in differences if d[0][0].scene == scene])) for scene in scenes}
-    by_method = {name: estimate(_nest([d for d in differences if d[0][0].levels.get(METHOD) == name])) for name in methods}
+    alone = {scene: over_seeds([one]) for scene, one in values.scenes.items()} if len(groups) > 1 else {}
     return Effect(
-        factor=path,
-        before=levels[0],
-        after=levels[1],
+        contrast=contrast,
         quantity=quantity,
         estimate=whole,
+        across=over_scenes(groups, least_error=whole.error) if len(groups) > 1 else None,
         adjusted=None,
         comparisons=0,
-        pairs=len(differences),
-        by_scene=_known(by_scene) if len(scenes) > 1 else {},
-        by_method=_known(by_method) if path != METHOD and len(methods) > 1 else {},
-        truths_differ=any(
-            one.run.provenance.truth_sha256 != other.run.provenance.truth_sha256 for (one, other), _ in differences
-        ),
+        pairs=values.pairs,
+        by_scene={scene: SceneEffect(one, None) for scene, one in alone.items() if one is not None},
+        by_method=_by_method(contrast, quantity, observations),
+        lost=values.lost,
+        silent=values.silent,
+        truths_differ=values.truths_differ,
     )
 
 
-def _known(table: Mapping[str, Estimate | None]) -> dict[str, Estimate]:
-    return {key: value for key, value in table.items() if value is not None}
-
-
-def _difference(pair: Pair, quantity: Quantity) -> Float[ndarray, " view"] | None:
-    """Paired differences, after minus before, on all shared views; one value where single views were not scored."""
-    one, other = (observation.run for observation in pair)
-    if quantity.group != "cost" and quantity.key in one.scores.quality and quantity.key in other.scores.quality:
-        left, right = one.scores.quality[quantity.key].per_view, other.scores.quality[quantity.key].per_view
-        if left and right:
-            there = dict(zip(other.scores.views, _numbers(right), strict=True))
-            shared = [
-                (value, there[name]) for name, value in zip(one.scores.views, _numbers(left), strict=True) if name in there
-            ]
-            with np.errstate(invalid="ignore"):
-                return np.array([b - a for a, b in shared])
-    before, after = value_of(one, quantity), value_of(other, quantity)
-    return None if before is None or after is None else np.array([after - before])
-
-
-def _numbers(values: Sequence[float | None]) -> Float[ndarray, " view"]:
-    return np.array([np.nan if value is None else value for value in values], dtype=float)
-
-
-def _nest(differences: Sequence[tuple[Pair, Float[ndarray, " view"]]]) -> list[list[ndarray]]:
-    """Nest differences as scene -> seed -> view; other factors are averaged per view, since they add no independent seed."""
-    cells: dict[str, dict[int, list[ndarray]]] = {}
-    for (one, _), values in differences:
-        cells.setdefault(one.scene, {}).setdefault(one.run.seed, []).append(values)
-    return [[_average(values) for values in seeds.values()] for seeds in cells.values()]
-
-
-def _average(values: Sequence[Float[ndarray, " view"]]) -> Float[ndarray, " view"]:
-    """Mean over strata: view by view where all scored the same views, else of each stratum's mean."""
-    if len({len(row) for row in values}) == 1:
-        block = np.stack(values)
-        present = np.isfinite(block)
-        with np.errstate(invalid="ignore"):
-            return np.where(present, block, 0.0).sum(axis=0) / np.where(present.any(axis=0), present.sum(axis=0), np.nan)
-    means = [row[np.isfinite(row)].mean() for row in values if np.isfinite(row).any()]
-    return np.array([np.mean(means)]) if means else np.full(1, np.nan)
-
-
-def _verb(quantity: Quantity, difference: float) -> str:
-    if quantity.better == "none":
-        return "adds" if difference > 0 else "saves"
-    return "gains" if (difference > 0) == (quantity.better == "higher") else "costs"
-
-
-def _unit(quantity: Quantity) -> str:
-    """Unit of a difference in words; the quantity's label where it has no unit."""
-    if quantity.unit == "dB":
-        return "dB"
-    return f"{quantity.unit} of {quantity.label}" if quantity.unit else quantity.label
-
-
-def _sentence(effect: Effect) -> str:
-    value, unit = effect.estimate, _unit(effect.quantity)
-    size = value.size
-    note = (
-        " The factor changes the truth itself, so the two were scored against different pictures."
-        if effect.truths_differ
-        else ""
-    )
-    magnitude = f"{_verb(effect.quantity, value.mean)} {effect.text(abs(value.mean))} {unit}"
-    if value.unit == "none":
-        return f"{effect.label} {magnitude} in the one seed there is, which gives no interval.{note}"
-    if value.mean == 0 and value.half_width == 0:
-        return f"{effect.label}: no difference at all, {size}.{note}"
-    if not (effect.found or effect.uncorrected):
-        return f"{effect.label}: no effect detectable above {effect.text(value.half_width)} {unit}, {size}.{note}"
-    # The verb (gains, costs) carries the sign, so the interval's ends are magnitudes.
-    low, high = sorted((abs(value.low), abs(value.high)))
-    sentence = f"{effect.label} {magnitude} [{effect.text(low)}, {effect.text(high)}], {size}"
-    if effect.found:
-        return f"{sentence}.{note}"
-    chance = f"with {effect.comparisons} comparisons in this study that may be chance (corrected p = {effect.adjusted:.2g})"
-    return f"{sentence}; {chance}.{note}"
+def _by_method(contrast: Contrast, quantity: Quantity, observations: Sequence[Observation]) -> dict[str, Estimate]:
+    methods = dict.fromkeys(one.levels.get(METHOD, "") for one in observations)
+    if contrast.independent or METHOD in contrast.where or len(methods) < 2:
+        return {}
+    found = {}
+    for method in methods:
+        own = sample(replace(contrast, where={**contrast.where, METHOD: method}), quantity, observations)
+        if (value := over_seeds(list(own.scenes.values()))) is not None:
+            found[method] = value
+    return found if len(found) > 1 else {}

@@ -1,37 +1,36 @@
-"""Confidence intervals and tests for hierarchical scores: views within a seed, seeds within a scene.
+"""Confidence intervals, tests, detectable effects and equivalence for scores of fits on scenes.
 
-Views of one fit share its weights, so they are never units. The unit is the seed (a fit), or the scene:
+Views of one fit share its weights, so they are averaged and never units. There are two estimands, neither replaces the other:
 
-- ten scenes or more: the scene; hierarchical bootstrap scene > seed > view. The interval generalises to scenes like these.
-- one seed on each of several scenes: the scene; a t-interval over scenes.
-- otherwise: the seed within its scene, scenes counted equally and held fixed. It generalises to new fits on these scenes.
-  Below ten seeds a Welch t-interval; from ten seeds on a hierarchical bootstrap seed > view inside each scene.
+- over *seeds*, on these scenes: scenes are fixed and count equally; the interval holds for new fits on the same scenes.
+  Student's t, with Welch's degrees of freedom over several scenes or over two independent groups of seeds.
+- over *scenes*, as a sample of scenes: the scene is the unit, its mean over seeds the value; the interval holds for scenes that
+  are like these as these are like each other. Student's t over scenes.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 
-ENOUGH = 10
-"""Units from which on resampling replaces the t distribution; fewer carry too little of a distribution's shape."""
-
-RESAMPLES = 1999
-"""Bootstrap resamples; with the observed one they make steps of 1/2000 in p."""
-
-BATCH = 1_500_000
-"""Scores drawn at a time, which bounds the memory of resampling."""
-
 CONFIDENCE = 0.95
+POWER = 0.8
+"""Probability with which a detectable effect is found."""
+NODES = 48
+"""Quantiles of the estimated spread over which power is averaged."""
 
 Nested = Sequence[Sequence[Float[ndarray, " view"]]]
 """Scene -> seed -> one value per view; lengths may differ, values that are not finite are left out."""
+
+Groups = Sequence[tuple[float, Float[ndarray, " fit"]]]
+"""(sign, one value per fit) of each independent group of fits on a scene: the signed sum of their means is estimated."""
 
 Unit = Literal["none", "seed", "scene"]
 
@@ -45,10 +44,12 @@ class Estimate:
         low: lower end of the interval; equal to the mean where there is none.
         high: its upper end.
         p: two-sided p-value of a true mean of zero, dual to the interval; ``None`` without an interval.
-        unit: what the interval counts as independent; ``none`` for a single fit, which has no interval.
-        resampled: whether the interval is a hierarchical bootstrap rather than a t-interval.
+        unit: what the interval counts as independent; ``none`` where no spread is known: a single unit, or units that agree to
+            the last digit, whose spread is not zero but unknown.
         scenes: number of scenes.
         seeds: (fewest, most) seeds per scene.
+        error: standard error of the mean; 0 where no spread is known.
+        freedom: its degrees of freedom; 0 likewise.
     """
 
     mean: float
@@ -56,9 +57,10 @@ class Estimate:
     high: float
     p: float | None
     unit: Unit
-    resampled: bool
     scenes: int
     seeds: tuple[int, int]
+    error: float = 0.0
+    freedom: float = 0.0
 
     @property
     def half_width(self) -> float:
@@ -73,54 +75,102 @@ class Estimate:
         scenes = f" × {self.scenes} scenes" if self.scenes > 1 else ""
         return f"{count} {'seed' if most == 1 else 'seeds'}{scenes}"
 
+    def detectable(self, comparisons: int = 1, power: float = POWER) -> float | None:
+        """Effect that a repetition of this design finds with probability ``power``, corrected for ``comparisons`` tests.
 
-@dataclass(frozen=True)
-class _Design:
-    """Finite scores of a hierarchical design, padded to a dense array.
+        Bonferroni's level, which is Holm's for the first of them. The spread is estimated from few fits, so power is averaged
+        over what the estimate may be (assurance; O'Hagan, Stevens & Campbell 2005) rather than computed as if it were known.
+        ``None`` where no spread is known.
+        """
+        if self.p is None:
+            return None
+        return self.error * _detectable_errors(round(self.freedom, 2), (1 - CONFIDENCE) / max(1, comparisons), power)
 
-    Attributes:
-        values: scores, NaN where a scene has fewer seeds or a seed fewer views.
-        seeds: seeds of each scene.
-        views: views of each seed, 0 where there is no such seed.
-        by_scene: whether scenes are the units.
-    """
+    def equivalence(self, margin: float) -> float | None:
+        """p-value of two one-sided tests (Schuirmann 1987) of a mean within ±``margin``; ``None`` where no spread is known."""
+        if self.p is None:
+            return None
+        from scipy.special import stdtr
 
-    values: Float[ndarray, "scene seed view"]
-    seeds: Int[ndarray, " scene"]
-    views: Int[ndarray, "scene seed"]
-    by_scene: bool
+        return float(stdtr(self.freedom, -(margin - abs(self.mean)) / self.error))
 
 
-def estimate(nested: Nested, confidence: float = CONFIDENCE, seed: int = 0) -> Estimate | None:
-    """Mean, confidence interval and p-value of nested scores or of paired differences of them.
+def estimate(nested: Nested, over: Literal["seeds", "scenes"] = "seeds", confidence: float = CONFIDENCE) -> Estimate | None:
+    """Mean, confidence interval and p-value of nested scores, or of paired differences of them.
 
     Args:
         nested: scene -> seed -> values per view.
+        over: what is drawn at random: new fits on these scenes, or scenes.
         confidence: probability that the interval covers the true mean, in (0, 1).
-        seed: of the resampling.
 
     Returns:
         The estimate; ``None`` where no value is finite.
     """
-    design = _arrange(nested)
-    if design is None:
+    fits = [np.array([row[np.isfinite(row)].mean() for row in scene if np.isfinite(row).any()]) for scene in nested]
+    groups = [[(1.0, values)] for values in fits if len(values)]
+    return over_scenes(groups, confidence) if over == "scenes" else over_seeds(groups, confidence)
+
+
+def over_seeds(scenes: Sequence[Groups], confidence: float = CONFIDENCE) -> Estimate | None:
+    """Mean over these scenes, with the interval for new fits on them; ``None`` without scenes.
+
+    The mean of scene means has variance Σ s²ₖ/nₖ / S² over all groups of fits, with Welch's (1947) degrees of freedom. Where a
+    group is a single fit, all use the variance pooled over groups.
+    """
+    if not scenes:
         return None
-    fits = _mean_of_views(design.values)
-    mean, error, freedom = (float(item) for item in _standard_error(fits, design.seeds, design.by_scene))
-    size = (len(design.seeds), (int(design.seeds.min()), int(design.seeds.max())))
-    if size[0] == 1 and size[1][1] == 1:
-        return Estimate(mean, mean, mean, None, "none", False, *size)
-    unit: Unit = "scene" if design.by_scene else "seed"
-    units = size[0] if design.by_scene else size[1][0]
-    resampled = units >= ENOUGH
-    scale = float(np.nanmax(np.abs(fits)))
-    if error <= 1e-12 * scale:  # seeds change nothing: the mean is exact
-        return Estimate(mean, mean, mean, 1.0 if abs(mean) <= 1e-12 * scale else 0.0, unit, resampled, *size)
-    if resampled:
-        critical, p = _bootstrap(design, mean, abs(mean) / error, confidence, seed)
+    parts = [values for groups in scenes for _, values in groups]
+    mean = float(np.mean([_signed_mean(groups) for groups in scenes]))
+    counts = np.array([len(values) for values in parts])
+    sums, freedom = np.array([((values - values.mean()) ** 2).sum() for values in parts]), counts - 1
+    size = len(scenes), _seeds(scenes)
+    scale = max(float(np.abs(values).max()) for values in parts)
+    if freedom.sum() == 0 or sums.sum() <= (1e-12 * scale) ** 2:
+        return Estimate(mean, mean, mean, None, "none", *size)
+    if (freedom > 0).all():
+        shares = sums / freedom / counts
+        known = shares > 0
+        satterthwaite = float(shares.sum() ** 2 / (shares[known] ** 2 / freedom[known]).sum())
     else:
-        critical, p = _student(abs(mean) / error, freedom, confidence)
-    return Estimate(mean, mean - critical * error, mean + critical * error, p, unit, resampled, *size)
+        shares = sums.sum() / freedom.sum() / counts
+        satterthwaite = float(freedom.sum())
+    return _student_estimate(mean, (math.sqrt(shares.sum()) / len(scenes), satterthwaite), "seed", size, confidence)
+
+
+def over_scenes(scenes: Sequence[Groups], confidence: float = CONFIDENCE, least_error: float = 0.0) -> Estimate | None:
+    """Mean over scenes as a sample of scenes, with the interval for scenes like these; ``None`` without scenes.
+
+    Args:
+        scenes: groups of fits of each.
+        confidence: of the interval.
+        least_error: standard error that the fits' own spread makes; scenes that agree better than that do so by chance.
+    """
+    if not scenes:
+        return None
+    means = np.array([_signed_mean(groups) for groups in scenes])
+    mean, size = float(means.mean()), (len(scenes), _seeds(scenes))
+    spread = float(means.std(ddof=1)) if len(means) > 1 else 0.0
+    if spread <= 1e-12 * float(np.abs(means).max()):
+        return Estimate(mean, mean, mean, None, "none", *size)
+    error = max(spread / math.sqrt(len(means)), least_error)
+    return _student_estimate(mean, (error, len(means) - 1.0), "scene", size, confidence)
+
+
+def _signed_mean(groups: Groups) -> float:
+    return float(sum(sign * values.mean() for sign, values in groups))
+
+
+def _seeds(scenes: Sequence[Groups]) -> tuple[int, int]:
+    counts = [len(values) for groups in scenes for _, values in groups]
+    return min(counts), max(counts)
+
+
+def _student_estimate(
+    mean: float, spread: tuple[float, float], unit: Unit, size: tuple[int, tuple[int, int]], confidence: float
+) -> Estimate:
+    error, freedom = spread
+    critical, p = _student(abs(mean) / error, freedom, confidence)
+    return Estimate(mean, mean - critical * error, mean + critical * error, p, unit, *size, error, freedom)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -152,56 +202,6 @@ def band(values: Float[ndarray, "seed time"], confidence: float = CONFIDENCE) ->
     return mean, mean - half, mean + half
 
 
-def _arrange(nested: Nested) -> _Design | None:
-    """Drop non-finite scores and pad the rest to a dense array; ``None`` where no score is finite."""
-    kept = [[finite for values in scene if len(finite := values[np.isfinite(values)])] for scene in nested]
-    kept = [scene for scene in kept if scene]
-    if not kept:
-        return None
-    seeds = np.array([len(scene) for scene in kept])
-    views = np.zeros((len(kept), int(seeds.max())), int)
-    block = np.full((*views.shape, max(len(values) for scene in kept for values in scene)), np.nan)
-    for s, scene in enumerate(kept):
-        for k, values in enumerate(scene):
-            views[s, k] = len(values)
-            block[s, k, : len(values)] = values
-    return _Design(block, seeds, views, len(kept) >= ENOUGH or (len(kept) > 1 and seeds.max() == 1))
-
-
-def _mean_of_views(values: Float[ndarray, "*b view"]) -> Float[ndarray, "*b"]:
-    """Mean over views that exist; NaN where none does."""
-    present = np.isfinite(values)
-    count = present.sum(axis=-1)
-    return np.where(count > 0, np.where(present, values, 0.0).sum(axis=-1) / np.maximum(count, 1), np.nan)
-
-
-def _standard_error(
-    fits: Float[ndarray, "*b scene seed"], seeds: Int[ndarray, "*b scene"], by_scene: bool
-) -> tuple[Float[ndarray, "*b"], Float[ndarray, "*b"], Float[ndarray, "*b"]]:
-    """(mean, its standard error, degrees of freedom) from one value per fit; NaN where a scene lacks a seed.
-
-    With the seed as unit, the mean of scene means has variance Σ s²ᵢ/nᵢ / S² with Welch's (1947) degrees of freedom. Where a
-    scene has a single seed, all use the variance pooled over scenes.
-    """
-    present = np.isfinite(fits)
-    scene_means = np.where(present, fits, 0.0).sum(axis=-1) / seeds
-    scenes = fits.shape[-2]
-    mean = scene_means.mean(axis=-1)
-    if by_scene:
-        spread = scene_means.std(axis=-1, ddof=1)
-        return mean, spread / math.sqrt(scenes), np.full_like(mean, scenes - 1)
-    squares = np.where(present, fits - scene_means[..., None], 0.0) ** 2
-    sums, freedom = squares.sum(axis=-1), seeds - 1
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if (seeds > 1).all():
-            parts = sums / freedom / seeds
-            satterthwaite = parts.sum(axis=-1) ** 2 / (parts**2 / freedom).sum(axis=-1)
-        else:
-            parts = (sums.sum(axis=-1) / freedom.sum(axis=-1))[..., None] / seeds
-            satterthwaite = freedom.sum(axis=-1).astype(float)
-    return mean, np.sqrt(parts.sum(axis=-1)) / scenes, satterthwaite
-
-
 def _student(statistic: float, freedom: float, confidence: float) -> tuple[float, float]:
     """(critical value, two-sided p) of Student's t."""
     from scipy.special import stdtr, stdtrit
@@ -209,43 +209,20 @@ def _student(statistic: float, freedom: float, confidence: float) -> tuple[float
     return float(stdtrit(freedom, (1 + confidence) / 2)), float(2 * stdtr(freedom, -statistic))
 
 
-def _bootstrap(design: _Design, mean: float, statistic: float, confidence: float, seed: int) -> tuple[float, float]:
-    """(critical value, p) of the symmetric bootstrap-t (Hall 1992, §3.5), units > seeds > views drawn with replacement.
+@functools.lru_cache(maxsize=4096)
+def _detectable_errors(freedom: float, level: float, power: float) -> float:
+    """True effect, in estimated standard errors, that a two-sided t-test of ``level`` finds with probability ``power``."""
+    from scipy.optimize import brentq
+    from scipy.special import chdtri, nctdtr, stdtrit
 
-    Studentising each resample keeps the error rate near its nominal value at ten units, where percentiles are too narrow.
-    """
-    generator = np.random.default_rng(seed)
-    batch = max(1, BATCH // design.values.size)
-    draws = []
-    for start in range(0, RESAMPLES, batch):
-        fits, seeds = _resample(design, min(batch, RESAMPLES - start), generator)
-        means, errors, _ = _standard_error(fits, seeds, design.by_scene)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            draws.append(np.nan_to_num(np.abs(means - mean) / errors, nan=0.0))
-    statistics = np.concatenate(draws)
-    p = (1 + int((statistics >= statistic).sum())) / (1 + RESAMPLES)
-    # The same rank rule as p, so that the interval holds zero exactly where p exceeds 1 - confidence.
-    rank = RESAMPLES - math.floor((1 - confidence) * (1 + RESAMPLES) + 1e-9)
-    return float(np.sort(statistics)[rank]), p
+    critical = float(stdtrit(freedom, 1 - level / 2))
+    # Quantiles of the estimated over the true standard error.
+    ratios = np.sqrt(chdtri(freedom, 1 - (np.arange(NODES) + 0.5) / NODES) / freedom)
 
+    def missed(log_errors: float) -> float:
+        shift = ratios * math.exp(log_errors)
+        below = nctdtr(freedom, np.minimum(shift, 1e3), critical)
+        return float(np.nan_to_num(below, nan=0.0).mean()) - (1 - power)
 
-def _resample(
-    design: _Design, count: int, generator: np.random.Generator
-) -> tuple[Float[ndarray, "b scene seed"], Int[ndarray, "b scene"]]:
-    """``count`` hierarchical bootstrap samples (scenes where they are units > seeds > views), averaged over views per fit."""
-    scenes, most_seeds, most_views = design.values.shape
-    if design.by_scene:
-        scene = generator.integers(scenes, size=(count, scenes))
-    else:
-        scene = np.broadcast_to(np.arange(scenes), (count, scenes))
-    seeds = design.seeds[scene]
-    place = scene[..., None]
-    seed = (generator.random((count, scenes, most_seeds)) * seeds[..., None]).astype(int)
-    views = design.views[place, seed]
-    view = (generator.random((count, scenes, most_seeds, most_views), np.float32) * views[..., None]).astype(int)
-    view = np.minimum(view, views[..., None] - 1)  # float32 can round up to the number of views
-    drawn = design.values[place[..., None], seed[..., None], view]
-    drawn[np.arange(most_views) >= views[..., None]] = np.nan
-    fits = _mean_of_views(drawn)
-    fits[np.arange(most_seeds) >= seeds[..., None]] = np.nan
-    return fits, seeds
+    root = brentq(missed, math.log(critical) - 3, math.log(critical) + 6, xtol=1e-3)
+    return math.exp(root)  # pyright: ignore[reportArgumentType]  # a tuple only with full_output

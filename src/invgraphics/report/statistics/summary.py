@@ -10,6 +10,8 @@ from typing import Literal
 
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.intervals import mean_half_width
+from invgraphics.report.statistics.leaders import leaders
+from invgraphics.report.statistics.values import diverged, value_of
 from invgraphics.report.wording import ABSENT, COSTS, TIMES, Quantity, budget_words, metric_label, quality_quantity
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.run import Run
@@ -26,7 +28,7 @@ class Cell:
         half_width: half of the mean's t-interval over seeds; 0 for a single one.
         text: the mean as written.
         spread: the deviation as written; empty for a single seed.
-        best: no method's written value is better.
+        best: the method leads this column by more than chance (`invgraphics.report.statistics.leaders`).
         note: number of the footnote that explains an absence; 0 for none.
     """
 
@@ -53,6 +55,7 @@ class Row:
         complete: it has as many runs as the method with the most. Others are shown but never ranked: a hard seed that is
             missing makes a mean look better than it is.
         disturbed: why its times are not ranked: what is wrong with the clock of its fits; empty where nothing is.
+        lost: keys of the columns in which one of its fits diverged; what is left of those is not ranked either.
     """
 
     label: str
@@ -63,10 +66,11 @@ class Row:
     cells: tuple[Cell, ...]
     complete: bool = True
     disturbed: str = ""
+    lost: frozenset[str] = frozenset()
 
     def ranked_in(self, column: Quantity) -> bool:
-        """Whether it is ranked in a column: it lacks no seed, and for times no clock was disturbed."""
-        return self.complete and not (self.disturbed and column.key in TIMES)
+        """Whether it is ranked in a column: it lacks no seed, none diverged, and for times no clock was disturbed."""
+        return self.complete and column.key not in self.lost and not (self.disturbed and column.key in TIMES)
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,13 @@ class Summary:
         return tuple(row for row in self.rows if row.kind == "baseline")
 
 
-def summarise(comparison: Comparison) -> Summary:
-    """Summarise a comparison: means over seeds, the best of each column marked."""
+def summarise(comparison: Comparison, tables: int = 1) -> Summary:
+    """Summarise a comparison: means over seeds; what leads a column by more than chance is marked.
+
+    Args:
+        comparison: the runs of one scene.
+        tables: tables of the page, over which tests are corrected.
+    """
     columns = table_columns(comparison)
     notes: list[str] = []
     rows = []
@@ -120,11 +129,12 @@ def summarise(comparison: Comparison) -> Summary:
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
         cells = tuple(_method_cell(column, runs, notes) for column in columns)
         kind: Literal["method", "failed"] = "method" if runs else "failed"
-        rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs)))
+        lost = frozenset(column.key for column in columns if any(diverged(run, column) for run in runs))
+        rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs), lost))
     for name, quality in comparison.baselines.items():
         cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
         rows.append(Row(name, "baseline", -1, 1, (), cells))
-    return Summary(columns, _mark_best(columns, rows), tuple(notes), _skipped(comparison))
+    return Summary(columns, _mark_best(comparison, columns, rows, tables), tuple(notes), _skipped(comparison))
 
 
 def quality_columns(comparison: Comparison) -> tuple[Quantity, ...]:
@@ -148,56 +158,6 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def seconds_to_reach(run: Run, level: float) -> float | None:
-    """Seconds of optimisation after which the monitored PSNR first was at least ``level`` dB."""
-    return next((entry.seconds for entry in run.history if entry.psnr is not None and entry.psnr >= level), None)
-
-
-@dataclass(frozen=True)
-class TimeToQuality:
-    """Time to quality: median seconds of each method to reach each PSNR level.
-
-    Attributes:
-        levels: PSNR thresholds in dB, rising.
-        rows: (method, series, one text per level).
-    """
-
-    levels: tuple[int, ...]
-    rows: tuple[tuple[str, int, tuple[str, ...]], ...]
-
-
-def time_to_quality(comparison: Comparison, count: int = 4) -> TimeToQuality | None:
-    """Median seconds over seeds to reach ``count`` round PSNR levels between the slowest start and the best end."""
-    starts, peaks = [], []
-    for method in comparison.methods:
-        curves = [[entry.psnr for entry in run.history if entry.psnr is not None] for run in comparison.runs_of(method)]
-        curves = [curve for curve in curves if curve]
-        if curves:
-            starts.append(statistics.median(curve[0] for curve in curves))
-            peaks.append(statistics.median_low(max(curve) for curve in curves))
-    if not starts:
-        return None
-    low, high = max(starts), max(peaks)
-    first, last = math.ceil(low + 0.1), math.floor(high)
-    if last < first:
-        return None
-    step = max(1, (last - first) // max(1, count - 1))
-    levels = tuple(range(last, first - 1, -step))[:count][::-1]
-    rows = []
-    for series, method in enumerate(comparison.methods):
-        runs = comparison.runs_of(method)
-        if runs:
-            rows.append((method, series, tuple(_reach_text(runs, level) for level in levels)))
-    return TimeToQuality(levels, tuple(rows))
-
-
-def _reach_text(runs: Sequence[Run], level: float) -> str:
-    times = [time for run in runs if (time := seconds_to_reach(run, level)) is not None]
-    if 2 * len(times) <= len(runs):
-        return "not reached"
-    return f"{statistics.median(times):.1f} s"
-
-
 def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
     """Columns of the summary: quality metrics, then the costs that any run has."""
     time_budget = budget_words(comparison.budget).endswith(" s")
@@ -216,12 +176,7 @@ def _mean(score: Score | None) -> float | None:
 
 
 def _known(values: Sequence[float | None]) -> list[float]:
-    return [value for value in values if value is not None]
-
-
-def value_of(run: Run, column: Quantity) -> float | None:
-    """A run's value of a quantity, in stored units."""
-    return _mean(run.scores.quality.get(column.key)) if column.group != "cost" else run.scores.cost.get(column.key)
+    return [value for value in values if value is not None and not math.isnan(value)]
 
 
 def _method_cell(column: Quantity, runs: Sequence[Run], notes: list[str]) -> Cell:
@@ -255,19 +210,19 @@ def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
     return Cell(mean, std, column.text(mean), "" if std is None else column.spread(mean, std), note=note, half_width=half)
 
 
-def _mark_best(columns: Sequence[Quantity], rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Mark, among ranked methods, every cell whose text equals the best one's; needs at least two methods."""
-    marked = [list(row.cells) for row in rows]
+def _mark_best(comparison: Comparison, columns: Sequence[Quantity], rows: Sequence[Row], tables: int) -> tuple[Row, ...]:
+    """Mark the cell of each column's leader, where there is one."""
+    means = []
     for index, column in enumerate(columns):
-        values = {i: row.cells[index].mean for i, row in enumerate(rows) if row.kind == "method" and row.ranked_in(column)}
-        known = {i: value for i, value in values.items() if value is not None}
-        if column.better == "none" or len(known) < 2:
-            continue
-        best = min(known.values(), key=column.sort_key)
-        for i, value in known.items():
-            if column.text(value) == column.text(best):
-                marked[i][index] = replace(marked[i][index], best=True)
-    return tuple(replace(row, cells=tuple(cells)) for row, cells in zip(rows, marked, strict=True))
+        ranked = [row for row in rows if row.kind == "method" and row.ranked_in(column)]
+        means.append((column, {row.label: mean for row in ranked if (mean := row.cells[index].mean) is not None}))
+    found = leaders(comparison, means, tables)
+    marked = []
+    for row in rows:
+        leads = [column.key in found and found[column.key][0] == row.label and row.kind == "method" for column in columns]
+        cells = (replace(cell, best=best) for cell, best in zip(row.cells, leads, strict=True))
+        marked.append(replace(row, cells=tuple(cells)))
+    return tuple(marked)
 
 
 def _disturbed(runs: Sequence[Run]) -> str:

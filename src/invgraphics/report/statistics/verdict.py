@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Factor, Observation
-from invgraphics.report.statistics.effects import effects_on
+from invgraphics.report.data.factors import METHOD, Observation
+from invgraphics.report.statistics.effects import effects_of
+from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.rules import DEAD_SHARE
+from invgraphics.report.statistics.sentences import detectable_words
 from invgraphics.report.statistics.summary import Row, Summary
 from invgraphics.report.wording import Quantity, budget_words, listing, times
+
+EXACT_POINTS = "exact surface points"
+"""How the notes of a rendered scene call points that were taken from its truth."""
 
 
 def verdict(comparison: Comparison, summary: Summary) -> list[str]:
@@ -34,7 +39,8 @@ def _quality(comparison: Comparison, summary: Summary) -> list[str]:
     given = f"Given {budget_words(comparison.budget)} each, " if comparison.budget else ""
     unit = f" {column.unit}" if column.unit else ""
     extreme = "highest" if column.better == "higher" else "lowest"
-    record = f"the {extreme} {column.label}," if len(ranking) > 1 else f"a {column.label} of"
+    once = " in the one fit there is of each" if _one_seed(ranking) else ""
+    record = f"the {extreme} {column.label}{once}," if len(ranking) > 1 else f"a {column.label} of"
     sentence = f"{given}{winner.label} reaches {record} {column.text(value)}{unit}"
     gaps = []
     if len(ranking) > 1:
@@ -62,44 +68,41 @@ def _best_baseline(summary: Summary, column: Quantity) -> tuple[float, Row] | No
     return min(found, key=lambda entry: column.sort_key(entry[0])) if found else None
 
 
+def _one_seed(ranking: list[tuple[float, Row]]) -> bool:
+    return max(row.seeds for _, row in ranking) < 2
+
+
 def _resolution(comparison: Comparison, summary: Summary, column: Quantity, ranking: list[tuple[float, Row]]) -> str:
-    """Sentence on the paired interval of the first method's lead over the second, and its significance over seeds."""
+    """Sentence on the interval of the first method's lead over the second, and its significance over seeds."""
     if len(ranking) < 2:
         return ""
-    if max(row.seeds for _, row in ranking) < 2:
-        return "One seed per method: small differences may be due to chance."
+    if _one_seed(ranking):
+        return "One seed per method is an observation, which names no winner: another seed may turn the order round."
     first, second = (row.label for _, row in ranking[:2])
     runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
-    effects = effects_on(column, [Factor(METHOD, (first, second), second)], runs)
+    effects = effects_of([Contrast(METHOD, second, first)], column, runs)
     if not effects or effects[0].estimate.unit == "none":
         return ""
     lead, unit = effects[0], f" {column.unit}" if column.unit else ""
+    size = f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]}"
     low, high = sorted((abs(lead.estimate.low), abs(lead.estimate.high)))
     if lead.found:
         return f"Over {lead.estimate.size} that lead lies in [{lead.text(low)}, {lead.text(high)}]{unit} (95% interval)."
-    half = lead.text(lead.estimate.half_width)
-    if lead.estimate.seeds[1] == 2:
-        return (
-            f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]} cannot tell that lead from chance: it would have to "
-            f"exceed about {half}{unit}; three seeds or more resolve smaller leads."
-        )
-    return f"Over {lead.estimate.size} that lead may be due to chance: it would have to exceed about {half}{unit}."
+    if lead.equivalent and column.margin is not None:
+        return f"Over {lead.estimate.size} the two are equal within {lead.text(column.margin)}{unit} (equivalence test)."
+    return f"{size} cannot tell that lead from chance: {detectable_words(lead)}."
 
 
 def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> str:
+    """Metrics that a method leads by more than chance."""
     agree: list[str] = []
     others: dict[str, list[str]] = {}
     for column in columns:
-        ranking = _ranking(summary, column)
         best = [row for row in summary.methods if (cell := summary.cell(row, column.key)) and cell.best]
-        if len(ranking) < 2 or not best:
-            continue
-        if best == [winner]:
-            agree.append(column.label)
-        elif winner not in best:
-            others.setdefault(listing(row.label for row in best), []).append(column.label)
+        for row in best:
+            (agree if row is winner else others.setdefault(row.label, [])).append(column.label)
     parts = [f"It also leads in {listing(agree)}" if agree else ""]
-    parts += [f"{who} {'lead' if ' and ' in who else 'leads'} in {listing(labels)}" for who, labels in others.items()]
+    parts += [f"{who} leads in {listing(labels)}" for who, labels in others.items()]
     text = "; ".join(part for part in parts if part)
     return f"{text}." if text else ""
 
@@ -116,6 +119,8 @@ def _costs(summary: Summary) -> list[str]:
         if len(ranking) < 2:
             continue
         (value, row), (second, _) = ranking[0], ranking[1]
+        if not ((cell := summary.cell(row, column.key)) and cell.best):
+            continue
         ratio = second / value if column.better == "lower" and value else value / second if second else math.inf
         if math.isfinite(ratio) and ratio >= 1.05:
             parts.append(
@@ -125,8 +130,21 @@ def _costs(summary: Summary) -> list[str]:
     return [f"{text}."] if text else []
 
 
+def _unequal_start(comparison: Comparison) -> list[str]:
+    """A warning where methods with primitives may start from points that no method could have found."""
+    told = [run for run in comparison.runs if EXACT_POINTS in str(run.provenance.notes.get("points", ""))]
+    explicit = {run.method for run in told if run.scores.cost.get("primitives")}
+    if not explicit or explicit == {run.method for run in comparison.runs}:
+        return []
+    names = listing(name for name in comparison.methods if name in explicit)
+    return [
+        f"The start is not equal: {names} may begin on exact surface points of the scene, which no method could find and "
+        "others do not use; `--set data.init=sfm` or `data.init=random` makes it equal."
+    ]
+
+
 def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
-    sentences = []
+    sentences = _unequal_start(comparison)
     columns = [column for column in summary.columns if column.group != "cost"]
     reference = _best_baseline(summary, columns[0]) if columns else None
     if reference is not None:
@@ -145,6 +163,9 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
         if run.scores.below_baseline:
             reasons.setdefault(run.method, run.scores.below_baseline)
     sentences += reasons.values()
+    if columns and (broken := [row.label for row in summary.methods if columns[0].key in row.lost]):
+        what = "a fit whose" if len(broken) == 1 else "fits whose"
+        sentences.append(f"{listing(broken)}: {what} {columns[0].label} is not a number, and so left out of the ranking.")
     short = [row.label for row in summary.methods if not row.complete]
     if short:
         words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from invgraphics.config import fill, to_table
+from invgraphics.scenes.mitsuba.build import BUILDERS
 from invgraphics.scenes.mitsuba.spec import Counts, SamplesPerPixel, SceneSpec
 from invgraphics.tables import parse_json
 from invgraphics.text import sha256_of
 
-# The sources that decide pixels, relative to the package; the rest (caching, messages) does not.
+# What decides pixels besides the scene's own builder, relative to the package; the rest (caching, messages) does not.
 _SOURCES = (
-    "scenes/mitsuba/build/*.py", "scenes/mitsuba/rig.py", "scenes/mitsuba/stage.py", "scenes/mitsuba/gbuffer.py",
-    "scenes/mitsuba/render.py", "scenes/mitsuba/folder.py", "core/camera.py", "core/transforms.py", "core/colour.py",
+    "scenes/mitsuba/rig.py", "scenes/mitsuba/stage.py", "scenes/mitsuba/gbuffer.py", "scenes/mitsuba/render.py",
+    "scenes/mitsuba/folder.py", "core/camera.py", "core/transforms.py", "core/colour.py",
 )  # fmt: skip
+_BUILD = "scenes/mitsuba/build"
+_IMPORTED = re.compile(r"^(?:from|import) invgraphics\.scenes\.mitsuba\.build\.(\w+)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -84,14 +88,27 @@ class Job:
 
     def key(self) -> str:
         """Hash of everything the pixels depend on: description, options, our sources, Mitsuba's version and variant."""
-        content = {"job": self.table(), "sources": _source_hash(), "mitsuba": version("mitsuba"), "drjit": version("drjit")}
+        sources, versions = _source_hash(self.spec.builder), {name: version(name) for name in ("mitsuba", "drjit")}
+        content = {"job": self.table(), "sources": sources, **versions}
         return sha256_of(content)[:16]
 
 
-def _source_hash() -> str:
+def _source_hash(builder: str) -> str:
     package = Path(__file__).resolve().parents[2]
     sha = hashlib.sha256()
-    for pattern in _SOURCES:
-        for path in sorted(package.glob(pattern)):
-            sha.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    for path in (*(package / name for name in _SOURCES), *_builder_sources(package / _BUILD, builder)):
+        sha.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return sha.hexdigest()
+
+
+def _builder_sources(folder: Path, builder: str) -> list[Path]:
+    """A builder's module and the modules of ``folder`` that it imports, directly or not: others build other scenes."""
+    module = BUILDERS.get(builder, "").partition(":")[0].rpartition(".")[2]
+    found: set[Path] = set()
+    waiting = [folder / f"{module}.py"] if module else []  # an unknown builder is refused by the renderer
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += [folder / f"{name}.py" for name in _IMPORTED.findall(path.read_text(encoding="utf-8"))]
+    return sorted(found)

@@ -37,7 +37,7 @@ def axis_cell(coordinate, cells):
 
 
 @inlined
-def _dense_entries(x, y, z, cells):
+def dense_entries(x, y, z, cells):
     """Entries of the 8 corners of a cell (x fastest) on a dense level."""
     edge = _u32(cells + 1)
     plane = _u32(edge * edge)
@@ -47,7 +47,7 @@ def _dense_entries(x, y, z, cells):
 
 
 @inlined
-def _hashed_entries(x, y, z, mask):
+def hashed_entries(x, y, z, mask):
     """Entries of the 8 corners of a cell (x fastest) on a hashed level."""
     y0, z0, u = _u32(y * _PRIME_Y), _u32(z * _PRIME_Z), _u32(x + _NEXT)
     y1, z1 = _u32(y0 + _PRIME_Y), _u32(z0 + _PRIME_Z)
@@ -56,16 +56,6 @@ def _hashed_entries(x, y, z, mask):
         _u32(_u32(x ^ a) & mask), _u32(_u32(u ^ a) & mask), _u32(_u32(x ^ b) & mask), _u32(_u32(u ^ b) & mask),
         _u32(_u32(x ^ c) & mask), _u32(_u32(u ^ c) & mask), _u32(_u32(x ^ d) & mask), _u32(_u32(u ^ d) & mask),
     )  # fmt: skip
-
-
-@inlined
-def cell_corners(point, cells, mask):
-    """Entries of the 8 corners around a position (x fastest), and the fractions; ``mask`` is 0 on dense levels."""
-    x, fx = axis_cell(point[0], cells)
-    y, fy = axis_cell(point[1], cells)
-    z, fz = axis_cell(point[2], cells)
-    entries = _dense_entries(x, y, z, cells) if mask == 0 else _hashed_entries(x, y, z, _u32(mask))
-    return entries, (fx, fy, fz)
 
 
 @inlined
@@ -88,13 +78,14 @@ def trilinear_weights(f):
 
 
 @inlined
-def _store_corners(values, n, v):
+def store_corners(values, n, v):
+    """Store the 8 corner values of the block's n-th point."""
     values[n], values[n + _V1], values[n + _V2], values[n + _V3] = v[0], v[1], v[2], v[3]
     values[n + _V4], values[n + _V5], values[n + _V6], values[n + _V7] = v[4], v[5], v[6], v[7]
 
 
 @inlined
-def _table_entries(offset, e):
+def table_entries(offset, e):
     """Entries of a level as entries of the whole table."""
     return (
         _u32(offset + e[0]), _u32(offset + e[1]), _u32(offset + e[2]), _u32(offset + e[3]),
@@ -119,8 +110,8 @@ def locate_block(x, y, z, block, level, entries, weights):
                 axis_cell(y[first + n], cells),
                 axis_cell(z[first + n], cells),
             )
-            _store_corners(entries, n, _table_entries(offset, _dense_entries(i, j, k, cells)))
-            _store_corners(weights, n, trilinear_weights((a, b, c)))
+            store_corners(entries, n, table_entries(offset, dense_entries(i, j, k, cells)))
+            store_corners(weights, n, trilinear_weights((a, b, c)))
     else:
         for number in range(count):
             n = index(number)
@@ -129,8 +120,8 @@ def locate_block(x, y, z, block, level, entries, weights):
                 axis_cell(y[first + n], cells),
                 axis_cell(z[first + n], cells),
             )
-            _store_corners(entries, n, _table_entries(offset, _hashed_entries(i, j, k, mask)))
-            _store_corners(weights, n, trilinear_weights((a, b, c)))
+            store_corners(entries, n, table_entries(offset, hashed_entries(i, j, k, mask)))
+            store_corners(weights, n, trilinear_weights((a, b, c)))
 
 
 @inlined

@@ -12,63 +12,10 @@ from torch import Tensor
 
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.hash.cells import (
-    BLOCK,
-    CHUNK,
-    ZERO,
-    feature_rows,
-    interpolate,
-    load_corners,
-    locate_block,
-    prefetch_entries,
-    scatter_add,
-)
+from invgraphics.kernels.numba.hash.blocks import TWO, block_at, gather_block, scatter_block
+from invgraphics.kernels.numba.hash.cells import BLOCK, CHUNK, ZERO, locate_block, prefetch_entries
 from invgraphics.kernels.numba.hash.jacobian import encode_jvp, encode_jvp_backward, position_gradient
-from invgraphics.kernels.numba.runtime import array, index, inlined, job_start, once_differentiable, parallel, prange, threads
-from invgraphics.kernels.numba.simd.instructions import interpolate_pair, scatter_add_pair
-
-UNIT, TWO = index(1), index(2)
-
-
-@inlined
-def _block(first, until):
-    """First point and number of points of the block that begins at ``first``."""
-    return index(first), min(BLOCK, until - first)
-
-
-@inlined
-def _gather(table, entries, weights, block, column, width, out):
-    """Interpolate the features of a block's points; the usual two are read as a pair."""
-    first, count = block
-    if width == TWO:
-        for point in range(count):
-            n = index(point)
-            low, high = interpolate_pair(table, load_corners(entries, n), load_corners(weights, n))
-            out[first + n, column] = low
-            out[first + n, column + UNIT] = high
-    else:
-        for point in range(count):
-            n = index(point)
-            r, w = feature_rows(load_corners(entries, n), index(0), width), load_corners(weights, n)
-            for feature in range(width):
-                out[first + n, column + index(feature)] = interpolate(table, r, w, index(feature))
-
-
-@inlined
-def _scatter(gradient, entries, weights, block, column, width, grad_table):
-    """The transpose of `_gather`."""
-    first, count = block
-    if width == TWO:
-        for point in range(count):
-            n = index(point)
-            low, high = gradient[first + n, column], gradient[first + n, column + UNIT]
-            scatter_add_pair(grad_table, load_corners(entries, n), load_corners(weights, n), low, high)
-    else:
-        for point in range(count):
-            n = index(point)
-            r, w = feature_rows(load_corners(entries, n), index(0), width), load_corners(weights, n)
-            for feature in range(width):
-                scatter_add(grad_table, r, w, index(feature), gradient[first + n, column + index(feature)])
+from invgraphics.kernels.numba.runtime import array, index, job_start, once_differentiable, parallel, prange, threads
 
 
 @parallel
@@ -85,13 +32,13 @@ def encode(positions, table, width, cells, offsets, masks, jobs, out):
                 for first in range(chunk, until + BLOCK, BLOCK):
                     # Software pipelining: a block's entries are prefetched before those of the previous block are read.
                     if first < until:
-                        block, place = _block(first, until), first // BLOCK % 2
+                        block, place = block_at(first, until), first // BLOCK % 2
                         locate_block(x, y, z, block, level, entries[place], weights[place])
                         if width == TWO:
                             prefetch_entries(table, entries[place], block[1])
                     if first > chunk:
-                        block, place = _block(first - BLOCK, until), (first // BLOCK - 1) % 2
-                        _gather(table, entries[place], weights[place], block, column, width, out)
+                        block, place = block_at(first - BLOCK, until), (first // BLOCK - 1) % 2
+                        gather_block(table, entries[place], weights[place], block, column, width, out)
 
 
 @parallel
@@ -104,9 +51,9 @@ def encode_backward(positions, gradient, width, cells, offsets, masks, jobs, gra
             level, column = (cells[number], offsets[number], masks[number]), index(number) * width
             grad_table[index(offsets[number]) * width : index(offsets[number + 1]) * width] = ZERO
             for first in range(0, len(x), BLOCK):
-                block = _block(first, len(x))
+                block = block_at(first, len(x))
                 locate_block(x, y, z, block, level, entries, weights)
-                _scatter(gradient, entries, weights, block, column, width, grad_table)
+                scatter_block(gradient, entries, weights, block, column, width, grad_table)
 
 
 @cache
@@ -149,17 +96,17 @@ class _PositionGradient(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, unit: Tensor, table: Tensor, gradient: Tensor, grid: HashGrid) -> Tensor:
         ctx.save_for_backward(unit, table, gradient)
-        ctx.grid, grad_unit, width = grid, torch.empty(unit.shape), index(table.shape[1])
+        ctx.grid, by_axis, width = grid, torch.empty(3, len(unit)), index(table.shape[1])
         flat = array(table).reshape(-1)
-        position_gradient(array(unit), flat, array(gradient), width, *levels_of(grid), threads(), grad_unit.numpy())
-        return grad_unit
+        position_gradient(_by_axis(unit), flat, array(gradient), width, *levels_of(grid), threads(), by_axis.numpy())
+        return by_axis.T.contiguous()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         unit, table, gradient = ctx.saved_tensors
         along = torch.where((unit >= 0) & (unit <= 1), grad_outputs[0], 0.0)
-        points, direction, width, levels = array(unit), array(along), index(table.shape[1]), levels_of(ctx.grid)
+        points, direction, width, levels = _by_axis(unit), _by_axis(along), index(table.shape[1]), levels_of(ctx.grid)
         grad_table = grad_cotangent = None
         if ctx.needs_input_grad[1]:
             grad_table = torch.empty(table.shape)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.hash.cells import CHUNK, ONE, ZERO, cell_corners, feature_rows, interpolate, scatter_add
+from invgraphics.kernels.numba.hash.blocks import TWO, block_at, dot_block, gather_block, locate_fractions, scatter_block
+from invgraphics.kernels.numba.hash.cells import BLOCK, CHUNK, ONE, ZERO, load_corners, prefetch_entries, store_corners
 from invgraphics.kernels.numba.runtime import index, inlined, job_start, parallel, prange
 
 
@@ -20,42 +21,6 @@ def trilinear_gradient(v, f):
 
 
 @inlined
-def _vertex_values(table, r, k):
-    return (
-        table[r[0] + k], table[r[1] + k], table[r[2] + k], table[r[3] + k],
-        table[r[4] + k], table[r[5] + k], table[r[6] + k], table[r[7] + k],
-    )  # fmt: skip
-
-
-@parallel
-def position_gradient(unit, table, gradient, width, cells, offsets, masks, jobs, grad_unit):
-    """Gradient of the positions (vector-Jacobian product); zero on axes on which a position was clamped."""
-    for job in prange(jobs):
-        begin, end = job_start(len(unit), jobs, job), job_start(len(unit), jobs, job + 1)
-        for chunk in range(begin, end, CHUNK):
-            grad_unit[chunk : min(chunk + CHUNK, end)] = ZERO
-            for level in range(len(cells)):
-                offset, mask, edge = index(offsets[level]), masks[level], cells[level]
-                scale, column = np.float32(edge), index(level) * width
-                for number in range(chunk, min(chunk + CHUNK, end)):
-                    i = index(number)
-                    entries, f = cell_corners(unit[i], edge, mask)
-                    r = feature_rows(entries, offset, width)
-                    for feature in range(width):
-                        k = index(feature)
-                        x, y, z = trilinear_gradient(_vertex_values(table, r, k), f)
-                        g = gradient[i, column + k] * scale
-                        grad_unit[i, 0] += g * x
-                        grad_unit[i, 1] += g * y
-                        grad_unit[i, 2] += g * z
-            for number in range(chunk, min(chunk + CHUNK, end)):
-                for a in range(3):
-                    coordinate = unit[number, a]
-                    if not (coordinate >= ZERO and coordinate <= ONE):
-                        grad_unit[number, a] = ZERO
-
-
-@inlined
 def weights_jvp(f, v, scale):
     """Jacobian-vector product of `trilinear_weights`: derivatives of the weights in the direction ``v``."""
     x, y, z = f
@@ -68,35 +33,98 @@ def weights_jvp(f, v, scale):
 
 
 @parallel
-def encode_jvp(unit, table, along, width, cells, offsets, masks, jobs, out):
-    """Jacobian-vector product of the encoding: derivative of all features in the direction ``along`` of each point."""
+def position_gradient(positions, table, gradient, width, cells, offsets, masks, jobs, grad_positions):
+    """Gradient of the positions (vector-Jacobian product); zero on axes on which a position was clamped.
+
+    ``positions`` and ``grad_positions`` are (3, m), ``table`` is flat.
+    """
+    x, y, z = positions[0], positions[1], positions[2]
     for job in prange(jobs):
-        begin, end = job_start(len(unit), jobs, job), job_start(len(unit), jobs, job + 1)
+        entries, fractions = np.empty((2, 8 * BLOCK), np.uint32), np.empty((2, 3, BLOCK), np.float32)
+        products = np.empty(8 * BLOCK, np.float32)
+        begin, end = job_start(len(x), jobs, job), job_start(len(x), jobs, job + 1)
         for chunk in range(begin, end, CHUNK):
-            for level in range(len(cells)):
-                offset, mask, edge = index(offsets[level]), masks[level], cells[level]
-                column = index(level) * width
-                for number in range(chunk, min(chunk + CHUNK, end)):
-                    i = index(number)
-                    entries, f = cell_corners(unit[i], edge, mask)
-                    w, r = weights_jvp(f, along[i], np.float32(edge)), feature_rows(entries, offset, width)
-                    for feature in range(width):
-                        k = index(feature)
-                        out[i, column + k] = interpolate(table, r, w, k)
+            until = min(chunk + CHUNK, end)
+            grad_positions[:, chunk:until] = ZERO
+            for number in range(len(cells)):
+                level, column = (cells[number], offsets[number], masks[number]), index(number) * width
+                # The next block's entries are prefetched, as in `encode`.
+                for first in range(chunk, until + BLOCK, BLOCK):
+                    if first < until:
+                        block, place = block_at(first, until), first // BLOCK % 2
+                        locate_fractions(x, y, z, block, level, entries[place], fractions[place])
+                        if width == TWO:
+                            prefetch_entries(table, entries[place], block[1])
+                    if first > chunk:
+                        block, place = block_at(first - BLOCK, until), (first // BLOCK - 1) % 2
+                        dot_block(table, entries[place], gradient, block, column, width, products)
+                        _add_gradient(products, fractions[place], block, np.float32(cells[number]), grad_positions)
+            for axis in range(3):
+                for number in range(chunk, until):
+                    coordinate = positions[axis, number]
+                    if not (coordinate >= ZERO and coordinate <= ONE):
+                        grad_positions[axis, number] = ZERO
+
+
+@inlined
+def _add_gradient(products, fractions, block, scale, grad_positions):
+    """Add a level's part of the gradients of a block's positions, from the `dot_block` of its corners."""
+    first, count = block
+    for number in range(count):
+        n = index(number)
+        f = fractions[0, n], fractions[1, n], fractions[2, n]
+        along_x, along_y, along_z = trilinear_gradient(load_corners(products, n), f)
+        grad_positions[0, first + n] += scale * along_x
+        grad_positions[1, first + n] += scale * along_y
+        grad_positions[2, first + n] += scale * along_z
+
+
+@inlined
+def _locate_jvp(positions, along, block, level, buffers):
+    """Entries of a block's corners, and the derivatives of their weights in each point's direction ``along``, (3, m)."""
+    entries, fractions, weights = buffers
+    first, count = block
+    locate_fractions(positions[0], positions[1], positions[2], block, level, entries, fractions)
+    a, b, c, scale = along[0], along[1], along[2], np.float32(level[0])
+    for number in range(count):
+        n = index(number)
+        f = fractions[0, n], fractions[1, n], fractions[2, n]
+        store_corners(weights, n, weights_jvp(f, (a[first + n], b[first + n], c[first + n]), scale))
 
 
 @parallel
-def encode_jvp_backward(unit, gradient, along, width, cells, offsets, masks, jobs, grad_table):
+def encode_jvp(positions, table, along, width, cells, offsets, masks, jobs, out):
+    """Jacobian-vector product of the encoding: derivative of all features in the direction ``along`` of each point."""
+    for job in prange(jobs):
+        entries, weights = np.empty((2, 8 * BLOCK), np.uint32), np.empty((2, 8 * BLOCK), np.float32)
+        fractions = np.empty((3, BLOCK), np.float32)
+        begin = job_start(positions.shape[1], jobs, job)
+        end = job_start(positions.shape[1], jobs, job + 1)
+        for chunk in range(begin, end, CHUNK):
+            until = min(chunk + CHUNK, end)
+            for number in range(len(cells)):
+                level, column = (cells[number], offsets[number], masks[number]), index(number) * width
+                for first in range(chunk, until + BLOCK, BLOCK):
+                    if first < until:
+                        block, place = block_at(first, until), first // BLOCK % 2
+                        _locate_jvp(positions, along, block, level, (entries[place], fractions, weights[place]))
+                        if width == TWO:
+                            prefetch_entries(table, entries[place], block[1])
+                    if first > chunk:
+                        block, place = block_at(first - BLOCK, until), (first // BLOCK - 1) % 2
+                        gather_block(table, entries[place], weights[place], block, column, width, out)
+
+
+@parallel
+def encode_jvp_backward(positions, gradient, along, width, cells, offsets, masks, jobs, grad_table):
     """Gradient of the table through `encode_jvp`, whose cotangent is ``gradient``; jobs own levels as in `encode_backward`."""
     for job in prange(jobs):
-        for level in range(job, len(cells), jobs):
-            offset, mask, edge = index(offsets[level]), masks[level], cells[level]
-            column = index(level) * width
-            grad_table[offset * width : index(offsets[level + 1]) * width] = ZERO
-            for number in range(len(unit)):
-                i = index(number)
-                entries, f = cell_corners(unit[i], edge, mask)
-                w, r = weights_jvp(f, along[i], np.float32(edge)), feature_rows(entries, offset, width)
-                for feature in range(width):
-                    k = index(feature)
-                    scatter_add(grad_table, r, w, k, gradient[i, column + k])
+        entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
+        fractions = np.empty((3, BLOCK), np.float32)
+        for number in range(job, len(cells), jobs):
+            level, column = (cells[number], offsets[number], masks[number]), index(number) * width
+            grad_table[index(offsets[number]) * width : index(offsets[number + 1]) * width] = ZERO
+            for first in range(0, positions.shape[1], BLOCK):
+                block = block_at(first, positions.shape[1])
+                _locate_jvp(positions, along, block, level, (entries, fractions, weights))
+                scatter_block(gradient, entries, weights, block, column, width, grad_table)

@@ -85,6 +85,23 @@ def scatter_add_pair(typing: Any, table: Any, entries: Any, weights: Any, low: A
 
 
 @_intrinsic
+def dot_pair(typing: Any, table: Any, entries: Any, low: Any, high: Any) -> Any:
+    """Products ``low a + high b`` with the pairs (a, b) of 8 entries (uint32) of a flat table."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointers = _pair_pointers(context, builder, signature.args[0], arguments[0], arguments[1])
+        products = []
+        for pointer in pointers:
+            pair = builder.load(pointer, align=4)
+            a, b = (builder.extract_element(pair, ir.Constant(ir.IntType(32), k)) for k in range(2))
+            first = builder.fmul(a, arguments[2], flags=_FLAGS)
+            products.append(_multiply_add(builder, b, arguments[3], first))
+        return context.make_tuple(builder, signature.return_type, products)
+
+    return types.UniTuple(types.float32, 8)(table, entries, low, high), generate
+
+
+@_intrinsic
 def lowest_bit(typing: Any, word: Any) -> Any:
     """Index of the lowest set bit of a non-zero uint64."""
 

@@ -6,6 +6,7 @@ BUILDERS = {
     "fence": "invgraphics.scenes.mitsuba.build.fence:build",
     "materials": "invgraphics.scenes.mitsuba.build.materials:build",
     "room": "invgraphics.scenes.mitsuba.build.room:build",
+    "shelf": "invgraphics.scenes.mitsuba.build.shelf:build",
     "textured": "invgraphics.scenes.mitsuba.build.textured:build",
 }
 """Builder name -> function that takes the scene's seed and returns a `Model`."""

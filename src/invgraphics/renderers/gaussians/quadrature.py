@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from invgraphics.core import Rays
-from invgraphics.renderers.gaussian_rays import MAX_DEVIATIONS, Intersections
+from invgraphics.renderers.gaussians.rays import MAX_DEVIATIONS, Intersections
 
 Weights = tuple[Float[Tensor, " p"], Float[Tensor, " p"] | None]
 """Each Gaussian's share of a ray's light; and the same times the distance from which it comes, or ``None``."""

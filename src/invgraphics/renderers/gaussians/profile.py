@@ -10,7 +10,7 @@ from torch import Tensor
 
 from invgraphics.core import Profile, Rays
 from invgraphics.core.contributions import POINTS
-from invgraphics.renderers.gaussian_quadrature import phi
+from invgraphics.renderers.gaussians.quadrature import phi
 
 REACH = 4.0
 """Standard deviations to either side of the first and last Gaussian that a profile covers."""

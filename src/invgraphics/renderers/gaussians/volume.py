@@ -14,14 +14,13 @@ from typing_extensions import override
 from invgraphics import kernels
 from invgraphics.core import Camera, Context, Contributions, Field, Quantity, RayRenderer, Rays, Rendering, Scene, Trace
 from invgraphics.core.contributions import opacities
-from invgraphics.kernels.types import ALPHA_MIN
+from invgraphics.kernels.extinction import SMALLEST_DEPTH, Opacity
 from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.gaussian_profile import density_profile, transmittance
-from invgraphics.renderers.gaussian_quadrature import Weights, integrate_overlapping, phi
-from invgraphics.renderers.gaussian_rays import (
+from invgraphics.renderers.gaussians.profile import density_profile, transmittance
+from invgraphics.renderers.gaussians.quadrature import Weights, integrate_overlapping, phi
+from invgraphics.renderers.gaussians.rays import (
     MAX_DEVIATIONS,
     Intersections,
-    Opacity,
     Primitives,
     colours,
     intersect,
@@ -44,7 +43,7 @@ class GaussianExactConfig:
     share of it each overlapping Gaussian has is found by quadrature, with an error of second order.
 
     Attributes:
-        opacity: what opacity means, see `invgraphics.renderers.gaussian_rays.Opacity`.
+        opacity: what opacity means, see `invgraphics.kernels.extinction.Opacity`.
         steps: intervals of each ray, placed where alpha and optical depth grow.
         smallest: optical depth below which a Gaussian is left out of a ray.
     """
@@ -53,7 +52,7 @@ class GaussianExactConfig:
 
     opacity: Literal["peak", "physical"] = "peak"
     steps: int = 32
-    smallest: float = ALPHA_MIN / 4
+    smallest: float = SMALLEST_DEPTH
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_STEPS:
@@ -70,7 +69,7 @@ class GaussianSortedConfig:
     """Each Gaussian integrated along the ray by itself, then composited front to back as if none overlapped.
 
     Attributes:
-        opacity: what opacity means, see `invgraphics.renderers.gaussian_rays.Opacity`.
+        opacity: what opacity means, see `invgraphics.kernels.extinction.Opacity`.
         order: ``ray`` sorts by the distance of the largest response on each ray; ``centre`` by the depth of the centre along
             the optical axis, one order for all pixels as splatters have it (along the ray itself where there is no camera).
         smallest: optical depth below which a Gaussian is left out of a ray; ``splat`` leaves out alphas below 1/255.
@@ -80,7 +79,7 @@ class GaussianSortedConfig:
 
     opacity: Opacity = "peak"
     order: Literal["ray", "centre"] = "ray"
-    smallest: float = ALPHA_MIN / 4
+    smallest: float = SMALLEST_DEPTH
 
     def __post_init__(self) -> None:
         _check_smallest(self.smallest)

@@ -8,7 +8,6 @@ direction, its response along the ray is ``G exp(-(t - t*)² / 2 sigma²)`` with
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -17,22 +16,11 @@ from torch.nn.functional import normalize
 
 from invgraphics.core import Gaussians, Rays, harmonics
 from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.kernels.extinction import Opacity, reach, strength
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN
-
-Opacity = Literal["peak", "physical", "splat"]
-"""What a primitive's opacity *a* means.
-
-- ``peak``: the optical depth of the whole line is ``-ln(1 - a) G``, so that a ray through the centre has alpha *a* from any
-  side. No density in space does that: each ray sees another one.
-- ``physical``: one density in space, the one whose extinction (optical depth over all lines of a direction), averaged over
-  directions, is that of ``peak``; long axes look denser from their ends. For a sphere the two are the same.
-- ``splat``: alpha is ``a G``, as splatters have it, which ignores that light is absorbed along the way.
-"""
 
 MAX_DEVIATIONS = 8.0
 """Standard deviations beyond which nothing of a Gaussian is left, even in float64."""
-THOMSEN = 1.6075
-"""Exponent of Thomsen's formula for the surface of an ellipsoid, whose relative error is at most 1.1%."""
 ROUNDING = 1e-5
 """Relative error allowed for in the search, which squares and subtracts distances in float32."""
 MOST_TESTED = 1 << 18
@@ -100,39 +88,19 @@ def precompute(gaussians: Gaussians, opacity: Opacity, smallest: float, origin: 
         origin: where all rays begin, if that is one point.
     """
     axes, scales = quaternion_to_matrix(gaussians.quaternions), gaussians.scales
-    peak = gaussians.opacities.clamp_max(ALPHA_MAX)
-    strength = gaussians.opacities if opacity == "splat" else -torch.log1p(-peak)
-    with torch.no_grad():
-        largest = strength
-    if opacity == "physical":
-        strength = strength * mean_inverse_scale(scales)
-        with torch.no_grad():
-            largest = strength * scales.amax(dim=1)
-    with torch.no_grad():
-        limit = ALPHA_MIN if opacity == "splat" else smallest
-        reach = (2 * torch.log((largest / limit).clamp_min(1.0))).sqrt()
-        radius = reach * scales.amax(dim=1)
+    deviations = reach(gaussians, opacity, smallest)
     shortest = scales.argmin(dim=1)[:, None, None].expand(-1, 3, 1)
     return Primitives(
         means=gaussians.means,
         whitening=axes.transpose(1, 2) / scales[:, :, None],
-        strength=strength,
+        strength=strength(gaussians, opacity),
         normals=axes.gather(2, shortest)[:, :, 0],
         sh=gaussians.sh,
         rgb=None if origin is None else _colour(gaussians.sh, gaussians.means - origin),
-        reach=reach,
-        radius=radius,
+        reach=deviations,
+        radius=deviations * scales.detach().amax(dim=1),
         opacity=opacity,
     )
-
-
-def mean_inverse_scale(scales: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
-    """Mean of 1 / sigma over all directions, where sigma is the standard deviation along a line.
-
-    It is the mean of ``sqrt(dᵀ Σ⁻¹ d)``, Carlson's R_G(1/s²), and by Cauchy's formula the ellipsoid's surface over
-    4 pi s1 s2 s3, for which Thomsen's power mean is taken.
-    """
-    return scales.reciprocal().pow(THOMSEN).mean(dim=1).pow(1 / THOMSEN)
 
 
 def intersect(primitives: Primitives, rays: Rays) -> Intersections:
@@ -140,10 +108,10 @@ def intersect(primitives: Primitives, rays: Rays) -> Intersections:
     ray, gaussian = _candidate_pairs(primitives, rays)
     table = torch.cat([primitives.means, primitives.whitening.flatten(1), primitives.strength[:, None]], dim=1)
     # index_select has a faster gradient than indexing.
-    means, whitening, strength = table.index_select(0, gaussian).split([3, 9, 1], dim=1)
+    means, whitening, factor = table.index_select(0, gaussian).split([3, 9, 1], dim=1)
     offset = means - rays.origins.index_select(0, ray)
     t, sigma, squared = _restrict_to_rays(whitening.view(-1, 3, 3), offset, rays.directions.index_select(0, ray))
-    response = strength[:, 0] * torch.exp(-0.5 * squared)
+    response = factor[:, 0] * torch.exp(-0.5 * squared)
     if primitives.opacity == "peak":
         depth = response
     elif primitives.opacity == "physical":

@@ -1,0 +1,85 @@
+"""``invgraphics convert``: make a run of another parameterisation of a finished one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from invgraphics.cli.output import show_table
+from invgraphics.recipes.recipe import presets
+from invgraphics.runs.folder import check_run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert:
+    """Convert a run's model to another kind of scene, score it, refit it briefly, and keep it as a run like any other."""
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a run."""
+    to: Annotated[str, arg(metavar="gaussians|lattice|mpi")]
+    """What to make: Gaussians on the surfaces that training views see; a voxel grid of density and spherical harmonics; or a
+    multi-plane image, for scenes seen from one side. The last two need a density."""
+    out: Annotated[Path, arg(metavar="RUN2")]
+    """Folder of the new run."""
+    method: Annotated[str, arg(metavar="METHOD", help_behavior_hint="(default: one that suits the target)")] = ""
+    """Method whose field is made, and which refits it."""
+    refit: Annotated[str, arg(metavar="10s|500steps")] = "10s"
+    """Budget of the refit."""
+    size: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 20000 Gaussians, 96 vertices)")] = None
+    """Number of Gaussians, or of vertices along a lattice's longest edge."""
+    overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
+    """Change one value of the method's recipe."""
+    seed: int = 0
+    """Seed of the sampling and of the refit."""
+    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    """Another copy of the scene, for instance where the data set has moved."""
+    kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
+    """Force an implementation of the hot operations: numba, or reference (plain torch)."""
+
+    def run(self) -> int:
+        """Convert, refit and score; prints the three scores and the new folder. Returns exit status 0."""
+        if self.method:
+            presets(self.method)  # refuses an unknown method before torch is imported
+        check_run(self.folder)
+
+        from invgraphics.tools.convert import ConvertRequest, convert_run
+
+        done = convert_run(
+            ConvertRequest(
+                run=self.folder,
+                to=self.to,
+                out=self.out,
+                method=self.method,
+                refit=self.refit,
+                size=self.size,
+                overrides=tuple(self.overrides),
+                seed=self.seed,
+                scene=self.scene,
+                kernels=self.kernels,
+            )
+        )
+        columns = (
+            (f"{done.native.method}", done.native),
+            ("converted", done.converted),
+            (f"after {self.refit}", done.refitted),
+        )
+        rows = [
+            (metric, *(_value(scores.quality[metric].mean) for _, scores in columns), quality.unit)
+            for metric, quality in done.refitted.quality.items()
+            if all(metric in scores.quality for _, scores in columns)
+        ]
+        rows.append(("size", *(_megabytes(scores.cost.get("model_bytes")) for _, scores in columns), "MB"))
+        show_table(f"Converted {self.folder} to {self.to}", ("metric", *(name for name, _ in columns), "unit"), rows)
+        print(done.folder.root)
+        return 0
+
+
+def _value(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _megabytes(value: float | None) -> str:
+    return "-" if value is None else f"{value / 1e6:.3g}"

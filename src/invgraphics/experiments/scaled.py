@@ -1,0 +1,47 @@
+"""Scores of a model in smaller pictures than those of the test views, against truth of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from invgraphics.core import Model, Scene
+from invgraphics.metrics.protocols import protocol_named, score, summarise
+from invgraphics.runs.scores import Score
+from invgraphics.scenes.scales import scene_at
+
+SCALED = ("psnr", "ssim")
+"""Metrics that are computed at other scales."""
+
+
+def scaled_scores(
+    model: Model, scene: Scene, protocol: str, data: Mapping[str, Any], *, refined: bool = False
+) -> tuple[dict[str, Score], dict[str, str]]:
+    """Render and score the test views at the scales that ``data.test_scales`` names.
+
+    Args:
+        model: what is scored.
+        scene: as loaded.
+        protocol: name of the rules.
+        data: the run's changes of the data (`TrainingData.changes`).
+        refined: whether the fit has refined its poses: test views at other scales are then not aligned, and not scored.
+
+    Returns:
+        ``psnr_at_1_8`` and the like, for each divisor, and what was left out and why.
+    """
+    rules, quality, skipped = protocol_named(protocol), {}, {}
+    for divisor in data.get("test_scales", ()):
+        if refined:
+            skipped |= {named(metric, divisor): "the fit has refined its poses" for metric in SCALED}
+            continue
+        smaller = scene_at(scene, divisor)
+        scores = [score(model.render(view.camera, normals=False), view, smaller, rules) for view in smaller.test]
+        found, missing = summarise(scores, rules)
+        quality |= {named(metric, divisor): found[metric] for metric in SCALED if metric in found}
+        skipped |= {named(metric, divisor): missing[metric] for metric in SCALED if metric in missing}
+    return quality, skipped
+
+
+def named(metric: str, divisor: int) -> str:
+    """Name of a metric at 1/``divisor`` of the test views' size."""
+    return f"{metric}_at_1_{divisor}"

@@ -1,0 +1,129 @@
+"""The training views with their depth maps as a field: nothing is fitted, other views are warped from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Camera, Context, Field, FieldValues, Quantity, Rays, Samples, Scene, View
+from invgraphics.core.bounds import Bounds
+from invgraphics.errors import InputError, NotComposableError
+from invgraphics.fields.convert import require_density, sample_weights
+
+MIN_ALPHA = 0.5
+"""Opacity of a ray from which on a fitted field has a depth there (CONVENTIONS.md)."""
+RAYS = 2048
+
+
+@dataclass(frozen=True)
+class DepthMapsConfig:
+    """Settings of the training views' depth maps.
+
+    Attributes:
+        depth: ``scene`` takes the depth that the data set has (for built-in scenes, the truth's); ``field`` renders that of the
+            run that ``source`` names.
+        source: folder of a run of a density field on the same scene; for ``depth = "field"``.
+    """
+
+    title: ClassVar[str] = "photographs with depth"
+
+    depth: Literal["scene", "field"] = "scene"
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if (self.depth == "field") != bool(self.source):
+            raise ValueError("depth = 'field' needs the folder of a run as 'source', and nothing else does.")
+
+    def build(self, scene: Scene) -> DepthMapField:
+        """Take over the training views; with ``depth = "field"`` they show nothing until `converted` is given the field.
+
+        Raises:
+            InputError: a training view has no depth, or they differ in size.
+        """
+        if self.depth == "field":
+            return DepthMapField(scene.train, [torch.full(view.image.shape[:2], torch.inf) for view in scene.train])
+        missing = [view.name for view in scene.train if view.depth is None]
+        if missing:
+            raise InputError(
+                f"{len(missing)} training views of scene '{scene.name}' have no depth, the first of them {missing[0]}.",
+                "Set field.depth = 'field' and field.source to a run of a density field on this scene.",
+            )
+        return DepthMapField(scene.train, [view.depth for view in scene.train if view.depth is not None])
+
+    def converted(self, source: Field, scene: Scene) -> DepthMapField:
+        """The training views with the depth that the density field ``source`` has there.
+
+        Raises:
+            InputError: it has no density and radiance.
+        """
+        require_density(source)
+        return DepthMapField(scene.train, [field_depth(source, view.camera, scene.bounds) for view in scene.train])
+
+
+@torch.no_grad()
+def field_depth(field: Field, camera: Camera, bounds: Bounds) -> Float[Tensor, "h w"]:
+    """Mean distance at which a density stops the light of each pixel's ray; infinite where alpha is below `MIN_ALPHA`."""
+    device = next((parameter.device for parameter in field.parameters()), torch.device("cpu"))
+    parts = []
+    for rays in camera.rays().chunks(RAYS):
+        parts.append(_depth_along(field, rays.to(device), bounds.to(device)).cpu())
+    return torch.cat(parts).view(camera.height, camera.width)
+
+
+def _depth_along(field: Field, rays: Rays, bounds: Bounds) -> Float[Tensor, " n"]:
+    samples, weights = sample_weights(field, rays, bounds)
+    middle = ((samples.t0 + samples.t1) / 2).view_as(weights)
+    alpha = weights.sum(dim=1)
+    return torch.where(alpha >= MIN_ALPHA, (weights * middle).sum(dim=1) / alpha.clamp_min(MIN_ALPHA), torch.inf)
+
+
+class DepthMapField(Field):
+    """Photographs with depth, all of one size; without parameters.
+
+    Args:
+        views: the photographs.
+        depths: distance along the unit ray of each pixel, infinite where nothing is hit.
+
+    Raises:
+        InputError: the photographs differ in size.
+    """
+
+    provides = Quantity.DEPTH_MAPS
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor
+    poses: Tensor
+    focal: Tensor
+    centre: Tensor
+
+    def __init__(self, views: Sequence[View], depths: Sequence[Float[Tensor, "h w"]]) -> None:
+        super().__init__()
+        sizes = {view.image.shape[:2] for view in views}
+        if len(sizes) > 1:
+            remedy = "Give one size with --size WIDTHxHEIGHT."
+            raise InputError("Warping by depth needs training views of one size; these differ.", remedy)
+        self.names = tuple(view.name for view in views)
+        self.register_buffer("rgb", torch.stack([view.colour() for view in views]))
+        self.register_buffer("alpha", torch.stack([view.opacity() for view in views]))
+        self.register_buffer("depth", torch.stack(list(depths)))
+        for name, values in (("poses", "cam_to_world"), ("focal", "focal"), ("centre", "centre")):
+            self.register_buffer(name, torch.stack([getattr(view.camera, values) for view in views]).detach().clone())
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        """Refuse pointwise queries: this field has photographs only."""
+        raise NotComposableError(f"DepthMapField has no {want.words()} at points.", "It provides depth_maps.")
+
+    def primitives(self, want: Quantity, ctx: Context) -> tuple[View, ...]:
+        """The photographs, each with its depth, in floats."""
+        if want != Quantity.DEPTH_MAPS:
+            return super().primitives(want, ctx)
+        height, width = self.depth.shape[1:]
+        lenses = zip(self.poses, self.focal, self.centre, strict=True)
+        cameras = [Camera(pose, focal, centre, width, height) for pose, focal, centre in lenses]
+        layers = zip(cameras, self.rgb, self.names, self.alpha, self.depth, strict=True)
+        return tuple(View(camera, rgb, name, alpha=alpha, depth=depth) for camera, rgb, name, alpha, depth in layers)

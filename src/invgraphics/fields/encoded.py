@@ -1,0 +1,35 @@
+"""Encodings built for a region, and evaluated at samples: at their positions, or over their cones' Gaussians."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.field import Encoding
+from invgraphics.core.samples import Samples
+from invgraphics.fields.encodings.lattices import LatticeConfig
+
+
+def build_encoding(config: Any, bounds: Bounds) -> Encoding:
+    """Build an encoding from its config; lattices take their proportions from the bounds."""
+    return config.build(bounds.half.tolist()) if isinstance(config, LatticeConfig) else config.build()
+
+
+def encode_samples(
+    encoding: Encoding, bounds: Bounds, samples: Samples, unit: Float[Tensor, "m 3"] | None = None
+) -> Float[Tensor, "m f"]:
+    """Features of samples; of their cones' Gaussians where the encoding takes covariances (mip-NeRF, equation 7 to 9).
+
+    Args:
+        encoding: of the unit cube.
+        bounds: of the field.
+        samples: where; differentiable in their positions.
+        unit: their positions in the unit cube, where they are known.
+    """
+    if not encoding.needs_covariance:
+        return encoding(bounds.to_unit(samples.position) if unit is None else unit)
+    mean = samples.cone_mean
+    return encoding(bounds.to_unit(mean), bounds.unit_covariance(mean, samples.covariance))

@@ -1,0 +1,163 @@
+"""Sampling by proposals, small densities that say where to look closer (mip-NeRF 360, Barron et al. 2022, §3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import prod
+from typing import Annotated, Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from typing_extensions import override
+
+from invgraphics.config import Slot
+from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.spacing import from_spacing, to_spacing
+from invgraphics.errors import NotComposableError
+from invgraphics.renderers.histograms import blur, dilate, resample
+from invgraphics.renderers.quadrature import sample_weights
+from invgraphics.renderers.samplers import hit_indices, pack, unit_ball_exit
+
+
+@dataclass(frozen=True)
+class ProposalsConfig:
+    """Settings of sampling by proposals; the defaults are mip-NeRF 360's unless noted.
+
+    Attributes:
+        counts: intervals per ray of each proposal level.
+        count: intervals per ray of the last level, which is rendered.
+        fields: densities of the proposal levels, one each, trained by the loss ``interlevel`` alone. None at all: each level
+            queries the rendered field, as in NeRF and mip-NeRF.
+        train_levels: whether levels that query the rendered field are rendered in colour in training, with gradients, for the
+            loss ``coarse`` (mip-NeRF).
+        dilation: widening of a level's intervals before the next one is drawn, in the longest interval of the spacing's [0, 1]
+            over the product of the numbers of intervals so far; thin things then survive between two rays.
+        dilation_bias: the same as a share of the ray.
+        blurred: whether weights are widened by mip-NeRF's filter (equation 18) instead.
+        padding: added to every weight before it is drawn from (mip-NeRF: 0.01).
+        anneal: slope s of the exponent s p / ((s - 1) p + 1) of weights at a progress p of the fit, which holds samples apart
+            while proposals know little; 0 for none.
+        jitter_per_ray: whether all samples of a ray are moved together in training, and not one by one.
+    """
+
+    counts: tuple[int, ...] = (64, 64)
+    count: int = 32
+    fields: tuple[Annotated[Any, Slot("fields")], ...] = ()
+    train_levels: bool = False
+    dilation: float = 0.5
+    dilation_bias: float = 0.0025
+    blurred: bool = False
+    padding: float = 1e-5
+    anneal: float = 10.0
+    jitter_per_ray: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.counts or min(*self.counts, self.count) < 2:
+            raise ValueError("counts must name one level at least, and every level needs 2 intervals or more.")
+        if self.fields and len(self.fields) != len(self.counts):
+            raise ValueError(f"fields must be one for each of the {len(self.counts)} counts, or none, not {len(self.fields)}.")
+        if min(self.dilation, self.dilation_bias, self.anneal) < 0 or self.padding <= 0:
+            raise ValueError("dilation, dilation_bias and anneal must not be negative, padding must be above 0.")
+        if self.fields and self.train_levels:
+            raise ValueError("train_levels is for levels without fields of their own.")
+        if self.blurred and (self.dilation or self.dilation_bias):
+            raise ValueError("weights are either blurred or dilated: blurred = true needs dilation = dilation_bias = 0.")
+
+    def exponent(self, progress: float) -> float:
+        """Exponent of weights at a progress of the fit in [0, 1], from 0 (even sampling) to 1."""
+        return 1.0 if self.anneal == 0 else self.anneal * progress / ((self.anneal - 1) * progress + 1)
+
+    def build(self, scene: Scene) -> Proposals:
+        """The sampler with the fields of its levels."""
+        return Proposals(self, [field.build(scene) for field in self.fields])
+
+
+class Proposals(Sampler):
+    """Sampler of several levels, each drawn from the weights of the one before.
+
+    Positions carry no gradient into levels with fields of their own: poses are fitted to the rendered level.
+
+    Attributes:
+        fields: densities of the proposal levels; empty where the rendered field is asked.
+    """
+
+    def __init__(self, config: ProposalsConfig, fields: list[Field]) -> None:
+        super().__init__()
+        for field in fields:
+            if Quantity.DENSITY not in field.provides:
+                raise NotComposableError(f"A proposal needs density, which {type(field).__name__} does not provide.")
+        self.config = config
+        self.fields = nn.ModuleList(fields)
+
+    @override
+    def untrained(self) -> Proposals:
+        """Copy of the sampler with the rendered field's density in place of trained proposals."""
+        if not self.config.fields:
+            return self
+        return Proposals(replace(self.config, fields=()), [])
+
+    @override
+    def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
+        """Sample every ray that meets the bounds, level by level; outside the graph the last level's density comes along."""
+        hit = hit_indices(rays)
+        near, far, knee = self._ends(rays, hit, ctx)
+        place, mass = near.new_tensor([0.0, 1.0]).expand(len(hit), 2), near.new_ones(len(hit), 1)
+        exponent = self.config.exponent(ctx.progress if ctx.training else 1.0)
+        levels: list[Trace] = []
+
+        def intervals(count: int) -> tuple[Tensor, Samples]:
+            drawn = resample(place, mass, count, ctx, per_ray=self.config.jitter_per_ray)
+            return drawn, pack(rays, hit, from_spacing(torch.lerp(near, far, drawn), ctx.bounds, knee))
+
+        for index, count in enumerate(self.config.counts):
+            place, samples = intervals(count)
+            levels.append(self._level(index, samples, len(rays), field, ctx))
+            weights = levels[-1].weights
+            assert weights is not None
+            place, mass = self._widened(place, weights.detach().view(len(hit), count), prod(self.config.counts[: index + 1]))
+            mass = (mass + self.config.padding) ** exponent
+        _, samples = intervals(self.config.count)
+        hidden = ctx.training and not self.config.fields and not self.config.train_levels
+        return self._with_density(samples, field, ctx), () if hidden else tuple(levels)
+
+    def _ends(self, rays: Rays, hit: Int[Tensor, " k"], ctx: Context) -> tuple[Tensor, Tensor, Tensor]:
+        """Both ends of the rays in spacing coordinates, and the knee of the spacing, each (k, 1)."""
+        knee = unit_ball_exit(rays[hit], ctx.bounds)
+        near, far = (to_spacing(end[hit, None], ctx.bounds, knee) for end in (rays.near, rays.far))
+        return near, far, knee
+
+    @torch.no_grad()
+    def _widened(
+        self, edges: Float[Tensor, "k edges"], weights: Float[Tensor, "k bins"], intervals: int
+    ) -> tuple[Tensor, Tensor]:
+        """Edges and weights to draw from: dilated or blurred, where the settings say so."""
+        if self.config.blurred:
+            return edges, blur(weights)
+        by = self.config.dilation_bias + self.config.dilation / intervals
+        return dilate(edges, weights, by) if by > 0 else (edges, weights)
+
+    def _level(self, index: int, samples: Samples, rays: int, field: Field, ctx: Context) -> Trace:
+        """Density and weights of one level."""
+        if self.config.fields:
+            still = {name: getattr(samples, name).detach() for name in ("t0", "t1", "position", "direction")}
+            samples = replace(samples, **still)
+            values = self.fields[index].query(samples, Quantity.DENSITY)  # type: ignore[operator]
+        elif self.config.train_levels and ctx.training:
+            values = field.query(samples, Quantity.DENSITY | (field.provides & Quantity.RADIANCE))
+        else:
+            values = field.query_no_grad(samples, Quantity.DENSITY)
+        assert values.density is not None
+        return Trace(samples, values, sample_weights(values.density, samples, rays), rays=rays)
+
+    def _with_density(self, samples: Samples, field: Field, ctx: Context) -> Samples:
+        """Samples with the field's density and features, outside the graph, where colour is queried of few of them only."""
+        if ctx.training or torch.is_grad_enabled() or Quantity.DENSITY not in field.provides:
+            return samples
+        want = Quantity.DENSITY | (field.provides & Quantity.FEATURES)
+        parts = [field.query_no_grad(samples[at : at + ctx.chunk], want) for at in range(0, len(samples), ctx.chunk)]
+        if not parts:
+            return samples
+        density = torch.cat([part.density for part in parts if part.density is not None])
+        features = [part.features for part in parts if part.features is not None]
+        return replace(samples, density=density, features=torch.cat(features) if features else None)

@@ -1,0 +1,220 @@
+"""Which runs a contrast compares, and with which values: same scene, same views, same other levels; diverged fits are counted.
+
+Seeds of one method share their random draws where only a setting differs, so that they pair. Seeds of different methods have
+nothing in common but the number: they are two independent groups.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from invgraphics.report.data.factors import METHOD, Lost, Observation
+from invgraphics.report.data.variants import level_words
+from invgraphics.report.statistics.values import clipped, diverged, value_of
+from invgraphics.report.wording import Quantity
+from invgraphics.runs.run import Run
+
+Sign = float
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """A comparison to be tested: ``after`` minus ``before`` of a factor, or how that differs between two levels of another.
+
+    Attributes:
+        factor: dotted path, or ``method``.
+        before: level that is subtracted.
+        after: level that it is subtracted from.
+        where: factor -> the only level that counts.
+        against: (factor, level, level) for an interaction: the difference at the second level minus that at the first.
+        name: what the contrast is called, where the levels alone do not say.
+    """
+
+    factor: str
+    before: str
+    after: str
+    where: Mapping[str, str] = field(default_factory=dict)
+    against: tuple[str, str, str] | None = None
+    name: str = ""
+
+    @property
+    def label(self) -> str:
+        """The contrast in words."""
+        words = self.name or contrast_words(self.factor, self.before, self.after)
+        if self.against is not None:
+            factor, low, high = self.against
+            words = f"{words}, at {f'{factor} ' if factor != METHOD else ''}{high} rather than {low},"
+        return ", ".join(self.where.values()) + ": " + words if self.where else words
+
+    @property
+    def independent(self) -> bool:
+        """Whether the two sides are independent groups of fits: different methods, whose seeds do not pair."""
+        return METHOD in (self.factor, self.against[0] if self.against else "")
+
+
+def contrast_words(factor: str, before: str, after: str) -> str:
+    """Contrast of two levels in words: ``data.train_views 20 instead of 40``; of a switch ``no clone``."""
+    if {before, after} == {"true", "false"}:
+        return level_words(factor, after)
+    return f"{after} instead of {before}" if factor == METHOD else f"{factor} {after} instead of {before}"
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Values of a contrast.
+
+    Attributes:
+        scenes: scene -> signed groups of values, one value per fit.
+        lost: diverged or failed fits of (before, after).
+        silent: scenes where one side has no number at all.
+        pairs: fits compared, on the side that has fewer.
+        truths_differ: some were scored against different pictures, because the factor changes the truth.
+    """
+
+    scenes: dict[str, list[tuple[Sign, Float[ndarray, " fit"]]]]
+    lost: tuple[int, int]
+    silent: tuple[str, ...]
+    pairs: int
+    truths_differ: bool
+
+
+Table = dict[tuple[Any, ...], dict[int, Observation]]
+"""(scene, other levels) -> seed -> run."""
+
+
+def sample(contrast: Contrast, quantity: Quantity, observations: Sequence[Observation], lost: Iterable[Lost] = ()) -> Sample:
+    """Collect the values of a contrast from a study's runs.
+
+    Args:
+        contrast: what is compared.
+        quantity: in which.
+        observations: finished runs.
+        lost: fits that failed.
+    """
+    counted = [one for one in observations if all(one.levels.get(key) == level for key, level in contrast.where.items())]
+    known, sides, missing = [], {contrast.before: 0, contrast.after: 0}, {}
+    for one in counted:
+        level = one.levels.get(contrast.factor, "")
+        if level in sides and diverged(one.run, quantity):
+            sides[level] += 1
+            missing[one.scene] = None
+        elif level in sides and value_of(one.run, quantity) is not None:
+            known.append(one)
+    for cell in lost:
+        level = cell.levels.get(contrast.factor, "")
+        if level in sides and all(cell.levels.get(key) == value for key, value in contrast.where.items()):
+            sides[level] += 1
+            missing[cell.scene] = None
+    differ = False
+    scenes: dict[str, list[tuple[Sign, ndarray]]] = {}
+    pairs = 0
+    for scene in dict.fromkeys(one.scene for one in known):
+        here = [one for one in known if one.scene == scene]
+        groups = _interaction(contrast, quantity, here) if contrast.against else _difference(contrast, quantity, here)
+        if groups:
+            scenes[scene] = groups
+            pairs += min(len(values) for _, values in groups)
+            compared = [one for one in here if one.levels.get(contrast.factor) in sides]
+            differ |= len({one.run.provenance.truth_sha256 for one in compared}) > 1
+    silent = tuple(scene for scene in missing if scene not in scenes)
+    return Sample(scenes, (sides[contrast.before], sides[contrast.after]), silent, pairs, differ)
+
+
+def _difference(contrast: Contrast, quantity: Quantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
+    """Signed groups of one scene: a single group of paired differences, or one group per side."""
+    before, after = (_table(contrast.factor, level, here) for level in (contrast.before, contrast.after))
+    shared = [key for key in before if key in after]
+    if not shared:
+        return []
+    if contrast.independent:
+        sides = (_side(table, other, shared, quantity) for table, other in ((after, before), (before, after)))
+        groups = [(sign, values) for sign, values in zip((1.0, -1.0), sides, strict=True) if len(values)]
+        return groups if len(groups) == 2 else []
+    values = _paired(before, after, quantity)
+    return [(1.0, values)] if len(values) else []
+
+
+def _interaction(contrast: Contrast, quantity: Quantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
+    """Differences of paired differences; two independent groups of them where one factor is the method."""
+    assert contrast.against is not None
+    factor, low, high = contrast.against
+    if contrast.factor == METHOD:  # the difference of differences is the same either way round
+        swapped = Contrast(factor, low, high, contrast.where, (METHOD, contrast.before, contrast.after))
+        return _interaction(swapped, quantity, here)
+    sides = []
+    for level in (high, low):
+        kept = [one for one in here if one.levels.get(factor) == level]
+        before, after = (_table(contrast.factor, side, kept, drop=factor) for side in (contrast.before, contrast.after))
+        sides.append(_by_seed(before, after, quantity))
+    if not all(sides):
+        return []
+    if factor == METHOD:
+        return [(1.0, np.array(list(sides[0].values()))), (-1.0, np.array(list(sides[1].values())))]
+    seeds = [seed for seed in sides[0] if seed in sides[1]]
+    return [(1.0, np.array([sides[0][seed] - sides[1][seed] for seed in seeds]))] if seeds else []
+
+
+def _table(path: str, level: str, observations: Sequence[Observation], drop: str = "") -> Table:
+    table: Table = {}
+    for one in observations:
+        if one.levels.get(path) == level:
+            others = tuple(sorted((key, value) for key, value in one.levels.items() if key not in (path, drop)))
+            table.setdefault((one.scene, others), {})[one.run.seed] = one
+    return table
+
+
+def _paired(before: Table, after: Table, quantity: Quantity) -> Float[ndarray, " seed"]:
+    return np.array(list(_by_seed(before, after, quantity).values()))
+
+
+def _by_seed(before: Table, after: Table, quantity: Quantity) -> dict[int, float]:
+    """Seed -> paired difference on shared views; other factors are averaged, since they add no independent seed."""
+    found: dict[int, list[float]] = {}
+    for key, runs in before.items():
+        for seed, one in runs.items():
+            other = after.get(key, {}).get(seed)
+            if other is not None and (values := run_values((one.run, other.run), quantity)) is not None:
+                found.setdefault(seed, []).append(values[1] - values[0])
+    return {seed: sum(values) / len(values) for seed, values in found.items()}
+
+
+def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantity: Quantity) -> Float[ndarray, " seed"]:
+    """One value per seed of one side, averaged over the strata that both sides have; seeds that lack one are left out."""
+    found: dict[int, list[float]] = {}
+    for key in shared:
+        runs = [one.run for one in table[key].values()]
+        values = run_values((*runs, *(one.run for one in other[key].values())), quantity)
+        if values is not None:
+            for seed, value in zip(table[key], values, strict=False):
+                found.setdefault(seed, []).append(value)
+    most = max(map(len, found.values()), default=0)
+    return np.array([sum(values) / most for values in found.values() if len(values) == most])
+
+
+def run_values(runs: Sequence[Run], quantity: Quantity) -> list[float] | None:
+    """Mean of each run over the views in which all of them have a finite score; over all where single views have none."""
+    if quantity.group != "cost":
+        tables = [_views(run, quantity) for run in runs]
+        if all(tables):
+            names = [name for name in tables[0] if all(name in table for table in tables)]
+            return [sum(table[name] for name in names) / len(names) for table in tables] if names else None
+    values = [value_of(run, quantity) for run in runs]
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    return known if len(known) == len(values) else None
+
+
+def _views(run: Run, quantity: Quantity) -> dict[str, float]:
+    """View -> finite score; empty where single views have none."""
+    score = run.scores.quality.get(quantity.key)
+    if score is None or not score.per_view:
+        return {}
+    values = (clipped(value, quantity) for value in score.per_view)
+    pairs = zip(run.scores.views, values, strict=True)
+    return {name: value for name, value in pairs if value is not None and math.isfinite(value)}

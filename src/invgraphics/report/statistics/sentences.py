@@ -1,0 +1,165 @@
+"""Effects in words: what was found, on which scenes, how far it generalises, and what could have been found."""
+
+from __future__ import annotations
+
+from invgraphics.report.data.factors import METHOD
+from invgraphics.report.data.variants import level_words
+from invgraphics.report.statistics.effects import Effect, Verdict
+from invgraphics.report.statistics.intervals import POWER, Estimate
+from invgraphics.report.wording import Quantity, listing
+
+FEW_SCENES = 5
+"""Fewer scenes than this tell little about others, and the sentence says so."""
+
+
+def effect_sentence(effect: Effect) -> str:
+    """An effect in one or two sentences."""
+    parts = [_verdict(effect), _lost(effect), _silent(effect)]
+    if effect.truths_differ:
+        parts.append("The factor changes the truth itself, so the two were scored against different pictures.")
+    return " ".join(part for part in parts if part)
+
+
+def _verdict(effect: Effect) -> str:
+    value, unit = effect.estimate, _unit(effect.quantity)
+    magnitude = f"{_verb(effect.quantity, value.mean)} {effect.text(abs(value.mean))} {unit}"
+    if effect.claim.unit == "none":
+        return _unmeasured(effect, magnitude)
+    basis = f"{value.size}{_scene_counts(effect)}"
+    if effect.found:
+        return f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}."
+    if effect.flattered:
+        return f"{effect.label}: no verdict, {_signed(effect)}, {basis}."
+    if _contradict(effect):
+        mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
+        return f"{effect.label}: no common direction, {basis}; {mean}."
+    if effect.scenes("higher") or effect.scenes("lower"):
+        return f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}; {_reserve(effect)}."
+    if effect.equivalent:
+        assert effect.quantity.margin is not None
+        margin = effect.text(effect.quantity.margin)
+        return f"{effect.label}: no effect beyond ±{margin} {unit} (equivalence test), {_signed(effect)}, {basis}."
+    if effect.uncorrected:
+        chance = f"with {effect.comparisons} comparisons in this study that may be chance"
+        words = f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}"
+        return f"{words}; {chance} (corrected p = {effect.adjusted:.2g})."
+    return f"{effect.label}: undecided, {_signed(effect)}, {basis}; {detectable_words(effect)}."
+
+
+def _unmeasured(effect: Effect, magnitude: str) -> str:
+    value = effect.estimate
+    if value.mean == 0 and (value.seeds[1] > 1 or value.scenes > 1):
+        return f"{effect.label}: no difference at all, {value.size}."
+    if value.seeds[1] == 1 and value.scenes == 1:
+        return f"{effect.label} {magnitude} in the one seed there is: an observation, which tells nothing from chance."
+    return f"{effect.label} {magnitude} by the same amount each time, {value.size}: no spread is known, so nothing is tested."
+
+
+def _signed(effect: Effect) -> str:
+    return f"{effect.text(effect.estimate.mean)} {_unit(effect.quantity)} {_intervals(effect)}".strip()
+
+
+def _intervals(effect: Effect, towards: float = 0.0) -> str:
+    """Both intervals with their populations; ends are magnitudes where a verb says the direction ``towards``."""
+    own = _bounds(effect, effect.estimate, towards)
+    if effect.across is None:
+        return own
+    scenes = f"these {effect.estimate.scenes} scenes"
+    parts = [f"{own} for new fits on {scenes}" if own else ""]
+    others = _bounds(effect, effect.across, towards)
+    few = f" (only {effect.across.scenes}, which tell little)" if effect.across.scenes < FEW_SCENES else ""
+    parts.append(f"{others} for scenes like these{few}" if others else "")
+    return ", ".join(part for part in parts if part)
+
+
+def _bounds(effect: Effect, value: Estimate, towards: float) -> str:
+    if value.unit == "none":
+        return ""
+    low, high = (value.low, value.high) if towards >= 0 else (-value.high, -value.low)
+    return f"[{effect.text(low)}, {effect.text(high)}]"
+
+
+def _scene_counts(effect: Effect) -> str:
+    """Verdict by scene in words, with those named that differ: ``; better on 5 of 6, `cloud` undecided``."""
+    if not effect.by_scene:
+        return ""
+    total = len(effect.by_scene)
+    if all(one.verdict == "undecided" for one in effect.by_scene.values()):
+        return "; no scene decides it alone"
+    if all(one.verdict == "untested" for one in effect.by_scene.values()):
+        higher = sum(one.estimate.mean > 0 for one in effect.by_scene.values())
+        return f"; {_direction(effect, 'higher')} on {higher} of {total} scenes in one fit each"
+    lead: Verdict = "higher" if len(effect.scenes("higher")) >= len(effect.scenes("lower")) else "lower"
+    rest: Verdict = "lower" if lead == "higher" else "higher"
+    parts = [f"{_direction(effect, lead)} on {len(effect.scenes(lead))} of {total} scenes"]
+    others: list[tuple[Verdict, str]] = [
+        (rest, _direction(effect, rest)),
+        ("undecided", "undecided"),
+        ("untested", "not tested"),
+    ]
+    for verdict, word in others:
+        scenes = effect.scenes(verdict)
+        if scenes and len(scenes) < total:
+            parts.append(f"{word} on {listing(scenes)}")
+    return f"; {', '.join(parts)}"
+
+
+def _direction(effect: Effect, verdict: Verdict) -> str:
+    if effect.quantity.better == "none":
+        return "more" if verdict == "higher" else "less"
+    return "better" if (verdict == "higher") == (effect.quantity.better == "higher") else "worse"
+
+
+def _contradict(effect: Effect) -> bool:
+    return bool(effect.scenes("higher")) and bool(effect.scenes("lower"))
+
+
+def _reserve(effect: Effect) -> str:
+    """Why an effect that single scenes show is no finding about scenes."""
+    if effect.across is not None and effect.across.scenes < FEW_SCENES:
+        return f"{effect.across.scenes} scenes are too few to tell about others"
+    return "the scenes differ too much to tell about others"
+
+
+def detectable_words(effect: Effect) -> str:
+    """The effect that a repetition would find with 80 % power, in words."""
+    reach = effect.detectable
+    if reach is None:
+        return ""
+    corrected = f" after correction for {effect.comparisons} comparisons" if effect.comparisons > 1 else ""
+    return f"an effect of {effect.text(reach)} {_unit(effect.quantity)} would be found with {POWER:.0%} power{corrected}"
+
+
+def _lost(effect: Effect) -> str:
+    """Diverged and failed fits in words."""
+    names = (level_words(effect.factor.rpartition(".")[2], level) for level in (effect.before, effect.after))
+    names = (effect.before, effect.after) if effect.factor == METHOD else names
+    parts = [f"{count} of {name}" for count, name in zip(effect.lost, names, strict=True) if count]
+    if not parts:
+        return ""
+    fits = "fit" if sum(effect.lost) == 1 else "fits"
+    words = f"Diverged or failed, and not in these numbers: {listing(parts)} ({sum(effect.lost)} {fits})"
+    return (
+        f"{words}; what is left flatters {effect.after if effect.better > 0 else effect.before}."
+        if effect.flattered
+        else f"{words}."
+    )
+
+
+def _silent(effect: Effect) -> str:
+    if not effect.silent:
+        return ""
+    return f"Nothing is known on {listing(effect.silent)}, where one side has no number."
+
+
+def _verb(quantity: Quantity, difference: float) -> str:
+    if quantity.better == "none":
+        return "adds" if difference > 0 else "saves"
+    return "gains" if (difference > 0) == (quantity.better == "higher") else "costs"
+
+
+def _unit(quantity: Quantity) -> str:
+    """Unit of a difference in words; the quantity's label where it has no unit."""
+    if quantity.unit == "dB":
+        return "dB"
+    return f"{quantity.unit} of {quantity.label}" if quantity.unit else quantity.label

@@ -1,0 +1,48 @@
+"""A run's value of a quantity: perfect pictures count, diverged fits are told from metrics that do not exist."""
+
+from __future__ import annotations
+
+import math
+import statistics
+
+from invgraphics.report.wording import Quantity
+from invgraphics.runs.run import Run
+
+PERFECT_DB = 100.0
+"""PSNR from which on a picture counts as perfect: errors of 1e-5 of white. Without a limit one equal picture is infinite."""
+
+
+def value_of(run: Run, column: Quantity) -> float | None:
+    """A run's value of a quantity, in stored units; a PSNR of equal pictures counts as `PERFECT_DB`."""
+    if column.group == "cost":
+        return run.scores.cost.get(column.key)
+    score = run.scores.quality.get(column.key)
+    if score is None or score.mean is None:
+        return None
+    if math.isinf(score.mean) and column.unit == "dB" and score.per_view:
+        return statistics.fmean(math.nan if value is None else clipped(value, column) for value in score.per_view)
+    return clipped(score.mean, column)
+
+
+def clipped(value: float | None, column: Quantity) -> float:
+    """A score with perfection at a finite value; NaN for ``None``."""
+    if value is None:
+        return math.nan
+    return min(value, PERFECT_DB) if column.unit == "dB" and column.better == "higher" else value
+
+
+def diverged(run: Run, column: Quantity) -> bool:
+    """Whether a fit has no finite score because it diverged, rather than because the metric is undefined or was not computed.
+
+    Of a picture's metric, one view that is not finite is enough: the others would flatter the fit. Geometry is undefined in
+    views where truth and prediction share no surface, so that there all views must lack it.
+    """
+    if column.group == "cost":
+        value = run.scores.cost.get(column.key)
+        return value is not None and not math.isfinite(value)
+    score = run.scores.quality.get(column.key)
+    if score is None:
+        return "finite" in run.scores.skipped.get(column.key, "")
+    values = [clipped(value, column) for value in score.per_view] or [clipped(score.mean, column)]
+    broken = [not math.isfinite(value) for value in values]
+    return any(broken) if column.group == "image" else all(broken)

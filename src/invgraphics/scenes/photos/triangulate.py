@@ -1,0 +1,154 @@
+"""SfM points at known poses: SIFT features of the training photographs, matched, verified and triangulated by COLMAP.
+
+What structure from motion would know of a scene whose poses are given. Only training views are read, so that points of fewer
+views know nothing of those that were left out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from invgraphics.arrays import read_arrays
+from invgraphics.core import Points, Scene, View
+from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.errors import InputError
+from invgraphics.files import write_arrays, write_text
+from invgraphics.scenes.mitsuba import cache
+
+NEIGHBOURS = 20
+"""A photograph is matched with as many of its nearest, by position and direction of the camera."""
+LONGEST_TRACK_ERROR = 2.0
+"""Largest reprojection error of a point, px."""
+SCHEMA = 1
+"""Rises where the same photographs give other points."""
+DATABASE, PHOTOS, PAIRS = "features.db", "photos", "pairs.txt"
+
+
+def triangulated(scene: Scene) -> Points:
+    """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else."""
+    sha = hashlib.sha256(f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour}".encode())
+    for view in scene.train:
+        for values in (view.camera.cam_to_world, view.camera.focal, view.camera.centre):
+            sha.update(values.detach().cpu().double().numpy().tobytes())
+    try:
+        folder = cache.root().parent / "points"
+        folder.mkdir(exist_ok=True)
+        path = folder / f"{sha.hexdigest()[:32]}.npz"
+        if path.is_file():
+            arrays = read_arrays(path)
+            return Points(torch.from_numpy(arrays["position"]), torch.from_numpy(arrays["rgb"]))
+    except (InputError, OSError, KeyError):  # no cache, or what is in it is damaged
+        return triangulate(scene)
+    points = triangulate(scene)
+    write_arrays(path, {"position": points.position.numpy(), "rgb": points.rgb.numpy()})
+    return points
+
+
+def triangulate(scene: Scene, seed: int = 0) -> Points:
+    """Triangulate SfM points from the training photographs at their known poses (Schönberger & Frahm 2016, §4.3).
+
+    Args:
+        scene: with its training views; transparent photographs are put in front of the scene's background.
+        seed: of RANSAC.
+
+    Returns:
+        Points in the local frame with display sRGB colours, the mean over the photographs that see them; empty where nothing
+        is matched.
+    """
+    if len(scene.train) < 2:
+        return Points(torch.zeros(0, 3), torch.zeros(0, 3))
+    from invgraphics.scenes.colmap_library import pycolmap
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / PHOTOS).mkdir()
+        names = [f"{index:05d}.png" for index in range(len(scene.train))]
+        for view, file in zip(scene.train, names, strict=True):
+            Image.fromarray(_bytes(view, scene).cpu().numpy()).save(folder / PHOTOS / file)
+        reconstruction = _posed(scene.train, names, folder)
+        write_text(folder / PAIRS, "".join(f"{names[i]} {names[j]}\n" for i, j in _pairs(scene)))
+        _match(folder, seed)
+        options = pycolmap.IncrementalPipelineOptions()
+        # One thread, because more would add up rounding errors in another order from call to call.
+        options.num_threads = 1
+        options.random_seed = options.triangulation.random_seed = seed
+        (folder / "model").mkdir()
+        pycolmap.set_random_seed(seed)
+        found = pycolmap.triangulate_points(
+            reconstruction, folder / DATABASE, folder / PHOTOS, folder / "model", options=options
+        )
+        found.extract_colors_for_all_images(folder / PHOTOS)
+    points = [found.points3D[key] for key in sorted(found.points3D)]
+    points = [point for point in points if point.error <= LONGEST_TRACK_ERROR]
+    position = np.array([point.xyz for point in points]).reshape(-1, 3)
+    rgb = np.array([point.color for point in points]).reshape(-1, 3) / 255
+    return Points(torch.from_numpy(position).float(), torch.from_numpy(rgb).float())
+
+
+def _bytes(view: View, scene: Scene) -> torch.Tensor:
+    colour = view.over(scene.background.to(view.image.device))
+    return quantise(linear_to_srgb(colour) if scene.colour == "linear" else colour)
+
+
+def _posed(views: Sequence[View], names: Sequence[str], folder: Path) -> Any:
+    """Write cameras, photographs and features into the data base; returns the known poses as a reconstruction."""
+    from invgraphics.scenes.colmap_library import pycolmap
+
+    with pycolmap.Database.open(folder / DATABASE):  # makes it
+        pass
+    reconstruction = pycolmap.Reconstruction()
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.num_threads = max(1, torch.get_num_threads())
+    for number, (view, name) in enumerate(zip(views, names, strict=True), 1):
+        camera = view.camera
+        params = [*camera.focal.tolist(), *camera.centre.tolist()]
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model, reader.camera_params = "PINHOLE", ", ".join(map(repr, params))
+        pycolmap.import_images(folder / DATABASE, folder / PHOTOS, pycolmap.CameraMode.PER_IMAGE, [name], reader)
+        with pycolmap.Database.open(folder / DATABASE) as database:
+            image = next(one for one in database.read_all_images() if one.name == name)
+        model = pycolmap.Camera(
+            model="PINHOLE", width=camera.width, height=camera.height, params=params, camera_id=image.camera_id
+        )
+        reconstruction.add_camera_with_trivial_rig(model)
+        pose = np.linalg.inv(camera.cam_to_world.detach().cpu().double().numpy())
+        rigid = pycolmap.Rigid3d(pose[:3])
+        reconstruction.add_image_with_trivial_frame(pycolmap.Image(name, [], image.camera_id, image.image_id), rigid)
+        assert image.image_id == number, "photographs are numbered in their order"
+    pycolmap.extract_features(
+        folder / DATABASE,
+        folder / PHOTOS,
+        list(names),
+        pycolmap.CameraMode.PER_IMAGE,
+        pycolmap.ImageReaderOptions(),
+        extraction,
+    )
+    return reconstruction
+
+
+def _match(folder: Path, seed: int) -> None:
+    from invgraphics.scenes.colmap_library import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = max(1, torch.get_num_threads())
+    geometry = pycolmap.TwoViewGeometryOptions()
+    geometry.ransac.random_seed = seed
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = folder / PAIRS
+    pycolmap.match_image_pairs(folder / DATABASE, matching, pairing, geometry)
+
+
+def _pairs(scene: Scene) -> list[tuple[int, int]]:
+    """Pairs of photographs whose cameras are near each other: position in units of the scene's extent, and direction."""
+    poses = torch.stack([view.camera.cam_to_world.double() for view in scene.train])
+    features = torch.cat([poses[:, :3, 3] / scene.extent, poses[:, :3, 2]], dim=1)
+    order = torch.cdist(features, features).argsort(dim=1)[:, 1 : NEIGHBOURS + 1]
+    return sorted({(min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row})

@@ -1,0 +1,84 @@
+"""The same scene in smaller pictures: rendered scenes as a rendering of that size, photographs as area averages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Scene, View
+from invgraphics.core.colour import quantise
+from invgraphics.errors import InputError
+from invgraphics.scenes.images import area_resize, wanted_size
+from invgraphics.scenes.open import open_scene, source_of
+
+SMALLEST = 12
+"""Shortest side in pixels that pictures can be scaled down to: SSIM's window has 11."""
+
+
+def check_scales(scales: tuple[int, ...], name: str) -> None:
+    """Check divisors of a picture's size: whole, at least 1, each once.
+
+    Raises:
+        ValueError: they are not.
+    """
+    if not scales or min(scales) < 1 or len(set(scales)) < len(scales):
+        raise ValueError(f"'{name}' must hold divisors of the pictures' size, each at least 1 and once, not {list(scales)}.")
+
+
+def scene_at(scene: Scene, divisor: int) -> Scene:
+    """The scene with all views 1/``divisor`` as large, in the same order.
+
+    A scene that was opened is opened again at that size. A rendered one is then a rendering at that size, or the mean of a
+    larger one's linear light, which is the same (see `invgraphics.scenes.mitsuba.average`), with depth and normals of that
+    size; photographs are averaged over each new pixel's area.
+
+    Raises:
+        InputError: pictures would be smaller than `SMALLEST` pixels.
+    """
+    if divisor == 1:
+        return scene
+    sides = [side for view in (*scene.train, *scene.test) for side in (view.camera.width, view.camera.height)]
+    if min(sides) // divisor < SMALLEST:
+        raise InputError(
+            f"Pictures of '{scene.name}' at 1/{divisor} would have a side of {min(sides) // divisor} pixels.",
+            f"The least is {SMALLEST}: leave that scale away, or give a larger --size.",
+        )
+    source = source_of(scene)
+    if source is not None:
+        smaller = open_scene(source.spec, replace(source.options, size=max(sides) // divisor))
+        return replace(smaller, bounds=scene.bounds, world_from_local=scene.world_from_local)
+    train, test = (tuple(_smaller(view, divisor) for view in views) for views in (scene.train, scene.test))
+    return scene.with_views(train=train, test=test)
+
+
+def _smaller(view: View, divisor: int) -> View:
+    return resized_view(view, max(view.camera.width, view.camera.height) // divisor)
+
+
+def like(colour: Float[Tensor, "h w 3"], view: View) -> Tensor:
+    """Convert colours to the number format of the view's photograph."""
+    return quantise(colour) if view.image.dtype == torch.uint8 else colour.clamp_min(0)
+
+
+def resized_view(view: View, size: int) -> View:
+    """Resize a view by area average of premultiplied colour; a pixel is masked unless all of it was valid."""
+    width, height = wanted_size(view.camera.width, view.camera.height, size)
+    alpha = view.opacity()[..., None]
+    mask = torch.ones_like(alpha) if view.mask is None else view.mask[..., None].float()
+    stacked = torch.cat([view.colour() * alpha, alpha, mask], dim=-1).numpy().astype(np.float64)
+    small = torch.from_numpy(area_resize(stacked, width, height)).float()
+    coverage = small[..., 3]
+    straight = small[..., :3] / coverage[..., None].clamp_min(1e-6)
+    return replace(
+        view,
+        camera=view.camera.resized(width, height),
+        image=like(straight, view),
+        alpha=None if view.alpha is None else quantise(coverage) if view.alpha.dtype == torch.uint8 else coverage,
+        depth=None,
+        normal=None,
+        mask=None if view.mask is None else small[..., 4] > 1 - 1e-6,
+    )

@@ -1,0 +1,184 @@
+"""Conversion of a run to another parameterisation: a new run, scored as converted and again after a short refit."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+
+from invgraphics.core import Model
+from invgraphics.errors import InputError, did_you_mean
+from invgraphics.experiments.build import build_plan, use_deterministic_algorithms, use_kernels
+from invgraphics.experiments.clocks import fit_costs, fit_record
+from invgraphics.experiments.environment import code_version
+from invgraphics.experiments.evaluate import evaluate, score_model
+from invgraphics.experiments.fitted import Fitted, open_fitted
+from invgraphics.experiments.job import Job
+from invgraphics.experiments.recorder import Recorder
+from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.run import describe
+from invgraphics.metrics.cost import PeakMemory
+from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import ConvertedRun, Provenance
+from invgraphics.runs.scores import Scores
+from invgraphics.text import sha256_of
+from invgraphics.tools.conversions import TARGETS, Target
+from invgraphics.training.fit import Fit
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertRequest:
+    """A run, and what to make of it.
+
+    Attributes:
+        run: folder of the run.
+        to: a name in `TARGETS`.
+        out: folder of the new run.
+        method: whose field is made and refitted; empty for the target's own.
+        refit: budget of the refit, ``10s`` or ``500steps``.
+        size: number of Gaussians, or vertices along a lattice's longest edge; ``None`` for the target's own.
+        overrides: ``key=value`` items laid over the method's recipe.
+        seed: of sampling and refit.
+        scene: another copy of the run's scene.
+        kernels: implementation to force; ``None`` for the best one here.
+    """
+
+    run: Path
+    to: str
+    out: Path
+    method: str = ""
+    refit: str = "10s"
+    size: int | None = None
+    overrides: tuple[str, ...] = ()
+    seed: int = 0
+    scene: str | None = None
+    kernels: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.to not in TARGETS:
+            raise InputError(f"--to cannot be '{self.to}'.{did_you_mean(self.to, TARGETS)}", f"Expected: {', '.join(TARGETS)}.")
+        if self.size is not None and not (TARGETS[self.to].size and self.size >= 2):
+            known = "Expected at least 2." if TARGETS[self.to].size else f"{self.to} has no size of its own; use --set."
+            raise InputError(f"--size cannot be {self.size}.", known)
+
+    @property
+    def target(self) -> Target:
+        """What the run becomes."""
+        return TARGETS[self.to]
+
+    def shell(self) -> str:
+        """Shell command that repeats the conversion."""
+        words = ["invgraphics", "convert", str(self.run), "--to", self.to, "--refit", self.refit, "--seed", str(self.seed)]
+        words += ["--method", self.method] if self.method else []
+        words += ["--size", str(self.size)] if self.size is not None else []
+        words += [word for item in self.overrides for word in ("--set", item)]
+        words += ["--scene", self.scene] if self.scene else []
+        words += ["--kernels", self.kernels] if self.kernels else []
+        return shlex.join([*words, "--out", str(self.out)])
+
+
+@dataclass(frozen=True)
+class Converted:
+    """Result of a conversion.
+
+    Attributes:
+        folder: the new run.
+        native: scores of the run that was converted.
+        converted: scores as converted, before the refit.
+        refitted: scores after it, those of the new run.
+    """
+
+    folder: RunFolder
+    native: Scores
+    converted: Scores
+    refitted: Scores
+
+
+def convert_run(request: ConvertRequest) -> Converted:
+    """Convert a run, score the result, refit it, and write it as a run of its own.
+
+    Raises:
+        InputError: anything about the request or the run that cannot be used; nothing has been written then.
+        NumericalError: the refit left the finite numbers.
+    """
+    fitted = open_fitted(request.run, request.scene)
+    if fitted.poses is not None:
+        sentence = f"{request.run} has refined its cameras' poses, which a converted run would not know."
+        raise InputError(sentence, "Convert a run that was fitted without --optimise poses.")
+    job = _job(request, fitted)
+    folder = job.folder
+    _check_empty(folder)
+    use_deterministic_algorithms(job.device)
+    use_kernels(request.kernels)
+    plan = build_plan(job.method, fitted.scene, job.budget, request.seed, job.device)
+    torch.manual_seed(request.seed)
+    size = request.size or request.target.size
+    field = request.target.convert(fitted.model, fitted.scene, job.method, size).to(job.device)
+    plan = replace(plan, model=Model(field, plan.model.renderer, plan.model.bounds))
+    native = fitted.folder.read_scores() if fitted.folder.finished else _scores(fitted.model, fitted, fitted.method.name)
+    converted = _scores(plan.model, fitted, f"{job.method.name} as converted")
+    folder.create()
+    with folder.held():
+        _check_empty(folder)
+        folder.clear()
+        origin = _origin(request, fitted, native, converted)
+        provenance = describe(job, (fitted.scene, fitted.scene), _identity(job, origin))
+        folder.write(replace(provenance, command=request.shell(), converted=origin, threads=torch.get_num_threads()))
+        with PeakMemory(job.device) as memory:
+            fit = Fit(plan)
+            fit.warmup_step()
+            Recorder(fit, folder, job.cadence, f"{job.method.name} refit").run()
+        spent = replace(fit_record(fit.steps, fit.clocks()), peak_memory_bytes=memory.peak_bytes)
+        folder.write(spent)
+        refitted = evaluate(folder, fitted.scene, fit.plan.model, "default", fit_costs(spent), job.method)
+    return Converted(folder, native, converted, refitted)
+
+
+def _job(request: ConvertRequest, fitted: Fitted) -> Job:
+    provenance, target = fitted.folder.read(Provenance), request.target
+    size = request.size or target.size
+    options = provenance.options
+    return Job.of(
+        FitRequest(
+            scene=request.scene or provenance.scene,
+            out=str(request.out),
+            method=request.method or target.method,
+            budget=request.refit,
+            overrides=tuple(item.format(size=size) for item in target.overrides) + request.overrides,
+            size=options.size,
+            test_views=options.test_views,
+            spp=options.spp,
+            seed=request.seed,
+            kernels=request.kernels,
+        )
+    )
+
+
+def _check_empty(folder: RunFolder) -> None:
+    if folder.has(Provenance):
+        raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
+
+
+def _scores(model: Model, fitted: Fitted, title: str) -> Scores:
+    return score_model(model, fitted.scene, "default", title)
+
+
+def _origin(request: ConvertRequest, fitted: Fitted, native: Scores, converted: Scores) -> ConvertedRun:
+    return ConvertedRun(
+        run=str(request.run),
+        cell_sha256=fitted.source.identity or "",
+        method=fitted.method.name,
+        to=request.to,
+        hub=request.target.hub,
+        native_psnr=native.quality["psnr"].mean,
+        converted_psnr=converted.quality["psnr"].mean,
+    )
+
+
+def _identity(job: Job, origin: ConvertedRun) -> str:
+    """Hash of everything that determines the new run's result."""
+    parts = {"recipe": job.method.digest, "method": job.method.name, "converted": asdict(origin), "code": code_version()}
+    request = {"budget": str(job.budget), "seed": job.request.seed, "kernels": job.request.kernels}
+    return sha256_of(parts | request | {"threads": torch.get_num_threads()})

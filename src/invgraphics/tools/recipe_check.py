@@ -1,0 +1,93 @@
+"""Check which published runs were made by other recipes than today's."""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from invgraphics.errors import InputError
+from invgraphics.experiments.request import DATA
+from invgraphics.recipes.recipe import load_method
+from invgraphics.report.wording import listing
+from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
+from invgraphics.training.budget import Budget
+
+
+@dataclass(frozen=True)
+class RecipeCheck:
+    """Outcome for one report.
+
+    Attributes:
+        folder: of the report.
+        runs: runs whose recipes were compared.
+        stale: method -> why, for methods with a run that today's recipe would not make.
+        unknown: runs whose records lack what is needed.
+    """
+
+    folder: Path
+    runs: int
+    stale: dict[str, str]
+    unknown: int = 0
+
+    @property
+    def current(self) -> bool:
+        """Whether every run was made by a recipe of today."""
+        return not self.stale and self.runs > 0
+
+    @property
+    def sentence(self) -> str:
+        """The outcome in words."""
+        if not self.runs:
+            return f"{self.folder}: holds no run whose recipe can be compared."
+        if self.current:
+            return f"{self.folder}: all {self.runs} runs were made by today's recipes."
+        reasons = "; ".join(f"{method} ({why})" for method, why in self.stale.items())
+        return f"{self.folder}: made by other recipes than today's: {reasons}."
+
+
+def check_recipes(folder: Path) -> RecipeCheck:
+    """Compare the recipe of every run below ``folder`` with today's under the same preset, overrides and budget.
+
+    Raises:
+        InputError: there is no such folder, or a record is broken.
+    """
+    if not folder.is_dir():
+        raise InputError(f"'{folder}' is no folder.", "Give the folder of a report.")
+    records = [RunFolder(path.parent).read(Provenance) for path in sorted(folder.rglob(Provenance.FILE))]
+    stale: dict[str, str] = {}
+    seen: dict[tuple[str, ...], str] = {}
+    for record in records:
+        overrides = _overrides(record.command)
+        key = record.method, record.preset or "", record.budget, *overrides
+        if key not in seen:
+            seen[key] = _todays_digest(record, overrides)
+        if seen[key] != record.recipe_sha256:
+            stale[record.method] = "differs" if len(seen[key]) == len(record.recipe_sha256) else seen[key]
+    return RecipeCheck(folder, len(records), stale)
+
+
+def _todays_digest(record: Provenance, overrides: Sequence[str]) -> str:
+    """SHA-256 of the recipe that the same request makes today; the reason where it makes none."""
+    try:
+        return load_method(record.method, record.preset or None, overrides, Budget.parse(record.budget)).digest
+    except InputError as error:
+        return error.sentence.rstrip(".")
+
+
+def _overrides(command: str) -> list[str]:
+    """``key=value`` overrides of the recipe in a ``fit`` command."""
+    words = shlex.split(command)
+    given = [value for flag, value in itertools.pairwise(words) if flag == "--set"]
+    return [item for item in given if not item.startswith(DATA)]
+
+
+def summary(checks: Sequence[RecipeCheck]) -> str:
+    """How many reports are current, in a sentence."""
+    stale = [check.folder.name for check in checks if not check.current]
+    if not stale:
+        return f"All {len(checks)} reports are current."
+    return f"{len(stale)} of {len(checks)} reports are not current: {listing(stale)}."

@@ -1,0 +1,304 @@
+"""The report's verdicts on data whose truth is known: null, powered, opposite, heterogeneous, diverged and perfect."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up_runs import made_up_run
+
+from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
+from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of, effects_on
+from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.summary import summarise
+from invgraphics.report.statistics.verdict import verdict
+from invgraphics.report.wording import quality_quantity
+from invgraphics.runs.environment import Environment
+from invgraphics.runs.scores import Score
+from invgraphics.scenes.truth import POINTS
+
+PSNR = quality_quantity("psnr", Score(mean=0.0, unit="dB", higher_is_better=True))
+A, B = "volumetric/nerf", "splatting/gaussians"
+METHODS = Factor(METHOD, (A, B), A)
+SIZE = Factor("field.size", ("8", "16"), "8")
+
+Values = Callable[[int, int, str], float | list[float]]
+"""(scene, seed, level) -> the score of a fit, or of its views."""
+
+
+def observe(shape: tuple[int, int], values: Values, factor: Factor = METHODS, **others: str) -> list[Observation]:
+    """Fits of a design of (scenes, seeds) and two levels."""
+    found = []
+    for s, k, level in ((s, k, level) for s in range(shape[0]) for k in range(shape[1]) for level in factor.levels):
+        views = values(s, k, level)
+        views = views if isinstance(views, list) else [views]
+        score = Score(mean=sum(views) / len(views), unit="dB", higher_is_better=True, per_view=tuple(views))
+        run = made_up_run({"psnr": score}, "m", k, f"t{s}", views=tuple(map(str, range(len(views)))))
+        found.append(Observation(run, f"scene-{s}", {METHOD: "m"} | others | {factor.path: level}))
+    return found
+
+
+def effect_of(shape: tuple[int, int], values: Values, factor: Factor = METHODS, lost: tuple[Lost, ...] = ()) -> Effect:
+    (effect,) = effects_on(PSNR, [factor], observe(shape, values, factor), lost)
+    return effect
+
+
+def rate(count: int, once: Callable[[np.random.Generator], bool], seed: int = 0) -> float:
+    """Share of simulated studies of which ``once`` is true."""
+    rng = np.random.default_rng(seed)
+    return sum(once(rng) for _ in range(count)) / count
+
+
+def test_null_studies_name_few_winners() -> None:
+    """Scenes differ in difficulty and in how reproducible they are; seeds pair, or do not."""
+
+    def share(shape: tuple[int, int], factor: Factor) -> float:
+        def once(rng: np.random.Generator) -> bool:
+            hard = rng.normal(25, 4, shape[0])
+            return effect_of(shape, lambda s, k, level: hard[s] + rng.normal(0, 0.3 * (1 + s % 2)), factor).found
+
+        return rate(300, once)
+
+    shares = [share(shape, factor) for shape in ((1, 3), (4, 2), (6, 1)) for factor in (METHODS, SIZE)]
+    assert np.mean(shares) <= 0.06 and max(shares) <= 0.08
+
+
+def test_a_mean_of_zero_over_different_scenes_names_few_winners() -> None:
+    """A scene-by-method effect of 2 dB, and none on average: the seeds of six scenes would find one in five of six studies."""
+
+    def once(rng: np.random.Generator) -> tuple[bool, bool]:
+        gain = rng.normal(0, 2, 6)
+        effect = effect_of((6, 3), lambda s, k, level: gain[s] * (level == B) + rng.normal(0, 0.2))
+        return effect.found, effect.estimate.p is not None and effect.estimate.p <= 0.05
+
+    rng = np.random.default_rng(1)
+    found = np.array([once(rng) for _ in range(300)]).mean(axis=0)
+    assert found[0] <= 0.06 and found[1] > 0.7
+
+
+@pytest.mark.parametrize(("shape", "factor", "comparisons"), [((1, 4), METHODS, 1), ((1, 4), SIZE, 3), ((5, 1), METHODS, 1)])
+def test_the_stated_power_is_the_power(shape: tuple[int, int], factor: Factor, comparisons: int) -> None:
+    """A study states what it could find; a repetition with an effect of that size finds it in four of five cases."""
+    spread = 0.7 if shape[0] > 1 else 0.0
+
+    def study(rng: np.random.Generator, gain: float) -> Effect:
+        own = rng.normal(gain, spread, shape[0])
+        last = factor.levels[-1]
+        observations = observe(shape, lambda s, k, level: own[s] * (level == last) + rng.normal(0, 0.5), factor)
+        extra = [
+            observe(shape, lambda s, k, level: rng.normal(0, 0.5), Factor(f"x{i}", ("0", "1"), "0"), other=str(i))
+            for i in range(1, comparisons)
+        ]
+        contrasts = contrasts_of([factor, *(Factor(f"x{i}", ("0", "1"), "0") for i in range(1, comparisons))])
+        return effects_of(contrasts, PSNR, [*observations, *(one for some in extra for one in some)])[0]
+
+    def once(rng: np.random.Generator) -> bool:
+        stated = study(rng, 0.0).detectable
+        assert stated is not None
+        return study(rng, stated).found
+
+    assert 0.75 <= rate(400, once, seed=2) <= 0.85
+
+
+def test_no_effect_is_said_of_equal_methods_and_rarely_of_others() -> None:
+    def share(gain: float, seed: int) -> float:
+        def once(rng: np.random.Generator) -> bool:
+            return effect_of((1, 10), lambda s, k, level: gain * (level == B) + rng.normal(0, 0.1)).equivalent
+
+        return rate(300, once, seed)
+
+    assert share(0.0, 3) > 0.9
+    assert share(0.21, 4) <= 0.06
+
+
+@pytest.mark.parametrize("gains", [(5.0, -5.0), (6.0, -4.0), (5.0, -5.0, 5.0, -5.0, 0.0)])
+def test_opposite_scenes_are_no_common_effect(gains: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        effect = effect_of((len(gains), 3), lambda s, k, level: gains[s] * (level == B) + rng.normal(0, 0.05))
+        assert not effect.found and not effect.equivalent
+        assert "no common direction" in effect_sentence(effect) and "no effect" not in effect_sentence(effect)
+        assert "worse on scene-1" in effect_sentence(effect) or f"better on {gains.count(5.0)} of" in effect_sentence(effect)
+
+
+def test_the_verdict_reads_by_scene_and_both_estimands_are_given() -> None:
+    """Six scenes that gain 5.8 dB on average, from 0 to 11: near for new fits on them, far for other scenes."""
+    gains, rng = (11.0, 9.0, 6.0, 5.0, 3.8, 0.0), np.random.default_rng(61)
+    effect = effect_of((6, 3), lambda s, k, level: gains[s] * (level == B) + rng.normal(0, 0.1))
+    assert effect.found and effect.across is not None
+    assert effect.estimate.half_width < 0.2 and 3 < effect.across.half_width < 5
+    assert "for new fits on these 6 scenes" in effect_sentence(effect) and "for scenes like these" in effect_sentence(effect)
+    assert "better on 5 of 6 scenes, undecided on scene-5" in effect_sentence(effect)
+
+
+def test_the_estimand_does_not_jump_with_the_number_of_seeds_or_scenes() -> None:
+    """Scene gains of equal spread: the interval over scenes narrows steadily, whatever the seeds."""
+    rng = np.random.default_rng(7)
+    widths = {}
+    for scenes, seeds in ((9, 1), (9, 2), (10, 2)):
+        gains = np.linspace(-3, 3, scenes)
+        effect = effect_of((scenes, seeds), lambda s, k, level, g=gains: g[s] * (level == B) + rng.normal(0, 0.02))
+        assert effect.across is not None
+        widths[scenes, seeds] = effect.across.half_width
+    assert max(widths.values()) / min(widths.values()) < 1.2
+
+
+def test_a_fit_that_diverges_never_helps_its_method() -> None:
+    """The method's bad seeds are lost; what is left looks better, and no lead is claimed for it."""
+    nan, rng = math.nan, np.random.default_rng(8)
+
+    def survives(s: int, k: int, level: str) -> float:
+        value = rng.normal(25, 0.1)
+        return value if level == A else nan if k == 0 else value + 3
+
+    kept = effect_of((1, 5), survives)
+    assert kept.estimate.p is not None and kept.estimate.p < 0.01
+    assert not kept.found and "Diverged or failed" in effect_sentence(kept) and "gains" not in effect_sentence(kept)
+    failed = tuple(Lost("scene-0", {METHOD: B}) for _ in range(1))
+    assert not effect_of((1, 5), lambda s, k, level: 25 + 3 * (level == B) + rng.normal(0, 0.1), lost=failed).found
+    worse = effect_of((1, 5), lambda s, k, level: nan if level == B and k == 0 else 25 - 3 * (level == B) + rng.normal(0, 0.1))
+    assert worse.found and worse.estimate.mean < 0
+
+
+def test_one_view_that_is_not_a_number_is_a_diverged_fit() -> None:
+    rng = np.random.default_rng(9)
+    effect = effect_of(
+        (1, 4), lambda s, k, level: [25 + rng.normal(0, 0.1), math.nan if (level, k) == (B, 0) else 25.0 + 2 * (level == B)]
+    )
+    assert effect.lost == (0, 1) and not effect.found
+
+
+def test_a_scene_without_numbers_is_spoken_of() -> None:
+    rng = np.random.default_rng(10)
+    effect = effect_of((3, 3), lambda s, k, level: math.nan if s == 2 and level == B else 25 + rng.normal(0, 0.1))
+    assert effect.silent == ("scene-2",)
+    assert "Nothing is known on scene-2" in effect_sentence(effect)
+
+
+def test_perfect_views_count() -> None:
+    """Equal pictures have an infinite PSNR: they are the best there is, not left out."""
+    rng = np.random.default_rng(11)
+    effect = effect_of((1, 4), lambda s, k, level: [math.inf if level == B else 40.0, 30 + rng.normal(0, 0.1)])
+    assert effect.found and effect.estimate.mean == pytest.approx(30.0, abs=0.2)
+
+
+def test_two_seeds_that_agree_are_not_certain() -> None:
+    effect = effect_of((1, 2), lambda s, k, level: 20.0 + k + (level == "16"), SIZE)
+    assert effect.adjusted is None and not effect.found and "nothing is tested" in effect_sentence(effect)
+
+
+def test_seeds_of_different_methods_do_not_pair() -> None:
+    """Which seed of one method is set against which of another makes no difference."""
+    rise = {A: (0.0, 1.0, 2.0), B: (3.0, 2.0, 1.0)}
+    down = effect_of((1, 3), lambda s, k, level: rise[level][k])
+    up = effect_of((1, 3), lambda s, k, level: sorted(rise[level])[k])
+    assert down.estimate.p == up.estimate.p
+    rng = np.random.default_rng(12)
+    settings = effect_of((1, 3), lambda s, k, level: 10.0 * k + (level == "16") + rng.normal(0, 0.01), SIZE)
+    assert settings.found  # one method, whose seeds pair
+
+
+def test_an_interaction_is_what_is_tested_where_it_is_the_question() -> None:
+    rng = np.random.default_rng(13)
+    table = Factor("field.table", ("11", "15"), "11")
+    steps = Factor("sampler.steps", ("96", "384"), "96")
+    observations = []
+    for level in steps.levels:
+        low = 1.0 if level == "96" else 0.0
+        observations += observe(
+            (1, 3), lambda s, k, t, low=low: 20 + low * (t == "15") + rng.normal(0, 0.05), table, **{steps.path: level}
+        )
+    effect, *rest = effects_of(contrasts_of([steps, table], interactions=[(table.path, steps.path)]), PSNR, observations)
+    assert effect.contrast.against == ("sampler.steps", "96", "384") and len(rest) == 2
+    assert effect.found and effect.estimate.mean == pytest.approx(-1.0, abs=0.2)
+    assert "at sampler.steps 384 rather than 96" in effect_sentence(effect)
+
+
+def test_questions_that_say_each_are_answered_for_each() -> None:
+    rng = np.random.default_rng(14)
+    observations = []
+    for method, gain in ((A, 2.0), (B, 0.0)):
+        noisy = observe((1, 4), lambda s, k, level, g=gain: 20 + g * (level == "16") + rng.normal(0, 0.1), SIZE)
+        observations += [Observation(one.run, one.scene, one.levels | {METHOD: method}) for one in noisy]
+    effects = effects_of(contrasts_of([METHODS, SIZE], METHOD, among=(A, B)), PSNR, observations)
+    answers = {effect.label: effect.found for effect in effects if effect.factor == SIZE.path}
+    assert answers == {f"{A}: field.size 16 instead of 8": True, f"{B}: field.size 16 instead of 8": False}
+
+
+SCORES = {"psnr": ("dB", True), "ssim": ("", True), "flip": ("", False), "lpips": ("", False), "ms_ssim": ("", True)}
+COSTS = ("render_fps", "model_bytes", "peak_memory_bytes")
+
+
+def page(rng: np.random.Generator, seeds: int, gain: float = 0.0) -> Comparison:
+    """A comparison of three methods whose scores and costs are draws of the same distributions, but for a gain of the last."""
+    runs = []
+    for i in range(3):
+        for seed in range(seeds):
+            quality = {
+                key: Score(mean=25 + rng.normal() + gain * (i == 2) * (1 if better else -1), unit=unit, higher_is_better=better)
+                for key, (unit, better) in SCORES.items()
+            }
+            cost = {name: float(100 + 10 * rng.normal()) for name in COSTS}
+            runs.append(made_up_run(quality, f"m/{i}", seed, cost=cost))
+    return Comparison(scene="s", question="?", methods=("m/0", "m/1", "m/2"), runs=tuple(runs), environment=Environment())
+
+
+def claims(comparison: Comparison) -> tuple[bool, str]:
+    """Whether anything is bold, and the verdict's sentences."""
+    summary = summarise(comparison)
+    bold = any(cell.best for row in summary.rows for cell in row.cells)
+    return bold, " ".join(verdict(comparison, summary))
+
+
+def test_identical_methods_lead_on_few_pages() -> None:
+    """All methods are the same: 94 % of pages once said that one leads in something."""
+
+    def once(rng: np.random.Generator) -> bool:
+        bold, told = claims(page(rng, 3))
+        named = any(
+            words in told for words in ("leads in", "renders fastest", "smallest model", "least memory", "that lead lies")
+        )
+        return bold or named
+
+    assert rate(200, once, seed=15) <= 0.06
+    bold, told = claims(page(np.random.default_rng(16), 4, gain=20.0))
+    assert bold and "It also leads in" in told and "that lead lies in" in told
+
+
+def test_one_seed_names_no_winner() -> None:
+    bold, told = claims(page(np.random.default_rng(17), 1, gain=20.0))
+    assert not bold
+    assert "highest PSNR in the one fit there is of each" in told and "names no winner" in told
+    assert not any(words in told for words in ("leads in", "fastest", "smallest"))
+
+
+def test_a_method_with_a_diverged_fit_is_not_ranked() -> None:
+    comparison = page(np.random.default_rng(18), 4, gain=20.0)
+    broken = {"psnr": Score(mean=None, unit="dB", higher_is_better=True)}
+    spoilt = made_up_run({**comparison.runs[-1].scores.quality, **broken}, "m/2", 3, cost={})
+    summary = summarise(Comparison(**{**comparison.__dict__, "runs": (*comparison.runs[:-1], spoilt)}))
+    row = next(row for row in summary.rows if row.label == "m/2")
+    assert not row.ranked_in(summary.columns[0]) and not row.cells[0].best and row.ranked_in(summary.columns[1])
+
+
+def test_an_unequal_start_is_told() -> None:
+    """Exact points help only a method that has primitives; a start on what all could have is not spoken of."""
+    quality = {"psnr": Score(mean=25.0, unit="dB", higher_is_better=True)}
+    runs = [made_up_run(quality, name, 0, cost={"primitives": 10.0 if name == B else None}) for name in (A, B)]
+
+    def told(points: str) -> str:
+        noted = [replace(run, provenance=replace(run.provenance, notes={"points": points})) for run in runs]
+        comparison = Comparison(scene="s", question="?", methods=(A, B), runs=tuple(noted), environment=Environment())
+        return " ".join(verdict(comparison, summarise(comparison)))
+
+    assert f"The start is not equal: {B} may begin on exact surface points" in told(POINTS)
+    assert "not equal" not in told("213 from SfM on the training photographs as they are here")
+
+
+def test_contrast_of_renderers_has_a_name() -> None:
+    assert Contrast("renderer", "a", "b", name="affine projection (b instead of a)").label.startswith("affine projection")

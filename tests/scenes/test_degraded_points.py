@@ -1,0 +1,130 @@
+"""Points to start from: SfM on known poses against a plane known exactly; a degraded scene holds nothing of what it lacks."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from invgraphics.core import Bounds, Camera, Points, Scene, View
+from invgraphics.scenes.degrade import ENOUGH_POINTS, TrainingData, degrade
+from invgraphics.scenes.photos import triangulate as sfm
+
+SIZE, CAMERAS = 128, 6
+
+
+def textured_plane() -> np.ndarray:
+    """A blotchy texture, equally rough at several scales."""
+    from scipy.ndimage import zoom
+
+    rng = np.random.default_rng(0)
+    layers = [zoom(rng.random((n, n, 3)), (256 / n, 256 / n, 1), order=1) for n in (12, 24, 48)]
+    texture = sum(layers) / len(layers)
+    return (texture - texture.min()) / (texture.max() - texture.min())
+
+
+def plane_view(index: int, texture: np.ndarray) -> View:
+    """The plane z = 0, [-1, 1]², seen from above by a camera that looks at its middle: each pixel's ray meets it once."""
+    angle = 2 * np.pi * index / CAMERAS
+    eye = np.array([0.5 * np.cos(angle), 0.5 * np.sin(angle), 2.5])
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = eye
+    camera = Camera(
+        cam_to_world=torch.from_numpy(pose),
+        focal=torch.tensor([180.0, 180.0], dtype=torch.float64),
+        centre=torch.tensor([SIZE / 2, SIZE / 2], dtype=torch.float64),
+        width=SIZE,
+        height=SIZE,
+    )
+    y, x = np.mgrid[0:SIZE, 0:SIZE] + 0.5
+    ray = np.stack([(x - SIZE / 2) / 180, (y - SIZE / 2) / 180, np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+    hit = eye - ray * (eye[2] / ray[..., 2:])
+    place = ((hit[..., :2] + 1) * 128).clip(0, 255).astype(int)
+    image = (255 * texture[place[..., 1], place[..., 0]]).round().astype(np.uint8)
+    return View(camera, torch.from_numpy(image), f"v{index}")
+
+
+@pytest.fixture(scope="module")
+def plane() -> Scene:
+    texture = textured_plane()
+    views = tuple(plane_view(index, texture) for index in range(CAMERAS))
+    return Scene(
+        name="plane",
+        train=views,
+        test=(replace(views[0], camera=views[0].camera.moved(views[0].camera.cam_to_world.clone() + 0)),),
+        background=torch.zeros(3),
+        bounds=Bounds(torch.full((3,), -1.2), torch.full((3,), 1.2)),
+        points=Points(torch.rand(500, 3), torch.rand(500, 3)),
+    )
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("INVGRAPHICS_CACHE", str(tmp_path))
+
+
+def test_sfm_points_lie_on_the_plane(plane: Scene) -> None:
+    points = sfm.triangulate(plane)
+    assert len(points) > 50
+    assert float(points.position[:, 2].abs().median()) < 0.02 and float(points.position[:, 2].abs().max()) < 0.2
+    place = ((points.position[:, :2].numpy() + 1) * 128).clip(0, 255).astype(int)
+    expected = textured_plane()[place[:, 1], place[:, 0]]
+    assert float(np.abs(points.rgb.numpy() - expected).mean()) < 0.1
+
+
+def tensors(value: object, path: str = "") -> dict[str, torch.Tensor]:
+    """Every tensor in a scene, by its path."""
+    if isinstance(value, torch.Tensor):
+        return {path: value}
+    if isinstance(value, tuple | list):
+        return {key: found for i, one in enumerate(value) for key, found in tensors(one, f"{path}[{i}]").items()}
+    if dataclasses.is_dataclass(value):
+        names = [field.name for field in dataclasses.fields(value)]
+        return {key: one for name in names for key, one in tensors(getattr(value, name), f"{path}.{name}").items()}
+    return {}
+
+
+@pytest.mark.parametrize("init", ["scene", "sfm", "random"])
+def test_nothing_in_a_degraded_scene_depends_on_withheld_photographs(plane: Scene, init: str) -> None:
+    """Two scenes that differ in the photographs that are left out, and in the points made from all of them."""
+    data = TrainingData(train_views=4, photo_noise=0.02, init=init)  # pyright: ignore[reportArgumentType]
+    kept = {view.name for view in degrade(plane, replace(data, init="random"), 0).train}
+    hidden = tuple(
+        view if view.name in kept else replace(view, image=255 - view.image, depth=torch.ones(SIZE, SIZE))
+        for view in plane.train
+    )
+    other = replace(plane, train=hidden, points=Points(torch.rand(300, 3), torch.rand(300, 3)))
+    first, second = (tensors(degrade(scene, data, 0)) for scene in (plane, other))
+    assert first.keys() == second.keys()
+    assert [path for path in first if not torch.equal(first[path], second[path])] == []
+    assert (".points.position" in first) == (init != "random")
+
+
+def test_the_start_is_declared(plane: Scene) -> None:
+    assert degrade(plane, TrainingData(), 0) is plane
+    assert degrade(plane, TrainingData(init="random"), 0).points is None
+    made = degrade(plane, TrainingData(init="sfm"), 0)
+    found = sfm.triangulated(plane)
+    assert made.points is not None and torch.equal(made.points.position[: len(found)], found.position)
+    rest = made.points.position[len(found) :]
+    assert len(rest) == ENOUGH_POINTS and bool(((rest >= plane.bounds.lo) & (rest <= plane.bounds.hi)).all())
+    words = f"{len(found)} from SfM on the training photographs as they are here, and 5,000 random ones"
+    assert made.notes["points"] == words
+    grey = tuple(replace(view, image=torch.full_like(view.image, 99)) for view in plane.train)
+    empty = degrade(replace(plane, train=grey), TrainingData(init="sfm"), 0)
+    assert empty.points is None and "too few: a random start" in empty.notes["points"]
+
+
+def test_points_are_cached_by_what_they_are_made_of(plane: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = sfm.triangulated(plane)
+    monkeypatch.setattr(sfm, "triangulate", lambda scene: pytest.fail("computed again"))
+    again = sfm.triangulated(replace(plane, points=None))
+    assert torch.equal(first.position, again.position) and torch.equal(first.rgb, again.rgb)

@@ -1,0 +1,63 @@
+"""Reports made by other recipes than today's are found; pages carry the commit."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+from made_up_runs import provenance_table
+
+from invgraphics.cli import main
+from invgraphics.experiments.environment import commit
+from invgraphics.recipes.recipe import load_method
+from invgraphics.tools.recipe_check import check_recipes
+from invgraphics.training.budget import Budget
+
+METHOD, OVERRIDE = "volumetric/hash", "field.encoding.log2_size=11"
+
+
+def write(folder: Path, **given: Any) -> None:
+    folder.mkdir(parents=True)
+    (folder / "provenance.json").write_text(json.dumps(provenance_table(**given)))
+
+
+def current(*overrides: str) -> dict[str, str]:
+    words = " ".join(f"--set {item}" for item in (*overrides, "data.train_views=5"))
+    digest = load_method(METHOD, "laptop", overrides, Budget.parse("60s")).digest
+    return {
+        "method": METHOD,
+        "recipe_sha256": digest,
+        "command": f"invgraphics fit {METHOD} balls {words} --budget 60s --out x",
+    }
+
+
+def test_a_report_is_current_until_its_recipe_changes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(tmp_path / "good" / "balls" / "runs" / "0-seed-0", **current(OVERRIDE))
+    write(tmp_path / "good" / "balls" / "runs" / "0-seed-1", **current())
+    assert check_recipes(tmp_path / "good").current
+    write(tmp_path / "old" / "runs" / "0", **(current() | {"recipe_sha256": "0" * 64}))
+    write(tmp_path / "gone" / "runs" / "0", **(current() | {"method": "volumetric/forgotten"}))
+    assert check_recipes(tmp_path / "old").stale == {METHOD: "differs"}
+    for name in ("good", "old", "gone"):
+        (tmp_path / name / "index.html").write_text("")
+    assert main.run(["report", "--check", str(tmp_path / "good")]) == main.DONE
+    assert main.run(["report", "--check", str(tmp_path)]) == 1
+    told = capsys.readouterr().out
+    assert "all 2 runs were made by today's recipes" in told and f"{METHOD} (differs)" in told
+    assert "volumetric/forgotten" in told and "2 of 3 reports are not current: gone and old." in told
+
+
+def test_the_commit_of_a_working_copy(tmp_path: Path) -> None:
+    assert commit(tmp_path / "nowhere") == ""
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    (tmp_path / "file").write_text("one")
+    for words in (["init", "-q"], ["add", "file"], ["commit", "-qm", "one"]):
+        subprocess.run([*git, *words], check=True)
+    head = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout.strip()
+    assert commit(tmp_path) == head
+    commit.cache_clear()
+    (tmp_path / "file").write_text("two")
+    assert commit(tmp_path) == f"{head} + changes"
