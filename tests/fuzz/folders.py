@@ -89,3 +89,55 @@ def checkpoint(root: Path) -> str:
     }
     save(root / "checkpoint.safetensors", sections)
     return "checkpoint.safetensors"
+
+
+def rendered_scene(root: Path) -> str:
+    """A folder of `invgraphics make-scene`, of a triangle seen by three cameras: all but its pictures, and ``truth.json``."""
+    from seeds import CENTRE, FOCAL, eyes, picture
+
+    from invgraphics.scenes.mitsuba import cache, ply
+
+    cameras: dict[str, list[Any]] = {}
+    for split, eye in zip(("train", "val", "test"), eyes(), strict=True):
+        (root / split).mkdir()
+        Image.fromarray(picture(len(cameras))).save(root / split / "0000.png")
+        normal = np.broadcast_to(np.array([0, 0, 1], np.float32), (*SIZE[::-1], 3))
+        np.savez(root / split / "0000.npz", depth=np.ones(SIZE[::-1], np.float32), normal=normal)
+        pose = {"cam_to_world": eye.cam_to_world.tolist(), "focal": FOCAL, "centre": CENTRE}
+        cameras[split] = [pose | {"width": SIZE[0], "height": SIZE[1]}]
+    np.savez(root / "points.npz", position=np.eye(3, dtype=np.float32), rgb=np.eye(3, dtype=np.float32))
+    ply.write(root / "mesh.ply", np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))
+    sizes = {path.relative_to(root).as_posix(): path.stat().st_size for path in sorted(root.rglob("*.*"))}
+    table = {"schema": cache.SCHEMA, "key": "c0ffee", "name": "tiny", "summary": "A triangle.", "stresses": "Nothing."}
+    table |= {"size": SIZE, "background": None, "bounds": {"lo": [-1.0, -1, -1], "hi": [1.0, 1, 1]}, "files": sizes}
+    table |= {"rig": {"kind": "hemisphere"}, "samples_per_pixel": {"train": 4, "val": 4, "test": 4}, "noise_ceiling": 40.0}
+    table |= {"seed": 0, "variant": "llvm", "versions": {"mitsuba": "3.6.0"}, "cameras": cameras}
+    (root / cache.TRUTH).write_text(json.dumps(table))
+    return "**/*.?[!n]*"
+
+
+def description(root: Path) -> str:
+    """A description of a scene of one's own."""
+    lines = ['name = "tiny"', 'builder = "materials"', 'summary = "Small."', 'stresses = "Nothing."', "depth = 3"]
+    lines += ["lo = [-1.05, -1.05, -0.8]", "hi = [1.05, 1.05, 0.7]", "size = [12, 9]", "background = [1.0, 1.0, 1.0]"]
+    lines += ['rig = { kind = "hemisphere", radius = 3.5, fov = 38.0 }', "views = { train = 3, val = 1, test = 1 }"]
+    (root / "scene.toml").write_text("\n".join([*lines, "samples = { train = 16, val = 2, test = 32 }", "seed = 1"]) + "\n")
+    return "scene.toml"
+
+
+def camera_path(root: Path) -> str:
+    """A camera path as the viewer saves it."""
+    from seeds import eyes
+
+    from invgraphics.tools.camera_path import CameraPath, Keyframe
+
+    poses = [torch_pose(eye.cam_to_world) for eye in eyes()]
+    CameraPath(tuple(Keyframe(pose, 0.9) for pose in poses), 2.0, loop=True).write(root / "path.json")
+    return "path.json"
+
+
+def torch_pose(pose: np.ndarray) -> Any:
+    """A pose as a float64 tensor."""
+    import torch
+
+    return torch.from_numpy(np.asarray(pose, np.float64))

@@ -46,15 +46,47 @@ def read_scene(path: Path) -> str:
         assert len(np.unique(image.reshape(-1, 3), axis=0)) > 3, "a picture is smeared"
         for values in (directions.astype(np.float32), origins.astype(np.float32), image):
             sha.update(values.tobytes())
+        for geometry in (view.depth, view.normal):
+            sha.update(b"" if geometry is None else geometry.float().numpy().tobytes())
     assert np.isfinite(scene.extent) and np.isfinite(scene.scale), "the extent is not finite"
     for values in (scene.bounds.lo, scene.bounds.hi, scene.world_from_local):
         assert bool(values.isfinite().all()), "bounds or frame are not finite"
         sha.update(values.numpy().tobytes())
     assert np.isfinite(scene.bounds.near), "no near plane"
+    if scene.mesh is not None:
+        vertices, faces = scene.mesh.vertices, scene.mesh.faces
+        assert bool((vertices**2).isfinite().all()) and bool(((faces >= 0) & (faces < len(vertices))).all()), "no mesh"
+        sha.update(vertices.numpy().tobytes() + faces.numpy().tobytes())
+    assert scene.noise_ceiling is None or np.isfinite(scene.noise_ceiling), "no noise ceiling"
     if scene.points is not None:
         squared = (scene.points.position**2).sum(dim=1)
         assert bool(squared.isfinite().all()) and bool(scene.points.rgb.isfinite().all()), "points are not finite"
         sha.update(scene.points.position.numpy().tobytes())
+    return sha.hexdigest()
+
+
+def read_description(path: Path) -> str:
+    """Read a description of a scene and place its cameras; returns a digest of it."""
+    from invgraphics.scenes.mitsuba import maker
+    from invgraphics.scenes.mitsuba.rig import cameras, make_rig
+
+    job = maker.planned(str(path), None, (None, None), None, 0)
+    rig = make_rig(job.spec.rig)
+    for camera in cameras(rig, "train", job.views.train, job.size, job.seed):
+        assert bool(camera.rays().directions.isfinite().all()) and bool(camera.position.isfinite().all()), "no rays"
+    assert np.isfinite([*job.spec.lo, *job.spec.hi, *(job.spec.background or ())]).all(), "not finite"
+    return hashlib.sha256(json.dumps(job.table()).encode()).hexdigest()
+
+
+def read_camera_path(path: Path) -> str:
+    """Read a camera path and its cameras; returns a digest of them."""
+    from invgraphics.tools.camera_path import read_camera_path as read
+
+    way, sha = read(path), hashlib.sha256()
+    for keyframe in (*way.keyframes, *way.at(way.frame_times(5))):
+        pose = keyframe.pose.float()
+        assert bool((pose**2).isfinite().all()) and 0 < keyframe.fov < np.pi, "no camera"
+        sha.update(pose.numpy().tobytes() + np.float32(keyframe.fov).tobytes())
     return sha.hexdigest()
 
 
@@ -176,6 +208,8 @@ READERS: dict[str, Callable[[Path], str]] = {
     "study_cells": read_study_cells,
     "pictures": read_pictures,
     "checkpoint": read_checkpoint,
+    "description": read_description,
+    "camera_path": read_camera_path,
 } | {kind: partial(make_page, kind) for kind in ("page", "run_page", "study_page")}
 
 

@@ -18,6 +18,7 @@ from invgraphics.report.data.pictures import read_arrays
 from invgraphics.runs.history import cut_history
 from invgraphics.scenes.open import open_scene
 from invgraphics.studies.reading import read_study
+from invgraphics.tools.camera_path import read_camera_path
 from invgraphics.tools.predictions import open_pictures
 
 
@@ -259,3 +260,38 @@ def test_a_history_without_steps_is_not_resumed(tmp_path: Path, step: str) -> No
     path.write_text(f'{{"step": {step}, "seconds": 1.0}}\n{{"step": 9, "seconds": 2.0}}\n')
     with pytest.raises(InputError, match="line 1, is"):
         cut_history(path, 5)
+
+
+RENDERED: dict[str, tuple[str, dict[str, np.ndarray], str]] = {
+    "points of another shape": ("points.npz", {"position": np.ones((3, 1), np.float32)}, "position of .* is float32 of shape"),
+    "points of text": ("points.npz", {"position": np.full((3, 3), "a")}, "position of .* is <U1"),
+    "depth of another size": ("test/0000.npz", {"depth": np.ones((4, 4), np.float32)}, "depth of .* is float32 of shape"),
+}
+
+
+@pytest.mark.parametrize("name", RENDERED)
+def test_rendered_scenes_are_refused(tmp_path: Path, name: str) -> None:
+    file, change, sentence = RENDERED[name]
+    folders.rendered_scene(tmp_path)
+    path, truth = tmp_path / file, tmp_path / "truth.json"
+    with np.load(path) as found:
+        arrays = dict(found)
+    np.savez(path, **(arrays | change))  # type: ignore[arg-type]
+    table = json.loads(truth.read_text())
+    truth.write_text(json.dumps(table | {"files": {}}))
+    with pytest.raises(InputError, match=sentence):
+        open_scene(str(tmp_path))
+
+
+def test_camera_paths_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / folders.camera_path(tmp_path)
+    good = path.read_text()
+    for place, value, sentence in (("fov_degrees", 1e-300, "fov_degrees"), ("camera_to_world", 1e300, "too far away")):
+        table = json.loads(good)
+        if place == "fov_degrees":
+            table["keyframes"][0][place] = value
+        else:
+            table["keyframes"][0][place][0][3] = value
+        path.write_text(json.dumps(table))
+        with pytest.raises(InputError, match=sentence):
+            read_camera_path(path)

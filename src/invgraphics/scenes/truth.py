@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from invgraphics.arrays import read_arrays
 from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
+from invgraphics.core.believable import FARTHEST
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, Photo, load_view
 from invgraphics.scenes.layout import SceneOptions, evenly, pose
@@ -45,7 +47,7 @@ class Truth:
             raise InputError(f"{path} is not a whole rendered scene: truth.json or a file it lists is damaged.", _DAMAGED)
         try:
             return self._scene(path, truth, options)
-        except (KeyError, TypeError, ValueError, OSError) as error:
+        except (AttributeError, IndexError, KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError) as error:
             raise InputError(f"{path} is damaged: {type(error).__name__} {error}.", _DAMAGED) from error
 
     def _scene(self, path: Path, truth: Mapping[str, Any], options: SceneOptions) -> Scene:
@@ -82,8 +84,12 @@ def _view(path: Path, split: str, index: int, table: Mapping[str, Any], options:
     view = load_view(Photo(picture, camera, name), options.size)
     if (view.camera.width, view.camera.height) != (camera.width, camera.height):
         return view
-    arrays = read_arrays(picture.with_suffix(".npz"))
-    depth, normal = (torch.from_numpy(arrays[key]) for key in ("depth", "normal"))
+    shape, file = (camera.height, camera.width), picture.with_suffix(".npz")
+    arrays = read_arrays(file)
+    depth, normal = (
+        _floats(arrays["depth"], shape, f"depth of {file}"),
+        _floats(arrays["normal"], (*shape, 3), f"normal of {file}"),
+    )
     # Fog has no surface: its truth is in the pictures only.
     return replace(view, depth=depth, normal=normal) if bool(depth.isfinite().any()) else view
 
@@ -92,14 +98,27 @@ def _points(path: Path) -> Points | None:
     if not path.is_file():
         return None
     arrays = read_arrays(path)
-    return Points(torch.from_numpy(arrays["position"]), torch.from_numpy(arrays["rgb"]))
+    position = _floats(arrays["position"], (len(arrays["position"]), 3), f"position of {path}")
+    rgb = _floats(arrays["rgb"], (len(position), 3), f"rgb of {path}")
+    if not bool(((rgb >= 0) & (rgb <= 1)).all()):
+        raise ValueError(f"colours of {path} are not in [0, 1]")
+    return Points(position, rgb)
 
 
 def _mesh(path: Path) -> Mesh | None:
     if not path.is_file():
         return None
     vertices, faces = ply.read(path)
+    if not (np.abs(vertices) <= FARTHEST).all() or (len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices)):
+        raise ValueError(f"{path} has vertices that are not finite, or faces without vertices")
     return Mesh(torch.from_numpy(vertices), torch.from_numpy(faces))
+
+
+def _floats(values: np.ndarray, shape: tuple[int, ...], what: str) -> torch.Tensor:
+    """An array of floating-point numbers of a shape, as float32."""
+    if values.dtype.kind != "f" or values.shape != shape:
+        raise ValueError(f"the {what} is {values.dtype} of shape {values.shape}")
+    return torch.from_numpy(values).float()
 
 
 def _notes(truth: Mapping[str, Any], view: View) -> dict[str, str]:

@@ -26,6 +26,8 @@ SCHEMA = 1
 KIND = "camera path"
 RIGID = 1e-3
 """Largest deviation of R Rᵀ from the identity in a file."""
+NARROWEST = 1e-3
+"""Smallest vertical field of view of a keyframe, degrees."""
 MOST_SECONDS = 3600.0
 
 
@@ -157,8 +159,8 @@ def read_camera_path(file: Path) -> CameraPath:
 
 def _keyframe(entry: Any, index: int, file: Path) -> Keyframe:
     rows, degrees = (entry.get(key) if isinstance(entry, dict) else None for key in ("camera_to_world", "fov_degrees"))
-    if not _is_number(degrees) or not 0 < degrees < 180:
-        raise _invalid(file, f"has fov_degrees {degrees} at keyframe {index}, not between 0 and 180")
+    if not _is_number(degrees) or not NARROWEST <= degrees < 180:
+        raise _invalid(file, f"has fov_degrees {degrees} at keyframe {index}, not between {NARROWEST:g} and 180")
     if not _is_matrix(rows):
         raise _invalid(file, f"has no 4 x 4 camera_to_world at keyframe {index}")
     pose = torch.tensor(rows, dtype=torch.float64)
@@ -166,6 +168,8 @@ def _keyframe(entry: Any, index: int, file: Path) -> Keyframe:
     deviation = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
     if not (deviation < RIGID and torch.linalg.det(rotation) > 0 and bool((pose[3] == last).all())):
         raise _invalid(file, f"has a camera_to_world at keyframe {index} that is not a rotation and a translation")
+    if not bool((pose.float() ** 2).isfinite().all()):
+        raise _invalid(file, f"has a camera at keyframe {index} that is too far away for float32")
     return Keyframe(pose, math.radians(degrees))
 
 

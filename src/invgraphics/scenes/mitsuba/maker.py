@@ -7,6 +7,7 @@ import shutil
 import sys
 from pathlib import Path
 
+from invgraphics.core.believable import check_camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
 from invgraphics.memory import check_fits
@@ -14,6 +15,7 @@ from invgraphics.scenes.mitsuba import cache, llvm
 from invgraphics.scenes.mitsuba.forecast import RenderingForecast
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.larger import averaged
+from invgraphics.scenes.mitsuba.rig import SPLITS, cameras, make_rig
 from invgraphics.scenes.mitsuba.spec import Counts, description_path, read
 from invgraphics.scenes.process import Progress, run_worker
 
@@ -54,7 +56,7 @@ def make(
     Raises:
         InputError: unknown scene, impossible option, unwritable folder, or the renderer failed.
     """
-    job = _job(name, size, (train, test), spp, seed)
+    job = planned(name, size, (train, test), spp, seed)
     folder = cache.root() / job.folder_name
     if cache.read_truth(folder) is None and (smaller := averaged(job)) is not None:
         job, folder = smaller, cache.root() / smaller.folder_name
@@ -66,7 +68,8 @@ def make(
     return folder if out is None else cache.copy(folder, Path(out))
 
 
-def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int | None], spp: int | None, seed: int) -> Job:
+def planned(name: str, size: tuple[int, int] | None, views: tuple[int | None, int | None], spp: int | None, seed: int) -> Job:
+    """Check a request for a rendering before anything is done; arguments and errors as `make`."""
     spec = read(description_path(name))
     limits = (
         ("The size", size and min(size), 8),
@@ -86,6 +89,10 @@ def _job(name: str, size: tuple[int, int] | None, views: tuple[int | None, int |
     (width, height), remedy = job.size, "Choose a lower --size, or fewer views."
     needed = width * height * (FILM_BYTES + job.total * PICTURE_BYTES)
     check_fits(needed, f"The scene '{spec.name}' with {job.total:,} views of {width:,}x{height:,} pixels", remedy)
+    rig = make_rig(spec.rig)
+    for split in SPLITS:
+        for index, camera in enumerate(cameras(rig, split, getattr(job.views, split), job.size, seed)):
+            check_camera(camera, f"the {split} view {index} of '{spec.name}'")
     return job
 
 
