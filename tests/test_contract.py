@@ -157,7 +157,7 @@ def test_integrated_encoding() -> None:
     scene = toy_scene(views=2, size=8)
     config = NeuralFieldConfig(encoding=IntegratedConfig(), layers=2, width=32, skip=-1, colour_layers=1, colour_width=32)
     field = config.build(scene)
-    # What reaches the encoding is the cone's covariance in unit coordinates: check against points drawn from it.
+    # What reaches the encoding is the cone's mean and covariance in unit coordinates: check against points drawn from it.
     rays = scene.train[0].camera.resized(2, 2).rays()[:1]
     samples = Samples.on(rays, torch.zeros(1, dtype=torch.int64), torch.tensor([2.8]), torch.tensor([3.1]))
     caught: list[tuple[Tensor, Tensor]] = []
@@ -165,7 +165,7 @@ def test_integrated_encoding() -> None:
     field.query(samples, Quantity.DENSITY)
     unit, covariance = caught[0]
     root = torch.linalg.cholesky(samples.covariance[0])
-    points = scene.bounds.to_unit(samples.position + torch.randn(200_000, 3) @ root.T)
+    points = scene.bounds.to_unit(samples.cone_mean + torch.randn(200_000, 3) @ root.T)
     sharp = field.encoding(points, torch.zeros(len(points), 3, 3)).mean(dim=0)
     torch.testing.assert_close(field.encoding(unit, covariance)[0], sharp, atol=1e-2, rtol=0)
     # And it learns: a few steps towards the toy scene's picture.
