@@ -198,4 +198,4 @@ def test_a_gaussian_too_far_for_a_format_is_refused(run: Path, tmp_path: Path) -
     far = replace(splats.gaussians, means=splats.gaussians.means + 1e8)
     with pytest.raises(InputError, match="SPZ holds up to"):
         write_gaussians(tmp_path / "a.spz", "spz", replace(splats, gaussians=far))
-    assert set(EXPORTERS) == {"ply", "splat", "spz", "mesh"}
+    assert set(EXPORTERS) == {"ply", "splat", "spz", "mesh", "mpi"}

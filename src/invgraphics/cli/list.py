@@ -116,7 +116,7 @@ def _list_protocols() -> None:
 
 
 def _list_surface_metrics() -> None:
-    from invgraphics.metrics.surfaces import SURFACE_METRICS
+    from invgraphics.metrics.surface_metrics import SURFACE_METRICS
 
     rows = [(metric.name, metric.unit, metric.summary) for metric in SURFACE_METRICS.values()]
     show_table("Geometry scores of distances and meshes", ("name", "unit", "definition"), rows)

@@ -7,7 +7,8 @@ from invgraphics.core.scan import Scan
 from invgraphics.errors import InputError
 from invgraphics.fields.isosurface import extract_mesh
 from invgraphics.metrics.dtu import dtu_score
-from invgraphics.metrics.surfaces import F_SCORE_SHARE, POINTS, SURFACE_METRICS, compare_surfaces
+from invgraphics.metrics.surface_metrics import SURFACE_METRICS
+from invgraphics.metrics.surfaces import F_SCORE_SHARE, POINTS, compare_surfaces
 from invgraphics.runs.scores import Score
 
 RESOLUTION = 192

@@ -24,37 +24,6 @@ VIEW_PIXELS = 256
 """Least size, along the longer side, of the depth maps that tell what a camera sees."""
 
 
-@dataclass(frozen=True)
-class SurfaceMetric:
-    """A geometry score of a mesh: name, unit and direction; `summary` defines it in a line."""
-
-    name: str
-    unit: str
-    higher_is_better: bool
-    summary: str
-
-
-_VISIBLE = "on surface that a training camera sees"
-SURFACE_METRICS = {
-    metric.name: metric
-    for metric in (
-        SurfaceMetric("chamfer", "world units", False, "mean of surface_accuracy and surface_completeness"),
-        SurfaceMetric(
-            "surface_accuracy", "world units", False, f"mean distance to the true surface of predicted points {_VISIBLE}"
-        ),
-        SurfaceMetric(
-            "surface_completeness", "world units", False, f"mean distance to the predicted surface of true points {_VISIBLE}"
-        ),
-        SurfaceMetric(
-            "f_score", "", True, "harmonic mean of the shares of these points within 1% of the longest edge of the scene's box"
-        ),
-        SurfaceMetric(
-            "normal_consistency", "", True, "mean |cosine| between the normals of these points and of the nearest ones"
-        ),
-    )
-}
-
-
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
     """Points on a mesh.
