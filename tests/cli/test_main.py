@@ -89,7 +89,7 @@ def test_every_command_has_help(name: str, capsys) -> None:
         ("evaluate", "[-h] RUN [SCENE] [--protocol NAME]"),
         ("view", "[-h] [OPTIONS] RUN [RUN2]"),
         ("list", "[-h] [KIND ...]"),
-        ("report", "[-h] RUN ... [--out FOLDER] [--public]"),
+        ("report", "[-h] RUN ... [--out FOLDER] [--public] [--check]"),
     ],
 )
 def test_usage_tells_what_is_optional(name: str, expected: str, capsys) -> None:

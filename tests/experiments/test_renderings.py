@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from training_fixtures import SMALL
 
+from invgraphics import kernels
 from invgraphics.cli.arguments import parse
 from invgraphics.cli.compare import Compare
 from invgraphics.core import Context
@@ -100,6 +101,7 @@ def test_a_rendering_is_a_run_that_knows_what_it_shows(run: Path) -> None:
     assert (folder / provenance["truth"] / "0000.png").is_file()
     assert (folder / provenance["fitted_run"]).resolve() == run.resolve()
     assert not (folder / CHECKPOINT).exists()
+    kernels.use("reference")  # as in the fit
     assert plain(evaluate_run(folder))["quality"] == scores["quality"]
 
 

@@ -159,7 +159,8 @@ def _pictures(run: Path, scene: Scene) -> list[_Pictured]:
 def _difference(renderers: tuple[str, str], one: Sequence[_Pictured], other: Sequence[_Pictured]) -> Difference:
     """Differences of colour and depth per view between pictures of one fit by two renderers."""
     gaps = [a.colour - b.colour for a, b in zip(one, other, strict=True)]
-    depths = [np.abs(a.depth - b.depth) for a, b in zip(one, other, strict=True)]
+    with np.errstate(invalid="ignore"):  # no surface in either: infinity minus infinity
+        depths = [np.abs(a.depth - b.depth) for a, b in zip(one, other, strict=True)]
     depth = tuple(float(np.median(gap[np.isfinite(gap)])) for gap in depths if np.isfinite(gap).any())
     rmse, largest = [float(np.sqrt((gap**2).mean())) for gap in gaps], [float(np.abs(gap).max()) for gap in gaps]
     return Difference(renderers=renderers, rmse=tuple(rmse), largest=tuple(largest), depth=depth)
