@@ -11,8 +11,8 @@ from invgraphics.experiments.surface_scores import mesh_scores
 from invgraphics.fields.analytic import Box, Sphere
 from invgraphics.fields.isosurface import extract_mesh
 from invgraphics.fields.mesh import MeshField, _box
+from invgraphics.metrics.surface_metrics import SURFACE_METRICS
 from invgraphics.metrics.surfaces import (
-    SURFACE_METRICS,
     compare_surfaces,
     nearest_on,
     sample_surface,
