@@ -71,8 +71,11 @@ class TrainingData:
 
     @property
     def changes_photographs(self) -> bool:
-        """Whether photographs or poses are left out or changed, so that points made from all of them know too much."""
-        return self.train_views is not None or self.size is not None or any((self.pose_noise, self.photo_noise, self.exposure))
+        """Whether photographs are left out or changed, so that points made from all of them know too much.
+
+        Disturbed poses do not count: points that were triangulated at wrong poses, or random ones, start no refinement of poses.
+        """
+        return self.train_views is not None or self.size is not None or any((self.photo_noise, self.exposure))
 
     def __post_init__(self) -> None:
         for name in ("train_views", "size"):
