@@ -73,7 +73,7 @@ class TrainingData:
     def changes_photographs(self) -> bool:
         """Whether photographs are left out or changed, so that points made from all of them know too much.
 
-        Disturbed poses do not count: points that were triangulated at wrong poses, or random ones, start no refinement of poses.
+        Disturbed poses do not count: points triangulated at wrong poses, or random ones, start no refinement of poses.
         """
         return self.train_views is not None or self.size is not None or any((self.photo_noise, self.exposure))
 
