@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -143,8 +142,10 @@ class SRN(RayRenderer):
         sums = sums.new_zeros(len(rays), 5).index_copy(0, hit, sums)
         normal = None
         if ctx.geometry:
-            turned = partial(_clipped_distances, self, field, ctx)
-            facing = normals_from_distances(seen, last.detach(), turned)
+            steady = replace(ctx, training=False)
+            facing = normals_from_distances(
+                seen, last.detach(), lambda turned: self.distances(field, ctx.bounds.clip(turned), steady)
+            )
             normal = torch.zeros_like(rays.directions).index_copy(0, hit, facing)
         rendering = to_rendering(sums[:, :3], sums[:, 3], sums[:, 4], normal, rays.far, rays.directions)
         return rendering, Trace(samples, FieldValues(radiance=radiance), weight, rays=len(rays))
@@ -153,10 +154,6 @@ class SRN(RayRenderer):
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
         """The one surface point of the pixel's ray; see `Renderer.contributions`."""
         return replace(super().contributions(field, camera, pixel, ctx), kind="surface points")
-
-
-def _clipped_distances(renderer: SRN, field: Field, ctx: Context, rays: Rays) -> Float[Tensor, " n"]:
-    return renderer.distances(field, ctx.bounds.clip(rays), replace(ctx, training=False))
 
 
 def pixel_network(inputs: int, layers: int, width: int, outputs: int) -> nn.Sequential:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, cast, runtime_checkable
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 from typing_extensions import override
 
-from invgraphics.core import RayRenderer
+from invgraphics.core import RayRenderer, Trace
 from invgraphics.core.lattice import LatticeEncoding, LatticeField
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
@@ -84,17 +84,23 @@ class Prune(MilestoneHook):
             prune(state, grid, dilated(seen, self._config.dilation))
 
 
-@torch.no_grad()
-def ray_weights(state: FitState, renderer: RayRenderer, count: int) -> tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]:
-    """Positions and weights of the samples on ``count`` random training rays, drawn from the context's generator."""
+def trace_random_rays(state: FitState, renderer: RayRenderer, count: int) -> Iterator[Trace]:
+    """Render ``count`` random training rays as evaluation does, an equal share per view; yields each share's trace."""
     cameras = [view.camera for view in state.scene.train]
     ctx = replace(state.ctx, training=False)
     share = -(-count // len(cameras))
-    positions, weights = [], []
     for camera in cameras:
         size = torch.tensor([camera.width, camera.height])
         pixels = torch.rand(share, 2, generator=state.ctx.generator) * size
         _, trace = renderer.render_rays(state.field, camera.rays(pixels).to(ctx.bounds.lo.device), ctx)
+        yield trace
+
+
+@torch.no_grad()
+def ray_weights(state: FitState, renderer: RayRenderer, count: int) -> tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]:
+    """Positions and weights of the samples on ``count`` random training rays, drawn from the context's generator."""
+    positions, weights = [], []
+    for trace in trace_random_rays(state, renderer, count):
         assert trace.samples is not None
         assert trace.weights is not None
         positions.append(trace.samples.position)

@@ -15,6 +15,7 @@ from invgraphics.errors import InputError
 from invgraphics.kernels.near import near_points
 from invgraphics.training.hooks import FitState
 from invgraphics.training.milestones import MilestoneHook, check_milestones
+from invgraphics.training.prune import trace_random_rays
 from invgraphics.training.requirement import Requirement
 
 NEIGHBOURS = 4
@@ -124,18 +125,12 @@ class PointControl(MilestoneHook):
 @torch.no_grad()
 def strongest_samples(state: FitState, renderer: RayRenderer, count: int) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"]]:
     """Position and weight of the heaviest sample of ``count`` random training rays, as far as they have samples."""
-    cameras = [view.camera for view in state.scene.train]
-    ctx = replace(state.ctx, training=False)
-    share = -(-count // len(cameras))
     positions, weights = [], []
-    for camera in cameras:
-        size = torch.tensor([camera.width, camera.height])
-        pixels = torch.rand(share, 2, generator=state.ctx.generator) * size
-        _, trace = renderer.render_rays(state.field, camera.rays(pixels).to(ctx.bounds.lo.device), ctx)
+    for trace in trace_random_rays(state, renderer, count):
         assert trace.samples is not None
         assert trace.weights is not None
         ray = trace.samples.ray
-        largest = trace.weights.new_zeros(share).scatter_reduce_(0, ray, trace.weights, reduce="amax")
+        largest = trace.weights.new_zeros(trace.rays).scatter_reduce_(0, ray, trace.weights, reduce="amax")
         strongest = (trace.weights == largest[ray]) & (trace.weights > 0)
         positions.append(trace.samples.position[strongest])
         weights.append(trace.weights[strongest])
