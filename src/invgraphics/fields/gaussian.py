@@ -17,7 +17,11 @@ from invgraphics.core.scene import Points, Scene
 from invgraphics.errors import NotComposableError
 from invgraphics.fields.convert import visible_points
 from invgraphics.fields.gaussian_density import query_density
-from invgraphics.fields.starting import backdrop_points, depth_points, random_points, scene_points, starting_scales
+from invgraphics.fields.starting import (
+    backdrop_points,
+    initial_points,
+    starting_scales,
+)
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 """Names of a `GaussianField`'s parameters; the first axis of each is the primitive."""
@@ -80,11 +84,8 @@ class GaussianFieldConfig:
         Raises:
             InputError: the scene's point cloud is empty or not finite, or there are no depth maps.
         """
-        if self.init == "depth":
-            return self.from_points(depth_points(scene, self.max_init), scene)
-        known = self.init == "scene" and scene.points is not None
-        points = scene_points(scene, self.max_init) if known else random_points(scene.bounds, self.count)
-        if self.init != "field":
+        points = initial_points(scene, self.init, self.count, self.max_init)
+        if self.init not in ("depth", "field"):
             points = points.joined(backdrop_points(scene, self.backdrop))
         return self.from_points(points, scene)
 

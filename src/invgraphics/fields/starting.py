@@ -149,3 +149,21 @@ def _subset(points: Points, most: int) -> Points:
     if len(points) <= most:
         return points
     return points[torch.randperm(len(points))[:most]]
+
+
+def initial_points(scene: Scene, init: str, count: int, most: int) -> Points:
+    """Points of ``scene`` to place primitives on.
+
+    Args:
+        scene: what is to be fitted.
+        init: ``depth`` for the training views' depth maps, ``scene`` for its own points where it has some; else random ones.
+        count: number of random points.
+        most: largest number of the others.
+
+    Raises:
+        InputError: the scene's point cloud is empty or not finite, or there are no depth maps.
+    """
+    if init == "depth":
+        return depth_points(scene, most)
+    known = init == "scene" and scene.points is not None
+    return scene_points(scene, most) if known else random_points(scene.bounds, count)

@@ -22,7 +22,7 @@ from invgraphics.errors import InputError
 from invgraphics.fields.convert import visible_points
 from invgraphics.fields.encodings.frequency import frequencies, frequency_width
 from invgraphics.fields.mlp import Mlp
-from invgraphics.fields.starting import depth_points, median_spacing, random_points, scene_points
+from invgraphics.fields.starting import initial_points, median_spacing
 from invgraphics.kernels.near import near_points
 
 ROWS = ("positions", "features", "raw_rgb", "confidence_logits")
@@ -95,10 +95,7 @@ class PointFieldConfig:
         Raises:
             InputError: the scene's point cloud is empty or not finite, or there are no depth maps.
         """
-        if self.init == "depth":
-            return self.from_points(depth_points(scene, self.max_init), scene)
-        known = self.init == "scene" and scene.points is not None
-        return self.from_points(scene_points(scene, self.max_init) if known else random_points(scene.bounds, self.count), scene)
+        return self.from_points(initial_points(scene, self.init, self.count, self.max_init), scene)
 
     def converted(self, source: Field, scene: Scene) -> PointField:
         """Place the points on another field: at the centres of its most opaque Gaussians, else where its density is seen.
