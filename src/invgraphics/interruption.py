@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from types import FrameType
+from typing import NoReturn
 
 INTERRUPTED = 130
 """Exit status of a process that was interrupted or terminated."""
@@ -21,10 +22,32 @@ GIVEN_UP = f"Terminated; not even a step was over within {GRACE_SECONDS:g} s. Wh
 class Terminated(KeyboardInterrupt):
     """SIGTERM came: something that has no time, unlike somebody at a terminal, wants the process to end."""
 
+    raised = False
+    """Whether it was ever raised in this process: a library that it passes through may turn it into an exception of its own."""
+
 
 def terminate(number: int, frame: FrameType | None) -> None:
-    """Handle a signal by raising `Terminated`."""
+    """Handle a signal by raising `Terminated`; while modules are loaded, end the process instead.
+
+    Extension modules do not survive exceptions in their initialisation: torch aborts, others are left half made.
+    """
+    if _importing(frame):
+        _end_now("Terminated.")
+    Terminated.raised = True
     raise Terminated
+
+
+def _importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _end_now(sentence: str) -> NoReturn:
+    os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"{sentence}\n".encode())
+    os._exit(INTERRUPTED)
 
 
 def end_on_sigterm() -> None:
@@ -56,8 +79,7 @@ def _end_later(receiver: int) -> None:
     while number := os.read(receiver, 1):
         if number[0] == signal.SIGTERM:
             time.sleep(GRACE_SECONDS)
-            os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"{GIVEN_UP}\n".encode())
-            os._exit(INTERRUPTED)
+            _end_now(GIVEN_UP)
 
 
 def end_with_parent() -> None:

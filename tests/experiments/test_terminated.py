@@ -5,6 +5,7 @@ a minute. On a loaded machine the two seconds are multiplied by how much slower 
 """
 
 import hashlib
+import importlib
 import os
 import signal
 import subprocess
@@ -108,6 +109,35 @@ def swallowing() -> None:
     run.open_with_progress = careless  # type: ignore[assignment]
 
 
+def turning() -> None:
+    """A library whose import turns all exceptions into its own, as that of torch does."""
+    from invgraphics.experiments import run
+
+    def careless(*_: Any) -> None:
+        Path(os.environ[REACHED]).touch()
+        try:
+            time.sleep(60)
+        except BaseException:
+            raise RuntimeError from None
+
+    run.open_with_progress = careless  # type: ignore[assignment]
+
+
+def loading() -> None:
+    """An extension module that does not survive an exception in its initialisation."""
+    from invgraphics.experiments import run
+
+    folder = Path(os.environ[REACHED]).parent
+    (folder / "fragile.py").write_text("import os, time\ntry:\n    time.sleep(60)\nexcept BaseException:\n    os.abort()\n")
+
+    def load(*_: Any) -> None:
+        sys.path.insert(0, str(folder))
+        Path(os.environ[REACHED]).touch()
+        importlib.import_module("fragile")
+
+    run.open_with_progress = load  # type: ignore[assignment]
+
+
 def _start(toy_folder: Path, tmp_path: Path, phase: str) -> Running:
     words = ["fit", METHOD, str(toy_folder), "--out", str(tmp_path / "run"), "--budget", "12steps", "--kernels", "reference"]
     words += ["--checkpoint-every", "1steps", *(word for item in SMALL[METHOD] for word in ("--set", item))]
@@ -150,6 +180,18 @@ def test_sigterm_ends_a_fit_in_two_seconds(toy_folder: Path, tmp_path: Path, pha
     if steps is not None:
         assert int(checkpoint.load(saved)["fit"]["steps"]) == steps
     assert not (tmp_path / "run" / "scores.json").exists()
+
+
+def test_sigterm_is_an_interruption_whatever_a_library_makes_of_it(toy_folder: Path, tmp_path: Path) -> None:
+    process = _start(toy_folder, tmp_path, "turning")
+    assert _terminate(process) == INTERRUPTED
+    assert process.said().splitlines()[-1] == "Interrupted."
+
+
+def test_sigterm_is_not_raised_in_the_initialisation_of_a_module(toy_folder: Path, tmp_path: Path) -> None:
+    process = _start(toy_folder, tmp_path, "loading")
+    assert _terminate(process) == INTERRUPTED
+    assert process.said().splitlines()[-1] == "Terminated."
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.5, 1.5])

@@ -16,7 +16,7 @@ from typing import Any
 from invgraphics.cli.arguments import parse
 from invgraphics.errors import InputError, NumericalError, did_you_mean
 from invgraphics.files import file_fault
-from invgraphics.interruption import INTERRUPTED, end_on_sigterm
+from invgraphics.interruption import INTERRUPTED, Terminated, end_on_sigterm
 
 COMMANDS = {
     "list": (
@@ -86,7 +86,7 @@ def run(arguments: Sequence[str], debug: bool = False) -> int:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        status, lines = explain(error)
+        status, lines = (INTERRUPTED, ["Interrupted."]) if Terminated.raised else explain(error)
         for line in lines[:MOST_LINES]:
             print(line, file=sys.stderr)
         return status
