@@ -33,8 +33,9 @@ def draw(folder: Path, out: Path, view: int = 0) -> None:
         line[0].set_ylabel(textwrap.fill(row, 16), fontsize=9, rotation=0, ha="right", va="center", labelpad=8)
     for column, axis in zip(columns, axes.reshape(shape)[0], strict=True):
         axis.set_title(textwrap.fill(column, 16), fontsize=9, pad=10)
-    figure.text(0.01, 0.004, _caption(comparison), fontsize=8.5, color="#555", va="bottom")
-    figure.tight_layout(rect=(0, 0.02, 1, 1), h_pad=0.6, w_pad=0.6)
+    caption = textwrap.fill(_caption(comparison), round(13 * figure.get_figwidth()))
+    figure.text(0.01, 0.004, caption, fontsize=8.5, color="#555", va="bottom")
+    figure.tight_layout(rect=(0, 0.18 * (1 + caption.count("\n")) / figure.get_figheight(), 1, 1), h_pad=0.6, w_pad=0.6)
     figure.savefig(out)
 
 
