@@ -15,7 +15,7 @@ from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.posed import protocol_note
+from invgraphics.experiments.posed import exposure_note, protocol_note
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.interruption import INTERRUPTED
@@ -138,7 +138,10 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
     camera = scene.test[0].camera
     names = ", ".join(request.methods) if len(request.methods) <= MOST_NAMES else f"{len(request.methods)} methods"
     methods = [job.method for job in jobs]
-    notes = {protocol_note(method) for method in methods} - {""}
+    notes = {
+        "test_poses": {protocol_note(method) for method in methods} - {""},
+        "test_exposure": {f"{method.name}: {note}" for method in methods if (note := exposure_note(method))},
+    }
     baselines = baseline_scores(scene, protocol)
     return ComparisonRecord(
         scene=scene.name,
@@ -157,7 +160,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
         command=request.shell(),
         baselines=baselines,
         noise_ceiling=scene.noise_ceiling,
-        protocol=protocol.record() | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
+        protocol=protocol.record() | {key: "; ".join(sorted(found)) for key, found in notes.items() if found},
         scene_info=_scene_facts(scene),
         environment=environment(jobs[0].device),
         runs=(),

@@ -27,7 +27,7 @@ from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_tr
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, check_replaceable, identify
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.posed import protocol_note
+from invgraphics.experiments.posed import exposure_note, protocol_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder
 from invgraphics.experiments.renderings import check_variants, render_missing
@@ -214,6 +214,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance
         options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
         device=str(job.device),
         test_poses=protocol_note(method),
+        test_exposure=exposure_note(method),
     )
 
 

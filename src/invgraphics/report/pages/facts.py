@@ -179,6 +179,7 @@ def _run_facts(run: Run) -> dict[str, str]:
         "code version": known.code_version,
         "budget": known.budget,
         "test poses": known.test_poses,
+        "test exposure": known.test_exposure,
         "load average": _text(plain(known.load_average)),
     }
     for key, value in run.environment.facts().items():
