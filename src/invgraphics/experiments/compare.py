@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -20,10 +21,12 @@ from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
+from invgraphics.recipes.suitable import default_methods
 from invgraphics.recipes.table import cell_of
 from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, SceneFacts
 from invgraphics.runs.folder import RunFolder, output_folder
 from invgraphics.scenes.degrade import degrade
+from invgraphics.scenes.open import SceneOptions, space_note
 
 MOST_NAMES = 6
 """Methods that the question of a comparison names; of more it says how many there are."""
@@ -47,10 +50,11 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
 
 def _compare(request: CompareRequest) -> tuple[Path, int]:
     began = time.monotonic()
-    request, jobs, scene, refused = _resolve(request)
+    request, choice, opened = (request, "", None) if request.methods else _choose_methods(request)
+    request, jobs, scene, refused = _resolve(request, opened)
     folder = RunFolder(Path(request.out))
     failures: list[Failure] = []
-    summary = replace(_summary(request, jobs, scene), refused=tuple(refused))
+    summary = replace(_summary(request, jobs, scene), refused=tuple(refused), method_choice=choice)
     interrupted: KeyboardInterrupt | None = None
     try:
         with closing(LocalExecutor().run(request.fits(), folder.root / "jobs")) as outcomes:
@@ -71,8 +75,24 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     return folder.root, len(failures)
 
 
-def _resolve(request: CompareRequest) -> tuple[CompareRequest, list[Job], Scene, list[Refusal]]:
+def _choose_methods(request: CompareRequest) -> tuple[CompareRequest, str, Scene]:
+    """Choose the methods of a request that names none by its scene, and print them; returns the choice in words, and the scene.
+
+    Raises:
+        InputError: the scene cannot be opened.
+    """
+    scene = open_with_progress(request.scene, SceneOptions(request.size, request.test_views, request.spp))
+    methods, reason = default_methods(scene)
+    print(f"Methods: {', '.join(methods)}, chosen for {reason}; --methods overrides.{space_note(scene)}", file=sys.stderr)
+    return replace(request, methods=methods), f"chosen for {reason}", scene
+
+
+def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[CompareRequest, list[Job], Scene, list[Refusal]]:
     """Resolve one job per method with the first seed, and open the scene with that seed's data degradation.
+
+    Args:
+        request: with its methods.
+        opened: its scene, where it is open already.
 
     Returns:
         The request without the optional methods that do not go with the scene; its jobs; the scene; the refused methods.
@@ -80,8 +100,6 @@ def _resolve(request: CompareRequest) -> tuple[CompareRequest, list[Job], Scene,
     Raises:
         InputError: anything that could be wrong, before any time is spent.
     """
-    if not request.methods:
-        raise InputError("--methods is empty.", "Example: --methods volumetric/hash,splatting/gaussians.")
     if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
         raise InputError("A method or a seed is named twice.")
     jobs, refused = [], []
@@ -97,7 +115,7 @@ def _resolve(request: CompareRequest) -> tuple[CompareRequest, list[Job], Scene,
     for fit in request.fits():
         if fit.method in methods:
             check_replaceable(Job.of(fit, methods[fit.method]))
-    full = open_with_progress(request.scene, jobs[0].options)
+    full = opened or open_with_progress(request.scene, jobs[0].options)
     scene = degrade(full, jobs[0].data, request.seeds[0])
     jobs, unsuitable = _suitable(request, jobs, scene)
     request = replace(request, methods=tuple(job.request.method for job in jobs))
