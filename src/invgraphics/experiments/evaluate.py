@@ -21,7 +21,7 @@ from invgraphics.errors import NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
-from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
+from invgraphics.experiments.posed import PosedEvaluation, exposure_note, protocol_note, scene_in_fit_frame
 from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.experiments.scaled import scaled_scores
 from invgraphics.experiments.subjects import UnseenInstances
@@ -85,6 +85,7 @@ def evaluate(
         cost=costs | found.cost,
         disturbed=disturbance(costs.get("fit_processor_share")),
         test_poses="" if poses is None else protocol_note(method),
+        test_exposure=exposure_note(method),
     )
     folder.write(result)
     return result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 from weakref import WeakKeyDictionary
@@ -84,6 +84,8 @@ def open_scene(
     """
     options = options or SceneOptions()
     scene = validate(_load(spec, options, progress))
+    if words := _bounds_words(scene):
+        scene = replace(scene, notes=scene.notes | {"bounds": words})
     _SOURCES[scene] = SceneSource(spec, options)
     return scene
 
@@ -152,12 +154,18 @@ def selection_notes(scene: Scene) -> str:
 
 def space_note(scene: Scene) -> str:
     """Describe the bounds that were chosen for a scene without end, on a line; empty for a scene in a box."""
+    words = _bounds_words(scene)
+    return f"\n  space: {words}" if words else ""
+
+
+def _bounds_words(scene: Scene) -> str:
+    """Describe the bounds of a scene without end and what they were chosen from; empty for a scene in a box."""
     if scene.bounds.space == "box":
         return ""
     half, near = float(scene.bounds.half.max()), scene.bounds.near
     source = f"three quarters of {len(scene.points):,} known points" if scene.points else "the cameras: no points are known"
     return (
-        f"\n  space: endless, contracted around a box of half-edge {half:.2g} (from {source}); no sample nearer than {near:.2g}"
+        f"endless, contracted around a box of half-edge {half:.2g} (from {source}); no sample nearer than {near:.2g}"
         " to a camera, where the farthest camera is at 1"
     )
 
