@@ -12,19 +12,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from invgraphics import kernels
-from invgraphics.core import (
-    Camera,
-    Context,
-    Contributions,
-    Field,
-    Gaussians,
-    Quantity,
-    RayRenderer,
-    Rays,
-    Rendering,
-    Scene,
-    Trace,
-)
+from invgraphics.core import Camera, Context, Contributions, Field, Quantity, RayRenderer, Rays, Rendering, Scene, Trace
 from invgraphics.core.contributions import opacities
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, Opacity
 from invgraphics.kernels.gaussians import gaussian_integrals
@@ -102,9 +90,7 @@ class GaussianSortedConfig:
 
     def __post_init__(self) -> None:
         if self.opacity == "splat" and not self.self_attenuation:
-            raise ValueError(
-                "opacity 'splat' is an alpha that is not integrated: self_attenuation cannot be switched off there."
-            )
+            raise ValueError("opacity 'splat' is an alpha, not integrated: self_attenuation cannot be switched off there.")
         _check_smallest(self.smallest)
 
     def build(self, scene: Scene) -> GaussianSorted:
@@ -169,7 +155,7 @@ class GaussianRays(RayRenderer):
 
     def _precompute(self, field: Field, origin: Float[Tensor, 3] | None, ctx: Context) -> Primitives:
         """Precompute the field's Gaussians for rays, all from ``origin`` where one is given."""
-        gaussians: Gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
+        gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
         return precompute(gaussians, self._opacity, self._smallest, origin, self._self_attenuation)
 
     def _render(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, ctx: Context) -> Rendering:
