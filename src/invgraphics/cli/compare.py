@@ -20,7 +20,8 @@ from invgraphics.runs.folder import RUNS, RunFolder
 class Compare(Shared):
     """Fit several methods to one scene under one budget, each in its own process; score them; write a report.
 
-    The same command again keeps finished runs and continues the others. Exit status 1: some fits failed.
+    The same command again keeps finished runs and continues the others. On a rendered scene, methods that start from points
+    start from those found in the training photographs, unless --set data.init says otherwise. Exit status 1: some fits failed.
     """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]

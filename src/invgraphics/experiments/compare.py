@@ -18,7 +18,7 @@ from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import exposure_note, protocol_note
 from invgraphics.experiments.renderings import check_variants
-from invgraphics.experiments.request import CompareRequest
+from invgraphics.experiments.request import DATA, CompareRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.recipes.suitable import default_methods
@@ -27,7 +27,9 @@ from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, Scen
 from invgraphics.runs.folder import RunFolder, output_folder
 from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import SceneOptions, space_note
+from invgraphics.scenes.truth import POINTS as EXACT_POINTS
 
+START = f"{DATA}init"
 MOST_NAMES = 6
 """Methods that the question of a comparison names; of more it says how many there are."""
 
@@ -102,6 +104,28 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     """
     if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
         raise InputError("A method or a seed is named twice.")
+    jobs, refused = _jobs(request)
+    full = opened or open_with_progress(request.scene, jobs[0].options)
+    if start := _start_for_all(request, jobs, full):
+        request = replace(request, overrides=(*request.overrides, start))
+        jobs = [Job.of(replace(job.request, overrides=request.overrides), job.method) for job in jobs]
+    methods = {job.request.method: job.method for job in jobs}
+    for fit in request.fits():
+        if fit.method in methods:
+            check_replaceable(Job.of(fit, methods[fit.method]))
+    scene = degrade(full, jobs[0].data, request.seeds[0])
+    jobs, unsuitable = _suitable(request, jobs, scene)
+    request = replace(request, methods=tuple(job.request.method for job in jobs))
+    check_variants(jobs[0].variants, [job.method for job in jobs], full)
+    return request, jobs, scene, [*refused, *unsuitable]
+
+
+def _jobs(request: CompareRequest) -> tuple[list[Job], list[Refusal]]:
+    """Resolve one job per method with the first seed; returns the jobs and the methods that cannot be used.
+
+    Raises:
+        InputError: a method that is not optional cannot be used, or none can.
+    """
     jobs, refused = [], []
     for fit in request.fits():
         if fit.seed == request.seeds[0]:
@@ -111,16 +135,17 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
                 refused.append(_refusal(request, fit.method, error))
     if not jobs:
         raise InputError("None of the methods can be used.", f"{refused[0].method}: {refused[0].reason}")
-    methods = {job.request.method: job.method for job in jobs}
-    for fit in request.fits():
-        if fit.method in methods:
-            check_replaceable(Job.of(fit, methods[fit.method]))
-    full = opened or open_with_progress(request.scene, jobs[0].options)
-    scene = degrade(full, jobs[0].data, request.seeds[0])
-    jobs, unsuitable = _suitable(request, jobs, scene)
-    request = replace(request, methods=tuple(job.request.method for job in jobs))
-    check_variants(jobs[0].variants, [job.method for job in jobs], full)
-    return request, jobs, scene, [*refused, *unsuitable]
+    return jobs, refused
+
+
+def _start_for_all(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> str:
+    """Override that lets fields start from what photographs tell; empty where the request, or the scene, says what from.
+
+    Points of a rendered scene are exact: no method could find them, and most have no use for them.
+    """
+    chosen = any(item.partition("=")[0] == START for item in request.data_overrides)
+    used = any(getattr(job.method.recipe.field, "init", "") == "scene" for job in jobs)
+    return f"{START}=sfm" if used and not chosen and scene.notes.get("points") == EXACT_POINTS else ""
 
 
 def _suitable(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> tuple[list[Job], list[Refusal]]:
