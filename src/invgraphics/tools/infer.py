@@ -24,6 +24,7 @@ from invgraphics.runs.inference import Inference, InstanceScores
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.layout import evenly
 from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.text import slug
 from invgraphics.tools.inference_baselines import Observed, class_mean, nearest_instance, without_prior
 from invgraphics.training.budget import Budget
 from invgraphics.training.codes.inference import CodeInference, infer_codes
@@ -127,6 +128,10 @@ def infer(request: InferRequest) -> Inference:
             instances=tuple(scores),
         )
         record.write(request.out / Inference.FILE)
+        for how, one in _names(fitted).items():  # by which `report --check` knows the recipes
+            copy = RunFolder(request.out / "runs" / slug(how))
+            copy.create()
+            copy.write(one.folder.read(Provenance))
     return record
 
 
