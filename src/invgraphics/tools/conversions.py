@@ -160,7 +160,7 @@ def quaternions_to(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
 
 
 def to_points(model: Model, scene: Scene, method: Method, size: int) -> PointField:
-    """Neural points on surface points, in their colours; the networks that make density of them are new, and learnt in the refit.
+    """Neural points on surface points, in their colours; the networks that make density of them are learnt in the refit.
 
     Raises:
         InputError: the model shows nothing, or the method has no point cloud.
