@@ -44,8 +44,8 @@ def test_pairs_are_those_of_the_reference() -> None:
         assert torch.equal(found[1], expected[1])
 
 
-@pytest.mark.parametrize("opacity", ["peak", "physical"])
-def test_light_and_gradients_are_the_references(opacity: str) -> None:
+@pytest.mark.parametrize(("opacity", "attenuated"), [("peak", True), ("physical", True), ("extinction", False)])
+def test_light_and_gradients_are_the_references(opacity: str, attenuated: bool) -> None:
     rays, generator = rays_of(3, 7), torch.Generator().manual_seed(2)
     wanted = torch.randn(len(rays), 4, generator=generator)
 
@@ -56,7 +56,8 @@ def test_light_and_gradients_are_the_references(opacity: str) -> None:
             moved, origins=moved.origins.clone().requires_grad_(), directions=moved.directions.clone().requires_grad_()
         )
         # Strong gradients make colours negative somewhere: what would lower those further must not pass.
-        sums = gaussian_integrals(precompute(Gaussians(**tensors), opacity, SMALLEST), moved, 32)
+        primitives = precompute(Gaussians(**tensors), opacity, SMALLEST, self_attenuation=attenuated)
+        sums = gaussian_integrals(primitives, moved, 32)
         gradients = torch.autograd.grad((sums * wanted.to(dtype)).sum(), (*tensors.values(), moved.origins, moved.directions))
         return sums.detach(), *gradients
 

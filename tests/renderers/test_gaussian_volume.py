@@ -116,6 +116,70 @@ def test_physical_reading_is_one_density_in_space() -> None:
     torch.testing.assert_close(peak.alpha, physical.alpha)
 
 
+def test_extinction_reading_is_the_papers_projection() -> None:
+    """Celarek et al.: a' = θ 2π √(λ1 λ2) / I2(Σ'), with eigenvalues and projected covariances by numpy."""
+    gaussians, rays = some(3), some_rays(4)
+    found = intersect(precompute(gaussians, "extinction", 1e-12), rays)
+    theta = -np.log1p(-gaussians.opacities.numpy())
+    for r, i, depth in zip(*(getattr(found, name).tolist() for name in ("ray", "gaussian", "depth")), strict=True):
+        axes = quaternion_to_matrix(gaussians.quaternions)[i].numpy()
+        covariance = axes @ np.diag(gaussians.scales[i].numpy() ** 2) @ axes.T
+        _, _, frame = np.linalg.svd(rays.directions[r].numpy()[None])
+        across = frame[1:]
+        projected = across @ covariance @ across.T
+        offset = across @ (rays.origins[r] - gaussians.means[i]).numpy()
+        largest = np.sort(np.linalg.eigvalsh(covariance))[1:]
+        whole = theta[i] * 2 * math.pi * math.sqrt(largest.prod()) / (2 * math.pi * math.sqrt(np.linalg.det(projected)))
+        assert depth == pytest.approx(whole * math.exp(-0.5 * offset @ np.linalg.solve(projected, offset)), rel=1e-9)
+
+
+def test_extinction_reading_has_the_same_mass_from_every_side() -> None:
+    """Optical depths of the renderer, integrated over a plane across any direction, are those of the broad side."""
+    scales = torch.tensor([[0.25, 0.1, 0.15]], dtype=F64)
+    one = some(1, means=torch.zeros(1, 3, dtype=F64), scales=scales, opacities=torch.tensor([0.6], dtype=F64))
+    u = torch.linspace(-1.4, 1.4, 57, dtype=F64)
+    x, y = (grid.reshape(-1, 1) for grid in torch.meshgrid(u, u, indexing="ij"))
+    for seed in range(3):
+        frame = torch.linalg.qr(torch.randn(3, 3, dtype=F64, generator=torch.Generator().manual_seed(seed)))[0]
+        rays = Rays.make(x * frame[0] + y * frame[1] - 3 * frame[2], frame[2].expand(len(x), 3))
+        mass = -torch.log1p(-show(replace(EXACT, opacity="extinction", steps=8), one, rays).alpha).sum() * (u[1] - u[0]) ** 2
+        assert float(mass) == pytest.approx(-math.log(0.4) * 2 * math.pi * 0.25 * 0.15, rel=1e-6)
+
+
+@pytest.mark.parametrize("config", [EXACT, SORTED], ids=str)
+def test_without_self_attenuation_alphas_are_optical_depths(config: Any) -> None:
+    """Closed forms for one Gaussian, two far apart, two in one place, and one that is too dense for an alpha."""
+    config = replace(config, self_attenuation=False)
+    white, black = 0.5 / math.sqrt(1 / (4 * math.pi)), -0.5 / math.sqrt(1 / (4 * math.pi))
+    rays = Rays.make(torch.tensor([[0.0, -3, 0]], dtype=F64), torch.tensor([[0.0, 1, 0]], dtype=F64))
+    a, b = 0.3, 0.5  # optical depths; the first Gaussian shines
+
+    def picture(*given: tuple[float, float]) -> Any:
+        n = len(given)
+        means = torch.tensor([[0.0, y, 0.0] for y, _ in given], dtype=F64)
+        opacities = torch.tensor([-math.expm1(-depth) for _, depth in given], dtype=F64)
+        sh = torch.tensor([white] + [black] * (n - 1), dtype=F64)[:, None, None].expand(n, 1, 3)
+        scales = torch.full((n, 3), 0.08, dtype=F64)
+        return show(
+            config, Gaussians(means, torch.tensor([[1.0, 0, 0, 0]], dtype=F64).repeat(n, 1), scales, opacities, sh), rays
+        )
+
+    assert float(picture((0.0, a)).alpha) == pytest.approx(a, abs=1e-9)
+    assert float(picture((0.0, 2.0)).alpha) == pytest.approx(0.99, abs=1e-9)
+    apart = picture((1.0, a), (-1.0, b))
+    assert float(apart.rgb[0, 0]) == pytest.approx((1 - b) * a, abs=1e-6)
+    assert float(apart.alpha) == pytest.approx(b + (1 - b) * a, abs=1e-9)
+    if isinstance(config, GaussianExactConfig):
+        same = picture((0.0, a), (0.0, a))
+        assert float(same.alpha) == pytest.approx(1 - (1 - a) ** 2, abs=1e-9)
+        assert float(same.rgb[0, 0]) == pytest.approx((1 - (1 - a) ** 2) / 2, abs=1e-6)
+
+
+def test_splat_alphas_cannot_lose_an_attenuation_that_they_lack() -> None:
+    with pytest.raises(ValueError, match="splat"):
+        GaussianSortedConfig(opacity="splat", self_attenuation=False)
+
+
 def test_mean_inverse_scale_is_that_of_an_ellipsoids_surface() -> None:
     """Against Carlson's integral, for spheres, needles and discs."""
     scales = torch.tensor([[1.0, 1, 1], [1, 0.1, 0.1], [1, 1, 0.01], [0.5, 0.2, 0.05], [1, 1e-3, 1e-5]], dtype=F64)
@@ -213,7 +277,17 @@ def test_a_camera_inside_a_gaussian_sees_the_half_before_it(a: float) -> None:
     assert float(show(EXACT, behind, rays).alpha) < 1e-9
 
 
-@pytest.mark.parametrize("config", [replace(EXACT, steps=200), replace(SORTED, opacity="physical"), SORTED], ids=str)
+@pytest.mark.parametrize(
+    "config",
+    [
+        replace(EXACT, steps=200),
+        replace(EXACT, steps=200, opacity="extinction", self_attenuation=False),
+        replace(SORTED, opacity="physical"),
+        replace(SORTED, self_attenuation=False),
+        SORTED,
+    ],
+    ids=str,
+)
 def test_gradients_are_those_of_finite_differences(config: Any) -> None:
     """Nodes of the quadrature move with the parameters and are held fixed in the gradient, which only costs its small error."""
     rays, names = some_rays(3), ("means", "quaternions", "scales", "opacities", "sh")

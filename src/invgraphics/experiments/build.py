@@ -9,6 +9,7 @@ from invgraphics.core import Model, RayRenderer, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.memory_check import check_memory
 from invgraphics.experiments.progress import Reporter
+from invgraphics.experiments.subjects import check_subjects
 from invgraphics.experiments.variants import as_shown
 from invgraphics.recipes.recipe import Method
 from invgraphics.recipes.schema import Recipe
@@ -57,6 +58,7 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *
     check_memory(method, scene)
     torch.manual_seed(seed)
     field, renderer = method.recipe.field.build(scene), method.recipe.renderer.build(scene)
+    check_subjects(field, scene, method.name)
     model = Model(as_shown(field, renderer) if shown else field, renderer, scene.bounds)
     training = method.recipe.training
     if training is not None and training.poses is not None and training.poses.optimise:

@@ -22,6 +22,7 @@ from invgraphics.report.pages.verdicts import write_verdict_report
 from invgraphics.report.statistics.cross_render import cross_effects
 from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
 from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.predictions import judge_predictions
 from invgraphics.report.statistics.rules import headline, judge
 from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.summary import quality_columns, table_columns
@@ -112,7 +113,8 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
     crossed = cross_effects(observations, study.approximations, clean)
     heat = draw_heat_maps(study.factors, quantities[0], observations, folder.figures) if quantities else []
     analyses = draw_analyses(root, study.analyses, folder.figures)
-    return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None, analyses, crossed)
+    judged = judge_predictions(study.predictions, observations, study.lost())
+    return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None, analyses, crossed, judged)
 
 
 def _quantities(study: Study, comparisons: Sequence[Comparison]) -> list[Quantity]:

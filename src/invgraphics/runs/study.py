@@ -44,6 +44,40 @@ class KnownDeviation:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """A statement made before anything ran: how far two kinds of fits are apart, and between which bounds that should lie.
+
+    Attributes:
+        text: the statement, one sentence.
+        source: where it comes from.
+        before: factor -> level (``method`` among them) of the fits that are subtracted.
+        after: the same of the fits that they are subtracted from.
+        where: levels that both sides have.
+        against: levels in place of ``where``; the statement is then about the growth of the difference from there to here.
+        scenes: of the study's; empty for all.
+        metric: key of the score.
+        low: lower bound, in the metric's stored unit; ``None`` for no bound.
+        high: upper bound, likewise.
+    """
+
+    text: str
+    source: str
+    before: dict[str, Any]
+    after: dict[str, Any]
+    where: dict[str, Any] = field(default_factory=dict)
+    against: dict[str, Any] = field(default_factory=dict)
+    scenes: tuple[str, ...] = ()
+    metric: str = "psnr"
+    low: float | None = None
+    high: float | None = None
+
+    def __post_init__(self) -> None:
+        bounds = [bound for bound in (self.low, self.high) if bound is not None]
+        if not bounds or bounds != sorted(bounds):
+            raise ValueError("A prediction needs 'low', 'high' or both, in rising order.")
+
+
+@dataclass(frozen=True, kw_only=True)
 class CellRecord:
     """Record of a study's cell: its levels, run folder, state and times.
 
@@ -107,6 +141,7 @@ class StudyRecord(Record):
         each: factor that the question asks about level by level (``method``); empty where the mean answers it.
         interactions: pairs of factors whose interaction is the question.
         margins: metric -> difference that is of no interest, stated before anything ran.
+        predictions: statements made before anything ran, which the report judges.
         protocol: how scores were made: ``name``, ``summary`` and further facts.
         command: makes the study again.
         environment: machine and versions.
@@ -135,6 +170,7 @@ class StudyRecord(Record):
     each: str = ""
     interactions: tuple[tuple[str, str], ...] = ()
     margins: dict[str, float] = field(default_factory=dict)
+    predictions: tuple[Prediction, ...] = ()
     protocol: dict[str, Any] = field(default_factory=dict)
     command: str = ""
     environment: Environment = field(default_factory=Environment)

@@ -189,15 +189,15 @@ def _render(description: str, options: SceneOptions, progress: Callable[[int, in
     from invgraphics.scenes.mitsuba import make
     from invgraphics.scenes.mitsuba.spec import description_path, read
 
-    size = options.size
+    size, spec = options.size, read(description_path(description))
     if isinstance(size, int):
-        width, height = read(description_path(description)).size
+        width, height = spec.size
         size = (round(size * width / max(width, height)), round(size * height / max(width, height)))
     return make(
         description,
         size=size,
-        train=options.train_views,
-        test=options.test_views,
+        train=None if spec.instances else options.train_views,  # of a class, every instance has its own number of views
+        test=None if spec.instances else options.test_views,
         spp=options.spp,
         seed=options.seed,
         progress=progress,
@@ -216,12 +216,12 @@ def validate(scene: Scene) -> Scene:
             raise InputError(
                 f"The scene '{scene.name}' has no {split} views.", "At least one to fit and one to score is needed."
             )
-    for split in ("train", "val", "test"):
+    for split in ("train", "val", "test", "observed"):
         for view in getattr(scene, split):
             _validate_view(view, f"{split} view '{view.name}' of '{scene.name}'")
     check_scene(scene)
     tested = torch.stack([_flat(view) for view in scene.test])
-    for split in ("train", "val"):
+    for split in ("train", "val", "observed"):
         for view in getattr(scene, split):
             same = ((tested - _flat(view)).abs().amax(dim=1) < _SAME_POSE).nonzero()
             if len(same):

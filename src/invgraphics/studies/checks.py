@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from invgraphics.errors import InputError
+from invgraphics.runs.study import Prediction
 from invgraphics.studies.analyses import check_analyses
 from invgraphics.studies.factors import BUDGET, NARROWING, PRESET, SETTINGS, SIZE, in_scope, levels_of, path_of
 from invgraphics.studies.study import Study
@@ -37,7 +38,11 @@ def completed(study: Study, where: str) -> Study:
         found = ([base[name]] if absent else []) + [cell[name] for cell in cells if name in cell]
         factors[name] = [level for index, level in enumerate(found) if level not in found[:index]]
     first = {name: levels[0] for name, levels in factors.items() if levels}
-    return replace(study, base=first | base, factors=factors, cells=cells)
+    predictions = tuple(
+        replace(one, **{side: _flat(getattr(one, side)) for side in ("before", "after", "where", "against")})
+        for one in study.predictions
+    )
+    return replace(study, base=first | base, factors=factors, cells=cells, predictions=predictions)
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -73,6 +78,8 @@ def checked(study: Study, where: str) -> Study:
                 f"{where}: '{twice[0]}' is set by two entries for {method}.", "Let their scopes exclude each other."
             )
     _check_questions(study, where)
+    for number, prediction in enumerate(study.predictions, 1):
+        _check_prediction(prediction, study, f"{where}: prediction {number}")
     check_analyses(study.analyses, where)
     for name in (name for pair in study.approximations for name in (pair.exact, pair.approximate)):
         if name not in study.render_with:
@@ -98,6 +105,24 @@ def _check_questions(study: Study, where: str) -> None:
     for metric, margin in study.margins.items():
         if not 0 < margin < math.inf:
             raise InputError(f"{where}: the margin of '{metric}' cannot be {margin}.", "Expected: a positive difference.")
+
+
+def _check_prediction(prediction: Prediction, study: Study, where: str) -> None:
+    """Check that a prediction names scenes, factors and levels of the study, and that its two sides differ."""
+    levels: dict[str, Sequence[Any]] = {"method": study.methods, **study.factors}
+    for side in ("before", "after", "where", "against"):
+        for name, level in getattr(prediction, side).items():
+            if name not in levels:
+                raise InputError(f"{where} names '{name}', which is no factor.", f"Expected: {', '.join(sorted(levels))}.")
+            if level not in levels[name]:
+                listed = ", ".join(map(repr, levels[name]))
+                raise InputError(f"{where} names '{name}' = {level!r}, which is none of its levels.", f"Expected: {listed}.")
+    if strange := [scene for scene in prediction.scenes if scene not in study.scenes]:
+        raise InputError(f"{where} names {strange[0]!r}, which is none of the study's scenes.", ", ".join(study.scenes))
+    if prediction.before == prediction.after:
+        raise InputError(f"{where}: 'before' and 'after' are the same fits.")
+    if prediction.against and prediction.against.keys() != prediction.where.keys():
+        raise InputError(f"{where}: 'against' must name the factors of 'where', at other levels.")
 
 
 def _check_count(study: Study, where: str) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from invgraphics.experiments.request import AblateRequest, FitRequest
-from invgraphics.runs.study import Approximation, KnownDeviation
+from invgraphics.runs.study import Approximation, KnownDeviation, Prediction
 from invgraphics.studies.factors import (
     BUDGET,
     PRESET,
@@ -63,6 +63,7 @@ class Study:
         interactions: pairs of factors whose interaction is the question; the report tests it first.
         margins: metric -> difference, in its stored unit, below which levels count as equal (the report's equivalence tests);
             others have the margins of `invgraphics.report.wording.MARGINS`.
+        predictions: differences that are stated before anything runs, which the report judges.
     """
 
     question: str
@@ -87,6 +88,7 @@ class Study:
     each: str = ""
     interactions: tuple[tuple[str, str], ...] = ()
     margins: dict[str, float] = default(default_factory=dict)
+    predictions: tuple[Prediction, ...] = ()
 
     def points(self) -> list[Levels]:
         """List the design's combinations of levels, in the order of the factors; at least the base."""

@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 from invgraphics.core import Gaussians, Rays, harmonics
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.kernels.dispatch import choose
-from invgraphics.kernels.extinction import Opacity, reach, strength
+from invgraphics.kernels.extinction import Opacity, is_density, reach, strength, without_self_attenuation
 from invgraphics.kernels.types import ALPHA_MAX, ALPHA_MIN
 
 MAX_DEVIATIONS = 8.0
@@ -35,13 +35,14 @@ class Primitives:
     Attributes:
         means: centres.
         whitening: takes offsets to the frame where the Gaussian is the unit one, diag(1/s) Rᵀ.
-        strength: *a* for ``splat``, else what a response is multiplied with to be an optical depth (``physical``: per length).
+        strength: *a* for ``splat``, else what a response is multiplied with to be an optical depth (a density: per length).
         normals: shortest axes, of either sign.
         sh: coefficients of the colour.
         rgb: colours as seen from the only origin that rays have; ``None`` where they have several.
         reach: standard deviations beyond which a Gaussian is left out.
         radius: the same as a length, along the longest axis.
         opacity: the reading that ``strength`` follows.
+        self_attenuation: whether a Gaussian absorbs its own light; see `kernels.extinction.without_self_attenuation`.
     """
 
     means: Float[Tensor, "m 3"]
@@ -53,6 +54,7 @@ class Primitives:
     reach: Float[Tensor, " m"]
     radius: Float[Tensor, " m"]
     opacity: Opacity
+    self_attenuation: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,13 @@ class Intersections:
         return len(self.ray)
 
 
-def precompute(gaussians: Gaussians, opacity: Opacity, smallest: float, origin: Float[Tensor, 3] | None = None) -> Primitives:
+def precompute(
+    gaussians: Gaussians,
+    opacity: Opacity,
+    smallest: float,
+    origin: Float[Tensor, 3] | None = None,
+    self_attenuation: bool = True,
+) -> Primitives:
     """Precompute whitening transforms, strengths and reaches of Gaussians, for any ray.
 
     Args:
@@ -87,6 +95,7 @@ def precompute(gaussians: Gaussians, opacity: Opacity, smallest: float, origin: 
         opacity: how opacities are read.
         smallest: optical depth below which a Gaussian is left out of a ray; ``splat`` has its own limit, `ALPHA_MIN`.
         origin: where all rays begin, if that is one point.
+        self_attenuation: whether a Gaussian absorbs its own light; ``splat`` alphas are none of an absorbing Gaussian.
     """
     axes, scales = quaternion_to_matrix(gaussians.quaternions), gaussians.scales
     deviations = reach(gaussians, opacity, smallest)
@@ -101,6 +110,7 @@ def precompute(gaussians: Gaussians, opacity: Opacity, smallest: float, origin: 
         reach=deviations,
         radius=deviations * scales.detach().amax(dim=1),
         opacity=opacity,
+        self_attenuation=self_attenuation,
     )
 
 
@@ -113,10 +123,9 @@ def intersect(primitives: Primitives, rays: Rays) -> Intersections:
     offset = means - rays.origins.index_select(0, ray)
     t, sigma, squared = _restrict_to_rays(whitening.view(-1, 3, 3), offset, rays.directions.index_select(0, ray))
     response = factor[:, 0] * torch.exp(-0.5 * squared)
-    if primitives.opacity == "peak":
-        depth = response
-    elif primitives.opacity == "physical":
-        depth = response * sigma
+    if primitives.opacity != "splat":
+        depth = response * sigma if is_density(primitives.opacity) else response
+        depth = depth if primitives.self_attenuation else without_self_attenuation(depth)
     else:
         seen = (response >= ALPHA_MIN) & (t > rays.near[ray])
         depth = torch.where(seen, -torch.log1p(-response.clamp_max(ALPHA_MAX)), 0.0)

@@ -48,13 +48,16 @@ class GaussianExactConfig:
         opacity: what opacity means, see `invgraphics.kernels.extinction.Opacity`.
         steps: intervals of each ray, placed where alpha and optical depth grow.
         smallest: optical depth below which a Gaussian is left out of a ray.
+        self_attenuation: whether a Gaussian absorbs its own light too: one alone has the alpha ``1 - exp(-depth)``; without,
+            its optical depth itself, up to 0.99 (see `invgraphics.kernels.extinction.without_self_attenuation`).
     """
 
     title: ClassVar[str] = "exact line integrals"
 
-    opacity: Literal["peak", "physical"] = "peak"
+    opacity: Literal["peak", "physical", "extinction"] = "peak"
     steps: int = 32
     smallest: float = SMALLEST_DEPTH
+    self_attenuation: bool = True
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_STEPS:
@@ -75,6 +78,7 @@ class GaussianSortedConfig:
         order: ``ray`` sorts by the distance of the largest response on each ray; ``centre`` by the depth of the centre along
             the optical axis, one order for all pixels as splatters have it (along the ray itself where there is no camera).
         smallest: optical depth below which a Gaussian is left out of a ray; ``splat`` leaves out alphas below 1/255.
+        self_attenuation: as of `GaussianExactConfig`; not for ``splat``, whose alphas are not integrated.
     """
 
     title: ClassVar[str] = "line integrals in ray order"
@@ -82,8 +86,11 @@ class GaussianSortedConfig:
     opacity: Opacity = "peak"
     order: Literal["ray", "centre"] = "ray"
     smallest: float = SMALLEST_DEPTH
+    self_attenuation: bool = True
 
     def __post_init__(self) -> None:
+        if self.opacity == "splat" and not self.self_attenuation:
+            raise ValueError("opacity 'splat' is an alpha, not integrated: self_attenuation cannot be switched off there.")
         _check_smallest(self.smallest)
 
     def build(self, scene: Scene) -> GaussianSorted:
@@ -96,10 +103,11 @@ class GaussianRays(RayRenderer):
 
     requires: ClassVar[Quantity] = Quantity.GAUSSIANS
 
-    def __init__(self, opacity: Opacity, smallest: float) -> None:
+    def __init__(self, opacity: Opacity, smallest: float, self_attenuation: bool = True) -> None:
         super().__init__()
         self._opacity: Opacity = opacity
         self._smallest = smallest
+        self._self_attenuation = self_attenuation
 
     @abstractmethod
     def blending_weights(
@@ -116,14 +124,13 @@ class GaussianRays(RayRenderer):
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays from any number of cameras."""
-        primitives = precompute(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest)
+        primitives = self._precompute(field, None, ctx)
         return self._render(primitives, rays, None, ctx), Trace(rays=len(rays))
 
     @override
     def render_whole(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
         """Render every pixel, tile by tile. Depth is left at infinity in training, unless ``ctx.geometry`` is set."""
-        gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
-        primitives = precompute(gaussians, self._opacity, self._smallest, camera.position)
+        primitives = self._precompute(field, camera.position, ctx)
         rays, order = camera.rays(), self._parts(camera)
         axis = camera.cam_to_world[:3, 2]
         parts = [self._render(primitives, rays[part], axis, ctx) for part in order]
@@ -136,7 +143,7 @@ class GaussianRays(RayRenderer):
     @torch.no_grad()
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
         """List the Gaussians that the pixel's ray intersects; see `Renderer.contributions`."""
-        primitives = precompute(field.primitives(Quantity.GAUSSIANS, ctx), self._opacity, self._smallest, camera.position)
+        primitives = self._precompute(field, camera.position, ctx)
         rays = _clip_near(camera.ray(pixel), ctx)
         return self._list_contributions(intersect(primitives, rays), primitives, rays, camera.cam_to_world[:3, 2])
 
@@ -145,6 +152,11 @@ class GaussianRays(RayRenderer):
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
         """Contributions of one ray's intersections, in compositing order."""
+
+    def _precompute(self, field: Field, origin: Float[Tensor, 3] | None, ctx: Context) -> Primitives:
+        """Precompute the field's Gaussians for rays, all from ``origin`` where one is given."""
+        gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
+        return precompute(gaussians, self._opacity, self._smallest, origin, self._self_attenuation)
 
     def _render(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, ctx: Context) -> Rendering:
         rays = _clip_near(rays, ctx)
@@ -170,7 +182,7 @@ class GaussianExact(GaussianRays):
     """Integrates overlapping Gaussian densities."""
 
     def __init__(self, config: GaussianExactConfig) -> None:
-        super().__init__(config.opacity, config.smallest)
+        super().__init__(config.opacity, config.smallest, config.self_attenuation)
         self.config = config
 
     def blending_weights(
@@ -216,7 +228,7 @@ class GaussianSorted(GaussianRays):
     """Composites Gaussians one after the other."""
 
     def __init__(self, config: GaussianSortedConfig) -> None:
-        super().__init__(config.opacity, config.smallest)
+        super().__init__(config.opacity, config.smallest, config.self_attenuation)
         self.config = config
 
     def blending_weights(

@@ -17,7 +17,7 @@ from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.inside import inside
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.scores import DEFAULT
-from invgraphics.runs.study import Approximation, CellRecord, KnownDeviation, StudyRecord
+from invgraphics.runs.study import Approximation, CellRecord, KnownDeviation, Prediction, StudyRecord
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class Study:
         each: factor that the question asks about level by level; empty where the mean answers it.
         interactions: pairs of factors whose interaction is the question.
         margins: metric -> difference that is of no interest.
+        predictions: statements made before anything ran.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Study:
     each: str = ""
     interactions: tuple[tuple[str, str], ...] = ()
     margins: Mapping[str, float] = field(default_factory=dict)
+    predictions: tuple[Prediction, ...] = ()
 
     @property
     def variants(self) -> tuple[str, ...]:
@@ -137,6 +139,7 @@ def read_study(folder: Path) -> Study:
         each=record.each,
         interactions=record.interactions,
         margins=record.margins,
+        predictions=record.predictions,
     )
 
 

@@ -20,6 +20,7 @@ from invgraphics.report.pages.parts import Contrasts, Part
 from invgraphics.report.pages.tables import escape_markdown, markdown_across, markdown_effects
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.intervals import CONFIDENCE, POWER
+from invgraphics.report.statistics.predictions import PREDICTION_HEADS, JudgedPrediction, predictions_sentence
 from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity, budget_words, listing
@@ -44,6 +45,7 @@ class StudyPage:
         quantity: the metric that sentences, plots and the matrix are about; ``None`` where nothing ran.
         analyses: computations beside the fits.
         crossed: what approximations do to the scores of the same fits; empty where a study compares none.
+        predictions: the statements made beforehand, judged.
     """
 
     study: Study
@@ -53,12 +55,14 @@ class StudyPage:
     quantity: Quantity | None
     analyses: list[AnalysisPart]
     crossed: list[Effect] = field(default_factory=list)
+    predictions: list[JudgedPrediction] = field(default_factory=list)
 
     @property
     def headline(self) -> list[str]:
         """Unfinished cells, a sentence per comparison that the question asks for, and the population of the intervals."""
         effects = [*self.crossed, *self.contrasts.first]
-        return [*_progress(self.study), *map(effect_sentence, effects), *_scope(self)]
+        judged = [predictions_sentence(self.predictions)] if self.predictions else []
+        return [*_progress(self.study), *judged, *map(effect_sentence, effects), *_scope(self)]
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,7 @@ def write_study_html(page: StudyPage, folder: Folder) -> None:
         "cells": {
             part.key: facts.reproduction(part.comparison, Folder(folder.root, part.key, folder.redactor)) for part in page.parts
         },
+        "prediction_heads": PREDICTION_HEADS,
         "rules": {"percent": f"{100 * CONFIDENCE:g}", "power": f"{100 * POWER:g}", "margins": _margins(page)},
     }
     render("study.html", context, folder)
@@ -196,6 +201,9 @@ def write_study_markdown(page: StudyPage, folder: Folder) -> None:
     lines += ["", "## Design", "", f"{text(design_words(study))}.", ""]
     lines += [f"- {text(name)}: {text(value)}" for name, value in study_facts(study)]
     lines += [f"- {text(_factor_word(factor.path))}: {text(', '.join(factor.levels))}" for factor in study.factors]
+    if page.predictions:
+        rows = [PREDICTION_HEADS, ("---",) * len(PREDICTION_HEADS), *(judged.cells for judged in page.predictions)]
+        lines += ["", "## Predictions", "", *(f"| {' | '.join(map(text, row))} |" for row in rows)]
     if page.contrasts.tables:
         lines += ["", "## Effects", "", markdown_effects(page.contrasts.first)]
     if across := across_scenes(study, page.quantity):

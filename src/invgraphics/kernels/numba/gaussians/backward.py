@@ -7,9 +7,12 @@ import numpy as np
 from invgraphics.kernels.numba.gaussians.integrals import STRIDE, all_shares, colour_of
 from invgraphics.kernels.numba.gaussians.pairs import restrict
 from invgraphics.kernels.numba.harmonics import harmonics_gradient
-from invgraphics.kernels.numba.runtime import inlined, parallel, prange
+from invgraphics.kernels.numba.runtime import exp2, inlined, parallel, prange
+from invgraphics.kernels.types import ALPHA_MAX
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+_LOG2E = np.float32(1 / np.log(2.0))
+_LEAST_PASSED = np.float32((1 - ALPHA_MAX) * (1 + 1e-5))
 _ROOT = np.float32(1 / np.sqrt(2 * np.pi))
 
 
@@ -68,13 +71,17 @@ def _colour_gradient(sh, g, offset, inverse, basis, grad_rgb, grad_sh, buffer):
 
 
 @inlined
-def _place_gradient(table, strength, physical, g, o, d, found, given, grad):
+def _place_gradient(table, strength, reading, g, o, d, found, given, grad):
     """Add gradients in distance, width and depth to those of a Gaussian's row; returns those in offset and direction."""
     sigma, depth = found
     shift, widen, thicken = given
+    if not reading[1]:
+        # Of -ln(1 - alpha) in alpha, which is the optical depth before it was taken for an alpha; cut off at the largest one.
+        passed = exp2(-depth * _LOG2E)
+        depth, thicken = _ONE - passed, thicken / passed if passed > _LEAST_PASSED else _ZERO
     t, _, _, (x0, x1, x2), (d0, d1, d2) = restrict(table, g, o[0], o[1], o[2], d[0], d[1], d[2])
     grad[g, 12] += thicken * depth / strength[g]
-    if physical:
+    if reading[0]:
         widen += thicken * depth / sigma
     squared = -_HALF * thicken * depth
     y0, y1, y2 = x0 - t * d0, x1 - t * d1, x2 - t * d2
@@ -128,7 +135,7 @@ def _weights_gradients(sh, table, gaussian, begin, end, o, depth, grad_sums, roo
 
 
 @parallel
-def integrate_backward(rays, primitives, physical, pairs, first_ray, kept, grad_sums, rooms, grads):
+def integrate_backward(rays, primitives, reading, pairs, first_ray, kept, grad_sums, rooms, grads):
     """Gradients of every job in the rows of Gaussians and in their coefficients, and in each ray's origin and direction."""
     origins, directions = rays
     table, strength, sh = primitives
@@ -159,7 +166,7 @@ def integrate_backward(rays, primitives, physical, pairs, first_ray, kept, grad_
                     nodes[r], t[p], sigma[p], room[0][i], room[1][i], limits, given[i], slopes, light
                 )
                 found, moved = (sigma[p], depth[p]), (shift * depth[p], widen * depth[p], thicken)
-                offset, direction = _place_gradient(table, strength, physical, g, o, d, found, moved, grad)
+                offset, direction = _place_gradient(table, strength, reading, g, o, d, found, moved, grad)
                 cx, cy, cz = table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2]
                 inverse = colour_of(sh, g, cx, cy, cz, basis, rgb)
                 for c in range(3):

@@ -9,12 +9,14 @@ from invgraphics.kernels.numba.gaussians.pairs import restrict
 from invgraphics.kernels.numba.harmonics import harmonics
 from invgraphics.kernels.numba.runtime import exp2, inlined, parallel, prange
 from invgraphics.kernels.reference.gaussian_rays import MAX_DEVIATIONS
+from invgraphics.kernels.types import ALPHA_MAX
 
 STRIDE = 16
 """Between the functions that `harmonics` writes."""
 CUT = np.float32(5.6)
 """Standard deviations beyond which a normal distribution counts as over: 1e-8 of it is left."""
 _EIGHT, _ZERO, _HALF, _ONE = np.float32(MAX_DEVIATIONS), np.float32(0.0), np.float32(0.5), np.float32(1.0)
+_ALPHA_MAX = np.float32(ALPHA_MAX)
 _LOG2E = np.float32(1 / np.log(2.0))
 _HALF_LOG2E = np.float32(0.5 / np.log(2.0))
 _ROOT = np.float32(1 / np.sqrt(2 * np.pi))
@@ -110,8 +112,11 @@ def all_shares(nodes, t, sigma, depth, begin, end, room):
 
 
 @inlined
-def optical_depths(table, strength, physical, gaussian, begin, end, o, d, t, sigma, depth):
-    """Distance, width and optical depth of a ray's Gaussians; returns the interval that they cover."""
+def optical_depths(table, strength, reading, gaussian, begin, end, o, d, t, sigma, depth):
+    """Distance, width and optical depth of a ray's Gaussians; returns the interval that they cover.
+
+    ``reading`` tells whether strengths are per length, and whether a Gaussian absorbs its own light.
+    """
     low, high = np.float32(np.inf), np.float32(-np.inf)
     for p in range(begin, end):
         g = gaussian[p]
@@ -119,13 +124,14 @@ def optical_depths(table, strength, physical, gaussian, begin, end, o, d, t, sig
         width = _ONE / np.sqrt(rate)
         response = strength[g] * exp2(-_HALF_LOG2E * squared)
         t[p], sigma[p] = peak, width
-        depth[p] = response * width if physical else response
+        whole = response * width if reading[0] else response
+        depth[p] = whole if reading[1] else -np.log1p(-min(whole, _ALPHA_MAX))
         low, high = min(low, peak - _EIGHT * width), max(high, peak + _EIGHT * width)
     return low, high
 
 
 @parallel
-def integrate(rays, primitives, physical, pairs, first_ray, kept, sums, rooms):
+def integrate(rays, primitives, reading, pairs, first_ray, kept, sums, rooms):
     """Sums of weight times (1, colour, distance, normal) for every ray; ``kept`` gets what a backward pass needs."""
     origins, directions, near, far = rays
     table, strength, sh, normals = primitives
@@ -139,7 +145,7 @@ def integrate(rays, primitives, physical, pairs, first_ray, kept, sums, rooms):
             if begin == end:
                 continue
             o, d = origins[r], directions[r]
-            low, high = optical_depths(table, strength, physical, gaussian, begin, end, o, d, t, sigma, depth)
+            low, high = optical_depths(table, strength, reading, gaussian, begin, end, o, d, t, sigma, depth)
             low = max(low, near[r])
             high = max(min(high, far[r]), low)
             place_nodes(t, sigma, depth, begin, end, low, high, nodes[r], rooms[4][job], rooms[5][job])

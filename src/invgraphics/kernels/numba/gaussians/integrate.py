@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core.rays import Rays
+from invgraphics.kernels.extinction import is_density
 from invgraphics.kernels.numba.gaussians.backward import integrate_backward
 from invgraphics.kernels.numba.gaussians.integrals import integrate
 from invgraphics.kernels.numba.gaussians.nodes import COUNT
@@ -59,16 +60,16 @@ class _Integrate(torch.autograd.Function):
     def forward(
         ctx: Any, table: Tensor, strength: Tensor, sh: Tensor, origins: Tensor, directions: Tensor, settings: Any
     ) -> Tensor:
-        work, limits, normals, physical, steps, width = settings
+        work, limits, normals, reading, steps, width = settings
         rays, p = len(origins), len(work.pairs[0])
         sums = torch.zeros(rays, width)
         kept = (*(np.empty(p, np.float32) for _ in range(3)), np.empty((rays, steps + 1), np.float32))
         given = tuple(array(x) for x in (table, strength, sh, normals))
         along = (array(origins), array(directions), *(array(x) for x in limits))
         rooms = (*work.rooms(steps + 1), *work.sorting())
-        integrate(along, given, physical, work.pairs, work.first_ray, kept, sums.numpy(), rooms)
+        integrate(along, given, reading, work.pairs, work.first_ray, kept, sums.numpy(), rooms)
         ctx.save_for_backward(table, strength, sh, origins, directions)
-        ctx.work, ctx.kept, ctx.physical = work, kept, physical
+        ctx.work, ctx.kept, ctx.reading = work, kept, reading
         return sums
 
     @staticmethod
@@ -83,7 +84,7 @@ class _Integrate(torch.autograd.Function):
         integrate_backward(
             (array(origins), array(directions)),
             (array(table), array(strength), array(sh)),
-            ctx.physical,
+            ctx.reading,
             work.pairs,
             work.first_ray,
             ctx.kept,
@@ -107,7 +108,7 @@ def gaussian_integrals(primitives: Primitives, rays: Rays, steps: int, extra: in
         _Work(gaussian.numpy(), starts),
         (rays.near, rays.far),
         primitives.normals,
-        primitives.opacity == "physical",
+        (is_density(primitives.opacity), primitives.self_attenuation),
         steps,
         4 + extra,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from jaxtyping import Float
 
@@ -21,11 +23,15 @@ SUNSET = (
 )
 
 
-def build(seed: int) -> Model:
-    """The model; ``seed`` shapes the cloud."""
+def build(seed: int, extinction: float = EXTINCTION) -> Model:
+    """The model; ``seed`` shapes the cloud, ``extinction`` is its largest, per world unit."""
     rng = np.random.default_rng(seed)
-    fog = Fog(EXTINCTION * density(rng), albedo=(0.985, 0.98, 0.97), anisotropy=0.35, lo=LO, hi=HI)
+    fog = Fog(extinction * density(rng), albedo=(0.985, 0.98, 0.97), anisotropy=0.35, lo=LO, hi=HI)
     return Model(lights={"sunset": studio(SUNSET, sky=(0.55, 0.65, 0.95), floor=(0.42, 0.35, 0.36), exposure=0.86)}, fog=fog)
+
+
+# The same cloud at other optical depths, by factors of three.
+build_1, build_3, build_27, build_81 = (partial(build, extinction=extinction) for extinction in (1.0, 3.0, 27.0, 81.0))
 
 
 def density(rng: np.random.Generator) -> Float[np.ndarray, "x y z"]:

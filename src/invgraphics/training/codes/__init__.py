@@ -1,0 +1,1 @@
+"""Codes of the instances of a class: their penalty, and their inference from views."""

@@ -1,0 +1,141 @@
+"""Predictions of a study on made-up scores: intervals against scipy, every verdict, growth with a factor, losses, the page."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from made_up_runs import made_up_run
+from report_folders import PREDICTED
+from scipy import stats
+
+from invgraphics.errors import InputError
+from invgraphics.report.data.factors import Lost, Observation
+from invgraphics.report.statistics.predictions import judge_predictions, predictions_sentence
+from invgraphics.runs.scores import Score
+from invgraphics.runs.study import Prediction
+from invgraphics.studies.checks import checked, completed
+from invgraphics.studies.study import Study
+
+N = "field.count"
+SPLAT, EXACT = "splatting/gaussians", "gaussian-volume/exact"
+GAIN = {("ball", 4): 0.6, ("ball", 100): 0.0, ("fog", 4): 0.2, ("fog", 100): 0.9}
+METHODS = Prediction(
+    text="The integral is better.", source="a paper", before={"method": SPLAT}, after={"method": EXACT}, low=0.3, high=0.9
+)
+
+
+def fit(scene: str, method: str, count: int, seed: int, psnr: float) -> Observation:
+    score = Score(mean=psnr, unit="dB", higher_is_better=True)
+    run = made_up_run({"psnr": score}, method=method, seed=seed, truth=scene)
+    return Observation(run, scene, {"method": method, N: str(count), "field.init": "random"})
+
+
+def fits(noise: float = 0.02, seeds: int = 4) -> list[Observation]:
+    rng = np.random.default_rng(0)
+    return [
+        fit(scene, method, count, seed, 30 + (gain if method == EXACT else 0) + rng.normal(0, noise))
+        for (scene, count), gain in GAIN.items()
+        for method in (SPLAT, EXACT)
+        for seed in range(seeds)
+    ]
+
+
+def values(made: list[Observation], scene: str, method: str, count: int) -> np.ndarray:
+    wanted = (scene, method, str(count))
+    return np.array([
+        one.run.scores.quality["psnr"].mean for one in made if (one.scene, one.levels["method"], one.levels[N]) == wanted
+    ])  # fmt: skip
+
+
+def test_interval_over_two_methods_is_welchs() -> None:
+    made = fits()
+    (judged,) = judge_predictions([replace(METHODS, where={N: 4}, scenes=("ball",))], made)
+    expected = stats.ttest_ind(values(made, "ball", EXACT, 4), values(made, "ball", SPLAT, 4), equal_var=False)
+    low, high = expected.confidence_interval()
+    assert judged.estimate is not None
+    assert (judged.estimate.low, judged.estimate.high) == pytest.approx((low, high), rel=1e-9)
+    assert judged.verdict == "held"
+
+
+def test_interval_within_a_method_is_paired() -> None:
+    made = fits()
+    wanted = replace(
+        METHODS, before={"method": EXACT, N: 4}, after={"method": EXACT, N: 100}, scenes=("fog",), low=0.0, high=None
+    )
+    (judged,) = judge_predictions([wanted], made)
+    pairs = values(made, "fog", EXACT, 100) - values(made, "fog", EXACT, 4)
+    low, high = stats.ttest_1samp(pairs, 0).confidence_interval()
+    assert judged.estimate is not None
+    assert (judged.estimate.low, judged.estimate.high) == pytest.approx((low, high), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("scene", "where", "against", "low", "high", "verdict"),
+    [
+        ("ball", 4, None, 0.3, 0.9, "held"),
+        ("ball", 100, None, 0.3, 0.9, "failed"),
+        ("ball", 100, None, None, 0.2, "held"),
+        ("ball", 4, None, 0.6, None, "undecided"),  # the bound lies within the interval
+        ("fog", 4, 100, 0.0, None, "held"),  # grows by 0.7
+        ("ball", 4, 100, 0.0, None, "failed"),  # shrinks by 0.6
+        ("ball", 7, None, 0.0, None, "open"),
+    ],
+)
+def test_verdicts(scene: str, where: int, against: int | None, low: float | None, high: float | None, verdict: str) -> None:
+    there = {} if against is None else {N: against}
+    one = replace(METHODS, scenes=(scene,), where={N: where}, against=there, low=low, high=high)
+    (judged,) = judge_predictions([one], fits())
+    assert judged.verdict == verdict
+    if against is not None:
+        assert judged.estimate is not None
+        assert judged.estimate.mean == pytest.approx(GAIN[scene, against] - GAIN[scene, where], abs=0.05)
+
+
+def test_nothing_is_claimed_from_one_seed_or_after_losses() -> None:
+    held = replace(METHODS, where={N: 4}, scenes=("ball",))
+    (single,) = judge_predictions([held], fits(seeds=1))
+    assert single.verdict == "undecided"
+    assert "no interval from 1 seed" in single.cells[-1]
+    lost = [Lost("ball", {"method": SPLAT, N: "4"}), Lost("fog", {"method": SPLAT, N: "4"})]
+    (fewer,) = judge_predictions([held], fits(), lost)
+    assert (fewer.verdict, fewer.lost) == ("undecided", 1)
+    assert predictions_sentence([single, fewer]) == "Of 2 predictions: 2 undecided."
+
+
+def test_the_page_states_the_verdict(built_study: Path) -> None:
+    table = pd.read_csv(built_study / "results.csv", dtype=str)
+    table = table[(table["metric"] == "psnr") & (table["scene"] == "moons") & (table["field.encoding.levels"] == "8")]
+    table["value"] = table["value"].astype(float)
+    means = table[table["status"] == "ok"].groupby(["data.train_views", "seed"])["value"].mean().unstack(0)
+    low, high = stats.ttest_1samp(means["20"] - means["40"], 0).confidence_interval()
+    page, text = ((built_study / name).read_text() for name in ("index.html", "index.md"))
+    verdict = "held" if high < -0.1 else "failed" if low > -0.1 else "undecided"
+    row = page.split(f'data-verdict="{verdict}"')[1].split("</tr>")[0]
+    assert PREDICTED["text"] in row
+    assert f"<td>{low:+.2f} to {high:+.2f}</td>".replace("-", "−") in row
+    assert "Of 1 prediction: 1 " in page
+    assert f"| {PREDICTED['text']} | a paper | moons | at most −0.10 |" in text
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"where": {"field.size": 4}}, "no factor"),
+        ({"where": {N: 5}}, "none of its levels"),
+        ({"scenes": ("room",)}, "none of the study's scenes"),
+        ({"after": {"method": SPLAT}}, "same fits"),
+        ({"against": {N: 100}}, "'against'"),
+    ],
+)
+def test_predictions_of_what_a_study_lacks_are_refused(change: dict, word: str) -> None:
+    study = Study("?", ("bricks",), (SPLAT, EXACT), factors={N: [4, 100]}, predictions=(replace(METHODS, **change),))
+    with pytest.raises(InputError, match=word):
+        checked(completed(study, "here"), "here")
+
+
+def test_a_prediction_needs_bounds_in_order() -> None:
+    for low, high in ((None, None), (1.0, 0.0)):
+        with pytest.raises(ValueError, match="low"):
+            replace(METHODS, low=low, high=high)
