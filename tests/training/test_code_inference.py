@@ -20,6 +20,7 @@ from invgraphics.report.inference import paired
 from invgraphics.runs.inference import Inference, InstanceScores
 from invgraphics.scenes.npz import save_npz
 from invgraphics.testing import toy_scene
+from invgraphics.tools.recipe_check import check_recipes
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.codes.inference import CodeInference, infer_codes
 from invgraphics.training.codes.penalty import CodePenalty
@@ -109,9 +110,10 @@ def test_from_a_fit_to_a_page(toy_class: Scene, tmp_path: Path, monkeypatch: pyt
     record = Inference.read(Path("inferred") / Inference.FILE)
     ways = ("prior/srn", "class mean", "nearest training instance", "no prior")
     assert [(one.subject, one.how) for one in record.instances] == [(s, way) for way in ways for s in (2, 3)]
-    assert all(f"above {way}" in said for way in ways[1:])
+    assert all(f"against {way}:" in said for way in ways[1:])
     page = (tmp_path / "inferred/index.html").read_text()
     assert all(f"pictures/1/{s:04d}.png" in page and (tmp_path / f"inferred/pictures/1/{s:04d}.png").is_file() for s in (2, 3))
+    assert check_recipes(Path("inferred")).runs == 1
     assert command(["infer", "run", "--views", "2"]) == 2 and "has 1 observed views, not 2" in capsys.readouterr().err
     picture = next(Path("run/truth").glob("*/0000.png"))
     assert command(["infer", "run", str(picture), "--view", "0002-00", "--steps", "2", "--out", "photo.png"]) == 0

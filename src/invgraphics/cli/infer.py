@@ -38,7 +38,7 @@ class Infer:
     against: Annotated[str, arg(metavar="RUN,RUN", help_behavior_hint="(default: none)")] = ""
     """Other fits to the same class to compare with."""
     no_prior: Annotated[str | None, arg(metavar="BUDGET", help_behavior_hint="(default: none)")] = None
-    """Also fit each instance without the prior, for so long (20s, 600steps), from the fewest views."""
+    """Also fit each instance without the prior, for so long (20s, 600steps); only from the fewest views, as the nearest."""
     view: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the angles)")] = None
     """The photograph's camera is that of this view of the class."""
     azimuth: Annotated[float, arg(metavar="DEGREES")] = -60.0

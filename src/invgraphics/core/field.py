@@ -126,9 +126,11 @@ class Conditional(Field):
 
     Attributes:
         codes: one of each instance, learnt.
+        subjects: numbers of the instances in the scene, in the order of ``codes``; empty where they have none.
     """
 
     codes: Float[Tensor, "s c"]
+    subjects: tuple[int | None, ...]
 
     @abstractmethod
     def at(self, code: Float[Tensor, " c"]) -> Field:

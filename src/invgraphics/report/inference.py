@@ -84,12 +84,12 @@ def inference_sentences(folder: Path) -> list[str]:
             if gain is None:
                 continue
             views = "1 view" if observed == 1 else f"{observed} views"
-            sentence = f"From {views}, {first} is {_signed(gain)} dB of PSNR on other views above {other}"
+            sentence = f"From {views}, {first} against {other}: {_signed(gain)} dB of PSNR on other views"
             errors = [mean_of(record, "normal_deg", observed, how) for how in (first, other)]
             if all(error is not None for error in errors):
                 turned = paired(record, "normal_deg", observed, (first, other))
                 assert turned is not None
-                sentence += f"; its normals are off by {errors[0]:.1f} instead of {errors[1]:.1f} degrees ({_signed(turned)})"
+                sentence += f"; normals are off by {errors[0]:.1f} instead of {errors[1]:.1f} degrees ({_signed(turned)})"
             sentences.append(f"{sentence}.")
     return sentences
 

@@ -24,6 +24,7 @@ from invgraphics.runs.inference import Inference, InstanceScores
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.layout import evenly
 from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.text import slug
 from invgraphics.tools.inference_baselines import Observed, class_mean, nearest_instance, without_prior
 from invgraphics.training.budget import Budget
 from invgraphics.training.codes.inference import CodeInference, infer_codes
@@ -47,7 +48,8 @@ class InferRequest:
         views: numbers of observed views, one after another.
         tests: test views of each instance that are scored, evenly spaced.
         instances: how many unseen instances, the first ones; ``None`` for all.
-        no_prior: budget of each fit without a prior (``600steps``), for the fewest views only; ``None`` for none.
+        no_prior: budget of each fit without a prior (``600steps``); ``None`` for none. As the nearest instance, for the fewest
+            views only: both take longer than all the rest.
         steps: of the inference.
         scene: another copy of the class.
     """
@@ -91,7 +93,8 @@ def infer(request: InferRequest) -> Inference:
     Raises:
         InputError: a folder holds no run of a class, the runs show different classes, or views are missing.
     """
-    budget = None if request.no_prior is None else Budget.parse(request.no_prior)
+    if request.no_prior is not None:
+        Budget.parse(request.no_prior)  # a mistake is found before anything is opened
     fitted = open_class_runs([request.run, *request.against], request.scene)
     scene = fitted[0].scene
     subjects = sorted({view.subject for view in scene.test if view.subject is not None})[: request.instances]
@@ -102,7 +105,7 @@ def infer(request: InferRequest) -> Inference:
         for place, count in enumerate(request.views):
             observed = observed_views(scene, subjects, count)
             columns: dict[str, Models] = {}
-            for how, make in _candidates(fitted, observed, request, budget if count == min(request.views) else None):
+            for how, make in _candidates(fitted, observed, request, count == min(request.views)):
                 reporter.show(place / len(request.views), f"{how}, {count} observed views")
                 began = time.perf_counter()
                 columns[how] = make()
@@ -125,6 +128,10 @@ def infer(request: InferRequest) -> Inference:
             instances=tuple(scores),
         )
         record.write(request.out / Inference.FILE)
+        for how, one in _names(fitted).items():  # by which `report --check` knows the recipes
+            copy = RunFolder(request.out / "runs" / slug(how))
+            copy.create()
+            copy.write(one.folder.read(Provenance))
     return record
 
 
@@ -180,7 +187,7 @@ def _names(fitted: list[Fitted]) -> dict[str, Fitted]:
 
 
 def _candidates(
-    fitted: list[Fitted], observed: Observed, request: InferRequest, budget: Budget | None
+    fitted: list[Fitted], observed: Observed, request: InferRequest, fewest: bool
 ) -> Iterator[tuple[str, Callable[[], Models]]]:
     """Name and maker of the instances' models, each way."""
     first = fitted[0]
@@ -189,8 +196,10 @@ def _candidates(
     for name, one in _names(fitted).items():
         yield name, lambda one=one: with_prior(one.model, scene, observed, config)
     yield MEAN, lambda: class_mean(model, observed)
-    yield NEAREST, lambda: nearest_instance(model, scene, observed)
-    if budget is not None:
+    if fewest:
+        yield NEAREST, lambda: nearest_instance(model, scene, observed)
+    if fewest and request.no_prior is not None:
+        budget = Budget.parse(request.no_prior)
         yield NO_PRIOR, lambda: without_prior(method, scene, observed, budget)
 
 

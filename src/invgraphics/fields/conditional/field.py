@@ -136,7 +136,7 @@ class ConditionalField(Conditional):
         network: ConditionalNetwork,
         codes: Float[Tensor, "s c"],
         rows: Int[Tensor, " v"],
-        subjects: tuple[int, ...] = (),
+        subjects: tuple[int | None, ...] = (),
     ) -> None:
         super().__init__()
         self.network, self.subjects = network, subjects
