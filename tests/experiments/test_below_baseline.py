@@ -49,7 +49,7 @@ def test_says_why_and_what_to_try(method: str, colour: float, alpha: float, dept
         remedies = {
             "volumetric/hash": "volumetric/hash-proposal, for open",
             "volumetric/nerf": "volumetric/hash-proposal, for open",
-            "volumetric/hash-proposal": "--set training.exposure.model=affine",
+            "volumetric/hash-proposal": "--optimise exposure",
         }
         assert remedies.get(method, "") in found
     else:

@@ -25,6 +25,10 @@ def test_photographs_of_a_place_get_the_methods_for_open_spaces() -> None:
     boxed = replace(opaque, bounds=toy_scene(views=2, size=8).bounds)
     assert default_methods(boxed)[0] == CLOSED
     assert {*OPEN, *CLOSED} <= set(methods())
+    for name in ("volumetric/hash", OPEN[0]):  # two photographs are few, but for scenes whose points are not known
+        assert suggestion(load_method(name), opaque).startswith("splatting/gaussians, which starts from the 400 known points")
+    assert suggestion(load_method(OPEN[1]), opaque) == ""
+    opaque = replace(opaque, points=None)
     for name, suited in (("volumetric/hash", False), ("volumetric/nerf", False), (OPEN[0], True), (OPEN[1], True)):
         assert (suggestion(load_method(name), opaque) == "") is suited
         assert suggestion(load_method(name), boxed) == ""

@@ -25,7 +25,15 @@ from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.testing import TwoBalls, toy_scene
-from invgraphics.tools.conversions import quaternions_to, surface_points, to_gaussians, to_lattice, to_mesh, to_planes
+from invgraphics.tools.conversions import (
+    quaternions_to,
+    surface_points,
+    to_gaussians,
+    to_lattice,
+    to_mesh,
+    to_planes,
+    to_points,
+)
 from invgraphics.tools.convert import ConvertRequest
 
 RADIUS, CENTRE = 0.6, torch.tensor([0.1, -0.1, 0.05])
@@ -88,6 +96,20 @@ def test_gaussians_show_what_the_density_shows(scene: Scene) -> None:
     assert psnr(shown, truth, scene) < found - 2
     with pytest.raises(InputError, match="Gaussians already"):
         to_gaussians(shown, scene, method, 10)
+
+
+@pytest.mark.parametrize("hidden", [Quantity.NONE, Quantity.DENSITY])
+def test_neural_points_lie_where_the_model_is_seen(scene: Scene, hidden: Quantity) -> None:
+    """In its colours, also of a model that offers no density; the networks are new, so nothing is said of pictures."""
+    torch.manual_seed(0)
+    ball = Sphere(200.0, RADIUS, CENTRE, colour=(0.2, 0.6, 0.4))
+    model = model_of(ball, scene)
+    ball.provides = ball.provides & ~hidden if hidden else ball.provides
+    field = to_points(model, scene, load_method("volumetric/point-nerf", "laptop"), 200)
+    assert float(((field.positions - CENTRE).norm(dim=1) - RADIUS).abs().median()) < 0.02
+    assert float((field.raw_rgb.detach().sigmoid() - torch.tensor([0.2, 0.6, 0.4])).abs().median()) < 0.02
+    with pytest.raises(InputError, match="no point cloud"):
+        to_points(model, scene, load_method("volumetric/hash", "laptop"), 200)
 
 
 class Tinted(TwoBalls):

@@ -19,7 +19,7 @@ class Convert:
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a run."""
-    to: Annotated[str, arg(metavar="gaussians|lattice|mesh|mpi")]
+    to: Annotated[str, arg(metavar="gaussians|lattice|mesh|mpi|points")]
     """What to make: Gaussians on the surfaces that training views see; a voxel grid of density and spherical harmonics; the
     mesh of an isosurface; or a multi-plane image, for scenes seen from one side. All but the first need a density, or a mesh
     a distance."""

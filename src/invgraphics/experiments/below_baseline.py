@@ -14,8 +14,6 @@ from invgraphics.runs.scores import Score
 
 FLOATER_DEPTH = 0.6
 """Median depth, over the camera's distance to the scene's centre, below which floaters stand in front of the cameras."""
-EXPOSURE = "training.exposure.model=affine"
-"""Setting that gives every photograph an exposure of its own."""
 SPARSE_ALPHA = 0.6
 """Mean alpha below which renderings of opaque photographs are mostly background."""
 
@@ -62,7 +60,7 @@ def _diagnose(method: str, means: Mapping[str, float], scene: Scene) -> tuple[st
     others = ["splatting/gaussians, which starts from known points"]
     if is_open_space(scene):
         suited = method.startswith(OPEN)
-        others.insert(0, f"--set {EXPOSURE}, where photographs differ in exposure" if suited else f"{OPEN[0]}, for open spaces")
+        others.insert(0, "--optimise exposure, where photographs differ in it" if suited else f"{OPEN[0]}, for open spaces")
     remedy = f"a longer --budget, a smaller --size, more photographs, {', or '.join(others)}"
     if means["relative_depth"] < FLOATER_DEPTH:
         where = f"median depth {means['relative_depth']:.0%} of the way to the scene's middle"

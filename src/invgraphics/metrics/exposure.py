@@ -1,4 +1,4 @@
-"""PSNR that leaves out exposure: colours are mapped to those of one half of the photograph, and scored on the other half."""
+"""PSNR that leaves out exposure: fitted on one half of the photograph, and scored on the other half."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from invgraphics.metrics.base import Inapplicable, Metric, Pair, Skip
 from invgraphics.metrics.image import psnr
 
 FEWEST = 64
-"""Fewest pixels of a half: an affine map of colours has 12 numbers."""
+"""Fewest pixels of a half."""
 
 
 def psnr_exposed(pair: Pair) -> float:
-    """PSNR in dB of the right half under the affine map of colours that fits the left half best.
+    """PSNR in dB of the right half, each colour channel times the factor that fits the left half best.
 
-    The halves are NeRF-W's for photographs whose exposure nothing tells; the map, colour = A c + b by least squares over
-    display colours, is 3DGS's exposure. It depends on the pair alone: methods that fit exposures and others are scored alike.
-    The mapped colours are clamped to [0, 1] and not rounded again.
+    The halves are NeRF-W's for photographs whose exposure nothing tells. Factors are by least squares over display colours:
+    three numbers that hold for the other half too, where an affine map of colours would follow what is wrong with the left
+    one. It depends on the pair alone: methods that fit exposures and others are scored alike. The result is clamped to [0, 1]
+    and not rounded again.
 
     Raises:
         Inapplicable: the truth has alpha or depth, as renderings have, which are all under one exposure.
@@ -32,11 +33,9 @@ def psnr_exposed(pair: Pair) -> float:
     image, truth = (_counted(values, left) for values in (left.image, left.truth))
     if min(len(image), len(_counted(right.image, right))) < FEWEST:
         raise Skip(f"a half of the view has fewer than {FEWEST} pixels that count")
-    # Least-norm where colours of the half span less than all (a picture of one grey), so that no direction is extrapolated.
-    centre, aim = image.mean(axis=0), truth.mean(axis=0)
-    matrix, *_ = np.linalg.lstsq(image - centre, truth - aim, rcond=1e-6)
-    mapped = (right.image.double() - torch.from_numpy(centre)) @ torch.from_numpy(matrix) + torch.from_numpy(aim)
-    return psnr(replace(right, image=mapped.clamp(0, 1)))
+    power = np.square(image).sum(axis=0)
+    gain = np.where(power > 0, (image * truth).sum(axis=0) / np.maximum(power, 1e-12), 1.0)
+    return psnr(replace(right, image=(right.image.double() * torch.from_numpy(gain)).clamp(0, 1)))
 
 
 def _columns(pair: Pair, part: slice) -> Pair:
@@ -55,5 +54,5 @@ PSNR_EXPOSED = Metric(
     "dB",
     True,
     psnr_exposed,
-    "PSNR of each view's right half under the affine map of colours that fits its left half: what exposure costs is left out",
+    "PSNR of each view's right half under the gain per channel that fits its left half: what exposure costs is left out",
 )

@@ -24,6 +24,7 @@ from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
 from invgraphics.fields.mesh import MeshFieldConfig
 from invgraphics.fields.neural import NeuralField
 from invgraphics.fields.planes import PlanesConfig
+from invgraphics.fields.points.field import PointField, PointFieldConfig
 from invgraphics.fields.slicing import slice_density
 from invgraphics.recipes.recipe import Method
 
@@ -158,6 +159,18 @@ def quaternions_to(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
     return torch.where((1 + z < 1e-6)[:, None], half_turn, shortest)
 
 
+def to_points(model: Model, scene: Scene, method: Method, size: int) -> PointField:
+    """Neural points on surface points, in their colours; the networks that make density of them are learnt in the refit.
+
+    Raises:
+        InputError: the model shows nothing, or the method has no point cloud.
+    """
+    config = method.recipe.field
+    if not isinstance(config, PointFieldConfig):
+        raise InputError(f"{method.name} has no point cloud.", "Use --method volumetric/point-nerf.")
+    return config.from_points(surface_points(model, scene, size).points, scene)
+
+
 def to_planes(model: Model, scene: Scene, method: Method, size: int) -> Field:
     """Density in slabs around planes before the mean training camera."""
     config = method.recipe.field
@@ -259,5 +272,6 @@ TARGETS = {
     ),
     "mesh": Target("surface/mesh", "density or distance", 128, to_mesh, ("field.source='{run}'", "field.resolution={size}")),
     "mpi": Target("planes/mpi", "density and colour", 0, to_planes, ("field.init='uniform'",)),
+    "points": Target("volumetric/point-nerf", "surface points with normals", 15_000, to_points),
 }
 """Targets by the name that ``convert --to`` takes."""
