@@ -348,7 +348,6 @@ def _learnt(out: _Printed) -> None:
     learnt, traced = out.numbers("all rays: after 10 steps the LSTM is off by", "sphere tracing by")
     assert traced < 0.01 and learnt < 0.3
     assert out.numbers("ten steps more: the march drifts by")[0] > 0
-    out.numbers("normals: off by")
     out.numbers("attention: its mean distance is")
 
 

@@ -74,7 +74,7 @@ def test_the_penalty_is_the_mean_square_and_needs_codes(toy_class: Scene) -> Non
     field = ConditionalFieldConfig().build(toy_class)
     renderer = VolumetricConfig().build(toy_class)
     value = CodePenalty(0.5)(field, renderer, Context(toy_class.bounds))
-    assert float(value) == pytest.approx(0.5 * float((field.codes.detach() ** 2).sum()) / field.codes.numel())
+    assert float(value.detach()) == pytest.approx(0.5 * float((field.codes.detach() ** 2).sum()) / field.codes.numel())
     with pytest.raises(InputError, match="codes of a class"):
         CodePenalty.requires.check("penalty 'code'", NeuralFieldConfig().build(toy_class))
 

@@ -68,7 +68,7 @@ class Monitor:
 
     def _predict(self, fit: Fit, subject: int | None, camera: Camera, flat: Tensor, ctx: Context, background: Tensor) -> Tensor:
         renderer, field = fit.plan.model.renderer, fit.plan.model.field
-        if isinstance(field, Conditional) and subject in field.subjects:
+        if isinstance(field, Conditional) and subject is not None and subject in field.subjects:
             field = field.of_subject(subject)
         if isinstance(renderer, RayRenderer):
             pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5

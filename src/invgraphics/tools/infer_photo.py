@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from invgraphics.core import Camera, Conditional, Scene, View
+from invgraphics.core import Camera, Conditional, Rendering, Scene, View
 from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display
@@ -112,7 +113,7 @@ def _around(camera: Camera, scene: Scene) -> list[Camera]:
     return [camera.moved(_pose(scene, azimuth + turn * 2 * math.pi / TURNS, elevation)) for turn in range(1, TURNS)]
 
 
-def _draw(path: Path, scene: Scene, photo: View, pictures: list) -> None:
+def _draw(path: Path, scene: Scene, photo: View, pictures: Sequence[Rendering]) -> None:
     """Draw the photograph, then the instance from its viewpoint and from around; below them normals."""
     from PIL import Image
 
