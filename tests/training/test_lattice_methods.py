@@ -21,7 +21,7 @@ SHRUNK = {
         "hooks.0.resolutions=[24]",
     ],
     "volumetric/tensorf-cp": ["field.encoding.resolution=32", "field.appearance.resolution=32", "field.encoding.components=32"],
-    "volumetric/triplane": ["field.encoding.resolution=24", "field.encoding.features=8"],
+    "volumetric/triplane": ["field.encoding.resolution=16", "field.encoding.features=8", "hooks.0.resolution=24"],
     "volumetric/dense": ["field.encoding.resolution=33", "field.encoding.coarsest=5", "field.encoding.levels=4"],
 }
 STEPS = 300
