@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
 
-.PHONY: env compare picture bench notebooks test test-notebooks fuzz sabotage slow check clean
+.PHONY: env compare picture matrix bench notebooks test test-notebooks fuzz sabotage slow check clean
 
 env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
@@ -18,6 +18,11 @@ compare: env  ## the main job: three families on one scene under one budget, and
 picture: compare  ## renew the README's pictures
 	$(BIN)/python docs/picture.py reports/compare-bricks docs/compare-bricks.png
 	$(BIN)/python docs/example.py docs/example.png
+
+matrix: env  ## every method on one scene, a minute each (an hour in all), as a report and as the README's table of pictures
+	$(BIN)/invgraphics compare bricks --methods all --budget 60s --out reports/compare-all-bricks
+	$(BIN)/invgraphics report reports/compare-all-bricks --public --out reports/matrix
+	$(BIN)/python docs/matrix.py reports/compare-all-bricks docs/matrix.png
 
 bench: env  ## every kernel against the reference and the machine's limits: reports/bench
 	$(BIN)/invgraphics bench

@@ -195,7 +195,6 @@ def test_a_scene_is_kept_as_it_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda scene: replace(scene, val=scene.train[:1]), "validation views"),
         (lambda scene: replace(scene, colour="linear"), "linear colours"),
         (lambda scene: replace(scene, background=torch.zeros(3)), "a background other than the default"),
         (lambda scene: replace(scene, bounds=replace(scene.bounds, space="contracted")), "no box around it"),

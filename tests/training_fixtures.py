@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import pytest
 import torch
@@ -19,6 +19,7 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.recipes.recipe import Method, load_method
 from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.testing import toy_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -129,6 +130,46 @@ def same_state(one: State, other: State) -> bool:
         one[part].keys() == other[part].keys() and all(torch.equal(one[part][key], other[part][key]) for key in one[part])
         for part in one
     )
+
+
+class ToyScores(NamedTuple):
+    """PSNR over test views, and where prediction and truth show something, mean error of depth and overlap (IoU)."""
+
+    psnr: float
+    depth: float
+    overlap: float
+
+
+@torch.no_grad()
+def toy_scores(fit: Fit) -> ToyScores:
+    """Score a fit's test views without the project's own metrics."""
+    scene, errors, depths, overlaps = fit.plan.scene, [], [], []
+    for view in scene.test:
+        assert view.alpha is not None and view.depth is not None
+        picture = fit.plan.model.render(view.camera, normals=False)
+        errors.append((picture.over(scene.background).clamp(0, 1) - view.over(scene.background)).square().mean())
+        ours, true = picture.alpha >= 0.5, view.alpha >= 0.5
+        depths.append((picture.depth - view.depth)[ours & true].abs())
+        overlaps.append(float((ours & true).sum() / (ours | true).sum()))
+    psnr = -10 * math.log10(float(torch.stack(errors).mean()))
+    return ToyScores(psnr, float(torch.cat(depths).mean()), sum(overlaps) / len(overlaps))
+
+
+class Learnt(NamedTuple):
+    """A fit at its end, with a checkpoint of some steps before."""
+
+    name: str
+    fit: Fit
+    before: ToyScores
+    checkpoint: Path
+    final: State
+
+
+def learn(name: str, fit: Fit, steps: int, folder: Path) -> Learnt:
+    """Run a fit whole."""
+    path = folder / CHECKPOINT
+    before = toy_scores(fit)
+    return Learnt(name, fit, before, path, run_whole(fit, steps, path))
 
 
 def write_blender(scene: Scene, folder: Path) -> Path:

@@ -10,6 +10,8 @@ A plug-in's test needs three lines::
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -131,6 +133,20 @@ def toy_scene(
     train = tuple(view(camera, f"train{i}") for i, camera in enumerate(toy_cameras(views, size, 0.0, zoom, facing)))
     test = tuple(view(camera, f"test{i}") for i, camera in enumerate(toy_cameras(max(2, views // 4), size, 0.3, zoom, facing)))
     return scene.with_views(train=train, test=test)
+
+
+def as_class(scene: Scene) -> Scene:
+    """Make a class of objects of a scene: its training views show instances 0 and 1, half each, its test view instance 2.
+
+    Args:
+        scene: of one subject, with two test views or more; the last of them is observed.
+    """
+
+    def of(views: Sequence[View], first: int, each: int) -> tuple[View, ...]:
+        return tuple(replace(view, subject=first + index // each) for index, view in enumerate(views))
+
+    train, last = of(scene.train, 0, -(-len(scene.train) // 2)), len(scene.test) - 1
+    return replace(scene, train=train, test=of(scene.test[:1], 2, 1), observed=of(scene.test[last:], 2, 1))
 
 
 def perturb(field: Field, amount: float = 0.01) -> None:

@@ -6,8 +6,19 @@ import torch
 from scipy.spatial import KDTree
 
 from invgraphics import kernels
-from invgraphics.bench import iterations, lattice_cases, limits, memory, peers, run, sample_cases, splat_cases, workload
-from invgraphics.bench.results import BOTH, FORWARD, Results
+from invgraphics.bench import (
+    iterations,
+    lattice_cases,
+    limits,
+    memory,
+    peers,
+    run,
+    sample_cases,
+    splat_cases,
+    surface_cases,
+    workload,
+)
+from invgraphics.bench.results import BOTH, FORWARD, FORWARD_ONLY, SIZE_KEYS, Results
 from invgraphics.bench.run import BenchRequest, bench, measure_case
 from invgraphics.bench.timing import Effort
 from invgraphics.fields.encodings.hash import HashConfig
@@ -124,6 +135,25 @@ def test_a_run_measures_both_implementations_and_their_limit() -> None:
     assert {"sgemm", "triad", "exp2", "gather 1 KB"} <= {m.operation for m in results.measurements}
     assert any("hash_encode levels=16" in sentence for sentence in said)
     assert kernels.in_use() == "numba"
+
+
+@pytest.mark.usefixtures("tiny")
+def test_surfaces_and_neighbours_are_measured_by_both_implementations(monkeypatch) -> None:
+    monkeypatch.setattr(surface_cases, "QUICK_TRACE_RAYS", (16,))
+    monkeypatch.setattr(surface_cases, "QUICK_MESH_SIZES", ((12, 24),))
+    monkeypatch.setattr(surface_cases, "QUICK_NEAR_POINTS", ((60, 40),))
+    results = bench(BenchRequest(("trace", "mesh", "near"), quick=True))
+    for operation in ("sdf_trace", "mesh_rasterise", "mesh_interpolate", "near_points"):
+        for name in ("reference", "numba"):
+            found = results.find(operation, name, FORWARD)
+            assert found is not None and found.timing.median > 0 and found.amount > 0, (operation, name)
+            assert set(found.sizes) <= set(SIZE_KEYS)
+            assert (results.find(operation, name, BOTH) is None) == (operation in FORWARD_ONLY)
+    traced = results.find("sdf_trace", "numba", FORWARD)
+    # 19 features and coordinates to 32, and those to one distance; a ray looks once at least, 128 times at most.
+    look_ups = traced.amount / 2 / (19 * 32 + 32)
+    assert look_ups == int(look_ups)
+    assert 8 <= look_ups <= 16 * surface_cases.LIMITS.steps
 
 
 @pytest.mark.usefixtures("tiny")

@@ -165,10 +165,13 @@ def test_samples_per_pixel() -> None:
 
 def test_fit_becomes_a_request() -> None:
     words = ["splatting/gaussians", "data/fox/", "--budget", "2m", "--set", "batches.rays=-2", "--set", "a.b=c d"]
-    words += ["--size", "480", "--test-views", "all", "--seed", "3"]
+    words += ["--size", "480", "--test-views", "all", "--seed", "3", "--optimise", "exposure,poses"]
     request = arguments.parse(Fit, "invgraphics fit", words).request()
     assert (request.method, request.scene, request.budget, request.seed) == ("splatting/gaussians", "data/fox/", "2m", 3)
-    assert request.overrides == ("batches.rays=-2", "a.b=c d")
+    optimised = ("training.exposure.optimise=true", "training.poses.optimise=true")
+    assert request.overrides == ("batches.rays=-2", "a.b=c d", *optimised)
+    with pytest.raises(InputError, match=r"--optimise cannot be 'lens'.*\n?.*poses, exposure"):
+        arguments.parse(Fit, "invgraphics fit", [*words[:-1], "lens"]).request()
     assert (request.size, request.test_views, request.existing) == (480, None, "refuse")
     assert Path(request.out) == Path("runs/fox-splatting-gaussians-seed-3")
 

@@ -44,6 +44,19 @@ def test_equals_the_mean_over_the_cone_s_gaussian_inside_and_outside_the_unit_ba
     assert float((still - features).abs().max()) > 0.1
 
 
+def test_a_long_frustum_is_encoded_at_its_mean_and_not_at_its_interval_s_middle() -> None:
+    """Points drawn in the frustum itself, whose mean is far beyond the middle: the lowest octaves tell the two apart."""
+    rays = Rays.make(torch.tensor([[-0.9, 0.0, 0.0]], dtype=F64), torch.tensor([[1.0, 0.0, 0.0]], dtype=F64), radius=0.01)
+    t0, t1 = torch.tensor([0.1], dtype=F64), torch.tensor([0.9], dtype=F64)
+    samples = Samples.on(rays, torch.zeros(1, dtype=torch.int64), t0, t1)
+    t = (t0**3 + (torch.arange(4000, dtype=F64) + 0.5) / 4000 * (t1**3 - t0**3)) ** (1 / 3)  # volume grows with t²
+    encoding = IntegratedConfig(octaves=1).build()
+    mean = encoding(BOUNDS.to_unit(rays.origins + t[:, None] * rays.directions)).mean(dim=0)
+    torch.testing.assert_close(encode_samples(encoding, BOUNDS, samples)[0], mean, atol=5e-3, rtol=0)
+    middle = encoding(BOUNDS.to_unit(samples.position), BOUNDS.unit_covariance(samples.position, samples.covariance))[0]
+    assert float((middle - mean).abs().max()) > 0.1
+
+
 def test_the_icosahedral_basis_is_a_tight_frame_of_21() -> None:
     basis = icosahedral_basis().double()
     assert basis.shape == (21, 3)

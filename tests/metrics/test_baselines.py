@@ -71,7 +71,7 @@ def test_scores_of_both_baselines() -> None:
     scores = baselines.baseline_scores(scene, PROTOCOLS["default"])
     assert scores["nearest view"]["psnr"].per_view == (100.0, 100.0)
     assert scores["mean image"]["psnr"].mean == pytest.approx(20 * math.log10(1 / 0.2), abs=1e-4)
-    assert set(scores["mean image"]) == {"psnr", "ssim", "flip"}  # nothing about geometry
+    assert set(scores["mean image"]) == {"psnr", "psnr_exposed", "ssim", "flip"}  # nothing about geometry
 
 
 def test_no_training_views_is_said() -> None:

@@ -112,7 +112,7 @@ def test_depth_is_scored_in_world_units() -> None:
 def test_what_cannot_be_computed_says_why() -> None:
     view = view_of()
     result = score(rendering_of(), view, scene_of(view), PLAIN)
-    assert set(result.values) == {"psnr", "ssim", "flip"}
+    assert set(result.values) == {"psnr", "psnr_exposed", "ssim", "flip"}
     assert set(result.values) | set(result.skipped) == set(plugins.names("metrics"))
     assert all(result.skipped.values())
 

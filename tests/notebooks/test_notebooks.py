@@ -29,6 +29,8 @@ SMALL = {
     "09-the-same-gaussians-two-ways": "size, turns = 72, 21",
     "10-from-photos-to-a-scene": "size, steps, levels = 64, 800, [0.0, 3.0]",
     "11-design-an-ablation": "size, views, steps, seeds, studies = 24, 8, 40, [0, 1], 100",
+    "13-learning-to-render": "size, views, steps, attention_steps = 20, 12, 250, 20",
+    "14-priors": "instances, seen_views, size, steps, alone_steps, infer_steps = 8, 6, 16, 300, 100, 60",
 }
 
 
@@ -342,10 +344,42 @@ def _ablation(out: _Printed) -> None:
     assert out.numbers("factorial:") == (36,) and out.numbers("one-at-a-time:") == (24,)
 
 
+def _learnt(out: _Printed) -> None:
+    learnt, traced = out.numbers("all rays: after 10 steps the LSTM is off by", "sphere tracing by")
+    assert traced < 0.01 and learnt < 0.3
+    assert out.numbers("ten steps more: the march drifts by")[0] > 0
+    out.numbers("normals: off by")
+    out.numbers("attention: its mean distance is")
+
+
+def _priors(out: _Printed) -> None:
+    itself, elsewhere = out.numbers("no prior:", "dB on its picture,")
+    inferred = out.numbers("inferred:", "dB on its picture,")
+    assert itself > elsewhere + 2
+    assert inferred[1] > elsewhere
+    out.numbers("nearest training figure:")
+    free, believed = (out.numbers(f"weight {weight}:")[0] for weight in ("0", "1"))
+    assert free > believed - 0.5
+
+
 HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
     zip(
         sorted(SMALL),
-        (_cameras, _integral, _nerf, _grids, _surfaces, _cones, _ewa, _splatting, _two_ways, _photos, _ablation),
+        (
+            _cameras,
+            _integral,
+            _nerf,
+            _grids,
+            _surfaces,
+            _cones,
+            _ewa,
+            _splatting,
+            _two_ways,
+            _photos,
+            _ablation,
+            _learnt,
+            _priors,
+        ),
         strict=True,
     )
 )

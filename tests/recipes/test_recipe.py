@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from invgraphics.cli.arguments import parse_list
+from invgraphics.core import Conditional
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.recipes.recipe import load_method, methods, presets, resolve, split_name
-from invgraphics.testing import check_field, check_renderer, toy_scene
+from invgraphics.testing import as_class, check_field, check_renderer, toy_scene
 from invgraphics.text import slug
 
 CELLS = [(name, preset) for name in methods() for preset in (*presets(name), "")]
@@ -32,7 +33,9 @@ def test_recipe_reads_and_survives_a_round_trip(name: str, preset: str) -> None:
 @pytest.mark.parametrize("space", ["box", "contracted"])
 def test_recipe_conforms(name: str, space: str) -> None:
     scene = toy_scene(views=3, size=8, space=space, facing="forward")
-    model = build_model(load_method(name), scene, 0, torch.device("cpu"))
+    method = load_method(name)
+    scene = as_class(scene) if isinstance(method.recipe.field.build(scene), Conditional) else scene
+    model = build_model(method, scene, 0, torch.device("cpu"))
     check_field(model.field, scene)
     check_renderer(model.renderer, model.field, scene)
 

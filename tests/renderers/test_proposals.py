@@ -104,6 +104,27 @@ def test_samples_gather_where_the_proposals_have_weight(make_scene: Callable[...
     assert config.exponent(0.5) == pytest.approx(10 * 0.5 / 5.5)
 
 
+@pytest.mark.parametrize("settings", [{"dilation": 0.0, "dilation_bias": 0.1}, {"dilation": 3.2, "dilation_bias": 0.0}])
+def test_samples_reach_as_far_beyond_a_thin_thing_as_weights_are_widened(
+    make_scene: Callable[..., Scene], settings: dict[str, float]
+) -> None:
+    """All weight is in the small ball's intervals: without widening no sample is farther from it than one of them."""
+    scene, proposal = make_scene(), Sphere(200.0, 0.05)
+    rays = scene.bounds.clip(Rays.make(torch.tensor([[0.0, -4.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]])))
+    length = float(rays.far - rays.near)
+    plain = ProposalsConfig(counts=(32,), count=64, fields=(None,), dilation=0.0, dilation_bias=0.0, padding=1e-9)
+
+    def reach(config: ProposalsConfig) -> float:
+        samples, _ = Proposals(config, [proposal]).sample(rays, NOTHING, context(scene))
+        return float((samples.position.norm(dim=1) / length).max())
+
+    # Either setting widens by a tenth of the ray: 3.2 over the 32 intervals.
+    assert reach(plain) < 0.07
+    assert 0.09 < reach(replace(plain, **settings)) < 0.2
+    # The filter of mip-NeRF spreads weights to one neighbour on each side.
+    assert reach(plain) + 0.6 / 32 < reach(replace(plain, blurred=True)) < reach(plain) + 1.6 / 32
+
+
 def test_proposals_learn_from_the_loss_alone_and_nothing_else_does(make_scene: Callable[..., Scene]) -> None:
     scene, proposal, ball = make_scene(), Sphere(0.2, 0.8), Sphere(9.0, 0.5, colour=(0.2, 0.5, 0.7))
     sampler = Proposals(ProposalsConfig(counts=(16,), count=12, fields=(None,)), [proposal])

@@ -82,6 +82,21 @@ def test_strips_of_rows_are_one_picture(ball: Mesh, camera: Camera, monkeypatch:
     torch.testing.assert_close(parts.depth, whole.depth)
 
 
+@pytest.mark.parametrize("pixel", [(16, 12), (9, 12), (0, 0)])
+def test_hits_of_a_pixel_make_its_colour_and_depth(ball: Mesh, camera: Camera, pixel: tuple[int, int]) -> None:
+    """Inside, on the silhouette (some rays miss) and beside the ball."""
+    whole, (column, row) = picture(ball, camera), pixel
+    field = MeshField(ball, 0)
+    found = Surface(SurfaceConfig()).contributions(field, camera, pixel, Context(BOX, geometry=True))
+    assert len(found) == round(9 * float(whole.alpha[row, column]))
+    assert bool((found.t.diff() >= 0).all())
+    torch.testing.assert_close(found.colour, whole.rgb[row, column])
+    torch.testing.assert_close(found.transmittance * found.alpha, found.weight)
+    if float(whole.alpha[row, column]) >= 0.5:
+        assert found.expected_depth == pytest.approx(float(whole.depth[row, column]), rel=1e-6)
+        assert found.median_depth == pytest.approx(float(found.t[4]))
+
+
 def test_crop_and_near_open_the_ball(ball: Mesh, camera: Camera) -> None:
     """Behind the crop's front, the far half is seen from inside."""
     rays = camera.rays()

@@ -1,12 +1,17 @@
 """Cells that cameras see, against rays through their pictures."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
 
+import pytest
 import torch
 
-from invgraphics.core import Bounds, Camera, Scene
+from invgraphics.core import Bounds, Camera, Context, Scene
+from invgraphics.core.scene import Points
+from invgraphics.fields.analytic import Sphere
 from invgraphics.renderers.occupancy import OccupancyConfig
-from invgraphics.renderers.visibility import visible_cells
+from invgraphics.renderers.visibility import cells_near_points, visible_cells
 
 
 def cell_of(bounds: Bounds, position: torch.Tensor, resolution: int) -> tuple[torch.Tensor, ...]:
@@ -31,3 +36,31 @@ def test_nothing_is_occupied_where_no_camera_looks(make_scene: Callable[..., Sce
     assert bool(box.occupied.all())
     assert 0.02 < float(endless.occupied.float().mean()) < 0.9
     assert set(endless.state_dict()) == set(box.state_dict())
+
+
+@pytest.mark.parametrize("space", ["box", "contracted"])
+def test_cells_near_points_are_those_a_search_of_all_pairs_finds(space: Literal["box", "contracted"]) -> None:
+    bounds = Bounds(torch.full((3,), -0.5), torch.full((3,), 0.5), space)
+    points = torch.cat([0.6 * torch.rand(6, 3) - 0.3, torch.tensor([[9.0, 0.0, 0.0]])])  # the last is outside the box
+    near = cells_near_points(bounds, 12, points, 2)
+    cells = (bounds.to_unit(points) * 12).floor()
+    centres = torch.cartesian_prod(*[torch.arange(12.0)] * 3)
+    inside = ((cells >= 0) & (cells < 12)).all(dim=1)
+    expected = ((centres[:, None] - cells[inside]).abs().amax(dim=2) <= 2).any(dim=1)
+    assert torch.equal(near.flatten(), expected)
+    assert int(inside.sum()) == (7 if space == "contracted" else 6)
+
+
+def test_only_cells_near_points_are_sampled_until_others_have_proved_dense(make_scene: Callable[..., Scene]) -> None:
+    """A second look at a seeded grid: fog everywhere brings every cell back, but not before ``points_until``."""
+    scene = replace(make_scene("box"), points=Points(torch.zeros(1, 3), torch.zeros(1, 3)))
+    sampler = OccupancyConfig(resolution=8, points_until=0.1, point_cells=1).build(scene)
+    near = cells_near_points(scene.bounds, 8, torch.zeros(1, 3), 1)
+    assert torch.equal(sampler.occupied, near) and 0 < int(near.sum()) < 512
+    field = Sphere(0.1, 100.0)  # fog
+    sampler.update(field, Context(scene.bounds, progress=0.05, training=True))
+    assert torch.equal(sampler.occupied, near)
+    sampler.step.fill_(sampler.config.every)
+    sampler.update(field, Context(scene.bounds, progress=0.2, training=True))
+    assert bool(sampler.occupied.all())
+    assert bool(OccupancyConfig(resolution=8, points_until=0.1).build(make_scene("box")).occupied.all())  # without points

@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 pytestmark = pytest.mark.browser
 
@@ -306,3 +309,26 @@ def test_folded_scene_opens_when_it_is_asked_for(opened: Any, built_study: Path)
     failed.click()
     page.wait_for_function("location.hash.startsWith('#failure-')")
     assert "not finite" in page.locator(failed.get_attribute("href")).inner_text()
+
+
+def test_table_across_scenes_sorts_by_any_scene(opened: Any, built_study: Path) -> None:
+    page = opened(built_study)
+    values = "head => [...head.closest('table').tBodies[0].rows].map(row => row.cells[head.cellIndex].dataset.value ?? null)"
+    for order in (True, False):
+        head = page.locator("#across th[data-better]").first
+        head.locator("button").click()
+        shown = head.evaluate(values)
+        known = [float(value) for value in shown if value is not None]
+        assert known == sorted(known, reverse=order) and shown[: len(known)].count(None) == 0
+        assert head.get_attribute("aria-sort") == ("descending" if order else "ascending")
+        assert page.locator("#across th[aria-sort]").count() == 1
+
+
+def test_shade_marks_a_table_with_more_to_the_right(opened: Any, built_study: Path) -> None:
+    page = opened(built_study, viewport={"width": 375, "height": 800})
+    region = page.locator("#cells .scroll")
+    edge = Image.open(BytesIO(region.screenshot())).convert("L")
+    region.evaluate("region => region.scrollTo(region.scrollWidth, 0)")
+    end = Image.open(BytesIO(region.screenshot())).convert("L")
+    rightmost = (edge.width - 1, 0, edge.width, edge.height)
+    assert np.median(edge.crop(rightmost)) < 220 < np.median(end.crop(rightmost))

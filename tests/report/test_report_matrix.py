@@ -1,6 +1,7 @@
 """The table of methods on a comparison's page, and patterns that name many methods at once."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from invgraphics.report.pages.parts import Drawn, Part
 from invgraphics.report.statistics.summary import summarise
 from invgraphics.runs.comparison import Failure, Refusal
 from invgraphics.runs.scores import Score
+from invgraphics.scenes.truth import POINTS as EXACT_POINTS
 from invgraphics.testing import toy_scene
 
 CELLS = {
@@ -143,6 +145,31 @@ def test_a_key_that_only_some_methods_have_refuses_the_others(tmp_path: Path, mo
     assert "steps" in refused[0].reason
     with pytest.raises(InputError, match="steps"):
         comparing._resolve(CompareRequest(scene="toy", methods=names, out=str(tmp_path), overrides=("renderer.steps=5",)))
+
+
+@pytest.mark.parametrize(
+    ("methods", "overrides", "points", "start"),
+    [
+        (("splatting/gaussians", "volumetric/hash"), (), EXACT_POINTS, "sfm"),
+        (("splatting/gaussians", "volumetric/hash"), ("data.init=scene",), EXACT_POINTS, "scene"),
+        (("volumetric/nerf", "volumetric/hash"), (), EXACT_POINTS, "scene"),  # which have no use for points
+        (("splatting/gaussians", "volumetric/hash"), (), "4,096 from SfM", "scene"),
+    ],
+)
+def test_methods_are_compared_from_a_start_that_all_could_have(
+    methods: tuple[str, ...],
+    overrides: tuple[str, ...],
+    points: str,
+    start: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = replace(toy_scene(views=2, size=8), notes={"points": points})
+    monkeypatch.setattr(comparing, "open_with_progress", lambda *_: scene)
+    request = CompareRequest(scene="toy", methods=methods, out=str(tmp_path), overrides=overrides, seeds=(0, 1))
+    request, jobs, _, _ = comparing._resolve(request)
+    assert {job.data.init for job in jobs} == {Job.of(fit).data.init for fit in request.fits()} == {start}
+    assert ("--set data.init=" in request.shell()) == (start == "sfm" or bool(overrides))
 
 
 def test_cells_are_those_of_the_table_of_recipes() -> None:

@@ -8,6 +8,7 @@ import itertools
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -25,12 +26,15 @@ from invgraphics.errors import InputError
 from invgraphics.report.data.studies import read_study, scene_comparisons
 from invgraphics.report.data.variants import short_names
 from invgraphics.report.figures.effects import heat_map
+from invgraphics.report.pages.across import across_scenes
 from invgraphics.report.pages.study import design_words, study_facts
 from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.study import build_study_report, shown_variants, study_sentences
 from invgraphics.report.wording import quality_quantity
+from invgraphics.runs.scores import Score
 
 VIEWS, LEVELS = STUDY_FACTORS
+PSNR = quality_quantity("psnr", Score(mean=0.0, unit="dB", higher_is_better=True))
 
 
 def exported(folder: Path) -> pd.DataFrame:
@@ -334,3 +338,28 @@ def test_hostile_names_stay_text(small_study: Path, edit: Callable[..., None]) -
         line for line in (small_study / "index.md").read_text().splitlines() if not line.startswith("    ")
     ]  # code is inert
     assert "<script>" not in "".join(told)
+
+
+def test_table_across_scenes_is_what_pandas_finds_and_refuses_means_of_different_scenes(built_study: Path) -> None:
+    study = read_study(built_study)
+    table = across_scenes(study, PSNR)
+    assert table is not None
+    found = exported(built_study)
+    found = found[(found["metric"] == "psnr") & (found["status"] == "ok")]
+    per_run = found.groupby([VIEWS, LEVELS, "scene", "seed"])["value"].mean()
+    names = {cell.variant: (str(cell.levels[VIEWS]), str(cell.levels[LEVELS])) for cell in study.cells}
+    ordered = [row for row in table.rows if row.mean is not None]
+    assert [row.mean for row in ordered] == sorted((row.mean for row in ordered if row.mean is not None), reverse=True)
+    assert len(ordered) < len(table.rows)  # some cells are lost
+    for row in table.rows:
+        values = per_run[names[row.variant]]
+        for scene, value in zip(table.scenes, row.values, strict=True):
+            if value is None:
+                assert len(values.get(scene, [])) < len(STUDY_SEEDS) and scene in row.refused and row.mean is None
+            else:
+                assert value == pytest.approx(values[scene].mean(), abs=1e-9)
+        if row.mean is not None:
+            assert row.mean == pytest.approx(values.groupby("scene").mean().mean(), abs=1e-9)
+    markdown = (built_study / "index.md").read_text()
+    assert markdown.index(table.text(ordered[0].mean)) > markdown.index("## Across scenes")
+    assert across_scenes(replace(study, scenes=study.scenes[:1]), PSNR) is None

@@ -20,6 +20,7 @@ from invgraphics.runs.explanation import ExplanationRecord
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.runs.history import Moment, append_history, cut_history, read_history
+from invgraphics.runs.inference import Inference
 from invgraphics.runs.location import Location
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.renderings import Renderings
@@ -29,7 +30,7 @@ from invgraphics.runs.study import CellRecord, StudyRecord
 
 RECORDS = (
     Scores, Provenance, Environment, FitRecord, ComparisonRecord, StudyRecord, Renderings, ExplanationRecord, Analysis,
-    Location,
+    Location, Inference,
 )  # fmt: skip
 
 

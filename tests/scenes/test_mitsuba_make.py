@@ -238,7 +238,9 @@ def test_impossible_options_are_refused(fresh, scene_file, option, word):
 
 @pytest.mark.usefixtures("fresh")
 def test_unknown_scene():
-    with pytest.raises(InputError, match="bricks, cloud, cloud-1, cloud-27, cloud-3, cloud-81, fence, materials, room, shelf"):
+    with pytest.raises(
+        InputError, match=r"bricks, chairs, cloud, cloud-1, cloud-27, cloud-3, cloud-81, fence, materials, mugs, room"
+    ):
         make("lego")
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Model, Scene
+from invgraphics.core import Bounds, Model, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.scaled import scaled_scores
 from invgraphics.fields.analytic import Sphere
@@ -42,12 +42,17 @@ def test_a_scene_that_was_opened_is_opened_at_the_smaller_size(scene: Scene, mon
 
     def open_scene(spec: str, options: SceneOptions) -> Scene:
         asked.append((spec, options))
-        return toy_scene(views=3, size=12)
+        smaller = toy_scene(views=3, size=12)
+        return replace(smaller, bounds=Bounds(-2 * torch.ones(3), torch.ones(3)), world_from_local=2 * torch.eye(4))
 
     monkeypatch.setattr(scales, "source_of", lambda scene: SceneSource("bricks", SceneOptions(size=24, test_views=5)))
     monkeypatch.setattr(scales, "open_scene", open_scene)
     assert scene_at(scene, 1) is scene
-    assert scene_at(scene, 2).train[0].camera.width == 12
+    smaller = scene_at(scene, 2)
+    assert smaller.train[0].camera.width == 12
+    # One field is fitted to both: what a loader makes of smaller pictures must not move its bounds or its frame.
+    assert smaller.bounds is scene.bounds
+    assert smaller.world_from_local is scene.world_from_local
     assert asked == [("bricks", SceneOptions(size=12, test_views=5))]
 
 

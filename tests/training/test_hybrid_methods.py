@@ -1,14 +1,9 @@
 """NeuS and VolSDF: each recipe, shrunk, learns shape and colour of a toy scene, and resumes bit by bit."""
 
-import math
-from pathlib import Path
-from typing import NamedTuple
-
 import pytest
 import torch
-from training_fixtures import State, resume, run_whole, same_state
+from training_fixtures import Learnt, learn, resume, same_state, toy_scores
 
-from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.training.fit import Fit
 
 GRID = ["field.encoding.levels=4", "field.encoding.log2_size=12", "field.encoding.finest=48"]
@@ -23,33 +18,11 @@ BATCH = ["batches.rays=128"]
 STEPS = 120
 
 
-def _scores(fit) -> tuple[float, float]:
-    """PSNR, and mean absolute error of depth where prediction and truth have one."""
-    scene, errors, depths = fit.plan.scene, [], []
-    for view in scene.test:
-        picture = fit.plan.model.render(view.camera)
-        errors.append((picture.over(scene.background).clamp(0, 1) - view.over(scene.background)).square().mean())
-        both = (picture.alpha >= 0.5) & (view.alpha >= 0.5)
-        depths.append((picture.depth - view.depth)[both].abs())
-    return -10 * math.log10(float(torch.stack(errors).mean())), float(torch.cat(depths).mean())
-
-
-class Learnt(NamedTuple):
-    """A fit at its end."""
-
-    name: str
-    fit: Fit
-    before: tuple[float, float]
-    checkpoint: Path
-    final: State
-
-
 @pytest.fixture(scope="module", params=SHRUNK)
 def learnt(request: pytest.FixtureRequest, scene, make_fit, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
     torch.manual_seed(0)
-    fit, path = _fit(request.param, scene, make_fit), tmp_path_factory.mktemp("fits") / CHECKPOINT
-    before = _scores(fit)
-    return Learnt(request.param, fit, before, path, run_whole(fit, STEPS, path))
+    fit = _fit(request.param, scene, make_fit)
+    return learn(request.param, fit, STEPS, tmp_path_factory.mktemp("fits"))
 
 
 def _fit(name: str, scene, make_fit) -> Fit:
@@ -57,10 +30,10 @@ def _fit(name: str, scene, make_fit) -> Fit:
 
 
 def test_learns_the_toy_scene(learnt: Learnt) -> None:
-    (before, away), (after, depth) = learnt.before, _scores(learnt.fit)
+    before, after = learnt.before, toy_scores(learnt.fit)
     grid = learnt.name.endswith("hash")
-    assert after > before + (6 if grid else 2)
-    assert depth < (0.09 if grid else 0.15) < away
+    assert after.psnr > before.psnr + (6 if grid else 2)
+    assert after.depth < (0.09 if grid else 0.15) < before.depth
 
 
 @pytest.mark.parametrize("learnt", ["hybrid/neus-hash", "hybrid/volsdf-hash"], indirect=True)

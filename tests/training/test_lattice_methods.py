@@ -1,14 +1,9 @@
 """Factors, planes and dense grids: each recipe, shrunk, learns the toy scene from its poses, and resumes bit by bit."""
 
-import math
-from pathlib import Path
-from typing import NamedTuple
-
 import pytest
 import torch
-from training_fixtures import State, resume, run_whole, same_state
+from training_fixtures import Learnt, learn, resume, same_state, toy_scores
 
-from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.training.fit import Fit
 
 SAMPLER = [
@@ -32,31 +27,11 @@ SHRUNK = {
 STEPS = 300
 
 
-def _psnr(fit) -> float:
-    scene, errors = fit.plan.scene, []
-    with torch.no_grad():
-        for view in scene.test:
-            picture = fit.plan.model.render(view.camera, normals=False)
-            errors.append((picture.over(scene.background).clamp(0, 1) - view.over(scene.background)).square().mean())
-    return -10 * math.log10(float(torch.stack(errors).mean()))
-
-
-class Learnt(NamedTuple):
-    """A fit at its end."""
-
-    name: str
-    fit: Fit
-    before: float
-    checkpoint: Path
-    final: State
-
-
 @pytest.fixture(scope="module", params=SHRUNK)
 def learnt(request: pytest.FixtureRequest, scene, make_fit, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
     torch.manual_seed(0)
-    fit, path = _fit(request.param, scene, make_fit), tmp_path_factory.mktemp("fits") / CHECKPOINT
-    before = _psnr(fit)
-    return Learnt(request.param, fit, before, path, run_whole(fit, STEPS, path))
+    fit = _fit(request.param, scene, make_fit)
+    return learn(request.param, fit, STEPS, tmp_path_factory.mktemp("fits"))
 
 
 def _fit(name: str, scene, make_fit) -> Fit:
@@ -64,7 +39,7 @@ def _fit(name: str, scene, make_fit) -> Fit:
 
 
 def test_learns_the_toy_scene(learnt: Learnt) -> None:
-    assert _psnr(learnt.fit) > max(learnt.before + 8, 20)
+    assert toy_scores(learnt.fit).psnr > max(learnt.before.psnr + 8, 20)
 
 
 def test_resumed_equals_uninterrupted(learnt: Learnt, scene, make_fit) -> None:

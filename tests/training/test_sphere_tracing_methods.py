@@ -1,16 +1,11 @@
 """Sphere tracing: each recipe, shrunk, learns a toy scene from pictures and masks, and resumes bit by bit; the mask loss."""
 
-import math
-from pathlib import Path
-from typing import NamedTuple
-
 import pytest
 import torch
 from torch.nn.functional import binary_cross_entropy
-from training_fixtures import State, resume, run_whole, same_state
+from training_fixtures import Learnt, learn, resume, same_state, toy_scores
 
 from invgraphics.core import Batch, Bounds, Context, Rendering, SurfaceTrace, Trace
-from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.training.fit import Fit
 from invgraphics.training.losses import MaskLoss
 
@@ -22,35 +17,11 @@ SHRUNK = {
 STEPS = 200
 
 
-def scores(fit) -> tuple[float, float, float]:
-    """PSNR, mean absolute error of depth where both have one, and intersection over union of the silhouettes."""
-    scene, errors, depths, overlaps = fit.plan.scene, [], [], []
-    for view in scene.test:
-        picture = fit.plan.model.render(view.camera)
-        errors.append((picture.over(scene.background).clamp(0, 1) - view.over(scene.background)).square().mean())
-        ours, true = picture.alpha >= 0.5, view.alpha >= 0.5
-        depths.append((picture.depth - view.depth)[ours & true].abs())
-        overlaps.append(float((ours & true).sum() / (ours | true).sum()))
-    psnr = -10 * math.log10(float(torch.stack(errors).mean()))
-    return psnr, float(torch.cat(depths).mean()), sum(overlaps) / len(overlaps)
-
-
-class Learnt(NamedTuple):
-    """A fit at its end."""
-
-    name: str
-    fit: Fit
-    before: tuple[float, float, float]
-    checkpoint: Path
-    final: State
-
-
 @pytest.fixture(scope="module", params=SHRUNK)
 def learnt(request: pytest.FixtureRequest, scene, make_fit, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
     torch.manual_seed(0)
-    fit, path = _fit(request.param, scene, make_fit), tmp_path_factory.mktemp("fits") / CHECKPOINT
-    before = scores(fit)
-    return Learnt(request.param, fit, before, path, run_whole(fit, STEPS, path))
+    fit = _fit(request.param, scene, make_fit)
+    return learn(request.param, fit, STEPS, tmp_path_factory.mktemp("fits"))
 
 
 def _fit(name: str, scene, make_fit) -> Fit:
@@ -59,10 +30,10 @@ def _fit(name: str, scene, make_fit) -> Fit:
 
 def test_finds_two_balls_from_pictures_and_masks(learnt: Learnt) -> None:
     """From one sphere, which has to part in two."""
-    after, depth, overlap = scores(learnt.fit)
-    assert after > max(learnt.before[0] + 5, 18)
-    assert depth < 0.12
-    assert overlap > 0.85
+    after = toy_scores(learnt.fit)
+    assert after.psnr > max(learnt.before.psnr + 5, 18)
+    assert after.depth < 0.12
+    assert after.overlap > 0.85
 
 
 def test_resumed_equals_uninterrupted(learnt: Learnt, scene, make_fit) -> None:

@@ -92,7 +92,7 @@ class ComparisonResult:
 
 def compare(
     scene: Scene | str,
-    methods: Sequence[MethodLike] | str,
+    methods: Sequence[MethodLike] | str = (),
     budget: str = "60s",
     *,
     seeds: Sequence[int] = (0,),
@@ -108,7 +108,7 @@ def compare(
     Args:
         scene: loaded, made in Python, or what `load_scene` opens.
         methods: names, paths of recipes, tables, or loaded methods; ``all``, or a pattern such as ``volumetric/*``, takes
-            those that go with the scene.
+            those that go with the scene; none leaves the choice to the scene.
         budget: of each fit, ``60s`` or ``5000steps``.
         seeds: each method is fitted once per seed.
         out: folder of the report and its runs; ``None`` for ``reports/compare-SCENE``.

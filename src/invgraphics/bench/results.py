@@ -12,12 +12,12 @@ from invgraphics.files import writing_text
 
 FORWARD, BOTH = "forward", "forward+backward"
 """Directions."""
-FORWARD_ONLY = ("ray_march", "ngp_render")
+FORWARD_ONLY = ("ray_march", "ngp_render", "sdf_trace", "mesh_rasterise", "near_points")
 """Operations without a gradient."""
 
 SIZE_KEYS = (
     "gaussians", "width", "points", "levels", "log2_size", "hidden", "resolution", "vertices", "channels", "rays", "samples",
-    "bytes",
+    "triangles", "positions", "bytes",
 )  # fmt: skip
 """Columns of problem sizes, in order."""
 

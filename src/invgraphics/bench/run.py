@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from invgraphics import kernels
-from invgraphics.bench import PARTS, iterations, lattice_cases, limits, sample_cases, splat_cases
+from invgraphics.bench import PARTS, iterations, lattice_cases, limits, sample_cases, splat_cases, surface_cases
 from invgraphics.bench.case import Case
 from invgraphics.bench.memory import measure_memory
 from invgraphics.bench.peers import peers
@@ -29,6 +29,9 @@ _CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
     "march": sample_cases.ray_march,
     "composite": sample_cases.composite,
     "picture": sample_cases.ngp_render,
+    "trace": surface_cases.sdf_trace,
+    "mesh": surface_cases.meshes,
+    "near": surface_cases.near_points,
     "ssim": splat_cases.ssim,
 }
 

@@ -20,6 +20,9 @@ T = TypeVar("T")
 SMALLEST = 8
 """Pixels along the shorter side of the smallest pictures that are worth fitting."""
 
+OPTIMISED = {"poses", "exposure"}
+"""What ``--optimise`` can name: tables of a recipe's ``training``."""
+
 _BOX = "│╭╮╰╯"
 _POSITIONAL = get_args(Positional[int])[1]
 
@@ -45,8 +48,9 @@ class Shared:
     """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
     """Largest number of Gaussians; short for --set max_primitives=N."""
-    optimise: Annotated[str, arg(metavar="poses")] = ""
-    """Fit the training cameras' poses too; short for --set training.poses.optimise=true."""
+    optimise: Annotated[str, arg(metavar="poses,exposure")] = ""
+    """Fit the training cameras' poses too, or an exposure of each training photograph, or both; short for
+    --set training.poses.optimise=true and --set training.exposure.optimise=true."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
     """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
@@ -67,9 +71,10 @@ class Shared:
         Budget.parse(self.budget)
         short = () if self.max_primitives is None else (f"max_primitives={self.max_primitives}",)
         if self.optimise:
-            if self.optimise != "poses":
-                raise InputError(f"--optimise cannot be '{self.optimise}'.", "Expected: poses.")
-            short = ("training.poses.optimise=true", *short)
+            wanted = parse_list(self.optimise, "--optimise")
+            if not set(wanted) <= OPTIMISED:
+                raise InputError(f"--optimise cannot be '{self.optimise}'.", "Expected: poses, exposure, or poses,exposure.")
+            short = (*(f"training.{part}.optimise=true" for part in wanted), *short)
         return {
             "budget": self.budget,
             "preset": self.preset,

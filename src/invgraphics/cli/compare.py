@@ -20,12 +20,13 @@ from invgraphics.runs.folder import RUNS, RunFolder
 class Compare(Shared):
     """Fit several methods to one scene under one budget, each in its own process; score them; write a report.
 
-    The same command again keeps finished runs and continues the others. Exit status 1: some fits failed.
+    The same command again keeps finished runs and continues the others. On a rendered scene, methods that start from points
+    start from those found in the training photographs, unless --set data.init says otherwise. Exit status 1: some fits failed.
     """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """A built-in scene (see `invgraphics list scenes`), or the path of a data set."""
-    methods: Annotated[str, arg(metavar="A,B,C")]
+    methods: Annotated[str, arg(metavar="A,B,C", help_behavior_hint="(default: those that suit the scene)")] = ""
     """Methods with commas between them (see `invgraphics list methods`); METHOD:key=value changes a value of the recipe.
     `all`, or a pattern such as `volumetric/*`, takes those that go with the scene."""
     seeds: Annotated[str, arg(metavar="0,1,2")] = "0"
@@ -54,7 +55,7 @@ class Compare(Shared):
     def request(self) -> CompareRequest:
         """Convert the options to a validated request, without opening any data."""
         out = Path("reports") / f"compare-{Path(self.scene).resolve().name}" if self.out is None else self.out
-        methods, optional = expand(parse_list(self.methods, "--methods"))
+        methods, optional = expand(parse_list(self.methods, "--methods")) if self.methods else ((), frozenset[str]())
         request = CompareRequest(
             scene=self.scene, methods=methods, seeds=parse_seeds(self.seeds), optional=optional, out=str(out), **self.settings()
         )

@@ -44,6 +44,10 @@ COMMANDS = {
         "list and plot the contributions along one pixel's ray",
     ),
     "locate": ("invgraphics.cli.locate:Locate", "find a photograph's camera pose by gradient descent through a fitted scene"),
+    "infer": (
+        "invgraphics.cli.infer:Infer",
+        "infer unseen instances of a class of objects from few views or a photograph, with a fitted prior",
+    ),
     "report": ("invgraphics.cli.report:Report", "write page, tables and figures from finished runs"),
     "export": ("invgraphics.cli.export:Export", "write a run's model as a file for other programs, and report the loss"),
     "convert": (

@@ -26,6 +26,8 @@ class MakeScene:
     """Size of the pictures; one number is the longest side."""
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
     """Samples per pixel of the training views; the others keep their proportion."""
+    instances: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the class's own)")] = None
+    """Instances of a class of objects (chairs, mugs), one seed each; a ninth of them stay unseen by the fit."""
     seed: int = 0
     """Seed of cameras and of the renderer's noise."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the cache only)")] = None
@@ -39,10 +41,11 @@ class MakeScene:
 
         from invgraphics.experiments.progress import Reporter
         from invgraphics.scenes.mitsuba import make
+        from invgraphics.scenes.mitsuba.spec import description_path, read
 
         with Reporter(f"rendering {self.scene}") as reporter:
             folder = make(
-                self.scene,
+                self.scene if self.instances is None else read(description_path(self.scene)).with_instances(self.instances),
                 size=size,
                 train=self.views,
                 test=self.test_views,

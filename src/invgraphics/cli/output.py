@@ -47,6 +47,8 @@ def show_scores(scores: Scores) -> None:
     show_table(title, ("metric", "mean", "unit", "better"), rows)
     if scores.test_poses:
         print(f"Test poses: {scores.test_poses}. Pose errors are medians over the training views.")
+    if scores.test_exposure:
+        print(f"Test views' exposure: {scores.test_exposure}.")
     if scores.skipped:
         print(not_scored(scores.skipped))
     if scores.below_baseline:

@@ -7,6 +7,7 @@ from invgraphics.core.camera import Camera as Camera
 from invgraphics.core.contributions import Contributions as Contributions
 from invgraphics.core.contributions import Pass as Pass
 from invgraphics.core.contributions import Profile as Profile
+from invgraphics.core.field import Conditional as Conditional
 from invgraphics.core.field import Encoding as Encoding
 from invgraphics.core.field import Field as Field
 from invgraphics.core.field import Gaussians as Gaussians

@@ -55,7 +55,7 @@ def check_scene(scene: Scene) -> None:
     offset = float(world[:3, 3].double().norm()) / scene.scale
     _expect(offset <= FARTHEST_ORIGIN, f"The subject of '{scene.name}' is {offset:.2g} times its size from the world's origin.")
     _check_bounds(scene)
-    for split in ("train", "val", "test"):
+    for split in ("train", "val", "test", "observed"):
         for view in getattr(scene, split):
             what = f"{split} view '{view.name}' of '{scene.name}'"
             check_camera(view.camera, f"the {what}")
@@ -121,7 +121,7 @@ def _check_bounds(scene: Scene) -> None:
 
 def _check_positions(scene: Scene) -> None:
     """Cameras in relation to each other and to the bounds; none may be so far that the others become one point."""
-    views = [*scene.train, *scene.val, *scene.test]
+    views = [*scene.train, *scene.val, *scene.test, *scene.observed]
     position = torch.stack([view.camera.position for view in views]).double()
     middle = position.median(dim=0).values
     distance = (position - middle).norm(dim=1)

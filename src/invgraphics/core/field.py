@@ -8,7 +8,7 @@ from enum import Flag, auto
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from invgraphics.core.bounds import Bounds
@@ -117,6 +117,41 @@ class Field(nn.Module, ABC):
     def primitive_count(self) -> int | None:
         """Number of explicit primitives, ``None`` for fields that have none."""
         return None
+
+
+class Conditional(Field):
+    """A field over a class of objects: a code chooses the instance (auto-decoder; DeepSDF, Park et al. 2019, §4).
+
+    Rays of training views show the instance that the view names; others, whose ``view`` is -1, show that of the mean code.
+
+    Attributes:
+        codes: one of each instance, learnt.
+        subjects: numbers of the instances in the scene, in the order of ``codes``; empty where they have none.
+    """
+
+    codes: Float[Tensor, "s c"]
+    subjects: tuple[int | None, ...]
+
+    @abstractmethod
+    def at(self, code: Float[Tensor, " c"]) -> Field:
+        """The field of one instance, which shares the networks."""
+
+    @abstractmethod
+    def of_subject(self, subject: int) -> Field:
+        """The field of a training instance, by its number in the scene."""
+
+    @abstractmethod
+    def with_codes(self, codes: Float[Tensor, "k c"], rows: Int[Tensor, " v"]) -> Conditional:
+        """The same networks over other instances.
+
+        Args:
+            codes: of k instances; they become its parameter.
+            rows: which of them each of v training views shows.
+        """
+
+    def mean_code(self) -> Float[Tensor, " c"]:
+        """Mean of the training instances' codes, which stands for the class."""
+        return self.codes.mean(dim=0)
 
 
 class Encoding(nn.Module, ABC):

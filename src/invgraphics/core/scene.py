@@ -35,6 +35,7 @@ class View:
         normal: true unit normal, local frame, facing the camera; zero where nothing is hit.
         mask: True where the pixel counts; ``None`` means everywhere.
         ground_truth_pose: the camera's pose before it was degraded on purpose; ``None`` where it was not. For scores only.
+        subject: which instance of a class of objects it shows; ``None`` in scenes of one subject.
     """
 
     camera: Camera
@@ -45,6 +46,7 @@ class View:
     normal: Float[Tensor, "h w 3"] | None = None
     mask: Tensor | None = None
     ground_truth_pose: Float[Tensor, "4 4"] | None = None
+    subject: int | None = None
 
     @property
     def true_pose(self) -> Float[Tensor, "4 4"]:
@@ -118,6 +120,7 @@ class Scene:
         train: views to fit.
         val: views to look at during a fit.
         test: views to score; never shares a camera with ``train`` or ``val``.
+        observed: of a class of objects, views of the subjects of ``test`` from which these are inferred.
         background: declared background colour for scores, in the scene's colour space.
         bounds: the region to describe, local frame.
         points: known surface points, if any.
@@ -135,6 +138,7 @@ class Scene:
     background: Float[Tensor, 3]
     bounds: Bounds
     val: tuple[View, ...] = ()
+    observed: tuple[View, ...] = ()
     points: Points | None = None
     mesh: Mesh | None = None
     scan: Scan | None = None
@@ -152,6 +156,21 @@ class Scene:
     def has_alpha(self) -> bool:
         """Whether any training view has transparency, so that fits use a random background."""
         return any(view.alpha is not None for view in self.train)
+
+    @property
+    def is_class(self) -> bool:
+        """Whether it shows a class of objects: its training views name their subjects."""
+        return any(view.subject is not None for view in self.train)
+
+    def of_subject(self, subject: int, views: int | None = None) -> Scene:
+        """The scene of one unseen subject: its first ``views`` observed views to fit (``None``: all), its test views."""
+        own = {
+            split: tuple(replace(v, subject=None) for v in getattr(self, split) if v.subject == subject)
+            for split in ("observed", "test")
+        }
+        return replace(
+            self, name=f"{self.name}-{subject}", train=own["observed"][:views], test=own["test"], val=(), observed=()
+        )
 
     @property
     def extent(self) -> float:
@@ -191,7 +210,7 @@ class Scene:
     def camera_digest(self) -> str:
         """SHA-256 of all cameras of all splits, in world order of the views."""
         sha = hashlib.sha256()
-        for split in (self.train, self.val, self.test):
+        for split in (self.train, self.val, self.test, *([self.observed] if self.observed else [])):
             for view in split:
                 camera = view.camera
                 for values in (camera.cam_to_world, camera.focal, camera.centre):

@@ -9,6 +9,7 @@ import torch
 from invgraphics.core import Camera, Rendering, Scene
 from invgraphics.metrics.baselines import mean_image
 from invgraphics.metrics.protocols import Protocol, score
+from invgraphics.recipes.suitable import OPEN, is_open_space
 from invgraphics.runs.scores import Score
 
 FLOATER_DEPTH = 0.6
@@ -47,19 +48,23 @@ def below_baseline(
     if not known or psnr >= (baseline := sum(known) / len(known)):
         return ""
     means = {key: sum(view[key] for view in statistics) / len(statistics) for key in ("alpha", "relative_depth")}
-    cause, remedy = _diagnose(method, means, opaque=not scene.has_alpha)
+    cause, remedy = _diagnose(method, means, scene)
     lost = f"{method} reaches {psnr:.1f} dB, below the mean training image ({baseline:.1f} dB)"
     return f"{lost}: {cause}. Try {remedy}."
 
 
-def _diagnose(method: str, means: Mapping[str, float], opaque: bool) -> tuple[str, str]:
-    """Select cause and remedy by the family of the method and the statistics of its renderings."""
+def _diagnose(method: str, means: Mapping[str, float], scene: Scene) -> tuple[str, str]:
+    """Select cause and remedy by the family of the method, the kind of scene and the statistics of its renderings."""
     if method.startswith("splatting/"):
         return "its Gaussians do not cover the views yet, or overfit few photographs", "a longer --budget or more photographs"
-    remedy = "a longer --budget, a smaller --size, more photographs, or splatting/gaussians, which starts from known points"
+    others = ["splatting/gaussians, which starts from known points"]
+    if is_open_space(scene):
+        suited = method.startswith(OPEN)
+        others.insert(0, "--optimise exposure, where photographs differ in it" if suited else f"{OPEN[0]}, for open spaces")
+    remedy = f"a longer --budget, a smaller --size, more photographs, {', or '.join(others)}"
     if means["relative_depth"] < FLOATER_DEPTH:
         where = f"median depth {means['relative_depth']:.0%} of the way to the scene's middle"
         return f"fog hangs in front of the cameras ({where})", remedy
-    if opaque and means["alpha"] < SPARSE_ALPHA:
+    if not scene.has_alpha and means["alpha"] < SPARSE_ALPHA:
         return f"its pictures are mostly empty (mean alpha {means['alpha']:.2f})", remedy
     return "the budget ended before its fog had cleared, or it overfits few photographs", remedy

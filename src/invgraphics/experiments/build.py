@@ -9,6 +9,7 @@ from invgraphics.core import Model, RayRenderer, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.memory_check import check_memory
 from invgraphics.experiments.progress import Reporter
+from invgraphics.experiments.subjects import check_subjects
 from invgraphics.experiments.variants import as_shown
 from invgraphics.recipes.recipe import Method
 from invgraphics.recipes.schema import Recipe
@@ -16,6 +17,7 @@ from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Plan
 from invgraphics.training.poses import coarse_to_fine_encodings, make_poses
+from invgraphics.training.views.exposure import make_exposures
 
 
 def device_of(name: str | None) -> torch.device:
@@ -56,6 +58,7 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *
     check_memory(method, scene)
     torch.manual_seed(seed)
     field, renderer = method.recipe.field.build(scene), method.recipe.renderer.build(scene)
+    check_subjects(field, scene, method.name)
     model = Model(as_shown(field, renderer) if shown else field, renderer, scene.bounds)
     training = method.recipe.training
     if training is not None and training.poses is not None and training.poses.optimise:
@@ -65,24 +68,29 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *
 
 
 def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: torch.device) -> Plan:
-    """Build the plan of a fit: model, scene, losses, hooks, optimiser and batch settings, budget and poses."""
+    """Build the plan of a fit: model, scene, losses, hooks, optimiser and batch settings, budget, poses and exposures."""
     recipe = method.recipe
     model = build_model(method, scene, seed, device)
     poses = make_poses(recipe.training, scene)
+    exposures = make_exposures(None if recipe.training is None else recipe.training.exposure, len(scene.train))
+    optimiser = recipe.optimiser
+    if poses is not None:
+        optimiser = poses.config.optimiser(optimiser, _view_share(recipe, model.renderer, scene))
+    if exposures is not None:
+        optimiser = exposures.config.optimiser(optimiser)
     return Plan(
         model=model,
         scene=scene,
         losses=recipe.losses,
         penalties=recipe.penalties,
         hooks=[hook.build() for hook in recipe.hooks],
-        optimiser=recipe.optimiser
-        if poses is None
-        else poses.config.optimiser(recipe.optimiser, _view_share(recipe, model.renderer, scene)),
+        optimiser=optimiser,
         batches=recipe.batches if poses is None else poses.config.batches(recipe.batches),
         budget=budget,
         seed=seed,
         device=device,
         poses=None if poses is None else poses.to(device),
+        exposures=None if exposures is None else exposures.to(device),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -15,16 +16,20 @@ from invgraphics.experiments.environment import environment
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.posed import protocol_note
+from invgraphics.experiments.posed import exposure_note, protocol_note
 from invgraphics.experiments.renderings import check_variants
-from invgraphics.experiments.request import CompareRequest
+from invgraphics.experiments.request import DATA, CompareRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
+from invgraphics.recipes.suitable import default_methods
 from invgraphics.recipes.table import cell_of
 from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, SceneFacts
 from invgraphics.runs.folder import RunFolder, output_folder
 from invgraphics.scenes.degrade import degrade
+from invgraphics.scenes.open import SceneOptions, space_note
+from invgraphics.scenes.truth import POINTS as EXACT_POINTS
 
+START = f"{DATA}init"
 MOST_NAMES = 6
 """Methods that the question of a comparison names; of more it says how many there are."""
 
@@ -47,10 +52,11 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
 
 def _compare(request: CompareRequest) -> tuple[Path, int]:
     began = time.monotonic()
-    request, jobs, scene, refused = _resolve(request)
+    request, choice, opened = (request, "", None) if request.methods else _choose_methods(request)
+    request, jobs, scene, refused = _resolve(request, opened)
     folder = RunFolder(Path(request.out))
     failures: list[Failure] = []
-    summary = replace(_summary(request, jobs, scene), refused=tuple(refused))
+    summary = replace(_summary(request, jobs, scene), refused=tuple(refused), method_choice=choice)
     interrupted: KeyboardInterrupt | None = None
     try:
         with closing(LocalExecutor().run(request.fits(), folder.root / "jobs")) as outcomes:
@@ -71,8 +77,24 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     return folder.root, len(failures)
 
 
-def _resolve(request: CompareRequest) -> tuple[CompareRequest, list[Job], Scene, list[Refusal]]:
+def _choose_methods(request: CompareRequest) -> tuple[CompareRequest, str, Scene]:
+    """Choose the methods of a request that names none by its scene, and print them; returns the choice in words, and the scene.
+
+    Raises:
+        InputError: the scene cannot be opened.
+    """
+    scene = open_with_progress(request.scene, SceneOptions(request.size, request.test_views, request.spp))
+    methods, reason = default_methods(scene)
+    print(f"Methods: {', '.join(methods)}, chosen for {reason}; --methods overrides.{space_note(scene)}", file=sys.stderr)
+    return replace(request, methods=methods), f"chosen for {reason}", scene
+
+
+def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[CompareRequest, list[Job], Scene, list[Refusal]]:
     """Resolve one job per method with the first seed, and open the scene with that seed's data degradation.
+
+    Args:
+        request: with its methods.
+        opened: its scene, where it is open already.
 
     Returns:
         The request without the optional methods that do not go with the scene; its jobs; the scene; the refused methods.
@@ -80,10 +102,30 @@ def _resolve(request: CompareRequest) -> tuple[CompareRequest, list[Job], Scene,
     Raises:
         InputError: anything that could be wrong, before any time is spent.
     """
-    if not request.methods:
-        raise InputError("--methods is empty.", "Example: --methods volumetric/hash,splatting/gaussians.")
     if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
         raise InputError("A method or a seed is named twice.")
+    jobs, refused = _jobs(request)
+    full = opened or open_with_progress(request.scene, jobs[0].options)
+    if start := _start_for_all(request, jobs, full):
+        request = replace(request, overrides=(*request.overrides, start))
+        jobs = [Job.of(replace(job.request, overrides=request.overrides), job.method) for job in jobs]
+    methods = {job.request.method: job.method for job in jobs}
+    for fit in request.fits():
+        if fit.method in methods:
+            check_replaceable(Job.of(fit, methods[fit.method]))
+    scene = degrade(full, jobs[0].data, request.seeds[0])
+    jobs, unsuitable = _suitable(request, jobs, scene)
+    request = replace(request, methods=tuple(job.request.method for job in jobs))
+    check_variants(jobs[0].variants, [job.method for job in jobs], full)
+    return request, jobs, scene, [*refused, *unsuitable]
+
+
+def _jobs(request: CompareRequest) -> tuple[list[Job], list[Refusal]]:
+    """Resolve one job per method with the first seed; returns the jobs and the methods that cannot be used.
+
+    Raises:
+        InputError: a method that is not optional cannot be used, or none can.
+    """
     jobs, refused = [], []
     for fit in request.fits():
         if fit.seed == request.seeds[0]:
@@ -93,16 +135,17 @@ def _resolve(request: CompareRequest) -> tuple[CompareRequest, list[Job], Scene,
                 refused.append(_refusal(request, fit.method, error))
     if not jobs:
         raise InputError("None of the methods can be used.", f"{refused[0].method}: {refused[0].reason}")
-    methods = {job.request.method: job.method for job in jobs}
-    for fit in request.fits():
-        if fit.method in methods:
-            check_replaceable(Job.of(fit, methods[fit.method]))
-    full = open_with_progress(request.scene, jobs[0].options)
-    scene = degrade(full, jobs[0].data, request.seeds[0])
-    jobs, unsuitable = _suitable(request, jobs, scene)
-    request = replace(request, methods=tuple(job.request.method for job in jobs))
-    check_variants(jobs[0].variants, [job.method for job in jobs], full)
-    return request, jobs, scene, [*refused, *unsuitable]
+    return jobs, refused
+
+
+def _start_for_all(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> str:
+    """Override that lets fields start from what photographs tell; empty where the request, or the scene, says what from.
+
+    Points of a rendered scene are exact: no method could find them, and most have no use for them.
+    """
+    chosen = any(item.partition("=")[0] == START for item in request.data_overrides)
+    used = any(getattr(job.method.recipe.field, "init", "") == "scene" for job in jobs)
+    return f"{START}=sfm" if used and not chosen and scene.notes.get("points") == EXACT_POINTS else ""
 
 
 def _suitable(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> tuple[list[Job], list[Refusal]]:
@@ -138,7 +181,10 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
     camera = scene.test[0].camera
     names = ", ".join(request.methods) if len(request.methods) <= MOST_NAMES else f"{len(request.methods)} methods"
     methods = [job.method for job in jobs]
-    notes = {protocol_note(method) for method in methods} - {""}
+    notes = {
+        "test_poses": {protocol_note(method) for method in methods} - {""},
+        "test_exposure": {f"{method.name}: {note}" for method in methods if (note := exposure_note(method))},
+    }
     baselines = baseline_scores(scene, protocol)
     return ComparisonRecord(
         scene=scene.name,
@@ -157,7 +203,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
         command=request.shell(),
         baselines=baselines,
         noise_ceiling=scene.noise_ceiling,
-        protocol=protocol.record() | ({"test_poses": "; ".join(sorted(notes))} if notes else {}),
+        protocol=protocol.record() | {key: "; ".join(sorted(found)) for key, found in notes.items() if found},
         scene_info=_scene_facts(scene),
         environment=environment(jobs[0].device),
         runs=(),

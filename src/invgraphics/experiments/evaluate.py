@@ -21,9 +21,10 @@ from invgraphics.errors import NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
-from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
+from invgraphics.experiments.posed import PosedEvaluation, exposure_note, protocol_note, scene_in_fit_frame
 from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.experiments.scaled import scaled_scores
+from invgraphics.experiments.subjects import UnseenInstances
 from invgraphics.experiments.surface_scores import surface_scores
 from invgraphics.files import write_arrays, write_picture
 from invgraphics.metrics.cost import model_bytes, parameter_count
@@ -84,6 +85,7 @@ def evaluate(
         cost=costs | found.cost,
         disturbed=disturbance(costs.get("fit_processor_share")),
         test_poses="" if poses is None else protocol_note(method),
+        test_exposure=exposure_note(method),
     )
     folder.write(result)
     return result
@@ -98,6 +100,8 @@ def score_model(
     keep: Callable[[int, Rendering], None] = lambda index, picture: None,
 ) -> Scores:
     """Render and score all test views of ``scene`` without a run folder; returns their quality and the model's cost.
+
+    Of a class of objects, the instances of the test views are unseen: each is inferred from its first observed view.
 
     Args:
         model: what is scored.
@@ -115,12 +119,14 @@ def score_model(
         raise NumericalError(f"{title} cannot be scored: {found}.")
     scores, seconds, statistics_of_views = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
+    unseen = UnseenInstances.infer(model, scene) if scene.is_class else None
     with Reporter(f"{title} evaluation") as reporter:
         model.render(scene.test[0].camera.resized(16, 16))  # first use pays for allocation
         for index, view in enumerate(scene.test):
             camera = view.camera if posed is None else posed.camera(view)
             timed = index % ceil(len(scene.test) / TIMED) == 0
-            picture, took = _picture(model, camera, normals=view.normal is not None, timed=timed)
+            shown = model if unseen is None else unseen.of(view)
+            picture, took = _picture(shown, camera, normals=view.normal is not None, timed=timed)
             seconds += took
             picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
             keep(index, picture)

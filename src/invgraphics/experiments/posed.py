@@ -29,6 +29,13 @@ def protocol_note(method: Method) -> str:
     return f"aligned by the similarity between refined and true training poses{refined}"
 
 
+def exposure_note(method: Method) -> str:
+    """Describe the exposure under which test views are shown; empty where no exposures are fitted."""
+    training = method.recipe.training
+    exposure = None if training is None else training.exposure
+    return exposure.note if exposure is not None and exposure.optimise else ""
+
+
 def refined_poses(method: Method) -> PosesConfig | None:
     """Settings of a method's pose refinement; ``None`` for fixed poses."""
     training = method.recipe.training

@@ -12,7 +12,7 @@ from types import FrameType
 import torch
 from torch import Tensor
 
-from invgraphics.core import Camera, Context, RayRenderer, Rays, Scene, View
+from invgraphics.core import Camera, Conditional, Context, RayRenderer, Rays, Scene, View
 from invgraphics.core.finite import non_finite_values
 from invgraphics.errors import NumericalError
 from invgraphics.experiments.clocks import fit_record
@@ -62,12 +62,14 @@ class Monitor:
         drift = None if poses is None else world_to_fit(poses, self._scene)
         for view, flat in zip(self._views, self._pixels, strict=True):
             camera = view.camera if drift is None else transform_camera(view.camera, drift)
-            prediction = self._predict(fit, camera, flat, ctx, background)
+            prediction = self._predict(fit, view.subject, camera, flat, ctx, background)
             errors.append((prediction.clamp(0, 1).cpu() - view.over(self._scene.background, flat)).square().mean())
         return -10 * math.log10(max(float(torch.stack(errors).mean()), 1e-10))
 
-    def _predict(self, fit: Fit, camera: Camera, flat: Tensor, ctx: Context, background: Tensor) -> Tensor:
+    def _predict(self, fit: Fit, subject: int | None, camera: Camera, flat: Tensor, ctx: Context, background: Tensor) -> Tensor:
         renderer, field = fit.plan.model.renderer, fit.plan.model.field
+        if isinstance(field, Conditional) and subject in field.subjects:
+            field = field.of_subject(subject)
         if isinstance(renderer, RayRenderer):
             pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
             rays: Rays = camera.rays(pixels).to(self._device)

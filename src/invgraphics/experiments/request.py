@@ -115,7 +115,7 @@ class CompareRequest(Settings):
     """Request of a comparison: several methods on one scene.
 
     Attributes:
-        methods: in the order of the report.
+        methods: in the order of the report; empty leaves the choice to the scene (`recipes.suitable`).
         seeds: each method is fitted once per seed.
         optional: methods that are left out, with the reason, where they do not go with the scene; others are an error.
         asked: the methods as they were asked for, patterns included; empty for ``methods`` themselves.

@@ -27,7 +27,7 @@ from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_tr
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, check_replaceable, identify
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.posed import protocol_note
+from invgraphics.experiments.posed import exposure_note, protocol_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder
 from invgraphics.experiments.renderings import check_variants, render_missing
@@ -38,6 +38,7 @@ from invgraphics.interruption import INTERRUPTED, end_on_sigterm, end_with_paren
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
 from invgraphics.recipes.recipe import Method
+from invgraphics.recipes.suitable import suggestion
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import TRUTH, RunFolder
@@ -158,7 +159,8 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     scene = fit.plan.scene
-    notes = selection_notes(scene) + space_note(scene)
+    advice = suggestion(job.method, scene)
+    notes = selection_notes(scene) + space_note(scene) + (f"\n  try also: {advice}" if advice else "")
     return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{notes}"
 
 
@@ -214,6 +216,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance
         options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
         device=str(job.device),
         test_poses=protocol_note(method),
+        test_exposure=exposure_note(method),
     )
 
 

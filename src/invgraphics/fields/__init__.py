@@ -8,6 +8,7 @@ FIELDS = {
     "neural": "invgraphics.fields.neural:NeuralFieldConfig",
     "density": "invgraphics.fields.density_field:DensityFieldConfig",
     "features": "invgraphics.fields.features:FeatureFieldConfig",
+    "conditional": "invgraphics.fields.conditional.field:ConditionalFieldConfig",
     "gaussians": "invgraphics.fields.gaussian:GaussianFieldConfig",
     "points": "invgraphics.fields.points.field:PointFieldConfig",
     "mesh": "invgraphics.fields.mesh:MeshFieldConfig",

@@ -10,6 +10,7 @@ METRICS = {
     "ms_ssim": "invgraphics.metrics.image:MS_SSIM",
     "flip": "invgraphics.metrics.perceptual:FLIP",
     "lpips": "invgraphics.metrics.perceptual:LPIPS",
+    "psnr_exposed": "invgraphics.metrics.exposure:PSNR_EXPOSED",
     "depth_abs_rel": "invgraphics.metrics.geometry:DEPTH_ABS_REL",
     "depth_rmse": "invgraphics.metrics.geometry:DEPTH_RMSE",
     "depth_abs_rel_smooth": "invgraphics.metrics.geometry:DEPTH_ABS_REL_SMOOTH",

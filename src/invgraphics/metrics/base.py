@@ -16,6 +16,10 @@ class Skip(Exception):  # noqa: N818 - an outcome, not an error
     """Raised where a metric does not apply to a view; the message is the reason in ``skipped``."""
 
 
+class Inapplicable(Skip):
+    """Raised by a metric that is not about such data at all: it is then left out of scores and of ``skipped``."""
+
+
 @dataclass(frozen=True, eq=False)
 class Pair:
     """A prediction and the truth of one view, prepared by a protocol: display colours, background applied, cropped.

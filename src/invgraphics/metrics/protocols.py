@@ -14,7 +14,7 @@ from invgraphics import plugins
 from invgraphics.core import Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.errors import InputError, did_you_mean
-from invgraphics.metrics.base import Metric, Pair, Skip
+from invgraphics.metrics.base import Inapplicable, Metric, Pair, Skip
 from invgraphics.metrics.conventions import PROTOCOLS, Lpips, Measure, Protocol, Psnr, Rounding, Ssim
 from invgraphics.metrics.image import psnr, ssim
 from invgraphics.metrics.perceptual import lpips
@@ -158,6 +158,8 @@ def score(rendering: Rendering, view: View, scene: Scene, protocol: Protocol, on
     for name in wanted:
         try:
             values[name] = _registered(name, pair) if protocol.measures is None else measure(protocol.measures[name], pair)
+        except Inapplicable:
+            continue
         except Skip as reason:
             skipped[name] = str(reason)
     return ViewScore(view.name, values, skipped)

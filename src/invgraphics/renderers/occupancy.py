@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,14 +14,14 @@ from typing_extensions import override
 
 from invgraphics import kernels
 from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
-from invgraphics.core.fused import FusedLattice
-from invgraphics.core.ngp import FusedNGP
 from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import March, MarchSteps
+from invgraphics.renderers.fused_kernels import fused_kernel
 from invgraphics.renderers.samplers import check_samples, uniform
 from invgraphics.renderers.termination import joined, visible_samples
-from invgraphics.renderers.visibility import visible_cells
+from invgraphics.renderers.visibility import cells_near_points, visible_cells
 
+Cells = Bool[Tensor, "r r r"]
 LATE_STEPS_START = 0.5
 """Progress of a fit at which its late steps begin to replace the usual ones."""
 
@@ -51,6 +50,8 @@ class OccupancyConfig:
         threshold: least optical depth of a step that counts as occupied; the grid's mean, where that is smaller.
         warmup: training steps during which a refresh looks at all cells.
         every: training steps between two refreshes.
+        points_until: progress of a fit until which only cells within ``point_cells`` cells of one of the scene's points, where
+            it has some, are sampled: a start from points for fields without primitives.
         cells: cells that a refresh looks at after warm-up, half of them drawn from the occupied ones.
         stop: when to leave out samples behind opaque surfaces, at the price of a density look-up.
         transmittance: a ray stops when less than this is left of its light.
@@ -69,13 +70,15 @@ class OccupancyConfig:
     threshold: float = 0.01
     warmup: int = 256
     every: int = 16
+    points_until: float = 0.0
+    point_cells: int = 3
     cells: int = 1 << 17
     stop: Literal["always", "evaluation", "never"] = "always"
     transmittance: float = 1e-3
     chunk: int = 16
 
     def __post_init__(self) -> None:
-        for key in ("resolution", "every", "cells"):
+        for key in ("resolution", "every", "cells", "point_cells"):
             if getattr(self, key) < 1:
                 raise ValueError(f"{key} must be at least 1, not {getattr(self, key)}")
         for key in ("steps_per_diagonal", "evaluation_steps", "early_steps", "late_steps", "chunk"):
@@ -85,6 +88,8 @@ class OccupancyConfig:
             raise ValueError(f"early_decay must be in [0, 1), not {self.early_decay}")
         if not 0 <= self.decay <= 1 or not 0 <= self.transmittance < 1:
             raise ValueError(f"decay must be in [0, 1] and transmittance in [0, 1), not {self.decay} and {self.transmittance}")
+        if not 0 <= self.points_until <= 1:
+            raise ValueError(f"points_until must be in [0, 1], not {self.points_until}")
         if min(self.threshold, self.warmup, self.grace, self.cone or 0) < 0:
             raise ValueError("threshold, warmup, grace and cone must not be negative")
 
@@ -109,17 +114,16 @@ class OccupancyConfig:
         """Number of march steps across the bounds' diagonal in training, at a progress of the fit in [0, 1]."""
         usual = self.steps_per_diagonal
         early, late = self.early_steps or usual, self.late_steps or usual
-        return (
-            early
-            * (usual / early) ** min(1.0, 4 * progress)
-            * (late / usual) ** max(0.0, (progress - LATE_STEPS_START) / (1 - LATE_STEPS_START))
-        )
+        share = max(0.0, (progress - LATE_STEPS_START) / (1 - LATE_STEPS_START))
+        return early * (usual / early) ** min(1.0, 4 * progress) * (late / usual) ** share
 
     def build(self, scene: Scene) -> Occupancy:
         """Build the sampler with every cell occupied, in unbounded space only cells visible in a training view."""
-        endless = scene.bounds.space == "contracted" and len(scene.train) > 0
-        cameras = [view.camera for view in scene.train]
-        return Occupancy(self, scene.bounds, visible_cells(scene.bounds, self.resolution, cameras) if endless else None)
+        cameras = [view.camera for view in scene.train] if scene.bounds.space == "contracted" else []
+        visible = visible_cells(scene.bounds, self.resolution, cameras) if cameras else None
+        points = scene.points.position if scene.points is not None and self.points_until > 0 else None
+        near = None if points is None else cells_near_points(scene.bounds, self.resolution, points, self.point_cells)
+        return Occupancy(self, scene.bounds, visible, near)
 
 
 class Occupancy(Sampler):
@@ -129,21 +133,27 @@ class Occupancy(Sampler):
         ema: fading maximum of the optical depth that one step has in each cell.
         occupied: cells worth a sample.
         visible: cells that may be; ``None`` for all. Not part of the state: it follows from the scene.
+        near_points: those that may be early in a fit, likewise.
         step: number of calls of `update` so far.
     """
 
     ema: Float[Tensor, "r r r"]
-    occupied: Bool[Tensor, "r r r"]
-    visible: Bool[Tensor, "r r r"] | None
+    occupied: Cells
+    visible: Cells | None
+    near_points: Cells | None
     step: Int[Tensor, ""]
 
-    def __init__(self, config: OccupancyConfig, bounds: Bounds, visible: Bool[Tensor, "r r r"] | None = None) -> None:
+    def __init__(
+        self, config: OccupancyConfig, bounds: Bounds, visible: Cells | None = None, near_points: Cells | None = None
+    ) -> None:
         super().__init__()
         self.config = config
         shape = (config.resolution,) * 3
         self.register_buffer("ema", torch.zeros(shape))
         self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool) if visible is None else visible.clone())
         self.register_buffer("visible", visible, persistent=False)
+        self.register_buffer("near_points", near_points, persistent=False)
+        self._leave_out(near_points)
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
         self.contracted = bounds.space == "contracted" and config.cone is None
         self.cone = config.cone or 0.0
@@ -180,7 +190,7 @@ class Occupancy(Sampler):
         """March with early termination by a fused kernel, where it supports the field and these steps; else ``None``."""
         parts, steps = field.fused(ctx.bounds), self.steps(ctx)
         even = ctx.bounds.space == "box" or steps.contracted
-        march = _compiled("march", parts) if even and steps.cone == 0 else None
+        march = fused_kernel("march", parts) if even and steps.cone == 0 else None
         if march is None:
             return None
         start = self._start(rays, steps, ctx)
@@ -193,7 +203,7 @@ class Occupancy(Sampler):
     ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]] | None:
         """See `Sampler.composite_fused`; fields that hand out the parameters of a hash grid or of lattices have a kernel."""
         parts = field.fused(ctx.bounds)
-        render = None if self.config.stop == "never" else _compiled("render", parts)
+        render = None if self.config.stop == "never" else fused_kernel("render", parts)
         if render is None:
             return None
         limits = self.config.transmittance, max_error
@@ -233,11 +243,9 @@ class Occupancy(Sampler):
         if step == 0:
             self._leave_out(field.support(ctx.bounds, self.config.resolution))
         if step >= self.config.grace and step % self.config.every == 0:
-            cells = self._all_cells() if step < self.config.warmup else self._sampled_cells(ctx)
+            everywhere = step < self.config.warmup
+            cells = torch.arange(self.ema.numel(), device=self.ema.device) if everywhere else self._sampled_cells(ctx)
             self._refresh(cells, field, ctx)
-
-    def _all_cells(self) -> Int[Tensor, " k"]:
-        return torch.arange(self.ema.numel(), device=self.ema.device)
 
     def _sampled_cells(self, ctx: Context) -> Int[Tensor, " k"]:
         """Draw flat cell indices with replacement: half uniform, half from occupied cells."""
@@ -267,8 +275,10 @@ class Occupancy(Sampler):
         self.occupied.copy_(self.ema >= min(self.config.threshold, mean))
         self._leave_out(self.visible)
         self._leave_out(support)
+        if ctx.progress < self.config.points_until:
+            self._leave_out(self.near_points)
 
-    def _leave_out(self, possible: Bool[Tensor, "r r r"] | None) -> None:
+    def _leave_out(self, possible: Cells | None) -> None:
         """Keep only ``possible`` cells occupied; all, where that is ``None``."""
         if possible is not None:
             self.occupied &= possible
@@ -288,13 +298,3 @@ class Occupancy(Sampler):
             return field.density_no_grad(Samples.at(position)) * steps.step / ctx.bounds.radial_scale(position)
         distance = (position - ctx.bounds.centre).norm(dim=1)
         return field.density_no_grad(Samples.at(position)) * (steps.cone * distance).clamp_min(steps.step)
-
-
-def _compiled(operation: Literal["march", "render"], parts: FusedNGP | FusedLattice | None) -> Callable[..., Any] | None:
-    """The fused kernel for a field's parameters; ``None`` where only the reference supports them."""
-    if parts is None:
-        return None
-    lattices = isinstance(parts, FusedLattice)
-    name = f"{'lattice' if lattices else 'ngp'}_{operation}"
-    like = parts.geometry.lattices[0].features if lattices else parts.table
-    return getattr(kernels, name) if kernels.compiled(name, like) else None

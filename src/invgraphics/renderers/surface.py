@@ -9,12 +9,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
+from typing_extensions import override
 
 from invgraphics import kernels
 from invgraphics.core import (
     Bounds,
     Camera,
     Context,
+    Contributions,
     Field,
     Mesh,
     Quantity,
@@ -26,6 +28,7 @@ from invgraphics.core import (
     Trace,
     harmonics,
 )
+from invgraphics.core.contributions import opacities
 from invgraphics.core.mesh import face_normals
 from invgraphics.errors import NotComposableError
 from invgraphics.kernels.reference.mesh import hit
@@ -89,13 +92,25 @@ class Surface(Renderer):
         strips = [self._strip(field, mesh, _rows(fine, top, rows), ctx) for top in range(0, fine.height, rows)]
         return _joined(strips, camera), Trace(rays=fine.width * fine.height)
 
+    @override
+    @torch.no_grad()
+    def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
+        """The hits of the pixel's rays, nearest first, equal shares of its light; see `Renderer.contributions`."""
+        patch = _pixel(camera, pixel, self.config.supersampling)
+        mesh, fragments = _hits(field.primitives(Quantity.MESH, ctx), patch, patch.rays(), ctx.bounds)
+        colours = kernels.mesh_interpolate(fragments, mesh.faces, self._colours(field, mesh, patch, ctx)).reshape(-1, 3)
+        depth = fragments.depth.reshape(-1)
+        order = depth.argsort(stable=True)[: int(depth.isfinite().sum())]
+        t = depth[order]
+        weight = torch.full_like(t, 1 / len(depth))
+        alpha, reached = opacities(weight)
+        counted = torch.ones_like(order, dtype=torch.bool)
+        return Contributions("surface points", t, t, t, alpha, reached[:-1], weight, colours[order], counted)
+
     def _strip(self, field: Field, mesh: Mesh, camera: Camera, ctx: Context) -> Rendering:
         """Render some rows, averaged over each pixel's rays."""
         rays = camera.rays()
-        fragments = kernels.mesh_rasterise(
-            mesh.vertices.detach(), mesh.faces, _detached(camera), _interval(rays, ctx.bounds, camera)
-        )
-        mesh, fragments = visible_part(mesh, fragments)
+        mesh, fragments = _hits(mesh, camera, rays, ctx.bounds)
         if torch.is_grad_enabled() and (mesh.vertices.requires_grad or rays.directions.requires_grad):
             fragments = differentiable(fragments, mesh, rays)
         features = [self._colours(field, mesh, camera, ctx)]
@@ -139,6 +154,12 @@ class Surface(Renderer):
             normal = torch.where(normal.norm(dim=-1, keepdim=True) > 1e-6, normal, -directions)
         far = torch.full_like(alpha, torch.inf)
         return to_rendering(mean(fine.rgb), alpha, distance, normal, far, directions)
+
+
+def _hits(mesh: Mesh, camera: Camera, rays: Rays, bounds: Bounds) -> tuple[Mesh, Fragments]:
+    """The triangles that the camera sees within the bounds, and where its rays meet them."""
+    interval = _interval(rays, bounds, camera)
+    return visible_part(mesh, kernels.mesh_rasterise(mesh.vertices.detach(), mesh.faces, _detached(camera), interval))
 
 
 def visible_part(mesh: Mesh, fragments: Fragments) -> tuple[Mesh, Fragments]:
@@ -187,6 +208,13 @@ def _interval(rays: Rays, bounds: Bounds, camera: Camera) -> tuple[Float[Tensor,
 def _rows(camera: Camera, top: int, count: int) -> Camera:
     """The camera of some rows of a picture."""
     return replace(camera, centre=camera.centre - camera.centre.new_tensor([0, top]), height=min(count, camera.height - top))
+
+
+def _pixel(camera: Camera, pixel: tuple[int, int], supersampling: int) -> Camera:
+    """The camera of one pixel's rays."""
+    fine = camera.resized(supersampling * camera.width, supersampling * camera.height)
+    corner = fine.centre.new_tensor(pixel) * supersampling
+    return replace(fine, centre=fine.centre - corner, width=supersampling, height=supersampling)
 
 
 def _detached(camera: Camera) -> Camera:

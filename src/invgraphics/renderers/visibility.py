@@ -1,11 +1,11 @@
-"""Visibility of unit-cube cells in the training views; no other cell can be trained (Instant-NGP's untrained cells)."""
+"""Masks of unit-cube cells: visible in a training view, which no untrained cell is (Instant-NGP), or near known points."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from invgraphics.core import Bounds, Camera
@@ -36,3 +36,14 @@ def _corners(bounds: Bounds, resolution: int, offset: float, cameras: Sequence[C
         inside = ((pixel >= -IMAGE_MARGIN * size) & (pixel <= (1 + IMAGE_MARGIN) * size)).all(dim=1)
         seen |= inside & (depth > 0) & ((position - at.position).norm(dim=1) >= bounds.near)
     return seen.view(count, count, count)
+
+
+@torch.no_grad()
+def cells_near_points(bounds: Bounds, resolution: int, points: Float[Tensor, "n 3"], reach: int) -> Bool[Tensor, "r r r"]:
+    """Mask of cells at most ``reach`` cells along each axis from a cell with a point in it."""
+    cell = (bounds.to_unit(points.to(bounds.lo)) * resolution).floor().long()
+    cell = cell[((cell >= 0) & (cell < resolution)).all(dim=1)]
+    hit = torch.zeros((resolution,) * 3, device=cell.device)
+    hit[tuple(cell.T)] = 1.0
+    width = 2 * reach + 1
+    return torch.nn.functional.max_pool3d(hit[None, None], width, stride=1, padding=reach)[0, 0] > 0

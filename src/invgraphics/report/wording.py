@@ -78,6 +78,7 @@ _NAMES: dict[str, tuple[str, int]] = {
     "ms_ssim": ("MS-SSIM", 3),
     "flip": ("FLIP", 3),
     "lpips": ("LPIPS", 3),
+    "psnr_exposed": ("PSNR, exposure fitted", 2),
     "depth_abs_rel": ("Depth abs-rel", 3),
     "depth_rmse": ("Depth RMSE", 3),
     "depth_abs_rel_smooth": ("Depth abs-rel off edges", 3),

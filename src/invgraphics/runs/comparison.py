@@ -59,6 +59,7 @@ class ComparisonRecord(Record):
         scene: its name.
         question: that the comparison answers, one sentence.
         methods: in the order of the report.
+        method_choice: why these methods, where the scene chose them; empty where they were asked for.
         summaries: method -> what it is, one line.
         cells: method -> titles of its field and of its renderer, the row and the column of the table of methods.
         refused: methods that a pattern named and that do not go with the scene.
@@ -87,6 +88,7 @@ class ComparisonRecord(Record):
     scene: str
     question: str = ""
     methods: tuple[str, ...]
+    method_choice: str = ""
     summaries: dict[str, str] = field(default_factory=dict)
     cells: dict[str, tuple[str, str]] = field(default_factory=dict)
     refused: tuple[Refusal, ...] = ()

@@ -121,7 +121,8 @@ class ExplanationRecord(Record):
         colour: the scene's colour space, ``srgb`` or ``linear``.
         background: of the scene, in that colour space.
         kind: of the contributions, in the plural: ``samples`` are intervals of a field; ``splats`` in the order of the picture;
-            ``Gaussians`` met along the ray; ``surface points``, one at most, where a ray is traced to a surface.
+            ``Gaussians`` met along the ray; ``surface points``, one at most, where a ray is traced to a surface;
+            of a mesh, those of all rays of the pixel.
         length_unit: of all distances and densities: ``world``, the data set's; ``local`` in older files, which lack the key.
         near: where the ray enters the scene's bounds.
         far: where it leaves them.

@@ -112,6 +112,7 @@ class Provenance(Record):
         options: how the scene was opened.
         device: that computed.
         test_poses: how test poses are found; empty where they are taken as given.
+        test_exposure: under which exposure test views are shown; empty where exposures are not fitted.
         memory_forecast_bytes: memory that the fit was expected to hold at most; written after its first step.
         threads: of the process; written after the fit.
         load_average: of the machine; written after the fit.
@@ -148,6 +149,7 @@ class Provenance(Record):
     options: Options
     device: str
     test_poses: str = ""
+    test_exposure: str = ""
     memory_forecast_bytes: int | None = None
     threads: int | None = None
     load_average: LoadAverage | None = None

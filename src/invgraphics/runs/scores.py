@@ -86,6 +86,7 @@ class Scores(Record):
         disturbed: why the times say nothing, the subject left out; empty where they do.
         below_baseline: why the method may have lost to the mean training image, and what to try; empty where it has not.
         test_poses: how test poses were found; empty where they were taken as given.
+        test_exposure: under which exposure test views were shown; empty where exposures are not fitted.
         rescored: whether saved pictures were scored, rather than the model.
         conventions: of a rescoring: everything that the protocol states.
         truth: of a rescoring.
@@ -105,6 +106,7 @@ class Scores(Record):
     disturbed: str = ""
     below_baseline: str = ""
     test_poses: str = ""
+    test_exposure: str = ""
     rescored: bool = False
     conventions: dict[str, Any] = field(default_factory=dict)
     truth: ScoredTruth | None = None

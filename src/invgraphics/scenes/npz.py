@@ -13,6 +13,9 @@ normal         (n, h, w, 3), optional         unit normals, world frame, facing 
 points         (m, 3), optional               known surface points, world frame
 points_rgb     (m, 3), optional               their colours, as ``images``; default: grey
 test           (n,) booleans, optional        which views are scored; default: every 8th
+val            (n,) booleans, optional        which views are only looked at during a fit
+subject        (n,) integers, optional        of a class of objects: which one each view shows; scored ones are unseen
+observed       (n,) booleans, optional        of a class: views from which the unseen instances are inferred
 bounds         (2, 3), optional               lowest and highest corner of a box that holds all there is; default: unbounded
 ============== ============================== =====================================================================
 """
@@ -58,16 +61,15 @@ class Npz:
         n, height, width = arrays["images"].shape[:3]
         poses = torch.stack([_pose(path, arrays, i) for i in range(n)])
         frame = _frame(arrays, poses, path)
-        held_out = _held_out(arrays, n, path)
-        train, test = np.flatnonzero(~held_out).tolist(), np.flatnonzero(held_out).tolist()
+        train, val, test, observed = _splits(arrays, n, path)
         if not train or not test:
             raise InputError(f"{path} has {len(train)} views to fit and {len(test)} to score; it needs at least one of each.")
         final = wanted_size(width, height, options.size)
-        chosen = (evenly(train, options.train_views), evenly(test, options.test_views))
+        chosen = (evenly(train, options.train_views), val, evenly(test, options.test_views), observed)
         notes = {
             "loader": "npz",
             "train_views": f"{len(chosen[0])} of {len(train)}, evenly spaced",
-            "test_views": f"{len(chosen[1])} of {len(test)}, evenly spaced",
+            "test_views": f"{len(chosen[2])} of {len(test)}, evenly spaced",
             "resize": "none" if final == (width, height) else f"{RESIZE}, {width}x{height} to {final[0]}x{final[1]}",
         }
         if final != (width, height) and ("depth" in arrays or "normal" in arrays):
@@ -76,7 +78,9 @@ class Npz:
         return Scene(
             name=path.stem,
             train=tuple(views[i] for i in chosen[0]),
-            test=tuple(views[i] for i in chosen[1]),
+            val=tuple(views[i] for i in val),
+            test=tuple(views[i] for i in chosen[2]),
+            observed=tuple(views[i] for i in observed),
             background=torch.full((3,), float(any(view.alpha is not None for view in views.values()))),
             bounds=frame.bounds,
             points=local_points(frame),
@@ -104,6 +108,9 @@ def _read(path: Path) -> Arrays:
         "normal": [(n, h, w, 3)],
         "bounds": [(2, 3)],
         "test": [(n,)],
+        "val": [(n,)],
+        "subject": [(n,)],
+        "observed": [(n,)],
     }
     known = (*_REQUIRED, *allowed, "points", "points_rgb")
     if unknown := [key for key in arrays if key not in known]:
@@ -142,12 +149,38 @@ def _frame(arrays: Arrays, poses: Float[Tensor, "n 4 4"], path: Path) -> Frame:
     return Frame(Bounds(lo, hi), points=points)
 
 
-def _held_out(arrays: Arrays, n: int, path: Path) -> np.ndarray:
-    if "test" not in arrays:
-        return np.arange(n) % HOLD_OUT == 0
-    if arrays["test"].dtype != np.bool_:
-        raise InputError(f"'test' of {path} holds {arrays['test'].dtype}, expected one boolean per view.")
-    return arrays["test"]
+def _splits(arrays: Arrays, n: int, path: Path) -> tuple[list[int], list[int], list[int], list[int]]:
+    """Views to fit, to look at, to score, and from which unseen instances are inferred.
+
+    Raises:
+        InputError: they overlap, or the subjects do not fit to them.
+    """
+    nowhere = np.zeros(n, bool)
+    val, observed = (_booleans(arrays, key, nowhere, path) for key in ("val", "observed"))
+    test = _booleans(arrays, "test", (np.arange(n) % HOLD_OUT == 0) & ~val & ~observed, path)
+    if (test & val | test & observed | val & observed).any():
+        raise InputError(f"{path} has views that are more than one of 'test', 'val' and 'observed'.")
+    train = ~(test | val | observed)
+    subject = arrays.get("subject")
+    if subject is None:
+        if observed.any():
+            raise InputError(f"{path} has 'observed' views, but no 'subject' says whom they show.")
+    elif subject.dtype.kind not in "iu":
+        raise InputError(f"'subject' of {path} holds {subject.dtype}, expected one whole number per view.")
+    elif np.isin(subject[test | observed], subject[train]).any():
+        raise InputError(f"{path} scores or observes instances that are trained on, too.", "Hold out whole instances.")
+    elif not np.isin(subject[test], subject[observed]).all():
+        raise InputError(f"{path} scores instances without any 'observed' view.", "Give each of them one.")
+    train_views, val_views, test_views, observed_views = (
+        np.flatnonzero(split).tolist() for split in (train, val, test, observed)
+    )
+    return train_views, val_views, test_views, observed_views
+
+
+def _booleans(arrays: Arrays, key: str, default: np.ndarray, path: Path) -> np.ndarray:
+    if key in arrays and arrays[key].dtype != np.bool_:
+        raise InputError(f"'{key}' of {path} holds {arrays[key].dtype}, expected one boolean per view.")
+    return arrays.get(key, default)
 
 
 def _view(path: Path, arrays: Arrays, i: int, frame: Frame, final: tuple[int, int]) -> View:
@@ -161,6 +194,10 @@ def _view(path: Path, arrays: Arrays, i: int, frame: Frame, final: tuple[int, in
     centre = centre[i] if centre.ndim == 2 else centre
     focal, centre = (torch.from_numpy(np.array(values, dtype=np.float64)) for values in (focal, centre))
     view = make_view(Camera(local, focal, centre, width, height), pixels, str(i), final)
+    if "subject" in arrays:
+        subject = int(arrays["subject"][i])
+        nth = int((arrays["subject"][:i] == subject).sum())
+        view = replace(view, subject=subject, name=f"{subject:04d}-{nth:02d}")
     if final != (width, height):
         return view
     depth, normal = arrays.get("depth"), arrays.get("normal")
@@ -190,7 +227,7 @@ def save_npz(scene: Scene, path: Path) -> None:
     """Write a scene as one ``.npz`` file that `Npz` reads as the same scene; points' colours are rounded to 8 bits.
 
     Raises:
-        InputError: it holds what the convention does not: no box, validation views, linear or unrounded colours, masks, another
+        InputError: it holds what the convention does not: no box, linear or unrounded colours, masks, another
             background, pictures of several sizes; the sentence says what. Nothing is written then.
     """
     if beyond := _unsupported_parts(scene):
@@ -198,19 +235,24 @@ def save_npz(scene: Scene, path: Path) -> None:
             f"The scene '{scene.name}' cannot be kept as a data set: it has {beyond}.",
             "Write it in a format that `load_scene` reads, and load it from there.",
         )
-    views = [*scene.train, *scene.test]
+    views = [*scene.train, *scene.val, *scene.test, *scene.observed]
+    ends = np.cumsum([len(split) for split in (scene.train, scene.val, scene.test, scene.observed)])
+    split = np.searchsorted(ends, np.arange(len(views)), side="right")
     arrays: dict[str, np.ndarray] = {
         "images": np.stack([view.image.cpu().numpy() for view in views]),
         "cam_to_world": np.stack([view.camera.cam_to_world.cpu().numpy() for view in views]),
         "focal": np.stack([view.camera.focal.cpu().numpy() for view in views]),
         "centre": np.stack([view.camera.centre.cpu().numpy() for view in views]),
-        "test": np.arange(len(views)) >= len(scene.train),
+        "test": split == 2,
         "bounds": torch.stack([scene.bounds.lo, scene.bounds.hi]).cpu().numpy(),
     }
     for key in ("alpha", "depth", "normal"):
         values = [getattr(view, key) for view in views]
         if all(value is not None for value in values):
             arrays[key] = np.stack([value.cpu().numpy() for value in values])
+    arrays |= {"val": split == 1} if scene.val else {}
+    if scene.is_class:
+        arrays |= {"subject": np.array([view.subject for view in views]), "observed": split == 3}
     if scene.points is not None:
         arrays |= {"points": scene.points.position.cpu().numpy(), "points_rgb": scene.points.rgb.clamp(0, 1).cpu().numpy()}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -219,11 +261,10 @@ def save_npz(scene: Scene, path: Path) -> None:
 
 def _unsupported_parts(scene: Scene) -> str:
     """List what a scene has that the format cannot store, in words; empty for nothing."""
-    views = [*scene.train, *scene.test]
+    views = [*scene.train, *scene.val, *scene.test, *scene.observed]
     cameras = [view.camera for view in views]
     mixed = [key for key in ("alpha", "depth", "normal") if len({getattr(view, key) is None for view in views}) > 1]
     found = {
-        "validation views": bool(scene.val),
         "no box around it": scene.bounds.space != "box",
         "a near distance of its own": scene.bounds.near != Bounds.near,
         "a frame of its own": not torch.equal(scene.world_from_local, torch.eye(4)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 from weakref import WeakKeyDictionary
@@ -84,6 +84,8 @@ def open_scene(
     """
     options = options or SceneOptions()
     scene = validate(_load(spec, options, progress))
+    if words := _bounds_words(scene):
+        scene = replace(scene, notes=scene.notes | {"bounds": words})
     _SOURCES[scene] = SceneSource(spec, options)
     return scene
 
@@ -152,12 +154,18 @@ def selection_notes(scene: Scene) -> str:
 
 def space_note(scene: Scene) -> str:
     """Describe the bounds that were chosen for a scene without end, on a line; empty for a scene in a box."""
+    words = _bounds_words(scene)
+    return f"\n  space: {words}" if words else ""
+
+
+def _bounds_words(scene: Scene) -> str:
+    """Describe the bounds of a scene without end and what they were chosen from; empty for a scene in a box."""
     if scene.bounds.space == "box":
         return ""
     half, near = float(scene.bounds.half.max()), scene.bounds.near
     source = f"three quarters of {len(scene.points):,} known points" if scene.points else "the cameras: no points are known"
     return (
-        f"\n  space: endless, contracted around a box of half-edge {half:.2g} (from {source}); no sample nearer than {near:.2g}"
+        f"endless, contracted around a box of half-edge {half:.2g} (from {source}); no sample nearer than {near:.2g}"
         " to a camera, where the farthest camera is at 1"
     )
 
@@ -181,15 +189,15 @@ def _render(description: str, options: SceneOptions, progress: Callable[[int, in
     from invgraphics.scenes.mitsuba import make
     from invgraphics.scenes.mitsuba.spec import description_path, read
 
-    size = options.size
+    size, spec = options.size, read(description_path(description))
     if isinstance(size, int):
-        width, height = read(description_path(description)).size
+        width, height = spec.size
         size = (round(size * width / max(width, height)), round(size * height / max(width, height)))
     return make(
         description,
         size=size,
-        train=options.train_views,
-        test=options.test_views,
+        train=None if spec.instances else options.train_views,  # of a class, every instance has its own number of views
+        test=None if spec.instances else options.test_views,
         spp=options.spp,
         seed=options.seed,
         progress=progress,
@@ -208,12 +216,12 @@ def validate(scene: Scene) -> Scene:
             raise InputError(
                 f"The scene '{scene.name}' has no {split} views.", "At least one to fit and one to score is needed."
             )
-    for split in ("train", "val", "test"):
+    for split in ("train", "val", "test", "observed"):
         for view in getattr(scene, split):
             _validate_view(view, f"{split} view '{view.name}' of '{scene.name}'")
     check_scene(scene)
     tested = torch.stack([_flat(view) for view in scene.test])
-    for split in ("train", "val"):
+    for split in ("train", "val", "observed"):
         for view in getattr(scene, split):
             same = ((tested - _flat(view)).abs().amax(dim=1) < _SAME_POSE).nonzero()
             if len(same):

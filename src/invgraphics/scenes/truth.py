@@ -17,6 +17,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, Photo, load_view
 from invgraphics.scenes.layout import SceneOptions, evenly, pose
 from invgraphics.scenes.mitsuba import cache, ply
+from invgraphics.scenes.npz import Npz
 
 LINEAR_RESIZE = "area average of linear light"
 """The filter from a larger rendering to the folder's pictures, see `invgraphics.scenes.mitsuba.average`."""
@@ -46,7 +47,7 @@ class Truth:
         if truth is None:
             raise InputError(f"{path} is not a whole rendered scene: truth.json or a file it lists is damaged.", _DAMAGED)
         try:
-            return self._scene(path, truth, options)
+            return _class_scene(path, truth, options) if cache.INSTANCES in truth else self._scene(path, truth, options)
         except (AttributeError, IndexError, KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError) as error:
             raise InputError(f"{path} is damaged: {type(error).__name__} {error}.", _DAMAGED) from error
 
@@ -74,6 +75,17 @@ class Truth:
             noise_ceiling=truth["noise_ceiling"],
             notes=_notes(truth, views["train"][0]) | ({"points": POINTS} if points is not None else {}),
         )
+
+
+def _class_scene(path: Path, truth: Mapping[str, Any], options: SceneOptions) -> Scene:
+    """The scene of a class of objects: its data set, under the name and with the notes of its description."""
+    scene = Npz().load(path / cache.VIEWS, options)
+    count = truth[cache.INSTANCES]
+    notes = _notes(truth, scene.train[0]) | {
+        key: scene.notes[key] for key in ("train_views", "test_views", "geometry") if key in scene.notes
+    }
+    notes["instances"] = f"{count['train']} to fit, {count['unseen']} unseen with {count['observed']} observed views each"
+    return replace(scene, name=truth["name"], noise_ceiling=truth["noise_ceiling"], notes=notes)
 
 
 def _view(path: Path, split: str, index: int, table: Mapping[str, Any], options: SceneOptions) -> View:

@@ -31,9 +31,9 @@ def read_truth(path: Path, scene: Scene) -> View:
         image = srgb_to_linear(image.float() / 255)
     if has_transparency(pixels):
         alpha = torch.from_numpy(pixels[..., 3].copy())
-    maps = {key: torch.from_numpy(arrays[key]).float() for key in ("depth", "normal") if key in arrays}
+    depth, normal = (torch.from_numpy(arrays[key]).float() if key in arrays else None for key in ("depth", "normal"))
     mask = torch.from_numpy(arrays["mask"]) if "mask" in arrays else None
-    return View(_any_camera(image), image, path.stem, alpha, **maps, mask=mask)
+    return View(_any_camera(image), image, path.stem, alpha, depth, normal, mask)
 
 
 def is_baked(truth: Path) -> bool:

@@ -24,6 +24,7 @@ PENALTIES = {
     "sparsity": "invgraphics.training.penalties:SparsityPenalty",
     "curvature": "invgraphics.training.eikonal:CurvaturePenalty",
     "eikonal": "invgraphics.training.eikonal:EikonalPenalty",
+    "code": "invgraphics.training.codes.penalty:CodePenalty",
     "confidence": "invgraphics.training.points.control:ConfidencePenalty",
 }
 

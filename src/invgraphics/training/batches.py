@@ -23,6 +23,8 @@ class BatchConfig:
         samples: target number of samples per step: the ray count follows what is kept (Instant-NGP); 0 keeps ``rays``.
         resolution: image scale of each phase of the fit; the last should be 1.
         until: progress at which each phase but the last ends; one fewer than ``resolution``.
+        foreground: share of the rays that are drawn among the pixels with alpha, where a view has such: what is small in
+            its pictures is otherwise learnt from few rays.
         opaque: whether opaque photographs of an unbounded scene are fitted over a random background too: every ray must then
             end at a surface, and dark surfaces cannot be learnt as empty space.
     """
@@ -33,6 +35,7 @@ class BatchConfig:
     resolution: tuple[float, ...] = (1.0,)
     until: tuple[float, ...] = ()
     opaque: bool = False
+    foreground: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rays < 1 or self.views < 1 or self.samples < 0:
@@ -41,6 +44,8 @@ class BatchConfig:
             raise ValueError("'until' must hold one rising progress value fewer than 'resolution' has entries.")
         if not all(0 < scale <= 1 for scale in self.resolution):
             raise ValueError("'resolution' must hold scales in (0, 1].")
+        if not 0 <= self.foreground <= 1:
+            raise ValueError(f"'foreground' must be in [0, 1], not {self.foreground}.")
 
     def scale_at(self, progress: float) -> float:
         """Image scale at a point of the fit."""
@@ -113,7 +118,15 @@ class Batches:
         return rays.to(self._device), batch.to(self._device)
 
     def _pixels_of(self, view: View, count: int) -> Tensor:
-        """Flat indices of random pixels within the view's mask."""
+        """Flat indices of random pixels within the view's mask, a share of them where it has alpha."""
+        if self._config.foreground > 0 and view.alpha is not None:
+            solid = torch.nonzero((view.alpha > 0 if view.mask is None else (view.alpha > 0) & view.mask).reshape(-1))[:, 0]
+            inside = round(self._config.foreground * count) if len(solid) else 0
+            chosen = solid[torch.randint(max(len(solid), 1), (inside,), generator=self._generator)]
+            return torch.cat([chosen, self._anywhere(view, count - inside)])
+        return self._anywhere(view, count)
+
+    def _anywhere(self, view: View, count: int) -> Tensor:
         if view.mask is None:
             return torch.randint(view.camera.width * view.camera.height, (count,), generator=self._generator)
         valid = view.mask.reshape(-1).nonzero()[:, 0]

@@ -25,6 +25,7 @@ from invgraphics.training.losses import Loss
 from invgraphics.training.optimiser import Optimiser, OptimiserConfig
 from invgraphics.training.penalties import Penalty, check_penalty
 from invgraphics.training.poses import Poses, coarse_to_fine_encodings
+from invgraphics.training.views.exposure import Exposures
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Plan:
         device: where tensors live.
         poses: of the training cameras, where they are fitted too.
         penalties: of field and renderer alone.
+        exposures: of the training views, where they are fitted too.
     """
 
     model: Model
@@ -56,11 +58,13 @@ class Plan:
     device: torch.device = default(default_factory=lambda: torch.device("cpu"))
     poses: Poses | None = None
     penalties: Sequence[Penalty] = ()
+    exposures: Exposures | None = None
 
     @property
     def modules(self) -> dict[str, nn.Module]:
         """Modules with parameters, by the prefixes of the parameters' names."""
-        return self.model.parts | ({} if self.poses is None else {"poses": self.poses})
+        own = {"poses": self.poses, "exposure": self.exposures}
+        return self.model.parts | {name: module for name, module in own.items() if module is not None}
 
 
 class Fit:
@@ -153,14 +157,18 @@ class Fit:
                 encoding.window_alpha.fill_(self.plan.poses.config.alpha(progress))
 
     def _render(self, ctx: Context) -> tuple[Rendering, Trace, Batch]:
-        renderer, fitted = self.plan.model.renderer, self.plan.model.field
+        renderer, fitted, exposures = self.plan.model.renderer, self.plan.model.field, self.plan.exposures
         if isinstance(renderer, RayRenderer):
             rays, batch = self._batches.rays(ctx.progress)
+            views = rays.view
             rendering, trace = renderer.render_rays(fitted, rays, ctx)
             self._batches.observe(len(rays), 0 if trace.samples is None else len(trace.samples))
         else:
             camera, batch = self._batches.image(ctx.progress)
+            views = batch.view
             rendering, trace = renderer.render_image(fitted, camera, ctx)
+        if exposures is not None:
+            rendering, trace = exposures.expose(rendering, trace, views)
         return rendering, trace, batch
 
     def _first_not_finite(self, rendering: Rendering, terms: Tensor) -> str:

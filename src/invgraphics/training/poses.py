@@ -19,6 +19,7 @@ from invgraphics.core.transforms import se3_exp
 from invgraphics.fields.encodings.window import Windowed
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
+from invgraphics.training.views.exposure import ExposureConfig
 
 
 @dataclass(frozen=True)
@@ -104,13 +105,15 @@ class PosesConfig:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Options for optimising camera poses along with the scene.
+    """Options for optimising camera poses and exposures along with the scene.
 
     Attributes:
         poses: the training cameras' poses; ``None`` takes them as they are given.
+        exposure: an exposure of each training view; ``None`` takes all photographs as equally exposed.
     """
 
     poses: PosesConfig | None = None
+    exposure: ExposureConfig | None = None
 
 
 class Poses(nn.Module):

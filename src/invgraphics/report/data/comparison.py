@@ -39,6 +39,7 @@ class Comparison:
         cells: method -> titles of its field and of its renderer.
         refused: methods that were left out, because they do not go with the scene.
         shown: methods that get pictures and curves; empty for all.
+        method_choice: why these methods, where the scene chose them; empty where they were asked for.
     """
 
     scene: str
@@ -60,6 +61,7 @@ class Comparison:
     cells: dict[str, tuple[str, str]] = field(default_factory=dict)
     refused: tuple[Refusal, ...] = ()
     shown: tuple[str, ...] = ()
+    method_choice: str = ""
 
     @property
     def drawn_methods(self) -> tuple[tuple[int, str], ...]:
@@ -108,6 +110,7 @@ def read_comparison(folder: Path) -> Comparison:
         wall_seconds=record.wall_seconds,
         cells=record.cells,
         refused=record.refused,
+        method_choice=record.method_choice,
     )
 
 

@@ -52,7 +52,7 @@ class Cell:
 
 def protocol_facts(comparison: Comparison) -> Facts:
     """(name, value) facts of scoring: budget, picture size, views, seeds, presets and protocol settings."""
-    facts: dict[str, str] = {}
+    facts: dict[str, str] = {"methods": comparison.method_choice} if comparison.method_choice else {}
     if comparison.budget:
         facts["budget per fit"] = f"{budget_words(comparison.budget)} of optimisation"
     if comparison.size:
@@ -179,6 +179,7 @@ def _run_facts(run: Run) -> dict[str, str]:
         "code version": known.code_version,
         "budget": known.budget,
         "test poses": known.test_poses,
+        "test exposure": known.test_exposure,
         "load average": _text(plain(known.load_average)),
     }
     for key, value in run.environment.facts().items():

@@ -14,9 +14,10 @@ from invgraphics.report.data.variants import base_words
 from invgraphics.report.figures.analyses import AnalysisPart
 from invgraphics.report.figures.style import Figure
 from invgraphics.report.pages import facts
+from invgraphics.report.pages.across import across_scenes
 from invgraphics.report.pages.comparison import markdown_commands, markdown_figures, markdown_part, render
 from invgraphics.report.pages.parts import Contrasts, Part
-from invgraphics.report.pages.tables import escape_markdown, markdown_effects
+from invgraphics.report.pages.tables import escape_markdown, markdown_across, markdown_effects
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.intervals import CONFIDENCE, POWER
 from invgraphics.report.statistics.predictions import PREDICTION_HEADS, JudgedPrediction, predictions_sentence
@@ -93,6 +94,7 @@ def write_study_html(page: StudyPage, folder: Folder) -> None:
         "environment": study.environment,
         "facts_of_study": study_facts(study),
         "matrix": _matrix(page, folder),
+        "across": across_scenes(study, page.quantity),
         "failures": [(index, cell) for index, cell in enumerate(study.cells) if cell.status == "failed"],
         "design": design_words(study),
         "machine": facts.plain_facts(study.environment.facts()),
@@ -204,6 +206,15 @@ def write_study_markdown(page: StudyPage, folder: Folder) -> None:
         lines += ["", "## Predictions", "", *(f"| {' | '.join(map(text, row))} |" for row in rows)]
     if page.contrasts.tables:
         lines += ["", "## Effects", "", markdown_effects(page.contrasts.first)]
+    if across := across_scenes(study, page.quantity):
+        lines += [
+            "",
+            "## Across scenes",
+            "",
+            f"{text(across.quantity.heading)}, mean over seeds.",
+            "",
+            *markdown_across(across),
+        ]
     for part in page.parts:
         lines += ["", f"## Scene {text(part.comparison.scene)}", "", *markdown_part(part)]
     if page.analyses:

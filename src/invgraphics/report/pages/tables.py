@@ -7,6 +7,7 @@ from pathlib import Path
 
 from invgraphics.files import write_text
 from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.pages.across import AcrossScenes
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.summary import Cell, Row, Summary
 from invgraphics.report.wording import Quantity, budget_words
@@ -139,6 +140,18 @@ def markdown_effects(effects: list[Effect]) -> str:
         cells[2] = f"**{cells[2]}**" if effect.found else cells[2]
         lines.append(_line(cells))
     return "\n".join(lines) + "\n"
+
+
+def markdown_across(table: AcrossScenes) -> list[str]:
+    """A table across scenes as lines of Markdown."""
+    lines = [
+        _line(["Variant", *map(escape_markdown, table.scenes), "mean"]),
+        _line(["---", *["---:"] * (len(table.scenes) + 1)]),
+    ]
+    for row in table.rows:
+        name = f"{row.variant} ({row.refused})" if row.refused else row.variant
+        lines.append(_line([escape_markdown(name), *map(table.text, row.values), table.text(row.mean)]))
+    return lines
 
 
 def effects_caption(effects: list[Effect]) -> str:

@@ -150,6 +150,29 @@
     });
   }
 
+  // Tables that sort: a head orders the rows by its column, best first and then the other way; rows without a value come last.
+  for (const head of document.querySelectorAll("table.sortable th[data-better]")) {
+    const button = Object.assign(document.createElement("button"), { type: "button", className: "sort" });
+    button.append(...head.childNodes);
+    head.append(button);
+    button.addEventListener("click", () => {
+      const best = head.dataset.better === "higher" ? "descending" : "ascending";
+      const other = best === "descending" ? "ascending" : "descending";
+      const order = head.ariaSort === best ? other : best;
+      for (const one of head.parentElement.children) one.removeAttribute("aria-sort");
+      head.setAttribute("aria-sort", order);
+      const sign = order === "descending" ? -1 : 1;
+      const value = (row) => row.cells[head.cellIndex].dataset.value;
+      const body = head.closest("table").tBodies[0];
+      const rows = [...body.rows].sort((one, two) => {
+        const [a, b] = [value(one), value(two)];
+        if (a === undefined || b === undefined) return (a === undefined) - (b === undefined);
+        return sign * (a - b);
+      });
+      body.append(...rows);
+    });
+  }
+
   // On paper everything is open.
   addEventListener("beforeprint", () => {
     for (const details of document.querySelectorAll("details")) details.open = true;

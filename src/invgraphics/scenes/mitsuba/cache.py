@@ -18,6 +18,10 @@ VARIABLE = "INVGRAPHICS_CACHE"
 TRUTH = "truth.json"
 REQUEST = "job.json"
 SCHEMA = 1
+INSTANCES = "instances"
+"""Key of ``truth.json`` of a class of objects: its numbers of instances."""
+VIEWS = "views.npz"
+"""A class's views, in the format of `invgraphics.scenes.npz`."""
 AVERAGED_FROM = "averaged_from"
 """Key of ``truth.json``: size and samples of the larger rendering whose pictures were averaged."""
 

@@ -20,6 +20,7 @@ _SOURCES = (
     "scenes/mitsuba/rig.py", "scenes/mitsuba/stage.py", "scenes/mitsuba/gbuffer.py", "scenes/mitsuba/render.py",
     "scenes/mitsuba/folder.py", "core/camera.py", "core/transforms.py", "core/colour.py",
 )  # fmt: skip
+_CLASS_SOURCES = (*_SOURCES, "scenes/mitsuba/instances.py")
 _BUILD = "scenes/mitsuba/build"
 _IMPORTED = re.compile(r"^(?:from|import) invgraphics\.scenes\.mitsuba\.build\.(\w+)", re.MULTILINE)
 
@@ -84,19 +85,23 @@ class Job:
     @property
     def total(self) -> int:
         """Number of views to render."""
+        if (instances := self.spec.instances) is not None:
+            seen = instances.train * (self.views.train + self.views.val)
+            return seen + instances.unseen * (instances.observed + self.views.test)
         return self.views.train + self.views.val + self.views.test
 
     def key(self) -> str:
         """Hash of everything the pixels depend on: description, options, our sources, Mitsuba's version and variant."""
-        sources, versions = _source_hash(self.spec.builder), {name: version(name) for name in ("mitsuba", "drjit")}
+        paths = _SOURCES if self.spec.instances is None else _CLASS_SOURCES
+        sources, versions = _source_hash(self.spec.builder, paths), {name: version(name) for name in ("mitsuba", "drjit")}
         content = {"job": self.table(), "sources": sources, **versions}
         return sha256_of(content)[:16]
 
 
-def _source_hash(builder: str) -> str:
+def _source_hash(builder: str, paths: tuple[str, ...]) -> str:
     package = Path(__file__).resolve().parents[2]
     sha = hashlib.sha256()
-    for path in (*(package / name for name in _SOURCES), *_builder_sources(package / _BUILD, builder)):
+    for path in (*(package / name for name in paths), *_builder_sources(package / _BUILD, builder)):
         sha.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return sha.hexdigest()
 

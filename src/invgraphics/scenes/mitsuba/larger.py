@@ -19,6 +19,8 @@ def averaged(job: Job) -> Job | None:
     Of several, one that has been averaged before is taken, then one whose pixels are whole parts of the new ones, then the
     smallest.
     """
+    if job.spec.instances is not None:
+        return None  # a class is rendered at each size
     found = [replace(job, samples=effective, source=source) for source, effective in _sources(job)]
     return min(found, key=_preference, default=None)
 

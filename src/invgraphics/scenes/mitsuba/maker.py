@@ -16,7 +16,7 @@ from invgraphics.scenes.mitsuba.forecast import RenderingForecast
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.larger import averaged
 from invgraphics.scenes.mitsuba.rig import SPLITS, cameras, make_rig
-from invgraphics.scenes.mitsuba.spec import Counts, description_path, read
+from invgraphics.scenes.mitsuba.spec import Counts, SceneSpec, description_path, read
 from invgraphics.scenes.process import Progress, run_worker
 
 FILM_BYTES = 44
@@ -26,7 +26,7 @@ PICTURE_BYTES = 3
 
 
 def make(
-    name: str,
+    name: str | SceneSpec,
     *,
     size: tuple[int, int] | None = None,
     train: int | None = None,
@@ -41,7 +41,7 @@ def make(
     What takes time is announced on the terminal before it begins.
 
     Args:
-        name: of a built-in scene, or the path of one's own ``scene.toml``.
+        name: of a built-in scene, the path of one's own ``scene.toml``, or a description (see `SceneSpec.with_instances`).
         size: width and height in pixels. For this and what follows, ``None`` means what the scene's description says.
         train: number of training views.
         test: number of test views.
@@ -68,9 +68,11 @@ def make(
     return folder if out is None else cache.copy(folder, Path(out))
 
 
-def planned(name: str, size: tuple[int, int] | None, views: tuple[int | None, int | None], spp: int | None, seed: int) -> Job:
+def planned(
+    scene: str | SceneSpec, size: tuple[int, int] | None, views: tuple[int | None, int | None], spp: int | None, seed: int
+) -> Job:
     """Check a request for a rendering before anything is done; arguments and errors as `make`."""
-    spec = read(description_path(name))
+    spec = scene if isinstance(scene, SceneSpec) else read(description_path(scene))
     limits = (
         ("The size", size and min(size), 8),
         ("The number of training views", views[0], 1),
@@ -113,7 +115,11 @@ def _make(job: Job, folder: Path, progress: Progress, lock: int) -> None:
 
 def _run(job: Job, partial: Path, progress: Progress, lock: int) -> None:
     width, height = job.size
-    if job.source is None:
+    if job.spec.instances is not None:
+        module = "instances"
+        of_what = f"{job.total:,} views of {job.spec.instances.total} instances"
+        _notify(f"{job.spec.name} at {width}x{height}: {of_what}; cached afterwards.")
+    elif job.source is None:
         module, progress = "render", RenderingForecast(job, partial, progress, _notify)
     else:
         module = "average"

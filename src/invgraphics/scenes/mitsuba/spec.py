@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,35 @@ class Counts:
 
 
 @dataclass(frozen=True)
+class Instances:
+    """Instances of a class of objects; the model of instance k is built from the scene's seed + k.
+
+    Attributes:
+        train: instances that train a prior, the first ones.
+        unseen: instances that score it, the last ones.
+        observed: views of each unseen instance from which it is inferred; besides them it has test views.
+    """
+
+    train: int = 128
+    unseen: int = 16
+    observed: int = 8
+
+    def __post_init__(self) -> None:
+        if min(self.train, self.unseen, self.observed) < 1:
+            raise ValueError("there must be at least one instance to train and one unseen instance, with an observed view")
+
+    @property
+    def total(self) -> int:
+        """Number of instances."""
+        return self.train + self.unseen
+
+    def scaled(self, total: int) -> Instances:
+        """Change the number of instances; the share of unseen ones stays, at least one of each kind."""
+        unseen = min(max(1, round(total * self.unseen / self.total)), total - 1)
+        return Instances(total - unseen, unseen, self.observed)
+
+
+@dataclass(frozen=True)
 class SceneSpec:
     """Description of a scene, as in its ``scene.toml``.
 
@@ -66,6 +95,7 @@ class SceneSpec:
         background: colour put behind the scene when it is scored, display sRGB; ``None`` where the scene is opaque.
         depth: longest light path, in vertices.
         seed: of the model's own randomness (textures, placement), apart from the renderer's noise.
+        instances: of a class of objects, whose ``views`` are then those of each instance; ``None`` for a single scene.
     """
 
     name: str
@@ -81,6 +111,7 @@ class SceneSpec:
     background: Vector | None = None
     depth: int = 8
     seed: int = 0
+    instances: Instances | None = None
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.lo, self.hi, strict=True)):
@@ -90,11 +121,31 @@ class SceneSpec:
         if self.depth < 2:
             raise ValueError("'depth' must be at least 2, which is direct light only")
 
+    def with_instances(self, total: int) -> SceneSpec:
+        """The same class with another number of instances, unseen ones included.
+
+        Raises:
+            InputError: it is a single scene, or the number leaves none to train on or none unseen.
+        """
+        if self.instances is None:
+            raise InputError(f"'{self.name}' is a single scene, not a class of objects.", "Leave --instances away.")
+        if total < 2:
+            raise InputError(
+                f"The number of instances cannot be {total}.", "Expected: at least 2, one to train and one unseen."
+            )
+        return replace(self, instances=self.instances.scaled(total))
+
 
 @cache
 def names() -> tuple[str, ...]:
     """List the built-in scenes."""
     return tuple(sorted(path.parent.name for path in data.find("scenes").glob(f"*/{FILE}")))
+
+
+@cache
+def class_names() -> tuple[str, ...]:
+    """List the built-in scenes that are classes of objects."""
+    return tuple(name for name in names() if read(data.find("scenes", name) / FILE).instances is not None)
 
 
 def description_path(name: str) -> Path:

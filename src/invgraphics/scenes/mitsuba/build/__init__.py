@@ -2,6 +2,7 @@
 
 BUILDERS = {
     "bricks": "invgraphics.scenes.mitsuba.build.bricks:build",
+    "chairs": "invgraphics.scenes.mitsuba.build.chairs:build",
     "cloud": "invgraphics.scenes.mitsuba.build.cloud:build",
     "cloud-1": "invgraphics.scenes.mitsuba.build.cloud:build_1",
     "cloud-27": "invgraphics.scenes.mitsuba.build.cloud:build_27",
@@ -9,6 +10,7 @@ BUILDERS = {
     "cloud-81": "invgraphics.scenes.mitsuba.build.cloud:build_81",
     "fence": "invgraphics.scenes.mitsuba.build.fence:build",
     "materials": "invgraphics.scenes.mitsuba.build.materials:build",
+    "mugs": "invgraphics.scenes.mitsuba.build.mugs:build",
     "room": "invgraphics.scenes.mitsuba.build.room:build",
     "shelf": "invgraphics.scenes.mitsuba.build.shelf:build",
     "textured": "invgraphics.scenes.mitsuba.build.textured:build",

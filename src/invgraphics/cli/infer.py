@@ -1,0 +1,95 @@
+"""``invgraphics infer``: infer unseen instances of a class of objects, from held-out views or from a photograph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from invgraphics.errors import InputError
+from invgraphics.runs.folder import check_run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Infer:
+    """Infer unseen instances of a class of objects with a fitted prior: only their codes are optimised.
+
+    Without a photograph: the class's unseen instances, from their first observed views; their test views are scored beside the
+    class mean, the nearest training instance and, if asked, fits without a prior. Writes a page with pictures and intervals.
+
+    With a photograph: the instance that it shows. Its camera has the class's lens and is that of --view, or else looks at the
+    middle of the class from --azimuth and --elevation. Writes a picture of it from around, with normals, and its code.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of a fit to a class (`invgraphics fit prior/srn chairs`)."""
+    photo: Annotated[Positional[Path | None], arg(metavar="[PHOTO]", help_behavior_hint="(default: the unseen instances)")] = (
+        None
+    )
+    """A photograph of one object, before the scene's background or with alpha."""
+    views: Annotated[str, arg(metavar="N,N")] = "1"
+    """Numbers of observed views from which instances are inferred."""
+    test_views: Annotated[int, arg(metavar="N")] = 4
+    """Test views of each instance that are scored."""
+    instances: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
+    """Unseen instances, the first ones."""
+    against: Annotated[str, arg(metavar="RUN,RUN", help_behavior_hint="(default: none)")] = ""
+    """Other fits to the same class to compare with."""
+    no_prior: Annotated[str | None, arg(metavar="BUDGET", help_behavior_hint="(default: none)")] = None
+    """Also fit each instance without the prior, for so long (20s, 600steps); only from the fewest views, as the nearest."""
+    view: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the angles)")] = None
+    """The photograph's camera is that of this view of the class."""
+    azimuth: Annotated[float, arg(metavar="DEGREES")] = -60.0
+    """The photograph's camera: angle around the vertical axis, from +x towards +y."""
+    elevation: Annotated[float, arg(metavar="DEGREES")] = 25.0
+    """The photograph's camera: angle above the horizon."""
+    steps: Annotated[int, arg(metavar="N")] = 200
+    """Steps of the optimisation of the codes."""
+    scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
+    """Another copy of the class, for instance where the data set has moved."""
+    out: Annotated[
+        Path | None, arg(metavar="FOLDER|FILE.png", help_behavior_hint="(default: RUN-inferred, PHOTO-inferred.png)")
+    ] = None
+    """Where to write."""
+
+    def run(self) -> int:
+        """Infer; prints what was found and where it was written. Returns exit status 0."""
+        others = tuple(Path(one) for one in self.against.split(",") if one)
+        for folder in (self.folder, *others):
+            check_run(folder)
+        if self.photo is not None:
+            return self._infer_photo(self.photo)
+        views = self._view_counts()
+        out = self.folder.with_name(f"{self.folder.name}-inferred") if self.out is None else self.out
+
+        from invgraphics.report.inference import build_inference_report, inference_sentences
+        from invgraphics.tools.infer import InferRequest, infer
+
+        infer(
+            InferRequest(
+                self.folder, out, others, views, self.test_views, self.instances, self.no_prior, self.steps, self.scene
+            )
+        )
+        page = build_inference_report(out)
+        for sentence in inference_sentences(out):
+            print(sentence)
+        print(page)
+        return 0
+
+    def _view_counts(self) -> tuple[int, ...]:
+        try:
+            return tuple(int(word) for word in self.views.split(","))
+        except ValueError:
+            raise InputError(f"--views cannot be '{self.views}'.", "Expected numbers, separated by commas: 1,2,4,8.") from None
+
+    def _infer_photo(self, photo: Path) -> int:
+        out = Path(f"{photo.stem}-inferred.png") if self.out is None else self.out
+
+        from invgraphics.tools.infer_photo import PhotoRequest, infer_photo
+
+        placed = (self.view, self.azimuth, self.elevation, self.steps, self.scene)
+        print(f"the photograph is reproduced at {infer_photo(PhotoRequest(self.folder, photo, out, *placed)):.2f} dB")
+        print(out)
+        return 0

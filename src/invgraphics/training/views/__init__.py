@@ -1,0 +1,1 @@
+"""What a fit optimises for each training view besides its pose."""

@@ -1,0 +1,146 @@
+"""Codes of unseen instances: found again from pictures that they made, networks frozen; and the whole way to the page."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from invgraphics.cli.main import run as command
+from invgraphics.core import Context, Model, Scene, View
+from invgraphics.errors import InputError
+from invgraphics.experiments.build import build_model
+from invgraphics.experiments.subjects import UnseenInstances
+from invgraphics.fields.conditional.field import ConditionalFieldConfig
+from invgraphics.fields.neural import NeuralFieldConfig
+from invgraphics.recipes.recipe import load_method
+from invgraphics.renderers.samplers import StratifiedConfig
+from invgraphics.renderers.volumetric import VolumetricConfig
+from invgraphics.report.inference import paired
+from invgraphics.runs.inference import Inference, InstanceScores
+from invgraphics.scenes.npz import save_npz
+from invgraphics.testing import toy_scene
+from invgraphics.tools.recipe_check import check_recipes
+from invgraphics.training.batches import BatchConfig, Batches
+from invgraphics.training.codes.inference import CodeInference, infer_codes
+from invgraphics.training.codes.penalty import CodePenalty
+
+CPU = torch.device("cpu")
+
+
+def of(views: tuple[View, ...], subjects: list[int]) -> tuple[View, ...]:
+    return tuple(replace(view, subject=subject) for view, subject in zip(views, subjects, strict=True))
+
+
+@pytest.fixture(scope="module")
+def toy_class() -> Scene:
+    """Two training instances and two unseen ones, with an observed and a test view each."""
+    toy, more = toy_scene(views=8, size=12), toy_scene(views=5, size=12).train
+    return replace(
+        toy,
+        train=of(toy.train[:4], [0, 0, 1, 1]),
+        val=of(toy.train[4:5], [1]),
+        observed=of(more[:2], [2, 3]),
+        test=of(more[2:4], [2, 3]),
+    )
+
+
+def test_codes_are_found_again_and_nothing_else_changes(toy_class: Scene) -> None:
+    torch.manual_seed(0)
+    config = ConditionalFieldConfig(conditioning="film", code=2, hidden=16, layers=2, width=16, features=16, head="density")
+    field = config.build(toy_class)
+    with torch.no_grad():
+        for layer in field.network.layers:
+            layer.film[2].weight.mul_(8)  # pyright: ignore[reportIndexIssue, reportCallIssue]  # codes that matter
+    model = Model(field, VolumetricConfig(StratifiedConfig(12)).build(toy_class), toy_class.bounds)
+    true = torch.tensor([[0.4, 0.5], [-0.6, 0.8]])
+    seen = []
+    for code, view in zip(true, toy_class.observed, strict=True):
+        picture = replace(model, field=field.at(code)).render(view.camera, normals=False)
+        image = picture.rgb / picture.alpha.clamp_min(1e-3)[..., None]
+        seen.append([replace(view, image=image, alpha=picture.alpha)])
+    before = {name: value.clone() for name, value in field.state_dict().items()}
+    quick = CodeInference(steps=120, rays=128, lr=5e-2, weight=0.0)
+    found = infer_codes(model, toy_class, seen, quick)
+    assert float((found - true).abs().max()) < 0.1 < float((field.mean_code().detach() - true).abs().max())
+    assert torch.equal(found, infer_codes(model, toy_class, seen, quick))
+    assert all(torch.equal(value, before[name]) for name, value in field.state_dict().items())
+    assert all(parameter.requires_grad for parameter in field.parameters())
+    pulled = infer_codes(model, toy_class, seen, replace(quick, weight=1e3))
+    assert float(pulled.abs().max()) < 0.1  # the prior's mean
+
+
+def test_the_penalty_is_the_mean_square_and_needs_codes(toy_class: Scene) -> None:
+    field = ConditionalFieldConfig().build(toy_class)
+    renderer = VolumetricConfig().build(toy_class)
+    value = CodePenalty(0.5)(field, renderer, Context(toy_class.bounds))
+    assert float(value) == pytest.approx(0.5 * float((field.codes.detach() ** 2).sum()) / field.codes.numel())
+    with pytest.raises(InputError, match="codes of a class"):
+        CodePenalty.requires.check("penalty 'code'", NeuralFieldConfig().build(toy_class))
+
+
+def test_methods_and_scenes_that_disagree_about_classes_are_refused(toy_class: Scene) -> None:
+    with pytest.raises(InputError, match="volumetric/nerf fits one subject, and 'toy' is a class of 2"):
+        build_model(load_method("volumetric/nerf"), toy_class, 0, CPU)
+    with pytest.raises(InputError, match=r"prior/srn learns a prior .* 'toy' shows one subject") as refusal:
+        build_model(load_method("prior/srn"), toy_scene(views=2, size=8), 0, CPU)
+    assert "chairs, mugs" in refusal.value.remedy
+
+
+def test_rays_on_the_foreground_are_the_share_asked_for(toy_class: Scene) -> None:
+    view = toy_class.train[0]
+    alpha = torch.zeros(12, 12)
+    alpha[3, 5] = 1.0  # one pixel in 144
+    scene = replace(toy_class, train=(replace(view, alpha=alpha),))
+    batches = Batches(BatchConfig(rays=200, views=1, foreground=0.75), scene, torch.Generator().manual_seed(0), CPU)
+    _, batch = batches.rays()
+    assert 150 <= int((batch.alpha > 0).sum()) <= 156
+    _, batch = Batches(BatchConfig(rays=200, views=1), scene, torch.Generator().manual_seed(0), CPU).rays()
+    assert int((batch.alpha > 0).sum()) < 8
+
+
+def test_from_a_fit_to_a_page(toy_class: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_npz(toy_class, tmp_path / "things.npz")
+    small = [f"field.{key}=8" for key in ("code", "hidden", "width", "features")] + ["renderer.features=8", "renderer.width=8"]
+    sets = [word for item in [*small, "batches.rays=64", "renderer.steps=3"] for word in ("--set", item)]
+    assert command(["fit", "prior/srn", "things.npz", "--budget", "4steps", "--preset", "laptop", *sets, "--out", "run"]) == 0
+    assert command(["infer", "run", "--steps", "2", "--test-views", "1", "--no-prior", "2steps", "--out", "inferred"]) == 0
+    said = capsys.readouterr().out
+    record = Inference.read(Path("inferred") / Inference.FILE)
+    ways = ("prior/srn", "class mean", "nearest training instance", "no prior")
+    assert [(one.subject, one.how) for one in record.instances] == [(s, way) for way in ways for s in (2, 3)]
+    assert all(f"against {way}:" in said for way in ways[1:])
+    page = (tmp_path / "inferred/index.html").read_text()
+    assert all(f"pictures/1/{s:04d}.png" in page and (tmp_path / f"inferred/pictures/1/{s:04d}.png").is_file() for s in (2, 3))
+    assert check_recipes(Path("inferred")).runs == 1
+    assert command(["infer", "run", "--views", "2"]) == 2 and "has 1 observed views, not 2" in capsys.readouterr().err
+    picture = next(Path("run/truth").glob("*/0000.png"))
+    assert command(["infer", "run", str(picture), "--view", "0002-00", "--steps", "2", "--out", "photo.png"]) == 0
+    assert Path("photo.png").is_file() and Path("photo.npz").is_file()
+    assert command(["infer", "run", str(picture), "--view", "nowhere"]) == 2 and "no view 'nowhere'" in capsys.readouterr().err
+
+
+def test_unseen_instances_need_their_views(toy_class: Scene) -> None:
+    model = build_model(load_method("prior/srn", "laptop"), toy_class, 0, CPU)
+    with pytest.raises(InputError, match="fewer than 3 observed"):
+        UnseenInstances.infer(model, toy_class, views=3)
+    unseen = UnseenInstances.infer(model, toy_class, config=CodeInference(steps=1, rays=16))
+    assert set(unseen.models) == {2, 3} and unseen.of(toy_class.test[0]) is unseen.models[2]
+
+
+def test_intervals_are_those_of_paired_instances() -> None:
+    """Against scipy's paired t-test over the instances' means."""
+    from scipy.stats import ttest_rel
+
+    values = {"a": [(20.0, 22.0), (25.0, None), (30.0, 31.0)], "b": [(19.0, 20.0), (24.5, None), (27.0, 28.0)]}
+    scores = tuple(
+        InstanceScores(subject=s, observed=1, how=how, quality={"psnr": row}, input_psnr=0.0)
+        for how, rows in values.items()
+        for s, row in enumerate(rows)
+    )
+    record = Inference(scene="x", runs={}, command="", date="", pictures=(), columns={}, seconds={}, instances=scores)
+    gain = paired(record, "psnr", 1, ("a", "b"))
+    test = ttest_rel([21.0, 25.0, 30.5], [19.5, 24.5, 27.5])
+    assert gain is not None and gain.p == pytest.approx(test.pvalue) and gain.mean == pytest.approx(5 / 3)
+    assert (gain.low, gain.high) == pytest.approx(tuple(test.confidence_interval()))
