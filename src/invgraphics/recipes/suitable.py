@@ -11,7 +11,7 @@ OPEN = ("volumetric/hash-proposal", "splatting/gaussians")
 """Those for photographs of a place: a network of octaves alone would not be far after minutes."""
 FEW = 30
 """Fewer training photographs of a place than this leave fog to all ray-marched methods. With the 20 of colmap_statue proposals
-were 1.3 dB behind the occupancy grid, with the 43 of fox 1.1 dB ahead of it, and Gaussians ahead of both (160 px, 600 steps)."""
+were 1.3 dB behind the occupancy grid, with the 43 of fox 1.1 dB ahead; Gaussians led both (160 px, 600 steps)."""
 
 
 def is_open_space(scene: Scene) -> bool:
