@@ -11,8 +11,9 @@ from scipy.stats import multivariate_normal
 from invgraphics.core import Context, Field, FieldValues, Gaussians, Quantity, Samples, Trace
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.fields.gaussian import GaussianField
-from invgraphics.fields.gaussian_density import overlapping_pairs, query_density
+from invgraphics.fields.gaussian_density import query_density
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, mean_inverse_scale, reach
+from invgraphics.kernels.reference.gaussian_sums import overlapping_pairs
 from invgraphics.renderers.gaussians.volume import GaussianExactConfig
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.samplers import StratifiedConfig

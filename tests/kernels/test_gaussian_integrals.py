@@ -1,5 +1,6 @@
 """Compiled line integrals of Gaussians equal the reference in float64: pairs, light, and every gradient."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from invgraphics import kernels
 from invgraphics.core import Bounds, Gaussians, Rays
 from invgraphics.kernels.dispatch import choose
-from invgraphics.kernels.gaussians import gaussian_integrals
+from invgraphics.kernels.gaussians import gaussian_composites, gaussian_integrals
 from invgraphics.kernels.reference.gaussian_rays import gaussian_pairs, precompute
 from invgraphics.testing import toy_cameras
 
@@ -67,6 +68,57 @@ def test_light_and_gradients_are_the_references(opacity: str, attenuated: bool) 
         torch.testing.assert_close(fast.double(), exact, atol=3e-5 * scale, rtol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("opacity", "attenuated", "by"),
+    [("peak", True, "ray"), ("physical", True, "centre"), ("extinction", False, "own"), ("splat", True, "ray")],
+)
+def test_composited_light_and_gradients_are_the_references(opacity: str, attenuated: bool, by: str) -> None:
+    rays, generator = rays_of(3, 7), torch.Generator().manual_seed(2)
+    # Some begin within the cloud: their near planes cut Gaussians.
+    rays = rays.within(torch.where(torch.arange(len(rays)) % 2 == 0, rays.near + 1.2, rays.near), rays.far)
+    wanted = torch.randn(len(rays), 4, generator=generator)
+    axes = {"ray": None, "centre": torch.tensor([0.6, 0.0, 0.8]), "own": rays.directions}[by]
+
+    def run(dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+        tensors = {name: value.to(dtype).requires_grad_() for name, value in vars(blobs(50, 3)).items()}
+        moved = rays.to(dtype)
+        moved = replace(
+            moved, origins=moved.origins.clone().requires_grad_(), directions=moved.directions.clone().requires_grad_()
+        )
+        primitives = precompute(Gaussians(**tensors), opacity, SMALLEST, self_attenuation=attenuated)
+        sums = gaussian_composites(primitives, moved, None if axes is None else axes.to(dtype))
+        gradients = torch.autograd.grad((sums * wanted.to(dtype)).sum(), (*tensors.values(), moved.origins, moved.directions))
+        return sums.detach(), *gradients
+
+    for fast, exact in zip(run(torch.float32), run(torch.float64), strict=True):
+        scale = float(exact.abs().max())
+        assert scale > 0.1
+        torch.testing.assert_close(fast.double(), exact, atol=3e-5 * scale, rtol=1e-3)
+
+
+@pytest.mark.parametrize("kernel", [gaussian_integrals, gaussian_composites], ids=["integrals", "composites"])
+def test_what_lies_behind_an_opaque_wall_is_left_out(kernel: Callable[..., torch.Tensor]) -> None:
+    """Of rays through many dense layers, of which the reference sums all; and the fast one does not see the last."""
+    count = 40
+    layers = Gaussians(
+        means=torch.stack([torch.zeros(count), torch.linspace(-1, 1, count), torch.zeros(count)], dim=1),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        scales=torch.tensor([[0.5, 0.02, 0.5]]).repeat(count, 1),
+        opacities=torch.full((count,), 0.9),
+        sh=torch.randn(count, 1, 3, generator=torch.Generator().manual_seed(0)),
+    )
+    rays = Rays.make(torch.tensor([[0.1, -3, 0.0], [0.0, -3, 0.2]]), torch.tensor([[0.0, 1, 0]]).repeat(2, 1))
+    last = {"means": layers.means.clone().requires_grad_()}
+    given = (32,) if kernel is gaussian_integrals else (None,)
+    fast = kernel(precompute(replace(layers, **last), "peak", SMALLEST), rays, *given)
+    with kernels.using("reference"):
+        exact = kernel(precompute(layers, "peak", SMALLEST), rays, *given)
+    torch.testing.assert_close(fast.detach(), exact, atol=2e-5, rtol=1e-4)
+    (gradient,) = torch.autograd.grad(fast.sum(), last["means"])
+    assert bool(gradient[0].any())
+    assert not bool(gradient[-1].any())
+
+
 def test_distances_and_normals() -> None:
     rays, primitives = rays_of(2, 5), precompute(blobs(40, 4), "peak", SMALLEST)
     with torch.no_grad():
@@ -76,6 +128,11 @@ def test_distances_and_normals() -> None:
     torch.testing.assert_close(fast, exact, atol=2e-5, rtol=1e-4)
     assert float(exact[:, 4].max()) > 1
     # A gradient of those is had, by the reference.
+    with torch.no_grad():
+        fast = gaussian_composites(primitives, rays, None, 4)
+        with kernels.using("reference"):
+            exact = gaussian_composites(primitives, rays, None, 4)
+    torch.testing.assert_close(fast, exact, atol=2e-5, rtol=1e-4)
     moving = replace(primitives, means=primitives.means.clone().requires_grad_())
     gaussian_integrals(moving, rays, 8, 1)[:, 4].sum().backward()
     assert bool(moving.means.grad.any())

@@ -1,4 +1,4 @@
-"""Ray tracing of 3D Gaussians: their exact line integrals as overlapping densities."""
+"""3D Gaussians as overlapping densities: exact line integrals along rays, and sums at points."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.core.field import Gaussians
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.dispatch import choose
 
@@ -29,3 +30,41 @@ def gaussian_integrals(primitives: Primitives, rays: Rays, steps: int, extra: in
         (n, 4 + extra), differentiable in the primitives and in the rays.
     """
     return choose("gaussian_integrals", primitives.means)(primitives, rays, steps, extra)
+
+
+def gaussian_composites(primitives: Primitives, rays: Rays, axes: Tensor | None, extra: int = 0) -> Float[Tensor, "n c"]:
+    """Light of rays through Gaussians composited front to back, each integrated by itself as if none overlapped.
+
+    Compiled for float32 on the CPU; gradients of distances and normals are the reference's.
+
+    Args:
+        primitives: what the rays meet.
+        rays: as of `gaussian_integrals`.
+        axes: directions along which centres are sorted, (3,) for all rays or (n, 3); ``None`` sorts by the distance of the
+            largest response on each ray.
+        extra: as of `gaussian_integrals`.
+
+    Returns:
+        (n, 4 + extra), differentiable in the primitives and in the rays.
+    """
+    return choose("gaussian_composites", primitives.means)(primitives, rays, axes, extra)
+
+
+def gaussian_density(
+    gaussians: Gaussians, position: Float[Tensor, "m 3"], eye: Float[Tensor, "m 3"] | None, smallest: float
+) -> Float[Tensor, "m c"]:
+    """Sum densities of Gaussians, and densities times colours, at points; a point that no Gaussian reaches has zeros.
+
+    The density is the ``physical`` reading of the opacities (`invgraphics.kernels.extinction`). Compiled for float32 on the
+    CPU; gradients in positions are the reference's.
+
+    Args:
+        gaussians: activated primitives.
+        position: of m points; those with one eye should follow each other.
+        eye: whence each point is looked at, which decides the Gaussians' colours there; ``None`` for densities alone.
+        smallest: optical depth of a line below which a Gaussian is left out.
+
+    Returns:
+        (m, 4), or (m, 1) without ``eye``; differentiable in the Gaussians.
+    """
+    return choose("gaussian_density", position)(gaussians, position, eye, smallest)

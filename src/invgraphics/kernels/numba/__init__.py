@@ -8,7 +8,9 @@ encoding, second derivatives of the lattice encoding, fused rendering of hash gr
 from invgraphics.kernels.numba.adam import adam_rows as adam_rows
 from invgraphics.kernels.numba.fused.march import lattice_march as lattice_march
 from invgraphics.kernels.numba.fused.render import lattice_render as lattice_render
+from invgraphics.kernels.numba.gaussians.density import gaussian_density as gaussian_density
 from invgraphics.kernels.numba.gaussians.integrate import gaussian_integrals as gaussian_integrals
+from invgraphics.kernels.numba.gaussians.ordered import gaussian_composites as gaussian_composites
 from invgraphics.kernels.numba.gaussians.pairs import gaussian_pairs as gaussian_pairs
 from invgraphics.kernels.numba.hash.encode import hash_encode as hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode as lattice_encode

@@ -17,7 +17,9 @@ from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.adam import adam_rows
 from invgraphics.kernels.numba.fused.march import lattice_march
 from invgraphics.kernels.numba.fused.render import lattice_render
+from invgraphics.kernels.numba.gaussians.density import gaussian_density
 from invgraphics.kernels.numba.gaussians.integrate import gaussian_integrals
+from invgraphics.kernels.numba.gaussians.ordered import gaussian_composites
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
 from invgraphics.kernels.numba.mesh.interpolate import mesh_interpolate
@@ -52,6 +54,9 @@ def splats() -> None:
     gaussians = Gaussians(*(torch.full(shape, 0.5).requires_grad_() for shape in shapes))
     rays = camera.rays()
     gaussian_integrals(precompute(gaussians, "peak", 1e-3), rays, 2).sum().backward()
+    for axes in (None, torch.ones(3)):
+        gaussian_composites(precompute(gaussians, "peak", 1e-3), camera.rays(), axes).sum().backward()
+    gaussian_density(gaussians, torch.full((1, 3), 0.5), torch.zeros(1, 3), 1e-3).sum().backward()
     footprints, rgb = splat_project(gaussians, camera)
     splat_bin(footprints, 8, 8, 4)
     splat_median(footprints, 8, 8)

@@ -4,8 +4,10 @@ from invgraphics.kernels.reference.adam import adam_rows as adam_rows
 from invgraphics.kernels.reference.composite import composite as composite
 from invgraphics.kernels.reference.fused import lattice_march as lattice_march
 from invgraphics.kernels.reference.fused import lattice_render as lattice_render
+from invgraphics.kernels.reference.gaussian_order import gaussian_composites as gaussian_composites
 from invgraphics.kernels.reference.gaussian_quadrature import gaussian_integrals as gaussian_integrals
 from invgraphics.kernels.reference.gaussian_rays import gaussian_pairs as gaussian_pairs
+from invgraphics.kernels.reference.gaussian_sums import gaussian_density as gaussian_density
 from invgraphics.kernels.reference.hash import hash_encode as hash_encode
 from invgraphics.kernels.reference.lattice import lattice_encode as lattice_encode
 from invgraphics.kernels.reference.march import ray_march as ray_march

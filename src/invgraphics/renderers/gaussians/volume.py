@@ -15,10 +15,10 @@ from invgraphics import kernels
 from invgraphics.core import Camera, Context, Contributions, Field, Quantity, RayRenderer, Rays, Rendering, Scene, Trace
 from invgraphics.core.contributions import opacities
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, Opacity
-from invgraphics.kernels.gaussians import gaussian_integrals
-from invgraphics.kernels.reference.gaussian_quadrature import Weights, integrate_overlapping, phi, weighted_sums
+from invgraphics.kernels.gaussians import gaussian_composites, gaussian_integrals
+from invgraphics.kernels.reference.gaussian_order import composite_in_order, depth_order
+from invgraphics.kernels.reference.gaussian_quadrature import Weights, integrate_overlapping, weighted_sums
 from invgraphics.kernels.reference.gaussian_rays import (
-    MAX_DEVIATIONS,
     Intersections,
     Primitives,
     colours,
@@ -197,10 +197,7 @@ class GaussianExact(GaussianRays):
 
     @override
     def _parts(self, camera: Camera) -> list[Tensor]:
-        if not kernels.compiled("gaussian_integrals", camera.focal):
-            return super()._parts(camera)
-        # The compiled search has cells of its own; parts bound the memory of its pairs.
-        return list(torch.arange(camera.width * camera.height).split(PART))
+        return _compiled_parts(camera) if kernels.compiled("gaussian_integrals", camera.focal) else super()._parts(camera)
 
     def _list_contributions(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
@@ -235,18 +232,26 @@ class GaussianSorted(GaussianRays):
         self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None, with_distances: bool
     ) -> Weights:
         """Composite front to back: w_i = alpha_i times the product of (1 - alpha_j) before it, alpha_i = 1 - exp(-tau_i)."""
-        near, far = rays.near[intersections.ray], rays.far[intersections.ray]
-        t, sigma, depth = intersections.t, intersections.sigma, intersections.depth
-        if self.config.opacity != "splat":
-            start, end = (
-                ((limit - t) / sigma).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
-                for limit in (near, far.minimum((t + MAX_DEVIATIONS * sigma).detach()))
-            )
-            depth = depth * (phi(end) - phi(start))
         order = self.order(intersections, rays, axis)
-        ordered, _, _ = kernels.composite(depth[order], t.new_zeros(len(t), 0), intersections.ray, len(rays))
-        weights = ordered[order.argsort()]
-        return weights, weights * t.clamp(near, far) if with_distances else None
+        return composite_in_order(intersections, rays, self.config.opacity == "splat", order, with_distances)
+
+    @override
+    def _sums(self, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3] | None, extra: int) -> Float[Tensor, "n c"]:
+        return gaussian_composites(primitives, rays, self._axes(rays, axis), extra)
+
+    @override
+    def _parts(self, camera: Camera) -> list[Tensor]:
+        return _compiled_parts(camera) if kernels.compiled("gaussian_composites", camera.focal) else super()._parts(camera)
+
+    def order(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None) -> Int[Tensor, " p"]:
+        """Sort intersections by ray, then front to back."""
+        return depth_order(intersections, self._axes(rays, axis))
+
+    def _axes(self, rays: Rays, axis: Float[Tensor, 3] | None) -> Tensor | None:
+        """Directions along which centres are sorted; ``None`` where the largest responses are."""
+        if self.config.order == "ray":
+            return None
+        return rays.directions.detach() if axis is None else axis.detach()
 
     def _list_contributions(
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
@@ -270,16 +275,6 @@ class GaussianSorted(GaussianRays):
             marched=density_profile(t, sigma, depth, rays),
         )
 
-    @torch.no_grad()
-    def order(self, intersections: Intersections, rays: Rays, axis: Float[Tensor, 3] | None) -> Int[Tensor, " p"]:
-        """Sort intersections by ray, then front to back."""
-        key = intersections.t
-        if self.config.order == "centre":
-            axes = rays.directions[intersections.ray] if axis is None else axis
-            key = (intersections.offset * axes).sum(dim=1)
-        order = key.argsort(stable=True)
-        return order[intersections.ray[order].argsort(stable=True)]
-
 
 def _clip_near(rays: Rays, ctx: Context) -> Rays:
     """Clip rays to the near distance of the bounds."""
@@ -295,3 +290,8 @@ def _by_tiles(camera: Camera) -> list[Tensor]:
     """Flat pixel indices of each screen tile."""
     pixels = torch.arange(camera.width * camera.height, device=camera.focal.device).view(camera.height, camera.width)
     return [tile.reshape(-1) for row in pixels.split(TILE, dim=0) for tile in row.split(TILE, dim=1)]
+
+
+def _compiled_parts(camera: Camera) -> list[Tensor]:
+    """Flat pixel indices of parts that bound the memory of the compiled search's pairs; it has cells of its own."""
+    return list(torch.arange(camera.width * camera.height).split(PART))

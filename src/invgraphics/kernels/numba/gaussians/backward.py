@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.gaussians.integrals import STRIDE, all_shares, colour_of
+from invgraphics.kernels.numba.gaussians.integrals import STRIDE, all_shares, colour_of, seen_colour, shares_origin
 from invgraphics.kernels.numba.gaussians.pairs import restrict
 from invgraphics.kernels.numba.harmonics import harmonics_gradient
 from invgraphics.kernels.numba.runtime import exp2, inlined, parallel, prange
@@ -17,7 +17,7 @@ _ROOT = np.float32(1 / np.sqrt(2 * np.pi))
 
 
 @inlined
-def _cut_off(rgb, gradient):
+def cut_off(rgb, gradient):
     """Gradient through max(0, colour): where it is cut off, only what would raise it passes (see `core.harmonics.colour`)."""
     return gradient if rgb > _ZERO or gradient < _ZERO else _ZERO
 
@@ -71,7 +71,7 @@ def _colour_gradient(sh, g, offset, inverse, basis, grad_rgb, grad_sh, buffer):
 
 
 @inlined
-def _place_gradient(table, strength, reading, g, o, d, found, given, grad):
+def place_gradient(table, strength, reading, g, o, d, found, given, grad):
     """Add gradients in distance, width and depth to those of a Gaussian's row; returns those in offset and direction."""
     sigma, depth = found
     shift, widen, thicken = given
@@ -116,63 +116,101 @@ def _place_gradient(table, strength, reading, g, o, d, found, given, grad):
 
 
 @inlined
-def _weights_gradients(sh, table, gaussian, begin, end, o, depth, grad_sums, room, colours, given):
-    """Colours of a ray's Gaussians, gradients in their weights, and the sums of those in the light of the intervals."""
-    wanted, light, basis, rgb = room[3][3], room[3][1], room[4], room[5]
+def _weights_gradients(gaussian, begin, end, depth, grad_sums, room, colours, weights, given):
+    """Weights of a ray's Gaussians, gradients in them, and the sums of those in the light of the intervals."""
+    wanted, light = room[3][3], room[3][1]
     wanted[:] = _ZERO
     for p in range(begin, end):
         i, g = p - begin, gaussian[p]
-        colour_of(sh, g, table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2], basis, rgb)
+        if room[2][i, 0] == room[2][i, 1]:
+            continue
         value = grad_sums[0]
         for c in range(3):
-            value += grad_sums[1 + c] * max(rgb[c], _ZERO)
+            value += grad_sums[1 + c] * max(colours[g, c], _ZERO)
         given[i] = value
         weight = _ZERO
         for s in range(room[2][i, 0], room[2][i, 1]):
             weight += light[s] * room[0][i, s]
             wanted[s] += depth[p] * value * room[0][i, s]
-        colours[i] = weight * depth[p]
+        weights[i] = weight * depth[p]
+
+
+@inlined
+def spread_colour_gradients(sh, table, o, touched, count, work, basis, buffer, grad, grad_sh):
+    """Pass the summed colour gradients of one origin on to coefficients and centres; returns the centres' sum."""
+    sums, rgb = work[1], np.empty(3, np.float32)
+    x, y, z = _ZERO, _ZERO, _ZERO
+    for k in range(count):
+        g = touched[k]
+        offset = table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2]
+        inverse = colour_of(sh, g, offset[0], offset[1], offset[2], basis, rgb)
+        gx, gy, gz = _colour_gradient(sh, g, offset, inverse, basis, sums[g], grad_sh, buffer)
+        sums[g] = _ZERO
+        grad[g, 0] += gx
+        grad[g, 1] += gy
+        grad[g, 2] += gz
+        x, y, z = x + gx, y + gy, z + gz
+    return x, y, z
 
 
 @parallel
 def integrate_backward(rays, primitives, reading, pairs, first_ray, kept, grad_sums, rooms, grads):
-    """Gradients of every job in the rows of Gaussians and in their coefficients, and in each ray's origin and direction."""
+    """Gradients of every job in the rows of Gaussians and in their coefficients, and in each ray's origin and direction.
+
+    Those in colours are summed over rays of one origin that follow each other; ray by ray if origins have rows in ``grads``.
+    """
     origins, directions = rays
     table, strength, sh = primitives
     gaussian, starts = pairs
-    t, sigma, depth, nodes = kept
+    t, sigma, depth, nodes, stops = kept
     for job in prange(len(first_ray) - 1):
-        basis, rgb, buffer = (
-            np.empty(STRIDE * STRIDE, np.float32),
-            np.empty(3, np.float32),
-            np.empty(STRIDE * STRIDE, np.float32),
-        )
-        room = rooms[0][job], rooms[1][job], rooms[2][job], rooms[3][job], basis, rgb
+        basis, buffer = np.empty(STRIDE * STRIDE, np.float32), np.empty(STRIDE * STRIDE, np.float32)
+        room = rooms[0][job], rooms[1][job], rooms[2][job], rooms[3][job]
         weights, given = rooms[4][job, 0], rooms[4][job, 1]
-        light, slopes, grad_rgb = room[3][1], room[3][4], np.empty(3, np.float32)
+        light, slopes = room[3][1], room[3][4]
         grad, grad_sh = grads[0][job], grads[1][job]
+        stamps, touched, work = rooms[5][job, 0], rooms[5][job, 1], (rooms[6][job], rooms[7][job])
+        colours, colour_sums = work
+        group, count, by_ray = np.int32(0), 0, len(grads[2]) > 0
         for r in range(first_ray[job], first_ray[job + 1]):
+            if by_ray or not shares_origin(origins, r, first_ray[job]):
+                if count > 0:
+                    spread_colour_gradients(sh, table, origins[r - 1], touched, count, work, basis, buffer, grad, grad_sh)
+                group, count = group + np.int32(1), 0
             begin, end = starts[r], starts[r + 1]
             if begin == end:
                 continue
             o, d = origins[r], directions[r]
-            all_shares(nodes[r], t, sigma, depth, begin, end, room[:4])
-            _weights_gradients(sh, table, gaussian, begin, end, o, depth, grad_sums[r], room, weights, given)
+            all_shares(nodes[r], stops[r], t, sigma, depth, begin, end, room)
+            for p in range(begin, end):
+                g = gaussian[p]
+                if room[2][p - begin, 0] < room[2][p - begin, 1] and stamps[g] != group:
+                    touched[count] = g
+                    count += 1
+                    seen_colour(sh, table, g, o, group, stamps, colours, basis)
+            _weights_gradients(gaussian, begin, end, depth, grad_sums[r], room, colours, weights, given)
             _depths_gradient(nodes[r], light, room[3][2], room[3][3], slopes)
             for p in range(begin, end):
                 i, g = p - begin, gaussian[p]
                 limits = room[2][i, 0], room[2][i, 1]
+                if limits[0] == limits[1]:
+                    continue
                 thicken, shift, widen = _shape_gradient(
                     nodes[r], t[p], sigma[p], room[0][i], room[1][i], limits, given[i], slopes, light
                 )
                 found, moved = (sigma[p], depth[p]), (shift * depth[p], widen * depth[p], thicken)
-                offset, direction = _place_gradient(table, strength, reading, g, o, d, found, moved, grad)
-                cx, cy, cz = table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2]
-                inverse = colour_of(sh, g, cx, cy, cz, basis, rgb)
+                offset, direction = place_gradient(table, strength, reading, g, o, d, found, moved, grad)
                 for c in range(3):
-                    grad_rgb[c] = _cut_off(rgb[c], weights[i] * grad_sums[r, 1 + c])
-                seen = _colour_gradient(sh, g, (cx, cy, cz), inverse, basis, grad_rgb, grad_sh, buffer)
-                for c in range(3):
-                    grad[g, c] += offset[c] + seen[c]
-                    grads[2][r, c] -= offset[c] + seen[c]
+                    colour_sums[g, c] += cut_off(colours[g, c], weights[i] * grad_sums[r, 1 + c])
+                    grad[g, c] += offset[c]
                     grads[3][r, c] += direction[c]
+                    if by_ray:
+                        grads[2][r, c] -= offset[c]
+            if by_ray:
+                seen = spread_colour_gradients(sh, table, o, touched, count, work, basis, buffer, grad, grad_sh)
+                count = 0
+                for c in range(3):
+                    grads[2][r, c] -= seen[c]
+        if count > 0:
+            last = origins[first_ray[job + 1] - 1]
+            spread_colour_gradients(sh, table, last, touched, count, work, basis, buffer, grad, grad_sh)

@@ -97,13 +97,33 @@ def colour_of(sh, g, cx, cy, cz, basis, rgb):
 
 
 @inlined
-def all_shares(nodes, t, sigma, depth, begin, end, room):
-    """`own_shares` of a ray's Gaussians, and the light of the intervals, in a job's work arrays."""
+def seen_colour(sh, table, g, o, group, stamps, colours, basis):
+    """Make row g of ``colours`` the Gaussian's colour from an origin, once for all rays of the ``group`` that share it."""
+    if stamps[g] != group:
+        stamps[g] = group
+        colour_of(sh, g, table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2], basis, colours[g])
+
+
+@inlined
+def shares_origin(origins, r, first):
+    """Whether a job's ray r has the origin of the ray before it."""
+    if r == first:
+        return False
+    before, now = origins[r - 1], origins[r]
+    return now[0] == before[0] and now[1] == before[1] and now[2] == before[2]
+
+
+@inlined
+def all_shares(nodes, stop, t, sigma, depth, begin, end, room):
+    """`own_shares` of a ray's Gaussians that begin before ``stop``, and the light of the intervals, in a job's work arrays."""
     shares, bells, limits, lights = room
     totals = lights[0]
     totals[:] = _ZERO
     for p in range(begin, end):
         i = p - begin
+        if t[p] - CUT * sigma[p] > stop:
+            limits[i, 0], limits[i, 1] = 0, 0
+            continue
         first, last = own_shares(nodes, t[p], sigma[p], shares[i], bells[i])
         limits[i, 0], limits[i, 1] = first, last
         for s in range(first, last):
@@ -136,11 +156,13 @@ def integrate(rays, primitives, reading, pairs, first_ray, kept, sums, rooms):
     origins, directions, near, far = rays
     table, strength, sh, normals = primitives
     gaussian, starts = pairs
-    t, sigma, depth, nodes = kept
+    t, sigma, depth, nodes, stops = kept
     for job in prange(len(first_ray) - 1):
         room = rooms[0][job], rooms[1][job], rooms[2][job], rooms[3][job]
-        basis, rgb = np.empty(STRIDE * STRIDE, np.float32), np.empty(3, np.float32)
+        basis = np.empty(STRIDE * STRIDE, np.float32)
+        stamps, colours, group = rooms[6][job], rooms[7][job], np.int32(0)
         for r in range(first_ray[job], first_ray[job + 1]):
+            group += np.int32(not shares_origin(origins, r, first_ray[job]))
             begin, end = starts[r], starts[r + 1]
             if begin == end:
                 continue
@@ -148,19 +170,21 @@ def integrate(rays, primitives, reading, pairs, first_ray, kept, sums, rooms):
             low, high = optical_depths(table, strength, reading, gaussian, begin, end, o, d, t, sigma, depth)
             low = max(low, near[r])
             high = max(min(high, far[r]), low)
-            place_nodes(t, sigma, depth, begin, end, low, high, nodes[r], rooms[4][job], rooms[5][job])
-            all_shares(nodes[r], t, sigma, depth, begin, end, room)
+            stops[r] = place_nodes(t, sigma, depth, begin, end, low, high, nodes[r], rooms[4][job], rooms[5][job])
+            all_shares(nodes[r], stops[r], t, sigma, depth, begin, end, room)
             light = room[3][1]
             for p in range(begin, end):
                 g, own = gaussian[p], room[0][p - begin]
+                if room[2][p - begin, 0] == room[2][p - begin, 1]:
+                    continue
                 weight, drop = _ZERO, _ZERO
                 for s in range(room[2][p - begin, 0], room[2][p - begin, 1]):
                     weight += light[s] * own[s]
                 weight *= depth[p]
-                colour_of(sh, g, table[g, 0] - o[0], table[g, 1] - o[1], table[g, 2] - o[2], basis, rgb)
+                seen_colour(sh, table, g, o, group, stamps, colours, basis)
                 sums[r, 0] += weight
                 for c in range(3):
-                    sums[r, 1 + c] += weight * max(rgb[c], _ZERO)
+                    sums[r, 1 + c] += weight * max(colours[g, c], _ZERO)
                 if sums.shape[1] > 4:
                     # ∫ t over a piece of a normal distribution: t* times its mass minus sigma times the drop of its density.
                     bells = room[1][p - begin]

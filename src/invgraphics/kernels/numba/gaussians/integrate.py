@@ -13,7 +13,7 @@ from invgraphics.core.rays import Rays
 from invgraphics.kernels.extinction import is_density
 from invgraphics.kernels.numba.gaussians.backward import integrate_backward
 from invgraphics.kernels.numba.gaussians.integrals import integrate
-from invgraphics.kernels.numba.gaussians.nodes import COUNT
+from invgraphics.kernels.numba.gaussians.nodes import COUNT, PASSES
 from invgraphics.kernels.numba.gaussians.pairs import gaussian_pairs
 from invgraphics.kernels.numba.runtime import array, once_differentiable, scratch, split_by_work, threads
 from invgraphics.kernels.reference import gaussian_quadrature as reference
@@ -50,7 +50,13 @@ class _Work:
         """Arrays in which quadrature nodes are placed."""
         jobs, size = len(self.first_ray) - 1, 6 * COUNT * self.most
         rows = scratch("gaussians.nodes", jobs * size)[: jobs * size].reshape(jobs, 6, COUNT * self.most)
-        return rows, np.empty((jobs, 4, 256), np.int32)
+        return rows, np.empty((jobs, PASSES, 256), np.int32)
+
+    def colours(self, gaussians: int, columns: int) -> tuple[np.ndarray, ...]:
+        """``columns`` arrays of zeros, one entry per Gaussian, and room for their colours."""
+        jobs = len(self.first_ray) - 1
+        size = 3 * jobs * gaussians
+        return np.zeros((jobs, columns, gaussians), np.int32), scratch("gaussians.colours", size)[:size].reshape(jobs, -1, 3)
 
 
 class _Integrate(torch.autograd.Function):
@@ -63,10 +69,15 @@ class _Integrate(torch.autograd.Function):
         work, limits, normals, reading, steps, width = settings
         rays, p = len(origins), len(work.pairs[0])
         sums = torch.zeros(rays, width)
-        kept = (*(np.empty(p, np.float32) for _ in range(3)), np.empty((rays, steps + 1), np.float32))
+        kept = (
+            *(np.empty(p, np.float32) for _ in range(3)),
+            np.empty((rays, steps + 1), np.float32),
+            np.empty(rays, np.float32),
+        )
         given = tuple(array(x) for x in (table, strength, sh, normals))
         along = (array(origins), array(directions), *(array(x) for x in limits))
-        rooms = (*work.rooms(steps + 1), *work.sorting())
+        stamps, colours = work.colours(len(table), 1)
+        rooms = (*work.rooms(steps + 1), *work.sorting(), stamps[:, 0], colours)
         integrate(along, given, reading, work.pairs, work.first_ray, kept, sums.numpy(), rooms)
         ctx.save_for_backward(table, strength, sh, origins, directions)
         ctx.work, ctx.kept, ctx.reading = work, kept, reading
@@ -79,8 +90,11 @@ class _Integrate(torch.autograd.Function):
         work, edges = ctx.work, ctx.kept[3].shape[1]
         jobs = len(work.first_ray) - 1
         rows, coefficients = torch.zeros(jobs, len(table), 13), torch.zeros(jobs, *sh.shape)
-        grad_origins, grad_directions = torch.zeros(len(origins), 3), torch.zeros(len(origins), 3)
-        rooms = *work.rooms(edges), np.empty((jobs, 2, work.most), np.float32)
+        # Without a row for each ray, gradients of colours are summed over rays of one origin.
+        grad_origins = torch.zeros(len(origins) if ctx.needs_input_grad[3] else 0, 3)
+        grad_directions = torch.zeros(len(origins), 3)
+        colour_sums = np.zeros((jobs, len(table), 3), np.float32)
+        rooms = *work.rooms(edges), np.empty((jobs, 2, work.most), np.float32), *work.colours(len(table), 2), colour_sums
         integrate_backward(
             (array(origins), array(directions)),
             (array(table), array(strength), array(sh)),
@@ -93,7 +107,8 @@ class _Integrate(torch.autograd.Function):
             tuple(x.numpy() for x in (rows, coefficients, grad_origins, grad_directions)),
         )
         summed = rows.sum(dim=0)
-        return summed[:, :12], summed[:, 12], coefficients.sum(dim=0), grad_origins, grad_directions, None
+        moved = grad_origins if len(grad_origins) else None
+        return summed[:, :12], summed[:, 12], coefficients.sum(dim=0), moved, grad_directions, None
 
 
 def gaussian_integrals(primitives: Primitives, rays: Rays, steps: int, extra: int = 0) -> Float[Tensor, "n c"]:

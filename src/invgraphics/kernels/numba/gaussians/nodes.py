@@ -25,18 +25,17 @@ _RISES = _rises()
 _LOG2E = np.float32(1 / np.log(2.0))
 _MOST = np.float32(MAX_OPTICAL_DEPTH)
 _TINY, _EPS = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
-_BITS, _BUCKETS, _PASSES = np.uint32(8), 256, 4
+_BITS, _BUCKETS, PASSES = np.uint32(8), 256, 2
+_LAST_KEY = np.float32(65535.0)
+"""Edges are sorted in steps of this part of a ray's interval, which is far less than a node's distance from the next."""
+_DEEPEST = np.float32(18.0)
+"""Optical depth of the staircase behind which Gaussians are not looked at: float32 knows no alpha between it and 1."""
 
 
 @inlined
 def _sort(keys, rises, keys_swap, rises_swap, n, counts):
-    """Sort non-negative floats, viewed as unsigned integers, with what belongs to them; back in the first arrays."""
-    counts[:] = 0
-    for i in range(n):
-        key = keys[i]
-        for p in range(_PASSES):
-            counts[p, (key >> np.uint32(_BITS * np.uint32(p))) & np.uint32(255)] += 1
-    for p in range(_PASSES):
+    """Sort 16-bit keys with what belongs to them, of which ``counts`` holds the histograms; back in the first arrays."""
+    for p in range(PASSES):
         shift = np.uint32(_BITS * np.uint32(p))
         total = np.int32(0)
         for bucket in range(_BUCKETS):
@@ -56,27 +55,38 @@ def _sort(keys, rises, keys_swap, rises_swap, n, counts):
 def place_nodes(t, sigma, depth, begin, end, near, far, nodes, scratch, counts):
     """Fill ``nodes`` with edges from near to far for the Gaussians ``begin`` to ``end - 1`` of a ray.
 
-    ``scratch`` holds six rows of at least `COUNT` entries per Gaussian: keys, rises, both once more, and two sums.
+    ``scratch`` holds six rows of at least `COUNT` entries per Gaussian: keys, rises, both once more, and two sums. Returns the
+    distance behind which no light comes from, infinite where the ray is not blocked.
     """
     steps = len(nodes) - 1
     n = 0
+    counts[:] = 0
+    scale = _LAST_KEY / max(far - near, _TINY)
+    step = max(far - near, _TINY) / _LAST_KEY
+    keys, swap = scratch[0].view(np.uint32), scratch[2].view(np.uint32)
     for i in range(begin, end):
         height = depth[i] / sigma[i]
         for e in range(COUNT):
             at = min(max(t[i] + sigma[i] * _EDGES[e], near), far)
-            # Distances from near are not negative: their bits sort as integers do.
-            scratch[0, n], scratch[1, n] = at - near, height * _RISES[e]
+            key = np.uint32(min((at - near) * scale + np.float32(0.5), _LAST_KEY))
+            keys[n], scratch[1, n] = key, height * _RISES[e]
+            counts[0, key & np.uint32(255)] += 1
+            counts[1, key >> _BITS] += 1
             n += 1
-    keys, swap = scratch[0].view(np.uint32), scratch[2].view(np.uint32)
     _sort(keys, scratch[1], swap, scratch[3], n, counts)
-    place, reached, grown = scratch[0], scratch[4], scratch[5]
+    place, reached, grown = scratch[2], scratch[4], scratch[5]
+    for i in range(n):
+        place[i] = np.float32(keys[i]) * step
     density, total = 0.0, 0.0
     reached[0] = np.float32(0.0)
+    stop = np.float32(np.inf)
     for i in range(n - 1):
         # In float64, because the density of thin Gaussians is large and must vanish behind them.
         density += np.float64(scratch[1, i])
         total += max(density, 0.0) * np.float64(place[i + 1] - place[i])
         reached[i + 1] = np.float32(total)
+        if reached[i + 1] >= _DEEPEST and place[i + 1] < stop:
+            stop = place[i + 1]
     last = max(np.float32(total), _TINY)
     whole = np.float32(1.0) / _one_minus_exp(last)
     deepest = np.float32(1.0) / min(last, _MOST)
@@ -91,6 +101,7 @@ def place_nodes(t, sigma, depth, begin, end, near, far, nodes, scratch, counts):
         low, high = grown[after - 1], grown[after]
         part = min(max((wanted - low) / max(high - low, _EPS), np.float32(0.0)), np.float32(1.0))
         nodes[s] = near + place[after - 1] + part * (place[after] - place[after - 1])
+    return near + stop
 
 
 @inlined
