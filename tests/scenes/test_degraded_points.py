@@ -71,8 +71,9 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("INVGRAPHICS_CACHE", str(tmp_path))
 
 
-def test_sfm_points_lie_on_the_plane(plane: Scene) -> None:
+def test_sfm_points_lie_on_the_plane(plane: Scene, capfd: pytest.CaptureFixture[str]) -> None:
     points = sfm.triangulate(plane)
+    assert capfd.readouterr() == ("", "")  # COLMAP accounts for every photograph and pair
     assert len(points) > 50
     assert float(points.position[:, 2].abs().median()) < 0.02 and float(points.position[:, 2].abs().max()) < 0.2
     place = ((points.position[:, :2].numpy() + 1) * 128).clip(0, 255).astype(int)

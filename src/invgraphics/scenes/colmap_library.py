@@ -1,7 +1,8 @@
 """pycolmap, without what its import does to the process.
 
 COLMAP's logging takes SIGTERM as a crash: it prints a stack trace and dies, and a command could not save what it has computed.
-Whoever listened before gets the signal back here. This takes a second to import: do it where it is needed.
+Whoever listened before gets the signal back here, and its account of every photograph and pair, printed to the terminal, is
+left out: errors are shown. This takes a second to import: do it where it is needed.
 """
 
 import signal
@@ -10,6 +11,8 @@ import threading
 import pycolmap
 
 __all__ = ["pycolmap"]
+
+pycolmap.logging.minloglevel = 2
 
 _listener = signal.getsignal(signal.SIGTERM)
 # Python knows nothing of the change; only its main thread may speak of signals.

@@ -55,9 +55,6 @@ class Clock:
 
 def main(work: Path) -> None:
     """Do the whole work and leave it in ``work``/result."""
-    from invgraphics.scenes.colmap_library import pycolmap
-
-    pycolmap.logging.minloglevel = 2
     asked = read_json(work / JOB)
     job = PhotoJob.parse(json.dumps(asked["job"]))
     result = work / RESULT
