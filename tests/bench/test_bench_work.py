@@ -8,7 +8,6 @@ from scipy.spatial import KDTree
 from invgraphics import kernels
 from invgraphics.bench import (
     iterations,
-    lattice_cases,
     limits,
     memory,
     peers,
@@ -18,6 +17,7 @@ from invgraphics.bench import (
     surface_cases,
     workload,
 )
+from invgraphics.bench.gates import gates
 from invgraphics.bench.results import BOTH, FORWARD, FORWARD_ONLY, SIZE_KEYS, Results
 from invgraphics.bench.run import BenchRequest, bench, measure_case
 from invgraphics.bench.timing import Effort
@@ -214,4 +214,13 @@ def test_peers_that_are_missing_or_broken_are_named(monkeypatch) -> None:
         ("Dr.Jit (LLVM) hash encoding", "it failed: ZeroDivisionError: division by zero"),
         ("Mitsuba's volprim_rf_basic", "not installed"),
     ]
-    assert {m.implementation for m in results.measurements} == {"numba", lattice_cases.TORCH}
+    assert {m.implementation for m in results.measurements} == {"numba"}
+
+
+def test_quick_runs_measure_what_promises_on_lattices_are_made_for(monkeypatch) -> None:
+    monkeypatch.setattr("invgraphics.bench.run._CASES", {"lattice": lambda quick: iter(())})
+    monkeypatch.setattr("invgraphics.bench.run._effort", lambda request: Effort(0.0, 1, 1))
+    monkeypatch.setattr("invgraphics.bench.run._measure_limits", lambda request, results: None)
+    monkeypatch.setattr("invgraphics.bench.run.kernels.warm_up", lambda: None)
+    found = [gate for gate in gates(bench(BenchRequest(("lattice",), quick=True))) if "lattice" in gate.name]
+    assert len(found) == 4 and all(gate.measured is not None for gate in found)

@@ -50,14 +50,6 @@ def peers(effort: Effort, results: Results) -> None:
             _row(f"{PEERS}: hash encoding", name, direction, HASH_GATE, timing, passes * look_ups, "look-ups")
             for name, timing in timings.items()
         ]
-    for name, layout in LAYOUTS.items():
-        samplers = {ours: lattice_cases.ours(layout, GATE_POINTS), TORCH: torch_sampler(layout, GATE_POINTS)}
-        for direction in (FORWARD, BOTH):
-            timings = alternate({who: runs[direction] for who, runs in samplers.items()}, effort)
-            results.measurements += [
-                _row(f"{PEERS}: {name}", who, direction, layout.sizes(GATE_POINTS), timing, float(GATE_POINTS), "points")
-                for who, timing in timings.items()
-            ]
     pictures: dict[str, dict[str, Run]] = {ours: _our_splats()}
     _add(pictures, "Mitsuba's volprim_rf_basic", "Mitsuba (ray traced)", _mitsuba, results)
     timings = alternate({name: runs[FORWARD] for name, runs in pictures.items()}, effort)
@@ -66,6 +58,19 @@ def peers(effort: Effort, results: Results) -> None:
         _row(f"{PEERS}: picture of Gaussians", name, FORWARD, SPLAT_GATE, timing, pixels, "pixels")
         for name, timing in timings.items()
     ]
+
+
+def lattice_peers(effort: Effort, results: Results) -> None:
+    """Time torch's grid sampler in alternation with `kernels.lattice_encode`, on the layouts that promises are made for."""
+    ours = kernels.in_use()
+    for name, layout in LAYOUTS.items():
+        samplers = {ours: lattice_cases.ours(layout, GATE_POINTS), TORCH: torch_sampler(layout, GATE_POINTS)}
+        for direction in (FORWARD, BOTH):
+            timings = alternate({who: runs[direction] for who, runs in samplers.items()}, effort)
+            results.measurements += [
+                _row(f"{PEERS}: {name}", who, direction, layout.sizes(GATE_POINTS), timing, float(GATE_POINTS), "points")
+                for who, timing in timings.items()
+            ]
 
 
 def _row(

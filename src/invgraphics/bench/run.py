@@ -11,7 +11,7 @@ from invgraphics import kernels
 from invgraphics.bench import PARTS, iterations, lattice_cases, limits, sample_cases, splat_cases, surface_cases
 from invgraphics.bench.case import Case
 from invgraphics.bench.memory import measure_memory
-from invgraphics.bench.peers import peers
+from invgraphics.bench.peers import lattice_peers, peers
 from invgraphics.bench.results import BOTH, FORWARD_ONLY, MACHINE, THREADS, Measurement, Results, Skipped
 from invgraphics.bench.timing import Effort, alternate
 from invgraphics.kernels.allocator import keep_freed_memory
@@ -89,6 +89,9 @@ def _measure_part(part: str, request: BenchRequest, results: Results) -> None:
     if part in _CASES:
         for case in _CASES[part](request.quick):
             results.measurements += measure_case(case, request, results.skipped)
+        if part == "lattice" and "numba" in request.implementations:  # promises are about this ratio, in quick runs too
+            request.progress("torch's grid sampler")
+            lattice_peers(_effort(request), results)
     elif part == "threads":
         _measure_threads(request, results)
     elif "numba" not in request.implementations:
