@@ -153,6 +153,7 @@ def test_a_key_that_only_some_methods_have_refuses_the_others(tmp_path: Path, mo
         (("splatting/gaussians", "volumetric/hash"), (), EXACT_POINTS, "sfm"),
         (("splatting/gaussians", "volumetric/hash"), ("data.init=scene",), EXACT_POINTS, "scene"),
         (("volumetric/nerf", "volumetric/hash"), (), EXACT_POINTS, "scene"),  # which have no use for points
+        (("volumetric/hash",), ("renderer.sampler.points_until=0.1",), EXACT_POINTS, "sfm"),
         (("splatting/gaussians", "volumetric/hash"), (), "4,096 from SfM", "scene"),
     ],
 )
