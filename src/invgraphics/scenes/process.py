@@ -16,7 +16,7 @@ from subprocess import PIPE
 from typing import IO
 
 from invgraphics.errors import InputError
-from invgraphics.interruption import WITH_PARENT
+from invgraphics.interruption import WITH_PARENT, end_with_parent
 from invgraphics.tables import parse_json
 
 Progress = Callable[[int, int, str], None]
@@ -24,12 +24,29 @@ Progress = Callable[[int, int, str], None]
 
 def write_progress(done: int, total: int, what: str) -> None:
     """Write a worker's progress as a line of standard output."""
+    # A parent that was killed leaves a closed pipe: writing to it ends this process too.
     print(f"progress {done} {total} {what}", flush=True)
 
 
 def write_error(error: InputError) -> None:
     """Write a worker's failure as a line of standard output."""
     print(f"error {json.dumps([error.sentence, error.remedy])}", flush=True)
+
+
+def worker_main(main: Callable[[Path], None], unwritable: Callable[[Path, OSError], InputError]) -> None:
+    """Run a worker's main function on the folder of the command line; a failure is written, and ends with exit status 1.
+
+    Args:
+        main: does the work; reads its request from the folder and leaves its result there.
+        unwritable: explains what the operating system refused.
+    """
+    end_with_parent()
+    folder = Path(sys.argv[1])
+    try:
+        main(folder)
+    except (InputError, OSError) as error:
+        write_error(error if isinstance(error, InputError) else unwritable(folder, error))
+        sys.exit(1)
 
 
 def run_worker(

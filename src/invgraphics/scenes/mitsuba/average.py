@@ -22,16 +22,14 @@ from jaxtyping import Float
 
 from invgraphics.arrays import read_arrays
 from invgraphics.core import Camera
-from invgraphics.errors import InputError
 from invgraphics.files import write_text
-from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.images import area_resize
 from invgraphics.scenes.mitsuba import cache, render, stage
 from invgraphics.scenes.mitsuba import folder as folders
 from invgraphics.scenes.mitsuba.gbuffer import trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job, Source
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
-from invgraphics.scenes.process import write_error, write_progress
+from invgraphics.scenes.process import worker_main, write_progress
 from invgraphics.tables import read_json
 
 
@@ -86,12 +84,4 @@ def _declare(folder: Path, source: Source) -> None:
 
 
 if __name__ == "__main__":
-    end_with_parent()
-    try:
-        main(Path(sys.argv[1]))
-    except InputError as error:
-        write_error(error)
-        sys.exit(1)
-    except OSError as error:
-        write_error(cache.unwritable(Path(sys.argv[1]), error))
-        sys.exit(1)
+    worker_main(main, cache.unwritable)

@@ -7,7 +7,6 @@ view: ``progress DONE TOTAL WHAT``. Views that an interrupted process has left a
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import sys
 import tempfile
@@ -20,7 +19,6 @@ from invgraphics.arrays import read_arrays
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_arrays
-from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.mitsuba import folder as folders
 from invgraphics.scenes.mitsuba import ply, stage
 from invgraphics.scenes.mitsuba.build import BUILDERS
@@ -30,6 +28,7 @@ from invgraphics.scenes.mitsuba.cache import REQUEST, unwritable
 from invgraphics.scenes.mitsuba.gbuffer import GBuffer, sample_points, trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
+from invgraphics.scenes.process import worker_main, write_progress
 
 POINTS = 20_000
 
@@ -51,11 +50,11 @@ def main(folder: Path) -> None:
         for index, camera in enumerate(views[split]):
             if os.getppid() != parent:
                 sys.exit("nobody waits for this rendering any more")  # what is done stays, and is gone on with
-            _report(done, job.total, f"{split} {index:04d}")
+            write_progress(done, job.total, f"{split} {index:04d}")
             if not folders.view_paths(folder, split, index)[1].exists():
                 _render_view(job, scene, model, folder, (split, index, camera))
             done += 1
-    _report(done, job.total, "points and mesh")
+    write_progress(done, job.total, "points and mesh")
     _finish(job, model, folder, views)
 
 
@@ -120,19 +119,5 @@ def _write_points(job: Job, folder: Path, train: tuple[Camera, ...]) -> None:
     write_arrays(folder / "points.npz", {"position": position.astype(np.float32), "rgb": rgb.astype(np.float32)})
 
 
-def _report(done: int, total: int, what: str) -> None:
-    # A parent that was killed leaves a closed pipe: writing to it ends this process too.
-    print(f"progress {done} {total} {what}", flush=True)
-
-
 if __name__ == "__main__":
-    end_with_parent()
-    try:
-        main(Path(sys.argv[1]))
-    except InputError as error:
-        print("error", json.dumps([error.sentence, error.remedy]), flush=True)
-        sys.exit(1)
-    except OSError as error:
-        refused = unwritable(Path(sys.argv[1]), error)
-        print("error", json.dumps([refused.sentence, refused.remedy]), flush=True)
-        sys.exit(1)
+    worker_main(main, unwritable)

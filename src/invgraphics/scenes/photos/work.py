@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
-from invgraphics.interruption import end_with_parent
 from invgraphics.scenes.photos import sfm
 from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, SCHEMA, TOP_VIEW, PhotoJob
@@ -26,7 +24,7 @@ from invgraphics.scenes.photos.plot import top_view
 from invgraphics.scenes.photos.prepare import PREPARED, Preparation, prepare
 from invgraphics.scenes.photos.quality import EMPTY_FIGURES, describe, refusal, unplaced
 from invgraphics.scenes.photos.result import write_scene
-from invgraphics.scenes.process import write_error, write_progress
+from invgraphics.scenes.process import worker_main, write_progress
 from invgraphics.tables import parse_json, read_json
 
 STEPS = {"read": 10, "features": 20, "matches": 35, "poses": 27, "pictures": 8}
@@ -114,13 +112,9 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
     }
 
 
+def _unwritable(folder: Path, error: OSError) -> InputError:
+    return InputError(f"{folder} cannot be written: {error.strerror or error}.", "Choose another --out.")
+
+
 if __name__ == "__main__":
-    end_with_parent()
-    try:
-        main(Path(sys.argv[1]))
-    except InputError as error:
-        write_error(error)
-        sys.exit(1)
-    except OSError as error:
-        write_error(InputError(f"{sys.argv[1]} cannot be written: {error.strerror or error}.", "Choose another --out."))
-        sys.exit(1)
+    worker_main(main, _unwritable)
