@@ -19,7 +19,7 @@ FIELDS, RENDERERS, SAMPLERS = (sorted(plugins.names(registry)) for registry in (
 FEW = {
     "stratified": {"count": 24},
     "hierarchical": {"coarse": 12, "fine": 12},
-    "occupancy": {"steps_per_diagonal": 64, "cone": 0.1},
+    "occupancy": {"steps_per_diagonal": 64, "cone": 0.1, "resolution": 32},
     "proposals": {"counts": (12,), "count": 12},
     "up_sampling": {"coarse": 12, "fine": 12, "rounds": 2},
     "error_bounded": {"coarse": 12, "fine": 12, "extra": 4, "rounds": 2, "bisections": 4},
@@ -53,18 +53,14 @@ def matching(renderer: str, field: Any) -> dict[str, int]:
 def variants(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
     """A small neural field of every encoding and geometry, with every renderer of densities or distances and every sampler."""
     small = {"layers": 1, "width": 16, "skip": -1, "colour_layers": 1, "colour_width": 16, "geometry_features": 7}
-    for encoding, geometry, sampler in product(plugins.names("encodings"), ("density", "sdf"), SAMPLERS):
-        encode, look = (
-            plugins.load("encodings", encoding)(),
-            replace(plugins.load("samplers", sampler)(), **FEW.get(sampler, {})),
-        )
-        field = build("fields", "neural", scene, encoding=encode, geometry=geometry, **small)
+    for encoding, geometry in product(plugins.names("encodings"), ("density", "sdf")):
+        name = f"neural/{encoding}/{geometry}"
+        field = build("fields", "neural", scene, encoding=plugins.load("encodings", encoding)(), geometry=geometry, **small)
         perturb(field)
-        if sampler == SAMPLERS[0]:
-            yield f"neural/{encoding}/{geometry}", field, "sphere_tracing", build("renderers", "sphere_tracing", scene)
-        for renderer in ("volumetric", "volsdf", "neus"):
-            built = build("renderers", renderer, scene, sampler=look)
-            yield f"neural/{encoding}/{geometry}", field, f"{renderer}/{sampler}", built
+        yield name, field, "sphere_tracing", build("renderers", "sphere_tracing", scene)
+        for sampler, renderer in product(SAMPLERS, ("volumetric", "volsdf", "neus")):
+            look = replace(plugins.load("samplers", sampler)(), **FEW.get(sampler, {}))
+            yield name, field, f"{renderer}/{sampler}", build("renderers", renderer, scene, sampler=look)
 
 
 def assert_draws(field: Any, renderer: Any, scene: Scene, learns: bool = True) -> None:
@@ -80,6 +76,7 @@ def assert_draws(field: Any, renderer: Any, scene: Scene, learns: bool = True) -
     assert bool((((norm - 1).abs() < 1e-4) == (rendering.alpha >= 0.5)).all())
     if not list(field.parameters()):
         return  # nothing to fit
+    field.zero_grad()
     rendering.over(scene.background).sum().backward()
     gradients = [parameter.grad for parameter in field.parameters() if parameter.grad is not None]
     assert any(bool(gradient.any()) for gradient in gradients) or not learns

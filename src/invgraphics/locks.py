@@ -20,6 +20,8 @@ INSIDE = ".lock"
 """Lock file of a folder that is written file by file."""
 ORPHAN_SECONDS = 10.0
 """Longest wait for the child processes of a holder that died, which keep its lock until they have ended."""
+SIGNATURE_SECONDS = 1.0
+"""Longest wait for the name of a holder that has locked the file but not yet signed it."""
 POLL_SECONDS = 0.05
 
 
@@ -108,6 +110,9 @@ def _acquire(what: Path, file: Path, waiting: Callable[[Holder], None] | None) -
             continue
         holder = _holder(descriptor)
         os.close(descriptor)
+        if not holder.pid and time.monotonic() < began + SIGNATURE_SECONDS:
+            time.sleep(POLL_SECONDS)
+            continue
         if waiting is not None and not notified:
             waiting(holder)
             notified = True

@@ -1,10 +1,12 @@
 """One process writes an output at a time, a second one is refused and told who writes; what is finished is not erased."""
 
+import fcntl
 import json
 import os
 import re
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -68,6 +70,18 @@ def test_of_two_different_fits_one_is_refused(toy_folder: Path, tmp_path: Path, 
     assert json.loads((out / "provenance.json").read_text())["seed"] == first
     assert json.loads((out / "scores.json").read_text())["seed"] == first
     assert not (out / locks.INSIDE).exists()
+
+
+def test_a_holder_that_has_not_signed_yet_is_waited_for(tmp_path: Path) -> None:
+    """Between its lock and its signature the message named nobody."""
+    file = tmp_path / ".lock"
+    with file.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        signature = threading.Timer(0.2, file.write_text, [f"{os.getpid()}\nhere\n2026-01-01 00:00:00 UTC"])
+        signature.start()
+        with pytest.raises(InputError, match=f"process {os.getpid()} on here"), locks.locked(tmp_path, file):
+            pass
+        signature.join()
 
 
 def test_a_killed_process_holds_nothing(toy_folder: Path, tmp_path: Path) -> None:
