@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
 
-.PHONY: env compare picture matrix bench notebooks test test-notebooks fuzz sabotage slow check clean
+.PHONY: env compare picture matrix prior bench notebooks test test-notebooks fuzz sabotage slow check clean
 
 env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
@@ -23,6 +23,10 @@ matrix: env  ## every method on one scene, a minute each (an hour in all), as a 
 	$(BIN)/invgraphics compare bricks --methods all --budget 60s --out reports/compare-all-bricks
 	$(BIN)/invgraphics report reports/compare-all-bricks --public --out reports/matrix
 	$(BIN)/python docs/matrix.py reports/compare-all-bricks docs/matrix.png
+
+prior: env  ## priors over chairs by three conditionings, and what they are worth from 1 to 8 views (about two hours): out/prior-inferred
+	$(BIN)/invgraphics ablate prior --out out/prior
+	$(BIN)/invgraphics infer out/prior --views 1,2,4,8 --no-prior 400steps
 
 bench: env  ## every kernel against the reference and the machine's limits: reports/bench
 	$(BIN)/invgraphics bench

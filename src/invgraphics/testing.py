@@ -167,6 +167,8 @@ def check_field(field: Field, scene: Scene) -> None:
     Its parameters are perturbed before (see `perturb`) and put back afterwards.
     """
     new = {name: value.clone() for name, value in field.state_dict().items()}
+    unfit = [name for name, value in new.items() if not bool(value.isfinite().all())]
+    assert not unfit, f"not finite in a new field, which stops every fit: {unfit}"
     perturb(field)
     pointwise = [quantity for quantity in _POINTWISE if quantity in field.provides]
     position = scene.bounds.from_unit(torch.rand(37, 3)).requires_grad_(True)

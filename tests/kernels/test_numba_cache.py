@@ -76,6 +76,31 @@ def test_kernels_are_compiled_here_where_no_other_process_can(tmp_path: Path) ->
     assert run(ALONE, tmp_path, cold=False) == ["0", "2", "4"]
 
 
+def test_machine_code_is_that_of_all_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba itself looks at the kernel's own file only: what was inlined into it from others stayed as it had been."""
+    module = tmp_path / "doubling.py"
+    module.write_text("from invgraphics.kernels.numba import runtime\n\n@runtime.serial\ndef double(x):\n    return 2 * x\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    loaded = []
+    for sources in ("before", "before", "after", "after"):
+        monkeypatch.setattr(runtime, "SOURCES", sources)
+        sys.modules.pop("doubling", None)
+        kernel = import_module("doubling").double
+        assert kernel(21) == 42
+        loaded.append(sum(kernel.stats.cache_hits.values()))
+    assert loaded == [0, 1, 0, 1]
+
+
+def test_the_digest_of_sources_sees_every_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "splat").mkdir()
+    for name in ("runtime.py", "splat/raster.py"):
+        (tmp_path / name).write_text("x = 1\n")
+    monkeypatch.setattr(runtime, "__file__", str(tmp_path / "runtime.py"))
+    before = runtime.source_digest()
+    (tmp_path / "splat/raster.py").write_text("x = 2\n")
+    assert runtime.source_digest() != before
+
+
 def test_without_a_compiler_the_reference_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     code = "from invgraphics.kernels import dispatch; print(dispatch.in_use(), dispatch.unavailable_reason('numba'))"

@@ -14,6 +14,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes import mitsuba
 from invgraphics.scenes.layout import contracted_frame, evenly
 from invgraphics.scenes.open import SceneOptions, find_loader, open_scene, validate
+from invgraphics.scenes.poses import RIGID, pose, poses
 
 
 def view(index: int) -> View:
@@ -184,3 +185,17 @@ def test_plug_in_formats_are_asked_too(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(plugins, "names", lambda registry: {"mine": "somewhere:Mine"})
     monkeypatch.setattr(plugins, "load", lambda registry, name: Mine)
     assert open_scene(str(tmp_path)).name == "toy"
+
+
+def test_poses_of_a_class_are_made_rigid_as_each_alone_is() -> None:
+    generator = torch.Generator().manual_seed(0)
+    turned = torch.linalg.qr(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64)).Q
+    turned *= torch.linalg.det(turned)[:, None, None]
+    off = turned + 0.2 * RIGID * torch.randn(5, 3, 3, generator=generator, dtype=torch.float64)
+    matrices = torch.cat([off, torch.randn(5, 3, 1, generator=generator, dtype=torch.float64)], dim=2)
+    found = poses(matrices, str)
+    assert torch.allclose(found, torch.stack([pose(matrix, "") for matrix in matrices]), atol=1e-12)
+    assert torch.allclose(found[:, :3, :3].mT @ found[:, :3, :3], torch.eye(3, dtype=torch.float64).expand(5, 3, 3))
+    for bad, words in ((matrices[3] * 2, "not rigid"), (matrices[3] * torch.tensor([1, 1, -1, 1]), "left-handed")):
+        with pytest.raises(InputError, match=f"pose of view 3 is {words}"):
+            poses(torch.cat([matrices[:3], bad[None], matrices[4:]]), "view {}".format)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from invgraphics.cli.main import run as command
 from invgraphics.core import Context, Model, Scene, View
@@ -16,10 +17,14 @@ from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.recipes.recipe import load_method
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
-from invgraphics.report.inference import paired
+from invgraphics.report.statistics.instances import paired, table_of
 from invgraphics.runs.inference import Inference, InstanceScores
+from invgraphics.runs.study import CellRecord, StudyRecord
 from invgraphics.scenes.npz import save_npz
 from invgraphics.testing import toy_scene
+from invgraphics.tools import infer as module
+from invgraphics.tools import inference_pictures
+from invgraphics.tools.infer import InferRequest
 from invgraphics.tools.recipe_check import check_recipes
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.codes.inference import CodeInference, infer_codes
@@ -34,14 +39,14 @@ def of(views: tuple[View, ...], subjects: list[int]) -> tuple[View, ...]:
 
 @pytest.fixture(scope="module")
 def toy_class() -> Scene:
-    """Two training instances and two unseen ones, with an observed and a test view each."""
-    toy, more = toy_scene(views=8, size=12), toy_scene(views=5, size=12).train
+    """Two training instances and two unseen ones, with two observed views and a test view each."""
+    toy, more = toy_scene(views=8, size=12), toy_scene(views=7, size=12).train
     return replace(
         toy,
         train=of(toy.train[:4], [0, 0, 1, 1]),
         val=of(toy.train[4:5], [1]),
-        observed=of(more[:2], [2, 3]),
-        test=of(more[2:4], [2, 3]),
+        observed=of(more[:4], [2, 3, 2, 3]),
+        test=of(more[4:6], [2, 3]),
     )
 
 
@@ -55,7 +60,7 @@ def test_codes_are_found_again_and_nothing_else_changes(toy_class: Scene) -> Non
     model = Model(field, VolumetricConfig(StratifiedConfig(12)).build(toy_class), toy_class.bounds)
     true = torch.tensor([[0.4, 0.5], [-0.6, 0.8]])
     seen = []
-    for code, view in zip(true, toy_class.observed, strict=True):
+    for code, view in zip(true, toy_class.observed[:2], strict=True):
         picture = replace(model, field=field.at(code)).render(view.camera, normals=False)
         image = picture.rgb / picture.alpha.clamp_min(1e-3)[..., None]
         seen.append([replace(view, image=image, alpha=picture.alpha)])
@@ -99,26 +104,82 @@ def test_rays_on_the_foreground_are_the_share_asked_for(toy_class: Scene) -> Non
     assert int((batch.alpha > 0).sum()) < 8
 
 
-def test_from_a_fit_to_a_page(toy_class: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    save_npz(toy_class, tmp_path / "things.npz")
+@pytest.fixture(scope="module")
+def fitted_study(toy_class: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a study of two tiny priors that differ in how the code chooses the field."""
+    folder = tmp_path_factory.mktemp("priors")
+    save_npz(toy_class, folder / "things.npz")
     small = [f"field.{key}=8" for key in ("code", "hidden", "width", "features")] + ["renderer.features=8", "renderer.width=8"]
-    sets = [word for item in [*small, "batches.rays=64", "renderer.steps=3"] for word in ("--set", item)]
-    assert command(["fit", "prior/srn", "things.npz", "--budget", "4steps", "--preset", "laptop", *sets, "--out", "run"]) == 0
-    assert command(["infer", "run", "--steps", "2", "--test-views", "1", "--no-prior", "2steps", "--out", "inferred"]) == 0
+    fit = ["fit", "prior/srn", str(folder / "things.npz"), "--budget", "4steps", "--preset", "laptop"]
+    cells = []
+    for conditioning in ("hypernetwork", "film"):
+        sets = [*small, "batches.rays=64", "renderer.steps=3", f"field.conditioning={conditioning}"]
+        words = [word for item in sets for word in ("--set", item)]
+        assert command([*fit, *words, "--out", str(folder / "runs" / conditioning)]) == 0
+        run = f"runs/{conditioning}"
+        cells.append(CellRecord(id=conditioning, scene="things", method="prior/srn", seed=0, run=run, status="done"))
+    missing = replace(cells[0], id="missing", run="runs/missing", status="missing")
+    record = StudyRecord(name="priors", scenes=("things",), methods=("prior/srn",), cells=(*cells, missing))
+    record.write(folder / StudyRecord.FILE)
+    return folder
+
+
+def test_from_a_study_to_a_page(fitted_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["infer", str(fitted_study), "--steps", "2", "--test-views", "1", "--no-prior", "2steps", "--out", "inferred"]
+    assert command([*words, "--views", "1,2"]) == 0
     said = capsys.readouterr().out
     record = Inference.read(Path("inferred") / Inference.FILE)
-    ways = ("prior/srn", "class mean", "nearest training instance", "no prior")
-    assert [(one.subject, one.how) for one in record.instances] == [(s, way) for way in ways for s in (2, 3)]
+    ways = ("prior/srn, hypernetwork", "prior/srn, film", "class mean", "nearest training instance", "no prior")
+    made = [(one.subject, one.observed, one.how) for one in record.instances]
+    assert made == [(s, n, way) for s in (2, 3) for n in (1, 2) for way in ways]
     assert all(f"against {way}:" in said for way in ways[1:])
+    assert [fit.steps for fit in record.fits.values()] == [4, 4]
     page = (tmp_path / "inferred/index.html").read_text()
-    assert all(f"pictures/1/{s:04d}.png" in page and (tmp_path / f"inferred/pictures/1/{s:04d}.png").is_file() for s in (2, 3))
-    assert check_recipes(Path("inferred")).runs == 1
-    assert command(["infer", "run", "--views", "2"]) == 2 and "has 1 observed views, not 2" in capsys.readouterr().err
-    picture = next(Path("run/truth").glob("*/0000.png"))
-    assert command(["infer", "run", str(picture), "--view", "0002-00", "--steps", "2", "--out", "photo.png"]) == 0
+    for name in [f"{n}/{s:04d}.png" for s in (2, 3) for n in (1, 2)]:
+        assert f"pictures/{name}" in page
+        with Image.open(tmp_path / "inferred/pictures" / name) as picture:
+            assert picture.size == (12 * (1 + len(ways)), 12 * 3)
+    assert "psnr-over-views.svg" in page and (tmp_path / "inferred/figures/psnr-over-views.svg").is_file()
+    assert check_recipes(Path("inferred")).runs == 2
+    assert command([*words, "--views", "3"]) == 2 and "has 2 observed views, not 3" in capsys.readouterr().err
+    assert command([*words, "--views", "1", "--steps", "3"]) == 2 and "another inference" in capsys.readouterr().err
+
+
+def test_the_instance_in_a_photograph(fitted_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    picture = str(next(fitted_study.glob("runs/film/truth/*/0000.png")))
+    assert command(["infer", str(fitted_study), picture]) == 2 and "holds 2 runs" in capsys.readouterr().err
+    run = str(fitted_study / "runs/film")
+    assert command(["infer", run, picture, "--view", "0002-00", "--steps", "2", "--out", "photo.png"]) == 0
     assert Path("photo.png").is_file() and Path("photo.npz").is_file()
-    assert command(["infer", "run", str(picture), "--view", "nowhere"]) == 2 and "no view 'nowhere'" in capsys.readouterr().err
+    assert command(["infer", run, picture, "--view", "nowhere"]) == 2 and "no view 'nowhere'" in capsys.readouterr().err
+
+
+def test_an_interrupted_inference_loses_at_most_one_instance(
+    fitted_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = fitted_study / "runs/hypernetwork"
+    request = InferRequest(run, tmp_path / "whole", views=(1, 2), tests=1, no_prior="2steps", steps=2)
+    whole = module.infer(request)
+    drawn: list[Path] = []
+
+    def draw(path: Path, *rest: object) -> None:
+        drawn.append(path)
+        if len(drawn) == 3:
+            raise KeyboardInterrupt
+        inference_pictures.draw_instance(path, *rest)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(module, "draw_instance", draw)
+    again = replace(request, out=tmp_path / "again")
+    with pytest.raises(KeyboardInterrupt):
+        module.infer(again)
+    kept = Inference.read(again.out / Inference.FILE)
+    assert [(one.subject, one.observed) for one in kept.instances] == [(2, 1)] * 4 + [(2, 2)] * 4
+    found = module.infer(again)
+    assert [path.name for path in drawn] == ["0002.png", "0002.png", "0003.png", "0003.png", "0003.png"]
+    assert [replace(one, seconds=None) for one in found.instances] == [replace(one, seconds=None) for one in whole.instances]
+    assert module.infer(replace(again, views=(1,), instances=1)).instances == found.instances and len(drawn) == 5
 
 
 def test_unseen_instances_need_their_views(toy_class: Scene) -> None:
@@ -139,8 +200,10 @@ def test_intervals_are_those_of_paired_instances() -> None:
         for how, rows in values.items()
         for s, row in enumerate(rows)
     )
-    record = Inference(scene="x", runs={}, command="", date="", pictures=(), columns={}, seconds={}, instances=scores)
+    record = Inference(scene="x", runs={}, command="", date="", pictures=(), columns={}, instances=scores)
     gain = paired(record, "psnr", 1, ("a", "b"))
     test = ttest_rel([21.0, 25.0, 30.5], [19.5, 24.5, 27.5])
     assert gain is not None and gain.p == pytest.approx(test.pvalue) and gain.mean == pytest.approx(5 / 3)
     assert (gain.low, gain.high) == pytest.approx(tuple(test.confidence_interval()))
+    cell = table_of(record, "psnr", ["b", "a"])["a"][1]
+    assert cell.gain == gain and cell.mean == pytest.approx(76.5 / 3) and cell.certain == (test.pvalue < 0.05)

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from invgraphics.errors import InputError
-from invgraphics.runs.folder import check_run
+from invgraphics.runs.collection import runs_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,13 +18,14 @@ class Infer:
 
     Without a photograph: the class's unseen instances, from their first observed views; their test views are scored beside the
     class mean, the nearest training instance and, if asked, fits without a prior. Writes a page with pictures and intervals.
+    The same command again keeps what is finished; other --views and --instances are added to it.
 
     With a photograph: the instance that it shows. Its camera has the class's lens and is that of --view, or else looks at the
     middle of the class from --azimuth and --elevation. Writes a picture of it from around, with normals, and its code.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a fit to a class (`invgraphics fit prior/srn chairs`)."""
+    """The folder of a fit to a class (`invgraphics fit prior/srn chairs`), or of a comparison or study of such fits."""
     photo: Annotated[Positional[Path | None], arg(metavar="[PHOTO]", help_behavior_hint="(default: the unseen instances)")] = (
         None
     )
@@ -36,9 +37,9 @@ class Infer:
     instances: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     """Unseen instances, the first ones."""
     against: Annotated[str, arg(metavar="RUN,RUN", help_behavior_hint="(default: none)")] = ""
-    """Other fits to the same class to compare with."""
+    """Other fits to the same class to compare with, or comparisons and studies of them."""
     no_prior: Annotated[str | None, arg(metavar="BUDGET", help_behavior_hint="(default: none)")] = None
-    """Also fit each instance without the prior, for so long (20s, 600steps); only from the fewest views, as the nearest."""
+    """Also fit each instance without the prior, for so long (20s, 600steps)."""
     view: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the angles)")] = None
     """The photograph's camera is that of this view of the class."""
     azimuth: Annotated[float, arg(metavar="DEGREES")] = -60.0
@@ -57,10 +58,11 @@ class Infer:
     def run(self) -> int:
         """Infer; prints what was found and where it was written. Returns exit status 0."""
         others = tuple(Path(one) for one in self.against.split(",") if one)
-        for folder in (self.folder, *others):
-            check_run(folder)
+        runs = [run for folder in (self.folder, *others) for run in runs_of(folder)]
         if self.photo is not None:
-            return self._infer_photo(self.photo)
+            if len(runs) > 1:
+                raise InputError(f"{self.folder} holds {len(runs)} runs.", f"Give one, for instance {runs[0]}.")
+            return self._infer_photo(self.photo, runs[0])
         views = self._view_counts()
         out = self.folder.with_name(f"{self.folder.name}-inferred") if self.out is None else self.out
 
@@ -84,12 +86,12 @@ class Infer:
         except ValueError:
             raise InputError(f"--views cannot be '{self.views}'.", "Expected numbers, separated by commas: 1,2,4,8.") from None
 
-    def _infer_photo(self, photo: Path) -> int:
+    def _infer_photo(self, photo: Path, run: Path) -> int:
         out = Path(f"{photo.stem}-inferred.png") if self.out is None else self.out
 
         from invgraphics.tools.infer_photo import PhotoRequest, infer_photo
 
         placed = (self.view, self.azimuth, self.elevation, self.steps, self.scene)
-        print(f"the photograph is reproduced at {infer_photo(PhotoRequest(self.folder, photo, out, *placed)):.2f} dB")
+        print(f"the photograph is reproduced at {infer_photo(PhotoRequest(run, photo, out, *placed)):.2f} dB")
         print(out)
         return 0

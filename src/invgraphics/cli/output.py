@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -12,7 +13,24 @@ if TYPE_CHECKING:
 NO_TRUTH = "the scene has no true "
 """How the reason begins for which a metric of geometry has no value."""
 PIPED_WIDTH = 160
-"""Columns where there is no terminal that could say how many it has."""
+"""Characters of a line where there is no terminal that could say how many it has."""
+GAP = 4
+"""Characters between two columns of a table."""
+
+
+def columns_that_fit(columns: Sequence[Sequence[str]]) -> int:
+    """Count the columns, from the first one on, for whose cells and headings' words one line of the terminal has room.
+
+    Args:
+        columns: heading and texts of each.
+    """
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else PIPED_WIDTH
+    used = 0
+    for count, (heading, *texts) in enumerate(columns):
+        used += max(map(len, [*heading.split(), *texts]), default=0) + GAP
+        if used > width:
+            return count
+    return len(columns)
 
 
 def show_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -29,7 +47,7 @@ def show_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for index, column in enumerate(columns):
-        table.add_column(column, no_wrap=index == 0, overflow="fold")
+        table.add_column(column, no_wrap=index == 0, overflow="fold", min_width=max(map(len, column.split()), default=0))
     for row in rows:
         table.add_row(*row)
     console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH, highlight=False, markup=False)

@@ -5,14 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from invgraphics.cli.output import show_table
+from invgraphics.cli.output import columns_that_fit, show_table
 from invgraphics.errors import InputError
 from invgraphics.runs.comparison import ComparisonRecord
 from invgraphics.runs.folder import RUNS, RunFolder
+
+if TYPE_CHECKING:
+    from invgraphics.report.statistics.summary import Summary
+
+MOST_ACROSS = 6
+"""Most methods that a terminal's table has side by side; more stand below each other."""
+FIRST_SHOWN = ("psnr", "ssim", "normal_deg", "chamfer", "fit_seconds", "render_fps", "model_bytes", "primitives")
+"""Quantities that come first where a terminal has no room for all."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +124,7 @@ def write_report(folder: Path, out: Path | None = None, public: bool = False) ->
     page = build_report(folder, out, public)
     comparison = read_comparison(folder)
     summary = summarise(comparison)
-    # Quantities down, methods across: there are more of the former, and a terminal is narrow.
-    rows = []
-    for index, column in enumerate(summary.columns):
-        cells = [row.cells[index] for row in summary.rows]
-        rows.append([column.heading, *(f"{cell.text} {cell.spread}{' *' if cell.best else ''}".strip() for cell in cells)])
-    show_table(f"{comparison.question} (* best)", ["", *(row.label for row in summary.rows)], rows)
+    show_summary(f"{comparison.question} (* best)", summary)
     for sentence in dict.fromkeys(run.scores.below_baseline for run in comparison.runs if run.scores.below_baseline):
         print(sentence)
     for failure in comparison.failures:
@@ -129,3 +132,27 @@ def write_report(folder: Path, out: Path | None = None, public: bool = False) ->
             f"{failure.method}, seed {failure.seed}, failed: {failure.error.splitlines()[0] if failure.error else 'no message'}"
         )
     print(page)
+
+
+def show_summary(title: str, summary: Summary) -> None:
+    """Print a comparison's table: quantities down and methods across, or methods down where there are many."""
+    names = [row.label for row in summary.rows]
+    columns = {
+        column.key: [
+            column.heading,
+            *(
+                f"{row.cells[index].text} {row.cells[index].spread}{' *' if row.cells[index].best else ''}".strip()
+                for row in summary.rows
+            ),
+        ]
+        for index, column in enumerate(summary.columns)
+    }
+    if len(names) <= MOST_ACROSS:
+        show_table(title, ["", *names], list(columns.values()))
+        return
+    ranked = ["", *names], *(columns[key] for key in sorted(columns, key=lambda key: key not in FIRST_SHOWN))
+    count = columns_that_fit(ranked)
+    headings, *rows = zip(*ranked[:count], strict=True)
+    show_table(title, headings, rows)
+    if count < len(ranked):
+        print(f"Not shown here, for want of room: {', '.join(heading for heading, *_ in ranked[count:])}.")

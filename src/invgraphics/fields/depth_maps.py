@@ -46,7 +46,7 @@ class DepthMapsConfig:
             InputError: a training view has no depth, or they differ in size.
         """
         if self.depth == "field":
-            return DepthMapField(scene.train, [torch.full(view.image.shape[:2], torch.inf) for view in scene.train])
+            return DepthMapField(scene.train, [torch.zeros(view.image.shape[:2]) for view in scene.train])
         missing = [view.name for view in scene.train if view.depth is None]
         if missing:
             raise InputError(
@@ -87,7 +87,10 @@ class DepthMapField(Field):
 
     Args:
         views: the photographs.
-        depths: distance along the unit ray of each pixel, infinite where nothing is hit.
+        depths: distance along the unit ray of each pixel, infinite or 0 where nothing is hit.
+
+    Attributes:
+        depth: these, 0 where nothing is hit: what is not finite in a field stops a fit.
 
     Raises:
         InputError: the photographs differ in size.
@@ -110,7 +113,8 @@ class DepthMapField(Field):
         self.names = tuple(view.name for view in views)
         self.register_buffer("rgb", torch.stack([view.colour() for view in views]))
         self.register_buffer("alpha", torch.stack([view.opacity() for view in views]))
-        self.register_buffer("depth", torch.stack(list(depths)))
+        depth = torch.stack(list(depths))
+        self.register_buffer("depth", torch.where(depth.isinf(), 0.0, depth))
         for name, values in (("poses", "cam_to_world"), ("focal", "focal"), ("centre", "centre")):
             self.register_buffer(name, torch.stack([getattr(view.camera, values) for view in views]).detach().clone())
 
@@ -125,5 +129,6 @@ class DepthMapField(Field):
         height, width = self.depth.shape[1:]
         lenses = zip(self.poses, self.focal, self.centre, strict=True)
         cameras = [Camera(pose, focal, centre, width, height) for pose, focal, centre in lenses]
-        layers = zip(cameras, self.rgb, self.names, self.alpha, self.depth, strict=True)
+        depths = torch.where(self.depth > 0, self.depth, torch.inf)
+        layers = zip(cameras, self.rgb, self.names, self.alpha, depths, strict=True)
         return tuple(View(camera, rgb, name, alpha=alpha, depth=depth) for camera, rgb, name, alpha, depth in layers)

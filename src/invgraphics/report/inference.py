@@ -10,9 +10,22 @@ import numpy as np
 
 from invgraphics.files import write_text
 from invgraphics.report.data.assets import Folder, writing
-from invgraphics.report.pages.comparison import render
-from invgraphics.report.statistics.intervals import Estimate, estimate
-from invgraphics.runs.inference import Inference, InstanceScores
+from invgraphics.report.figures.few_views import draw_few_views
+from invgraphics.report.figures.style import Figure
+from invgraphics.report.pages.comparison import markdown_figures, render
+from invgraphics.report.pages.tables import escape_markdown
+from invgraphics.report.statistics.instances import (
+    Cell,
+    counts_of,
+    made,
+    mean_of,
+    paired,
+    subjects_of,
+    table_of,
+    ways_of,
+)
+from invgraphics.report.statistics.intervals import Estimate
+from invgraphics.runs.inference import Inference
 
 SHOWN = {
     "psnr": ("PSNR", "dB"),
@@ -22,7 +35,8 @@ SHOWN = {
     "alpha_iou": ("silhouette", "IoU"),
 }
 """Metric -> its heading and unit, in the order of the table."""
-NAMES = {"input": "input view", "truth": "truth, hidden side"}
+DRAWN = {"psnr": "PSNR (dB)", "normal_deg": "normal error (degrees)"}
+"""Metrics that have a plot and tables of differences."""
 
 
 @dataclass(frozen=True)
@@ -44,94 +58,92 @@ class Row:
     seconds: str
 
 
+@dataclass(frozen=True)
+class Differences:
+    """Table of a metric over numbers of views: each way's mean, and its difference from the first way.
+
+    Attributes:
+        label: the metric with its unit.
+        rows: name -> (mean, difference with interval, whether beyond chance) for each number of views.
+    """
+
+    label: str
+    rows: dict[str, list[tuple[str, str, bool]]]
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Pictures of an instance: number, file, and the PSNR of each model in words."""
+
+    subject: int
+    url: str
+    scores: tuple[str, ...]
+
+
 def build_inference_report(folder: Path) -> Path:
-    """Write the page of an inference; returns it, ``index.html``. Beside it: ``index.md`` with the table and the sentences.
+    """Write the page of an inference; returns it, ``index.html``. Beside it: ``index.md`` with tables and sentences.
 
     Raises:
         InputError: the folder holds no inference, or cannot be written.
     """
     record = Inference.read(folder / Inference.FILE)
-    rows, sentences = _rows(record), inference_sentences(folder)
+    rows, sentences, counts = _rows(record), inference_sentences(folder), counts_of(record)
+    priors, first = list(record.runs), next(iter(record.runs))
+    baselines = [how for how in ways_of(record) if how not in record.runs]
     with writing(folder):
-        write_text(folder / "index.md", _markdown(record, rows, sentences))
+        place = Folder(folder)
+        figures = [
+            one for key, label in DRAWN.items() if (one := draw_few_views(record, key, label, folder / "figures")) is not None
+        ]
+        worth = [_differences(record, key, [first, *baselines]) for key in DRAWN] if len(counts) > 1 else []
+        fits = [_differences(record, key, priors) for key in DRAWN] if len(priors) > 1 else []
         context = {
             "record": record,
             "rows": rows,
             "headings": tuple(SHOWN.values()),
             "sentences": sentences,
-            "columns": {views: [NAMES.get(name, name) for name in names] for views, names in record.columns.items()},
-            "subjects": sorted({one.subject for one in record.instances}),
+            "counts": counts,
+            "first": first,
+            "worth": worth,
+            "fits": fits,
+            "figures": figures,
+            "strips": {n: _strips(record, n) for n in counts if n in record.pictures},
             "count": len({one.subject for one in record.instances}),
             "environment": {"date": record.date},
         }
-        render("inference.html", context, Folder(folder))
+        write_text(folder / "index.md", _markdown(context, place))
+        render("inference.html", context, place)
     return folder / "index.html"
 
 
 def inference_sentences(folder: Path) -> list[str]:
-    """Differences of the first prior to everything else, from the same views: means over instances, 95 % intervals.
+    """Differences of the first prior to everything else, from the fewest views: means over instances, 95 % intervals.
 
     Raises:
         InputError: the folder holds no inference.
     """
     record = Inference.read(folder / Inference.FILE)
-    first = next(iter(record.runs))
+    first, observed = next(iter(record.runs)), min(counts_of(record), default=1)
     sentences = []
-    for observed in sorted({one.observed for one in record.instances}):
-        others = dict.fromkeys(one.how for one in record.instances if one.observed == observed and one.how != first)
-        for other in others:
-            gain = paired(record, "psnr", observed, (first, other))
-            if gain is None:
-                continue
-            views = "1 view" if observed == 1 else f"{observed} views"
-            sentence = f"From {views}, {first} against {other}: {_signed(gain)} dB of PSNR on other views"
-            errors = [mean_of(record, "normal_deg", observed, how) for how in (first, other)]
-            if all(error is not None for error in errors):
-                turned = paired(record, "normal_deg", observed, (first, other))
-                assert turned is not None
-                sentence += f"; normals are off by {errors[0]:.1f} instead of {errors[1]:.1f} degrees ({_signed(turned)})"
-            sentences.append(f"{sentence}.")
+    for other in sorted(ways_of(record), key=lambda how: how in record.runs):  # the baselines first
+        gain = None if other == first else paired(record, "psnr", observed, (first, other))
+        if gain is None:
+            continue
+        sentence = f"From {_views(observed)}, {first} against {other}: {_signed(gain)} dB of PSNR on other views"
+        errors = [mean_of(record, "normal_deg", observed, how) for how in (first, other)]
+        turned = paired(record, "normal_deg", observed, (first, other))
+        if errors[0] is not None and errors[1] is not None and turned is not None:
+            sentence += f"; normals are off by {errors[0].mean:.1f} instead of {errors[1].mean:.1f} degrees ({_signed(turned)})"
+        sentences.append(f"{sentence}.")
     return sentences
 
 
-def paired(record: Inference, metric: str, observed: int, pair: tuple[str, str]) -> Estimate | None:
-    """Mean difference of a metric between two ways on the same test views; instances are the sample."""
-    first, second = ({one.subject: one for one in _made(record, observed, how)} for how in pair)
-    differences = [[_values(first[s], metric) - _values(second[s], metric)] for s in first if s in second]
-    return estimate([d for d in differences if np.isfinite(d[0]).any()], over="scenes")
+def _views(count: int) -> str:
+    return "1 view" if count == 1 else f"{count} views"
 
 
-def mean_of(record: Inference, metric: str, observed: int, how: str) -> float | None:
-    """Mean of a metric over the test views of each instance, then over instances; ``None`` where there is none."""
-    means = [
-        values[np.isfinite(values)].mean()
-        for one in _made(record, observed, how)
-        if np.isfinite(values := _values(one, metric)).any()
-    ]
-    return float(np.mean(means)) if means else None
-
-
-def _made(record: Inference, observed: int, how: str) -> list[InstanceScores]:
-    return [one for one in record.instances if one.how == how and one.observed == observed]
-
-
-def _values(scores: InstanceScores, metric: str) -> np.ndarray:
-    return np.array([np.nan if value is None else value for value in scores.quality.get(metric, ())], dtype=float)
-
-
-def _rows(record: Inference) -> list[Row]:
-    rows = []
-    for observed, how in dict.fromkeys((one.observed, one.how) for one in record.instances):
-        cells = []
-        for metric in SHOWN:
-            mean = mean_of(record, metric, observed, how)
-            cells.append(
-                "–" if mean is None else f"{mean:.3f}" if metric in ("ssim", "depth_abs_rel", "alpha_iou") else f"{mean:.2f}"
-            )
-        seen = np.mean([one.input_psnr for one in _made(record, observed, how)])
-        spent = record.seconds.get(how, {}).get(str(observed))
-        rows.append(Row(how, observed, tuple(cells), f"{seen:.2f}", "–" if spent is None else f"{spent:.0f}"))
-    return rows
+def _text(metric: str, value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}" if metric in ("ssim", "depth_abs_rel", "alpha_iou") else f"{value:.2f}"
 
 
 def _signed(gain: Estimate) -> str:
@@ -139,15 +151,64 @@ def _signed(gain: Estimate) -> str:
     return f"{gain.mean:+.2f}{interval}"
 
 
-def _markdown(record: Inference, rows: Sequence[Row], sentences: Sequence[str]) -> str:
-    head = [
-        "observed views",
-        "made by",
-        *(f"{name} ({unit})" if unit else name for name, unit in SHOWN.values()),
-        "PSNR of the input (dB)",
-        "seconds",
-    ]
-    lines = [f"# Unseen {record.scene}", "", *(f"- {sentence}" for sentence in sentences), ""]
+def _rows(record: Inference) -> list[Row]:
+    rows = []
+    for observed in counts_of(record):
+        for how in ways_of(record):
+            found = made(record, observed, how)
+            if not found:
+                continue
+            means = {metric: mean_of(record, metric, observed, how) for metric in SHOWN}
+            cells = tuple(_text(metric, None if mean is None else mean.mean) for metric, mean in means.items())
+            spent = [one.seconds for one in found if one.seconds is not None]
+            seen = float(np.mean([one.input_psnr for one in found]))
+            rows.append(Row(how, observed, cells, f"{seen:.2f}", f"{sum(spent):.0f}" if spent else "–"))
+    return rows
+
+
+def _differences(record: Inference, metric: str, ways: Sequence[str]) -> Differences:
+    def words(cell: Cell) -> tuple[str, str, bool]:
+        return _text(metric, cell.mean), "" if cell.gain is None else _signed(cell.gain), cell.certain
+
+    table = table_of(record, metric, ways)
+    return Differences(DRAWN[metric], {how: [words(cell) for cell in cells.values()] for how, cells in table.items()})
+
+
+def _strips(record: Inference, observed: int) -> list[Strip]:
+    strips = []
+    for subject in subjects_of(record, observed):
+        texts = []
+        for how in record.columns[str(observed)]:
+            own = [one for one in made(record, observed, how) if one.subject == subject]
+            values = [value for one in own for value in one.quality.get("psnr", ()) if value is not None]
+            texts.append(f"{np.mean(values):.1f} dB" if values else "")
+        strips.append(Strip(subject, f"pictures/{observed}/{subject:04d}.png", tuple(texts)))
+    return strips
+
+
+def _markdown(context: dict, place: Folder) -> str:
+    record: Inference = context["record"]
+    figures: list[Figure] = context["figures"]
+    text, counts = escape_markdown, context["counts"]
+    lines = [f"# Unseen {record.scene}", "", *(f"- {text(sentence)}" for sentence in context["sentences"]), ""]
+    titles = [("What the prior is worth", context["worth"]), ("The fits compared", context["fits"])]
+    for title, one in ((title, one) for title, tables in titles for one in tables):
+        lines += [f"{title}: {one.label}, mean over instances; in brackets the difference from the first row.", ""]
+        lines += ["| made by | " + " | ".join(_views(n) for n in counts) + " |", "|---" * (1 + len(counts)) + "|"]
+        for how, cells in one.rows.items():
+            words = [f"{mean} ({'**' + gain + '**' if sure else gain})" if gain else mean for mean, gain, sure in cells]
+            lines.append(f"| {text(how)} | {' | '.join(words)} |")
+        lines.append("")
+    if context["fits"]:
+        lines += ["| fit | parameters | budget | steps | seconds |", "|---|---|---|---|---|"]
+        for how, fit in record.fits.items():
+            seconds = "–" if fit.seconds is None else f"{fit.seconds:.0f}"
+            lines.append(f"| {text(how)} | {fit.parameters:,} | {fit.budget} | {fit.steps or '–'} | {seconds} |")
+        lines.append("")
+    names = (f"{name} ({unit})" if unit else name for name, unit in SHOWN.values())
+    head = ["observed views", "made by", *names, "PSNR of the input (dB)", "seconds"]
     lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    lines += [f"| {row.observed} | {row.how} | " + " | ".join([*row.cells, row.input_psnr, row.seconds]) + " |" for row in rows]
+    for row in context["rows"]:
+        lines.append(f"| {row.observed} | {text(row.how)} | " + " | ".join([*row.cells, row.input_psnr, row.seconds]) + " |")
+    lines += markdown_figures(figures, place)
     return "\n".join([*lines, "", f"`{record.command}`, {record.date}", ""])

@@ -14,9 +14,10 @@ from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap_workspace import find_model, model_folders
 from invgraphics.scenes.images import Photo
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, existing_photos, pose, scene_name
+from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, existing_photos, scene_name
 from invgraphics.scenes.lens import Lens
 from invgraphics.scenes.photos.notes import pose_notes
+from invgraphics.scenes.poses import pose
 
 
 class Colmap:

@@ -15,8 +15,8 @@ from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import focal_from_fov, opengl_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import SUFFIXES, Photo, file_exists, image_size
-from invgraphics.scenes.layout import pose
 from invgraphics.scenes.lens import Lens
+from invgraphics.scenes.poses import pose
 from invgraphics.tables import read_json
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")

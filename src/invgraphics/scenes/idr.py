@@ -18,7 +18,8 @@ from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.dtu import find_scan
 from invgraphics.scenes.images import Photo, image_files, image_size
-from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth, pose
+from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth
+from invgraphics.scenes.poses import pose
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 

@@ -31,7 +31,6 @@ IMAGE_FOLDERS = ("images", "input", "images_2", "images_4", "images_8")
 
 _HOLDERS = ("sparse", "dense", "colmap", "undistorted", "distorted")  # folders of a COLMAP workspace, which name no scene
 
-_RIGID = 1e-3  # a pose that is farther from a rotation than this is an error, not rounding
 _PARALLEL = 0.01  # mean squared sine of the angle between viewing directions (6°) below which they have no common focus
 
 
@@ -97,32 +96,6 @@ class Frame:
     bounds: Bounds
     world_from_local: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
     points: Points | None = None
-
-
-def pose(values: object, where: str) -> Float[Tensor, "4 4"]:
-    """Convert nested lists or an array of 3 or 4 rows to a rigid 4x4 pose in float64, orthonormalised.
-
-    Raises:
-        InputError: wrong shape, not finite, or not rigid; ``where`` names the file and the view.
-    """
-    try:
-        matrix = torch.as_tensor(values, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        matrix = torch.empty(0)
-    if matrix.shape not in ((3, 4), (4, 4)):
-        raise InputError(f"The pose of {where} is not a 4x4 matrix of numbers.")
-    if not bool(matrix.isfinite().all()):
-        raise InputError(f"The pose of {where} has entries that are not finite.", "Remove the view or estimate its pose again.")
-    rotation = matrix[:3, :3]
-    error = float((rotation.T @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
-    if error > _RIGID:
-        raise InputError(f"The pose of {where} is not rigid: its axes are off from orthonormal by {error:.2g}.")
-    if float(torch.linalg.det(rotation)) < 0:
-        raise InputError(f"The pose of {where} is left-handed: its rotation has determinant -1.")
-    u, _, vh = torch.linalg.svd(rotation)
-    result = torch.eye(4, dtype=torch.float64)
-    result[:3, :3], result[:3, 3] = u @ vh, matrix[:3, 3]
-    return result
 
 
 def is_image_folder(path: Path) -> bool:

@@ -22,6 +22,7 @@ bounds         (2, 3), optional               lowest and highest corner of a box
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +38,8 @@ from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.files import write_arrays
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
-from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points, pose
+from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points
+from invgraphics.scenes.poses import poses
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -59,8 +61,8 @@ class Npz:
         """
         arrays = _read(path)
         n, height, width = arrays["images"].shape[:3]
-        poses = torch.stack([_pose(path, arrays, i) for i in range(n)])
-        frame = _frame(arrays, poses, path)
+        world = poses(torch.from_numpy(arrays["cam_to_world"].astype(np.float64)), lambda i: f"{path}, view {i}")
+        frame = _frame(arrays, world, path)
         train, val, test, observed = _splits(arrays, n, path)
         if not train or not test:
             raise InputError(f"{path} has {len(train)} views to fit and {len(test)} to score; it needs at least one of each.")
@@ -74,7 +76,8 @@ class Npz:
         }
         if final != (width, height) and ("depth" in arrays or "normal" in arrays):
             notes["geometry"] = "depth and normals are dropped: they are one ray per pixel and cannot be averaged"
-        views = {i: _view(path, arrays, i, frame, final) for part in chosen for i in part}
+        named = list(zip(_cameras(arrays, world, frame), _names(arrays), strict=True))
+        views = {i: _view(path, arrays, i, named[i], frame, final) for part in chosen for i in part}
         return Scene(
             name=path.stem,
             train=tuple(views[i] for i in chosen[0]),
@@ -124,11 +127,7 @@ def _read(path: Path) -> Arrays:
     return arrays
 
 
-def _pose(path: Path, arrays: Arrays, i: int) -> Float[Tensor, "4 4"]:
-    return pose(arrays["cam_to_world"][i], f"{path}, view {i}")
-
-
-def _frame(arrays: Arrays, poses: Float[Tensor, "n 4 4"], path: Path) -> Frame:
+def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> Frame:
     points = None
     if "points" in arrays:
         position = arrays["points"]
@@ -141,7 +140,7 @@ def _frame(arrays: Arrays, poses: Float[Tensor, "n 4 4"], path: Path) -> Frame:
             torch.from_numpy(position.astype(np.float64)), torch.from_numpy(_bytes(rgb, "points_rgb", path)).float() / 255
         )
     if "bounds" not in arrays:
-        return contracted_frame(poses, points)
+        return contracted_frame(world, points)
     with np.errstate(over="ignore"):  # infinite bounds are refused with the scene
         lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32))
     if not bool((lo < hi).all()):
@@ -183,36 +182,48 @@ def _booleans(arrays: Arrays, key: str, default: np.ndarray, path: Path) -> np.n
     return arrays.get(key, default)
 
 
-def _view(path: Path, arrays: Arrays, i: int, frame: Frame, final: tuple[int, int]) -> View:
+def _cameras(arrays: Arrays, world: Float[Tensor, "n 4 4"], frame: Frame) -> list[Camera]:
+    """Cameras of all views in the local frame, at the pictures' size."""
+    n, height, width = arrays["images"].shape[:3]
+    local = torch.vmap(apply_similarity, in_dims=(None, 0))(torch.linalg.inv(frame.world_from_local), world)
+    centre = arrays.get("centre", np.array([width / 2, height / 2]))
+    lens = [torch.from_numpy(np.broadcast_to(values, (n, 2)).astype(np.float64)) for values in (arrays["focal"], centre)]
+    return [Camera(pose, focal, middle, width, height) for pose, focal, middle in zip(local, *lens, strict=True)]
+
+
+def _names(arrays: Arrays) -> list[str]:
+    """A view's index; of a class, its subject and its place among that subject's views."""
+    if "subject" not in arrays:
+        return [str(i) for i in range(len(arrays["images"]))]
+    seen: Counter[int] = Counter()
+    names = []
+    for subject in arrays["subject"].tolist():
+        names.append(f"{subject:04d}-{seen[subject]:02d}")
+        seen[subject] += 1
+    return names
+
+
+def _view(path: Path, arrays: Arrays, i: int, named: tuple[Camera, str], frame: Frame, final: tuple[int, int]) -> View:
     pixels = _bytes(arrays["images"][i], "images", path)
     if "alpha" in arrays:
         pixels = np.concatenate([pixels[:, :, :3], _bytes(arrays["alpha"][i], "alpha", path)[:, :, None]], axis=2)
-    height, width = pixels.shape[:2]
-    local = apply_similarity(torch.linalg.inv(frame.world_from_local), _pose(path, arrays, i))
-    focal = np.broadcast_to(arrays["focal"][i] if arrays["focal"].ndim == 2 else arrays["focal"], 2)
-    centre = arrays.get("centre", np.array([width / 2, height / 2]))
-    centre = centre[i] if centre.ndim == 2 else centre
-    focal, centre = (torch.from_numpy(np.array(values, dtype=np.float64)) for values in (focal, centre))
-    view = make_view(Camera(local, focal, centre, width, height), pixels, str(i), final)
+    view = make_view(named[0], pixels, named[1], final)
     if "subject" in arrays:
-        subject = int(arrays["subject"][i])
-        nth = int((arrays["subject"][:i] == subject).sum())
-        view = replace(view, subject=subject, name=f"{subject:04d}-{nth:02d}")
-    if final != (width, height):
+        view = replace(view, subject=int(arrays["subject"][i]))
+    if final != (named[0].width, named[0].height):
         return view
     depth, normal = arrays.get("depth"), arrays.get("normal")
-    scale, rotation = _parts(frame.world_from_local)
-    return replace(
-        view,
-        depth=None if depth is None else torch.from_numpy(depth[i].astype(np.float32)) / scale,
-        normal=None if normal is None else torch.from_numpy(normal[i].astype(np.float32)) @ rotation.float(),
-    )
+    if depth is not None:
+        view = replace(view, depth=torch.from_numpy(depth[i].astype(np.float32)) / _scale(frame))
+    if normal is not None:
+        rotation = (frame.world_from_local[:3, :3] / _scale(frame)).float()
+        view = replace(view, normal=torch.from_numpy(normal[i].astype(np.float32)) @ rotation)
+    return view
 
 
-def _parts(similarity: Float[Tensor, "4 4"]) -> tuple[float, Float[Tensor, "3 3"]]:
-    """Scale and rotation of a similarity."""
-    scale = float(torch.linalg.det(similarity[:3, :3]) ** (1 / 3))
-    return scale, similarity[:3, :3] / scale
+def _scale(frame: Frame) -> float:
+    """World length of one local unit."""
+    return float(np.linalg.det(frame.world_from_local[:3, :3].numpy()) ** (1 / 3))
 
 
 def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shape"]:

@@ -15,7 +15,8 @@ from invgraphics import plugins
 from invgraphics.core import Scene, View
 from invgraphics.core.believable import check_scene
 from invgraphics.errors import InputError, did_you_mean
-from invgraphics.scenes.layout import SceneOptions, pose
+from invgraphics.scenes.layout import SceneOptions
+from invgraphics.scenes.poses import poses
 
 __all__ = [
     "Loader",
@@ -217,31 +218,39 @@ def validate(scene: Scene) -> Scene:
                 f"The scene '{scene.name}' has no {split} views.", "At least one to fit and one to score is needed."
             )
     for split in ("train", "val", "test", "observed"):
-        for view in getattr(scene, split):
-            _validate_view(view, f"{split} view '{view.name}' of '{scene.name}'")
+        views = getattr(scene, split)
+        names = [f"{split} view '{view.name}' of '{scene.name}'" for view in views]
+        if views:
+            poses(torch.stack([view.camera.cam_to_world for view in views]), names.__getitem__)
+        for view, name in zip(views, names, strict=True):
+            _validate_view(view, name)
     check_scene(scene)
-    tested = torch.stack([_flat(view) for view in scene.test])
     for split in ("train", "val", "observed"):
-        for view in getattr(scene, split):
-            same = ((tested - _flat(view)).abs().amax(dim=1) < _SAME_POSE).nonzero()
-            if len(same):
-                twin = scene.test[int(same[0])].name
-                raise InputError(f"The {split} view '{view.name}' and the test view '{twin}' of '{scene.name}' share a camera.")
+        _check_apart(scene, split)
     return scene
 
 
-def _flat(view: View) -> torch.Tensor:
-    return view.camera.cam_to_world[:3].reshape(-1)
+def _check_apart(scene: Scene, split: str) -> None:
+    views: tuple[View, ...] = getattr(scene, split)
+    if not views:
+        return
+    stacked = torch.stack([view.camera.cam_to_world for view in views])
+    for test in scene.test:
+        same = ((stacked - test.camera.cam_to_world)[:, :3].abs().amax(dim=(1, 2)) < _SAME_POSE).nonzero()
+        if len(same):
+            name = views[int(same[0])].name
+            raise InputError(f"The {split} view '{name}' and the test view '{test.name}' of '{scene.name}' share a camera.")
 
 
 def _validate_view(view: View, what: str) -> None:
     camera = view.camera
-    pose(camera.cam_to_world, what)
     for name, values in (("image", view.image), ("alpha", view.alpha), ("depth", view.depth), ("normal", view.normal)):
         if values is None:
             continue
         if tuple(values.shape[:2]) != (camera.height, camera.width):
             height, width = values.shape[:2]
             raise InputError(f"The {name} of {what} has {width}x{height} pixels, its camera {camera.width}x{camera.height}.")
+        if values.dtype == torch.uint8:
+            continue
         if bool(values.isnan().any()) or (name != "depth" and not bool(values.isfinite().all())):
             raise InputError(f"The {name} of {what} has pixels that are not finite.")

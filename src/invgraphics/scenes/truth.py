@@ -15,9 +15,10 @@ from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
 from invgraphics.core.believable import FARTHEST
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import RESIZE, Photo, load_view
-from invgraphics.scenes.layout import SceneOptions, evenly, pose
+from invgraphics.scenes.layout import SceneOptions, evenly
 from invgraphics.scenes.mitsuba import cache, ply
 from invgraphics.scenes.npz import Npz
+from invgraphics.scenes.poses import pose
 
 LINEAR_RESIZE = "area average of linear light"
 """The filter from a larger rendering to the folder's pictures, see `invgraphics.scenes.mitsuba.average`."""

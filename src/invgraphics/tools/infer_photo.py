@@ -18,7 +18,8 @@ from invgraphics.experiments.evaluate import display
 from invgraphics.files import write_arrays, write_picture
 from invgraphics.runs.folder import output_file
 from invgraphics.scenes.images import make_view, read_pixels
-from invgraphics.tools.infer import open_class_runs, shown_normals
+from invgraphics.tools.class_runs import open_class_runs
+from invgraphics.tools.inference_pictures import shown_normals
 from invgraphics.training.codes.inference import CodeInference, infer_codes
 from invgraphics.training.localise import photometric_error
 

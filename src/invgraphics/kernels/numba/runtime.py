@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 # Measured on Linux: with torch in the same process, Numba's own first choice (tbb) and `workqueue` are 1.6 times slower.
@@ -82,6 +84,29 @@ _compiler = _Compiler()
 event.register("numba:compile", _compiler)
 
 
+def source_digest() -> str:
+    """SHA-256 over the names and texts of all modules of kernels."""
+    digest, root = hashlib.sha256(), Path(__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+SOURCES = source_digest()
+
+
+def _stamp(kernel: Any) -> None:
+    """Have a kernel compiled anew whenever any module of kernels has changed.
+
+    Numba's stamp is that of the kernel's own file, but the device functions inlined into it lie in others: after a change there
+    the old machine code would be loaded. Numba has no public way to add to the stamp; a version whose cache has another form
+    keeps its own.
+    """
+    with contextlib.suppress(AttributeError):
+        file = kernel._cache._cache_file
+        file._source_stamp = (file._source_stamp, SOURCES)
+
+
 def _cached(**options: Any) -> _Decorator:
     """`_njit` for kernels called from Python: machine code always comes from the cache on disk, filled by a helper process.
 
@@ -91,6 +116,7 @@ def _cached(**options: Any) -> _Decorator:
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = _njit(cache=True, nogil=True, **options)(function)
+        _stamp(kernel)
         load = kernel.compile
 
         def compile_or_load(signature: Any) -> Any:

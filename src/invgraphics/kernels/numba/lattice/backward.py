@@ -10,6 +10,7 @@ import numpy as np
 
 from invgraphics.kernels.numba.hash.cells import ZERO
 from invgraphics.kernels.numba.lattice.cells import BLOCK, CORNERS, EMPTY, WRITE, corners_of, job_scratch, locate_block
+from invgraphics.kernels.numba.lattice.pairs import is_pair, scatter_pair
 from invgraphics.kernels.numba.lattice.rows import interpolate_block, load_part, scatter_block
 from invgraphics.kernels.numba.runtime import GROUP, LANES, index, inlined, job_start, parallel, prange, serial
 from invgraphics.kernels.numba.simd.lanes import load, store
@@ -207,16 +208,40 @@ def _visit_block(positions, gradient, block, lattices, targets, one, starts, job
             if number != one.pivot:
                 entries, weights = corners_of(scratch, number - one.first)
                 locate_block(positions, block, lattices[number], entries, weights)
-        if one.end - one.first > 1:
-            interpolate_group(lattices, one.first, one.end, (touched, count), scratch)
-        for number in range(one.first, one.end):
-            lattice, (entries, weights) = lattices[number], corners_of(scratch, number - one.first)
-            start, end, address = _rows_of(lattice, targets[number], one, number, job, starts, copies)
-            if start < end:
-                some = (touched, count) if number == one.pivot else (led, leaders)
-                source = gradient_of(gradient, block, lattices, number, some, scratch)
-                grad_rows = floats_at(address, lattice.rows * lattice.channels)
-                scatter_block(lattice, entries, weights, some, (start, end), source, grad_rows)
+        points = touched, count, led, leaders
+        if is_pair(lattices, one.first, one.end):
+            _visit_pair(gradient, block, lattices, targets, one, starts, job, copies, scratch, points)
+        else:
+            _visit_group(gradient, block, lattices, targets, one, starts, job, copies, scratch, points)
+
+
+@inlined
+def _visit_group(gradient, block, lattices, targets, one, starts, job, copies, scratch, points):
+    """`_visit_block` for any number of factors."""
+    touched, count, led, leaders = points
+    if one.end - one.first > 1:
+        interpolate_group(lattices, one.first, one.end, (touched, count), scratch)
+    for number in range(one.first, one.end):
+        lattice, (entries, weights) = lattices[number], corners_of(scratch, number - one.first)
+        start, end, address = _rows_of(lattice, targets[number], one, number, job, starts, copies)
+        if start < end:
+            some = (touched, count) if number == one.pivot else (led, leaders)
+            source = gradient_of(gradient, block, lattices, number, some, scratch)
+            grad_rows = floats_at(address, lattice.rows * lattice.channels)
+            scatter_block(lattice, entries, weights, some, (start, end), source, grad_rows)
+
+
+@inlined
+def _visit_pair(gradient, block, lattices, targets, one, starts, job, copies, scratch, points):
+    """`_visit_block` for a product of two."""
+    flat, width = gradient
+    owner = max(one.pivot, one.first)
+    other = one.first + one.end - 1 - owner
+    a, b = lattices[owner], lattices[other]
+    start, end, address = _rows_of(a, targets[owner], one, owner, job, starts, copies)
+    begin, stop, whole = _rows_of(b, targets[other], one, other, job, starts, copies)
+    members, source = (owner - one.first, other - one.first), (flat, block[0] * width + index(a.column), width)
+    scatter_pair(a, b, scratch, members, points, (start, end), source, (address, whole if begin < stop else np.int64(0)))
 
 
 @parallel

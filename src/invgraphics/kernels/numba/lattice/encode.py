@@ -32,6 +32,7 @@ from invgraphics.kernels.numba.lattice.cells import (
     records,
     scratch_words,
 )
+from invgraphics.kernels.numba.lattice.pairs import is_pair, multiply_pair
 from invgraphics.kernels.numba.lattice.positions import position_gradient
 from invgraphics.kernels.numba.lattice.rows import interpolate_block
 from invgraphics.kernels.numba.runtime import array, index, job_start, once_differentiable, parallel, prange, scratch, threads
@@ -41,8 +42,8 @@ MOST_ROWS = 2**32 - 1
 """Vertices and rows that 32 bits can number, one number aside for empty vertices."""
 
 
-ALONE = (1, 0, 0)
-"""Sizes of the forward pass's scratch: the corners of one lattice at a time."""
+CORNERS_OF_TWO = (2, 0, 0)
+"""Sizes of the forward pass's scratch: the corners of two lattices at a time."""
 
 
 def memory_of(sizes: tuple[int, int, int], jobs: int) -> int:
@@ -55,17 +56,22 @@ def encode(positions, lattices, memory, jobs, out):
     """Combined features of all lattices at each point; ``positions`` is (3, m), ``memory`` the address of the jobs' scratch."""
     points, width = positions.shape[1], index(out.shape[1])
     for job in prange(jobs):
-        scratch, flat = job_scratch(memory, ALONE, job), unowned(out)
-        (entries, weights), chosen = corners_of(scratch, 0), scratch[3]
+        scratch, flat = job_scratch(memory, CORNERS_OF_TWO, job), unowned(out)
+        (entries, weights), others, chosen = corners_of(scratch, 0), corners_of(scratch, 1), scratch[3]
         begin, end = job_start(points, jobs, job), job_start(points, jobs, job + 1)
         for start in range(begin, end, BLOCK):
             block = index(start), min(BLOCK, end - start)
             some = chosen, list_points(block[1], chosen)
             for number in range(len(lattices)):
                 lattice = lattices[number]
-                locate_block(positions, block, lattice, entries, weights)
                 place = block[0] * width + index(lattice.column)
-                interpolate_block(lattice, entries, weights, some, lattice.mode, flat, place, width)
+                if not is_pair(lattices, lattice.group, lattice.group_end):
+                    locate_block(positions, block, lattice, entries, weights)
+                    interpolate_block(lattice, entries, weights, some, lattice.mode, flat, place, width)
+                elif number == lattice.group:
+                    locate_block(positions, block, lattice, entries, weights)
+                    locate_block(positions, block, lattices[number + 1], *others)
+                    multiply_pair(lattice, lattices[number + 1], (entries, weights), others, some, flat, place, width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +97,7 @@ class _Encode(torch.autograd.Function):
         table = shape.records_of(features)
         out = unit.new_empty(len(unit), int((table["column"] + table["channels"]).max()))
         jobs = threads()
-        encode(array(unit.T), table, memory_of(ALONE, jobs), jobs, out.numpy())
+        encode(array(unit.T), table, memory_of(CORNERS_OF_TWO, jobs), jobs, out.numpy())
         ctx.save_for_backward(unit, *features)
         ctx.shape = shape
         return out

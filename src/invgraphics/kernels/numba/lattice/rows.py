@@ -24,7 +24,7 @@ _V1, _V2, _V3, _V4, _V5, _V6, _V7 = (index(BLOCK * vertex) for vertex in range(1
 
 
 @inlined
-def _prefetch_cells(features, lattice, entries, n):
+def prefetch_cells(features, lattice, entries, n):
     """Prefetch the rows around a block's n-th point; in a dense lattice, neighbours along the last axis lie side by side."""
     channels, dense = index(lattice.channels), lattice.links == 0
     for corner in range(lattice.corners // 2 if dense else lattice.corners):
@@ -40,7 +40,7 @@ def _row(features, row, channels, k):
 
 
 @inlined
-def _interpolate_dense(features, corners, entries, weights, n, channels, k):
+def interpolate_dense(features, corners, entries, weights, n, channels, k):
     """Interpolate `LANES` features, k, k + 1, ..., of the n-th point; every corner has a row."""
     total = weights[n] * _row(features, entries[n], channels, k)
     total = total + weights[n + _V1] * _row(features, entries[n + _V1], channels, k)
@@ -110,11 +110,11 @@ def interpolate_block(lattice, entries, weights, points, mode, out, first, strid
         n = index(chosen[number])
         at = first + n * stride
         if large and number + AHEAD < count:
-            _prefetch_cells(features, lattice, entries, index(chosen[number + AHEAD]))
+            prefetch_cells(features, lattice, entries, index(chosen[number + AHEAD]))
         for start in range(0, lattice.channels, GROUP):
             k = index(min(start, last))
             if dense:
-                value = _interpolate_dense(features, corners, entries, weights, n, channels, k)
+                value = interpolate_dense(features, corners, entries, weights, n, channels, k)
             else:
                 value = _interpolate_any(features, corners, entries, weights, n, channels, k, part)
             if mode != WRITE:
@@ -129,8 +129,8 @@ def _add_row(grad_rows, row, channels, k, weight, value):
 
 
 @inlined
-def _scatter_dense(grad_rows, corners, entries, weights, n, channels, k, value):
-    """Transpose of `_interpolate_dense`: one after the other, because corners may share a row."""
+def scatter_dense(grad_rows, corners, entries, weights, n, channels, k, value):
+    """Transpose of `interpolate_dense`: one after the other, because corners may share a row."""
     _add_row(grad_rows, entries[n], channels, k, weights[n], value)
     _add_row(grad_rows, entries[n + _V1], channels, k, weights[n + _V1], value)
     if corners > 2:
@@ -144,7 +144,7 @@ def _scatter_dense(grad_rows, corners, entries, weights, n, channels, k, value):
 
 
 @inlined
-def _scatter_any(grad_rows, corners, entries, weights, n, channels, k, part, owned, value):
+def scatter_any(grad_rows, corners, entries, weights, n, channels, k, part, owned, value):
     """Add ``part`` values to those corners whose rows are ``owned``."""
     start, end = owned
     for corner in range(corners):
@@ -177,17 +177,17 @@ def scatter_block(lattice, entries, weights, points, owned, source, grad_rows):
         n = index(chosen[number])
         at = first + n * stride
         if large and number + AHEAD < count:
-            _prefetch_cells(grad_rows, lattice, entries, index(chosen[number + AHEAD]))
+            prefetch_cells(grad_rows, lattice, entries, index(chosen[number + AHEAD]))
         # Rows of a dense cell lie between those of its first and last corner.
         inside = dense and entries[n] >= owned[0] and entries[n + last] < owned[1]
         for start in range(0, whole, GROUP):
             k = index(start)
             value = load(gradient, at + k)
             if inside:
-                _scatter_dense(grad_rows, corners, entries, weights, n, channels, k, value)
+                scatter_dense(grad_rows, corners, entries, weights, n, channels, k, value)
             else:
-                _scatter_any(grad_rows, corners, entries, weights, n, channels, k, LANES, owned, value)
+                scatter_any(grad_rows, corners, entries, weights, n, channels, k, LANES, owned, value)
         if rest > 0:
             k = index(whole)
             value = load_first(gradient, at + k, rest)
-            _scatter_any(grad_rows, corners, entries, weights, n, channels, k, rest, owned, value)
+            scatter_any(grad_rows, corners, entries, weights, n, channels, k, rest, owned, value)
