@@ -45,6 +45,13 @@ def test_combinations(combine, channels):
     assert_equal([lattice(name, channels) for name in axes], combine)
 
 
+@pytest.mark.parametrize("sizes", [(60, 50, 40), (900, 4, 3)])
+@pytest.mark.parametrize("names", [("xy", "z"), ("z", "xy"), ("xz", "yz")])
+def test_products_of_lattices_that_are_too_large_for_copies(names, sizes):
+    """Threads share out the rows of a large factor, and the points that write a small one, whichever comes first."""
+    assert_equal([lattice(name, 16, sizes) for name in names], "vm")
+
+
 def test_a_product_of_planes_and_voxels_of_unequal_widths():
     assert_equal([lattice("xy", 3), lattice("yz", 3), lattice("zyx", 17), lattice("x", 17)], "vm")
 

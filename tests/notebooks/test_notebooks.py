@@ -29,6 +29,10 @@ SMALL = {
     "09-the-same-gaussians-two-ways": "size, turns = 72, 21",
     "10-from-photos-to-a-scene": "size, steps, levels = 64, 800, [0.0, 3.0]",
     "11-design-an-ablation": "size, views, steps, seeds, studies = 24, 8, 40, [0, 1], 100",
+    "12-many-scenes-one-table": (
+        "size, spp, test_views, steps, refit, front_steps = 32, 8, 8, 350, 40, 100\n"
+        "points, gaussians, voxels, planes, trial_size, trial_voxels = 4000, 1200, 32, 16, 64, 32"
+    ),
     "13-learning-to-render": "size, views, steps, attention_steps = 20, 12, 250, 20",
     "14-priors": "instances, seen_views, size, steps, alone_steps, infer_steps = 8, 6, 16, 300, 100, 60",
 }
@@ -344,6 +348,31 @@ def _ablation(out: _Printed) -> None:
     assert out.numbers("factorial:") == (36,) and out.numbers("one-at-a-time:") == (24,)
 
 
+def _tables(out: _Printed) -> None:
+    """What each representation loses, and the law by which it does: slip of planes, holes between points, rims of voxels."""
+    sizes = {name: out.numbers(f"\n{name} ")[0] for name in ("field", "planes", "lattice", "Gaussians")}
+    assert min(sizes.values()) > out.numbers("\npoints ")[0]
+    before, after = out.numbers("gaussians:", "dB as converted,")
+    assert after > before + 1
+    slips = [out.numbers(f"\n{count} planes at 40°: planes slip by", "px,") for count in (4, 16, 64)]
+    for (coarse, _), (fine, _), planes in zip(slips, slips[1:], (4, 16), strict=False):
+        assert coarse / fine == pytest.approx((4 * planes - 1) / (planes - 1), rel=0.02)
+    assert slips[1][1] > slips[0][1] + 1
+    holes = [out.numbers(f"points at {zoom} times the size: holes in", "predicted")[0] / 100 for zoom in (2, 4, 8)]
+    assert holes == sorted(holes) and holes[-1] > 0.8
+    for name, grows in (("lattice", True), ("mesh", False)):
+        first, last = out.numbers(f"rim of the {name}:", "px at x4,")
+        assert (last > 2.5 * first) is grows
+    line = "of the rods is left", *[","] * 4, "fog's alpha"
+    exact, mesh, planes = (out.numbers(f"\n{name}: {line[0]}", *line[1:]) for name in ("exact", "mesh", "planes"))
+    assert exact[:5] == (1,) * 5
+    assert mesh[0] > 0.8 and mesh[4] < 0.3
+    assert mesh[5] < 0.05 and planes[5] == pytest.approx(exact[5], abs=0.1)
+    assert out.numbers("mesh, low level: of the rods is left", "fog's alpha")[1] > 0.95
+    near, far = out.numbers("one-sided:", "photograph,")
+    assert near > far + 3
+
+
 def _learnt(out: _Printed) -> None:
     learnt, traced = out.numbers("all rays: after 10 steps the LSTM is off by", "sphere tracing by")
     assert traced < 0.01 and learnt < 0.3
@@ -376,6 +405,7 @@ HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
             _two_ways,
             _photos,
             _ablation,
+            _tables,
             _learnt,
             _priors,
         ),

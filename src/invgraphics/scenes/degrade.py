@@ -22,15 +22,17 @@ from invgraphics.core import Points, Scene, View
 from invgraphics.core.colour import linear_to_srgb, srgb_to_linear
 from invgraphics.errors import InputError
 from invgraphics.scenes.scales import check_scales, like, resized_view, scene_at
+from invgraphics.scenes.silhouettes import points_inside
 
 COLOURS = {"black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "white": (1.0, 1.0, 1.0)}
 """Backgrounds that have a name."""
 
 FEWEST_POINTS, ENOUGH_POINTS = 16, 5000
 """Fewer SfM points than the first are no start. Fewer than the second, as small pictures give them, are joined by as many
-random ones: a few hundred alone begin below a random start. PSNR of `splatting/gaussians` at 128 px after 400 steps, bricks and
-textured: SfM 24.9 and 25.0 dB, random 27.1 and 25.6, both 27.2 and 26.3; exact points 29.1 and 28.6. After 1500 steps
-on bricks the start no longer tells: 31.2, 31.4, 31.5 and 31.4 dB."""
+random ones, inside the silhouettes where photographs have alpha: a few hundred alone begin below a random start. PSNR of
+`splatting/gaussians` at 128 px after 400 steps, bricks and textured: SfM 24.9 and 25.0 dB, random 27.1 and 25.6, both 27.2 and
+26.3, both with silhouettes 28.4 and 27.7; exact points 29.1 and 28.6. After 1500 steps on bricks the start no longer tells:
+SfM 31.2, random 31.4, both 31.5 and exact points 31.4 dB."""
 
 KEEP = "random"
 """The background of a scene as loaded: its photographs keep their alpha, and each step draws a colour."""
@@ -161,9 +163,13 @@ def _with_points(scene: Scene, data: TrainingData, seed: int) -> Scene:
     if len(points) < FEWEST_POINTS:
         return replace(scene, points=None, notes=scene.notes | {"points": f"{what}, too few: a random start"})
     if len(points) < ENOUGH_POINTS:
-        unit = torch.rand(2, ENOUGH_POINTS, 3, generator=_generator(seed, "points", 0))
-        points = points.joined(Points(scene.bounds.lo + unit[0] * (scene.bounds.hi - scene.bounds.lo), unit[1]))
-        what = f"{what}, and {ENOUGH_POINTS:,} random ones"
+        generator = _generator(seed, "points", 0)
+        # Silhouettes at disturbed poses have little in common.
+        views = () if data.pose_noise else scene.train
+        more = points_inside(scene.bounds, views, ENOUGH_POINTS, generator)
+        points = points.joined(Points(more, torch.rand(more.shape, generator=generator)))
+        where = "" if all(view.alpha is None for view in views) else " inside the photographs' silhouettes"
+        what = f"{what}, and {len(more):,} random ones{where}"
     return replace(scene, points=points, notes=scene.notes | {"points": what})
 
 

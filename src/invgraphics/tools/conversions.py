@@ -42,6 +42,18 @@ DIRECTIONS = 12
 """Training cameras from which a vertex's radiance is looked at, to fit its spherical harmonics."""
 RIDGE = 0.1
 """Weight of the squared coefficients of view-dependent bands in that fit, per direction."""
+QUICK_RATES = tuple(
+    f"optimiser.groups.{group}.lr={rate}"
+    for group, rate in {
+        "scales": 2e-2,
+        "rotations": 4e-3,
+        "opacities": 1e-1,
+        "colour": 1e-2,
+        "view_dependence": 5e-4,
+    }.items()
+)
+"""Rates of converted Gaussians, which start in the right places: twice those of ``splatting/gaussians``, laptop.
+With 10,000 instead of 20,000 of them, 10 s of refit end 0.5 dB higher on bricks, 0.2 dB on textured (128 px, one seed)."""
 VISIBLE = 1e-3
 """Opacity of a voxel below which its colour does not matter."""
 
@@ -262,7 +274,7 @@ class Target:
 
 
 TARGETS = {
-    "gaussians": Target("splatting/gaussians", "surface points with normals", 20_000, to_gaussians),
+    "gaussians": Target("splatting/gaussians", "surface points with normals", 10_000, to_gaussians, QUICK_RATES),
     "lattice": Target(
         "volumetric/plenoxels",
         "density and colour",

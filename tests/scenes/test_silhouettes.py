@@ -1,0 +1,50 @@
+"""Points inside silhouettes, against the two balls that the photographs show."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from invgraphics.core import Scene
+from invgraphics.scenes.silhouettes import inside_silhouettes, points_inside
+from invgraphics.testing import TwoBalls, toy_scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return toy_scene(views=12, size=32)
+
+
+def depth_in_balls(points: torch.Tensor) -> torch.Tensor:
+    """Signed distance from the balls, negative inside."""
+    balls = TwoBalls()
+    return ((points[:, None] - balls.centres).norm(dim=-1) - balls.radii).amin(dim=1)
+
+
+def test_what_the_object_fills_is_kept_and_what_is_far_from_it_is_not(scene: Scene) -> None:
+    points = 2 * torch.rand(20_000, 3) - 1
+    inside, distance = inside_silhouettes(points, scene.train), depth_in_balls(points)
+    assert bool(inside[distance < 0].all())
+    assert not bool(inside[distance > 0.3].any())
+    # The hull of twelve silhouettes, each wider by a pixel, is not much larger than the balls; the box is 15 times as large.
+    volume = float(inside.float().mean() / (distance < 0).float().mean())
+    assert 1.0 < volume < 2.0
+
+
+def test_as_many_as_asked_for(scene: Scene) -> None:
+    draw = lambda views, count: points_inside(scene.bounds, views, count, torch.Generator().manual_seed(1))  # noqa: E731
+    found = draw(scene.train, 500)
+    assert found.shape == (500, 3)
+    assert float((depth_in_balls(found) < 0.15).float().mean()) > 0.9
+    opaque = tuple(replace(view, alpha=None) for view in scene.train)
+    assert float((depth_in_balls(draw(opaque, 500)) < 0.15).float().mean()) < 0.4
+    nothing = tuple(replace(view, alpha=torch.zeros_like(view.alpha)) for view in scene.train)
+    assert draw(nothing, 500).shape == (0, 3)
+
+
+def test_what_a_mask_leaves_out_says_nothing(scene: Scene) -> None:
+    blind = tuple(
+        replace(view, alpha=torch.zeros_like(view.alpha), mask=torch.zeros(view.image.shape[:2], dtype=torch.bool))
+        for view in scene.train
+    )
+    assert bool(inside_silhouettes(2 * torch.rand(100, 3) - 1, blind).all())
