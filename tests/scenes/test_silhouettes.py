@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Scene
+from invgraphics.core import Points, Scene
+from invgraphics.scenes.degrade import FEWEST_POINTS, TrainingData, degrade
 from invgraphics.scenes.silhouettes import inside_silhouettes, points_inside
 from invgraphics.testing import TwoBalls, toy_scene
 
@@ -48,3 +49,23 @@ def test_what_a_mask_leaves_out_says_nothing(scene: Scene) -> None:
         for view in scene.train
     )
     assert bool(inside_silhouettes(2 * torch.rand(100, 3) - 1, blind).all())
+
+
+def test_a_view_says_nothing_of_what_is_behind_its_camera(scene: Scene) -> None:
+    """Mirrored at the camera's centre, a point falls on the same pixel."""
+    view = scene.train[0]
+    outside = 2 * torch.rand(2000, 3) - 1
+    outside = outside[~inside_silhouettes(outside, (view,))]
+    assert len(outside) > 100
+    assert bool(inside_silhouettes(2 * view.camera.cam_to_world[:3, 3] - outside, (view,)).all())
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_they_join_few_points_unless_poses_are_disturbed(scene: Scene, monkeypatch: pytest.MonkeyPatch, noise: float) -> None:
+    few = Points(torch.zeros(FEWEST_POINTS, 3), torch.zeros(FEWEST_POINTS, 3))
+    monkeypatch.setattr("invgraphics.scenes.photos.triangulate.triangulated", lambda scene: few)
+    found = degrade(scene, TrainingData(init="sfm", pose_noise=noise), 0)
+    assert found.points is not None
+    share = float(inside_silhouettes(found.points.position[FEWEST_POINTS:], scene.train).float().mean())
+    assert (share == 1.0) == (noise == 0.0)
+    assert ("silhouettes" in found.notes["points"]) == (noise == 0.0)
