@@ -15,7 +15,7 @@ from invgraphics.runs.comparison import ComparisonRecord
 from invgraphics.runs.folder import RUNS, RunFolder
 
 if TYPE_CHECKING:
-    from invgraphics.report.statistics.summary import Summary
+    from invgraphics.report.statistics.summary import Cell, Summary
 
 MOST_ACROSS = 6
 """Most methods that a terminal's table has side by side; more stand below each other."""
@@ -138,13 +138,7 @@ def show_summary(title: str, summary: Summary) -> None:
     """Print a comparison's table: quantities down and methods across, or methods down where there are many."""
     names = [row.label for row in summary.rows]
     columns = {
-        column.key: [
-            column.heading,
-            *(
-                f"{row.cells[index].text} {row.cells[index].spread}{' *' if row.cells[index].best else ''}".strip()
-                for row in summary.rows
-            ),
-        ]
+        column.key: [column.heading, *(_text(row.cells[index]) for row in summary.rows)]
         for index, column in enumerate(summary.columns)
     }
     if len(names) <= MOST_ACROSS:
@@ -156,3 +150,7 @@ def show_summary(title: str, summary: Summary) -> None:
     show_table(title, headings, rows)
     if count < len(ranked):
         print(f"Not shown here, for want of room: {', '.join(heading for heading, *_ in ranked[count:])}.")
+
+
+def _text(cell: Cell) -> str:
+    return f"{cell.text} {cell.spread}{' *' if cell.best else ''}".strip()
