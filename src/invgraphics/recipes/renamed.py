@@ -35,6 +35,7 @@ ADDED_KEYS: dict[str, dict[str, Any]] = {
     "field.neural": _ADDED_TO_NEURAL,
     "renderer.sampler.proposal.neural": _ADDED_TO_NEURAL,
     "renderer.volumetric": {"colour_threshold": 0.0},
+    "batches": {"foreground_until": 1.0},
 }
 """Part of a recipe -> keys that later versions added, with the values that change nothing."""
 

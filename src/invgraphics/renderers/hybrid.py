@@ -115,7 +115,8 @@ class WeightPruned(Sampler):
     """Another sampler's samples, in training without those of negligible weight by the densities that it found on the way.
 
     Few samples of a sharp surface weigh anything, and those that do not have no gradient worth its price either: the
-    derivative of a density's tail is as small as the tail.
+    derivative of a density's tail is as small as the tail. Each ray keeps its heaviest sample, however light: were all left
+    out, a ray through empty space could never say that there should be something.
 
     Args:
         sampler: the other; samples that come without densities are all kept.
@@ -138,7 +139,9 @@ class WeightPruned(Sampler):
         if samples.density is None or not ctx.training:
             return samples, levels
         with torch.no_grad():
-            seen = torch.nonzero(sample_weights(samples.density, samples, len(rays)) > self.threshold)[:, 0]
+            weights = sample_weights(samples.density, samples, len(rays))
+            heaviest = weights.new_zeros(len(rays)).scatter_reduce(0, samples.ray, weights, "amax")
+            seen = torch.nonzero((weights > self.threshold) | ((weights > 0) & (weights == heaviest[samples.ray])))[:, 0]
         return samples[seen], levels
 
     @override

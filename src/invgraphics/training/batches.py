@@ -24,7 +24,9 @@ class BatchConfig:
         resolution: image scale of each phase of the fit; the last should be 1.
         until: progress at which each phase but the last ends; one fewer than ``resolution``.
         foreground: share of the rays that are drawn among the pixels with alpha, where a view has such: what is small in
-            its pictures is otherwise learnt from few rays.
+            its pictures is otherwise learnt from few rays, and a field that begins with empty space may stay empty.
+        foreground_until: progress at which that ends, and rays are drawn from all pixels alike. The start decides whether
+            there is a shape; NeRF's own code crops the middle of the pictures for it.
         opaque: whether opaque photographs of an unbounded scene are fitted over a random background too: every ray must then
             end at a surface, and dark surfaces cannot be learnt as empty space.
     """
@@ -36,6 +38,7 @@ class BatchConfig:
     until: tuple[float, ...] = ()
     opaque: bool = False
     foreground: float = 0.0
+    foreground_until: float = 1.0
 
     def __post_init__(self) -> None:
         if self.rays < 1 or self.views < 1 or self.samples < 0:
@@ -46,10 +49,16 @@ class BatchConfig:
             raise ValueError("'resolution' must hold scales in (0, 1].")
         if not 0 <= self.foreground <= 1:
             raise ValueError(f"'foreground' must be in [0, 1], not {self.foreground}.")
+        if not 0 <= self.foreground_until <= 1:
+            raise ValueError(f"'foreground_until' must be in [0, 1], not {self.foreground_until}.")
 
     def scale_at(self, progress: float) -> float:
         """Image scale at a point of the fit."""
         return self.resolution[sum(progress >= end for end in self.until)]
+
+    def foreground_at(self, progress: float) -> float:
+        """Share of rays among the pixels with alpha at a point of the fit."""
+        return self.foreground if progress < self.foreground_until or self.foreground_until == 1 else 0.0
 
 
 class RefinedCameras(Protocol):
@@ -101,7 +110,8 @@ class Batches:
         shares = [self._rays // count + (i < self._rays % count) for i in range(count)]
         scale = config.scale_at(progress)
         views = [self._scaled(int(view), scale) for view in chosen]
-        flat = [self._pixels_of(view, share) for view, share in zip(views, shares, strict=True)]
+        solid = config.foreground_at(progress)
+        flat = [self._pixels_of(view, share, solid) for view, share in zip(views, shares, strict=True)]
         which = torch.repeat_interleave(torch.arange(count), torch.tensor(shares))
         wide = torch.tensor([view.camera.width for view in views])[which]
         index = torch.cat(flat)
@@ -117,11 +127,11 @@ class Batches:
         batch = Batch(*_composited(views, flat, background), background)
         return rays.to(self._device), batch.to(self._device)
 
-    def _pixels_of(self, view: View, count: int) -> Tensor:
-        """Flat indices of random pixels within the view's mask, a share of them where it has alpha."""
-        if self._config.foreground > 0 and view.alpha is not None:
+    def _pixels_of(self, view: View, count: int, foreground: float) -> Tensor:
+        """Flat indices of random pixels within the view's mask, the share ``foreground`` of them where it has alpha."""
+        if foreground > 0 and view.alpha is not None:
             solid = torch.nonzero((view.alpha > 0 if view.mask is None else (view.alpha > 0) & view.mask).reshape(-1))[:, 0]
-            inside = round(self._config.foreground * count) if len(solid) else 0
+            inside = round(foreground * count) if len(solid) else 0
             chosen = solid[torch.randint(max(len(solid), 1), (inside,), generator=self._generator)]
             return torch.cat([chosen, self._anywhere(view, count - inside)])
         return self._anywhere(view, count)

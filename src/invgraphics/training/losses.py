@@ -19,6 +19,9 @@ Loss = Callable[[Rendering, Trace, Batch, Context], Tensor]
 """A term of the objective. The rendering's ``rgb`` is in front of ``batch.background`` already, composited once per step by
 `invgraphics.training.fit.Fit`; its ``alpha`` is still that of the scene alone."""
 
+LEAST_OPACITY = 1e-6
+"""Opacities are cut off here, and as far below 1, before a logarithm is taken."""
+
 Distance = Literal["mse", "l1", "huber", "charbonnier"]
 
 CHARBONNIER = 0.001
@@ -131,7 +134,7 @@ class BackgroundEntropyLoss:
 
     def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
         """The weighted mean over pixels, in nats."""
-        through = (1 - rendering.alpha).clamp(1e-6, 1 - 1e-6)
+        through = (1 - rendering.alpha).clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
         return self.weight * -(through * through.log() + (1 - through) * (1 - through).log()).mean()
 
 
@@ -162,7 +165,9 @@ class MaskLoss:
 
     Where sphere tracing says what its opacity is the sigmoid of, the loss is taken there and divided by the sigmoid's sharpness
     per half-extent of the box, as in IDR: its slope in the signed distance then neither grows with the sharpness nor vanishes
-    where the opacity saturates. Other opacities are cut off at 1e-3 and 1 - 1e-3, as in NeuS.
+    where the opacity saturates. Other opacities are cut off at 1e-6 and 1 - 1e-6, where NeuS takes 1e-3: the density of a
+    distance falls off exponentially, so the logarithm of what little opacity is left has a slope that calls back a shape which
+    has shrunk to nothing. Batches without a transparent pixel, such as those of opaque photographs, count nothing there.
 
     Attributes:
         weight: factor (IDR: 100; NeuS: 0.1).
@@ -173,7 +178,9 @@ class MaskLoss:
     def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
         """The weighted mean over pixels, in nats; over the sharpness where there is one."""
         if trace.surface is None:
-            alpha = rendering.alpha.clamp(1e-3, 1 - 1e-3)
+            if bool((batch.alpha >= 1).all()):
+                return batch.alpha.new_zeros(())
+            alpha = rendering.alpha.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
             return self.weight * torch.nn.functional.binary_cross_entropy(alpha, batch.alpha)
         logit, sharpness = trace.surface.logit, trace.surface.sharpness * float(ctx.bounds.half.mean())
         # Rays that miss the bounds are empty whatever the field is, and have a logit that is not finite.
