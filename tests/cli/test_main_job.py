@@ -56,6 +56,16 @@ def test_compare_then_evaluate_and_report(tmp_path, capsys) -> None:
     assert main.run(["evaluate", str(cell), "--protocol", "float"]) == main.DONE
     assert "protocol float" in capsys.readouterr().out
     assert json.loads((cell / "scores.float.json").read_text())["protocol"] == "float"
+    # Of other code: kept with --keep, fitted again without.
+    provenance = json.loads((cell / "provenance.json").read_text())
+    (cell / "provenance.json").write_text(json.dumps(provenance | {"cell_sha256": "0" * 64}))
+    scored = (cell / "scores.json").stat().st_mtime_ns
+    assert main.run(["compare", str(data), *words, "--keep"]) == main.DONE
+    assert (cell / "scores.json").stat().st_mtime_ns == scored
+    assert "--keep" in json.loads((out / "compare.json").read_text())["command"]
+    assert main.run(["compare", str(data), *words]) == main.DONE
+    assert (cell / "scores.json").stat().st_mtime_ns > scored
+    assert main.run(["evaluate", str(cell), "--protocol", "float"]) == main.DONE
     for name in ("scores.json", "scores.float.json", "provenance.json"):  # of the fit, and of the later evaluation
         assert json.loads((cell / name).read_text())["preset_choice"] == "as for every budget in steps"
 

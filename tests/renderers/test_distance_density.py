@@ -295,3 +295,21 @@ def test_samples_of_no_weight_are_left_out_in_training_only(config):
     assert torch.equal(pictures[2], pictures[3])
     assert some.untrained().volumetric.sampler.threshold == 1e-3
     assert some.required == every.required
+
+
+@pytest.mark.parametrize("config", [VolSDFConfig, NeuSConfig])
+def test_rays_through_emptiness_keep_their_heaviest_sample(config):
+    """So that a loss can say there should be something: the ball is too small for the threshold at every sample."""
+    scene, field = toy_scene(views=2, size=16), Sphere(1.0, 0.02)
+    sampler, wide = OccupancyConfig(resolution=16, steps_per_diagonal=64), {"beta": 0.02, "sharpness": 50.0}
+    wide = {key: value for key, value in wide.items() if hasattr(config, key)}
+    renderer = config(sampler, weight_threshold=0.9, **wide).build(scene)
+    rays = scene.train[0].camera.rays()
+    ctx = Context(scene.bounds, training=True, generator=torch.Generator().manual_seed(3))
+    rendering, trace = renderer.render_rays(field, rays, ctx)
+    assert trace.samples is not None
+    counts = torch.bincount(trace.samples.ray, minlength=len(rays))
+    all_weights = config(sampler, weight_threshold=0.0, **wide).build(scene).render_rays(field, rays, ctx)[0].alpha
+    assert counts.max() == 1
+    assert bool((counts[all_weights > 1e-6] == 1).all())
+    assert bool((rendering.alpha <= all_weights + 1e-6).all())

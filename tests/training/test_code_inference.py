@@ -104,6 +104,19 @@ def test_rays_on_the_foreground_are_the_share_asked_for(toy_class: Scene) -> Non
     assert int((batch.alpha > 0).sum()) < 8
 
 
+def test_the_foreground_has_its_share_until_then(toy_class: Scene) -> None:
+    alpha = torch.zeros(12, 12)
+    alpha[3, 5] = 1.0
+    scene = replace(toy_class, train=(replace(toy_class.train[0], alpha=alpha),))
+    config = BatchConfig(rays=200, views=1, foreground=0.5, foreground_until=0.3)
+    batches = Batches(config, scene, torch.Generator().manual_seed(0), CPU)
+    seen = [int((batches.rays(progress)[1].alpha > 0).sum()) for progress in (0.0, 0.29, 0.3, 1.0)]
+    assert min(seen[:2]) >= 100
+    assert max(seen[2:]) < 8
+    with pytest.raises(ValueError, match="foreground_until"):
+        BatchConfig(foreground_until=1.5)
+
+
 @pytest.fixture(scope="module")
 def fitted_study(toy_class: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a study of two tiny priors that differ in how the code chooses the field."""

@@ -58,6 +58,21 @@ def test_mask_loss_is_the_cross_entropy_over_the_sharpness() -> None:
     torch.testing.assert_close(masked(logit, true, 40.0).double(), 2 * plain / 60, rtol=1e-5, atol=0)
 
 
+def test_mask_loss_calls_back_what_is_nearly_gone() -> None:
+    """An opacity of 4.5e-5 still has the slope -1 / opacity, where NeuS's cut at 1e-3 leaves none."""
+    logit = torch.tensor([-10.0, -3.0], requires_grad=True)
+    masked(logit, torch.tensor([1.0, 0.0]), None).backward()
+    assert logit.grad is not None
+    # d/dx -log(sigmoid(x)) = sigmoid(x) - 1, and d/dx -log(1 - sigmoid(x)) = sigmoid(x); mean of two, times the weight of two.
+    torch.testing.assert_close(
+        logit.grad, torch.stack([logit[0].sigmoid() - 1, logit[1].sigmoid()]).detach(), rtol=1e-2, atol=0
+    )
+
+
+def test_mask_loss_of_opaque_photographs_is_nothing() -> None:
+    assert masked(torch.tensor([-2.0, 3.0]), torch.ones(2), None) == 0
+
+
 def test_mask_loss_pulls_on_saturated_rays_and_leaves_those_outside_the_bounds_alone() -> None:
     distance = torch.tensor([0.9, -0.9, 0.9, torch.inf], requires_grad=True)
     true = torch.tensor([1.0, 0.0, 0.0, 1.0])

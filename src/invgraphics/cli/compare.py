@@ -31,6 +31,8 @@ class Compare(Shared):
     `all`, or a pattern such as `volumetric/*`, takes those that go with the scene."""
     seeds: Annotated[str, arg(metavar="0,1,2")] = "0"
     """Each method is fitted once per seed."""
+    keep: bool = False
+    """Keep finished runs whose recipe, scene and request are the same although the code has changed since."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/compare-SCENE)")] = None
     """Folder of the report and its runs."""
 
@@ -57,7 +59,13 @@ class Compare(Shared):
         out = Path("reports") / f"compare-{Path(self.scene).resolve().name}" if self.out is None else self.out
         methods, optional = expand(parse_list(self.methods, "--methods")) if self.methods else ((), frozenset[str]())
         request = CompareRequest(
-            scene=self.scene, methods=methods, seeds=parse_seeds(self.seeds), optional=optional, out=str(out), **self.settings()
+            scene=self.scene,
+            methods=methods,
+            seeds=parse_seeds(self.seeds),
+            optional=optional,
+            out=str(out),
+            keep=self.keep,
+            **self.settings(),
         )
         return replace(request, asked=self.methods) if optional else request
 

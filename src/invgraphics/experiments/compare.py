@@ -17,8 +17,8 @@ from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import exposure_note, protocol_note
-from invgraphics.experiments.renderings import check_variants
-from invgraphics.experiments.request import DATA, CompareRequest
+from invgraphics.experiments.renderings import check_variants, is_kept
+from invgraphics.experiments.request import DATA, CompareRequest, FitRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.recipes.recipe import Method
@@ -38,7 +38,8 @@ MOST_NAMES = 6
 def compare(request: CompareRequest) -> tuple[Path, int]:
     """Fit and evaluate every cell, then write the comparison's record for the report.
 
-    Cells that an earlier, identical command finished are kept; one that it left half done goes on from its checkpoint.
+    Cells that an earlier, identical command finished are kept, with ``request.keep`` those of earlier code too; one that it
+    left half done goes on from its checkpoint.
 
     Returns:
         The comparison's folder, and how many cells failed.
@@ -60,7 +61,7 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     summary = replace(_summary(request, jobs, scene), refused=tuple(refused), method_choice=choice)
     interrupted: KeyboardInterrupt | None = None
     try:
-        with closing(LocalExecutor().run(request.fits(), folder.root / "jobs")) as outcomes:
+        with closing(LocalExecutor().run(_missing(request, jobs), folder.root / "jobs")) as outcomes:
             for outcome in outcomes:
                 if outcome.status == INTERRUPTED:
                     raise KeyboardInterrupt
@@ -120,6 +121,12 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     request = replace(request, methods=tuple(job.request.method for job in jobs))
     check_variants(jobs[0].variants, [job.method for job in jobs], full)
     return request, jobs, scene, [*refused, *unsuitable]
+
+
+def _missing(request: CompareRequest, jobs: Sequence[Job]) -> list[FitRequest]:
+    """Fits to start: all, since each knows by itself whether it is finished, but those that are kept whatever the code."""
+    methods = {job.request.method: job.method for job in jobs}
+    return [fit for fit in request.fits() if not (request.keep and is_kept(Job.of(fit, methods[fit.method])))]
 
 
 def _jobs(request: CompareRequest) -> tuple[list[Job], list[Refusal]]:

@@ -63,6 +63,16 @@ def renderings_complete(job: Job) -> bool:
     return record.identity == _identity(job.folder, job.variants, job.method)
 
 
+def is_kept(job: Job) -> bool:
+    """Whether a finished run counts although the code has changed since: by the same recipe, with every requested rendering.
+
+    Its folder, or `check_replaceable`, tells that scene and request are the same.
+    """
+    if not job.folder.finished or not renderings_complete(job):
+        return False
+    return job.folder.read(Provenance).recipe_sha256 == job.method.digest
+
+
 def render_missing(job: Job, scene: Scene) -> None:
     """Render and score a finished fit by every requested renderer; existing renderings are kept.
 

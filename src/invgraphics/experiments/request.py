@@ -119,12 +119,14 @@ class CompareRequest(Settings):
         seeds: each method is fitted once per seed.
         optional: methods that are left out, with the reason, where they do not go with the scene; others are an error.
         asked: the methods as they were asked for, patterns included; empty for ``methods`` themselves.
+        keep: whether finished runs count although the code has changed since, if recipe, scene and request are the same.
     """
 
     methods: tuple[str, ...]
     seeds: tuple[int, ...] = (0,)
     optional: frozenset[str] = frozenset()
     asked: str = ""
+    keep: bool = False
 
     def fits(self) -> list[FitRequest]:
         """List the fit requests, one per method and seed."""
@@ -143,7 +145,8 @@ class CompareRequest(Settings):
     def shell(self) -> str:
         """Shell command that repeats this comparison."""
         chosen = ["--methods", self.asked or ",".join(self.methods), "--seeds", ",".join(map(str, self.seeds))]
-        return shlex.join(["invgraphics", "compare", self.scene, *chosen, *self.flags()])
+        kept = ["--keep"] if self.keep else []
+        return shlex.join(["invgraphics", "compare", self.scene, *chosen, *self.flags(), *kept])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,12 +20,11 @@ from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, identify
 from invgraphics.experiments.progress import Reporter
-from invgraphics.experiments.renderings import check_variants, renderings_complete
+from invgraphics.experiments.renderings import check_variants, is_kept, renderings_complete
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs.folder import RunFolder
-from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.study import CellRecord
 from invgraphics.scenes.open import missing_data_reason
 from invgraphics.studies.analyses import write_analyses
@@ -119,18 +118,11 @@ def _state(planned: Planned, keep: bool, chosen: bool) -> CellState:
             request.
         chosen: whether the cell is part of this command.
     """
-    if keep and _is_kept(planned):
+    if keep and is_kept(planned.job):
         return CellState("done")
     if reason := missing_data_reason(planned.cell.scene):
         return CellState("skipped", reason)
     return CellState("missing" if chosen else "later")
-
-
-def _is_kept(planned: Planned) -> bool:
-    run = planned.job.folder
-    if not run.finished or not renderings_complete(planned.job):
-        return False
-    return run.read(Provenance).recipe_sha256 == planned.method.digest
 
 
 def _truth_key(planned: Planned) -> tuple[str, Size]:
