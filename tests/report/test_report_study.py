@@ -181,6 +181,14 @@ def bare_study(root: Path, factors: dict[str, list[Any]], psnr_of: Callable[[dic
     return root
 
 
+def test_scenes_from_paths_have_their_last_folders_name(tmp_path: Path) -> None:
+    """Where two have the same, both keep their paths."""
+    scenes = ["balls", "$SOME_DATA/mic", "/here/fox", "/there/fox/"]
+    study = read_study(bare_study(tmp_path, {}, lambda _: [30.0, 31.0], scenes=scenes))
+    assert study.scenes == ("balls", "mic", "/here/fox", "/there/fox/")
+    assert {one.scene for one in study.observations()} == set(study.scenes)
+
+
 def test_null_study_says_no_effect_and_a_planted_one_is_found(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     shift = {20: -2.0, 40: 0.0}

@@ -114,7 +114,8 @@ def read_study(folder: Path) -> Study:
         raise InputError(f"'{source}' lists no cells.", "Give a study with at least one scene, method and seed.")
     base = {key: level_text(value) for key, value in record.base.items()}
     protocol = str(record.protocol.get("name", DEFAULT))
-    cells = [_cell(cell, base, folder, protocol) for cell in record.cells]
+    shown = _scene_names([*record.scenes, *(cell.scene for cell in record.cells)])
+    cells = [_cell(cell, shown[cell.scene], base, folder, protocol) for cell in record.cells]
     factors = find_factors(record.factors, base, cells)
     return Study(
         name=record.name,
@@ -122,7 +123,7 @@ def read_study(folder: Path) -> Study:
         design=record.design,
         factors=factors,
         base=base,
-        scenes=_in_stated_order(record.scenes, (cell.scene for cell in cells)),
+        scenes=_in_stated_order([shown[scene] for scene in record.scenes], (cell.scene for cell in cells)),
         methods=_in_stated_order(record.methods, (cell.method for cell in cells)),
         seeds=tuple(sorted({cell.seed for cell in cells})),
         budget=record.budget,
@@ -139,7 +140,9 @@ def read_study(folder: Path) -> Study:
         each=record.each,
         interactions=record.interactions,
         margins=record.margins,
-        predictions=record.predictions,
+        predictions=tuple(
+            replace(one, scenes=tuple(shown.get(scene, scene) for scene in one.scenes)) for one in record.predictions
+        ),
     )
 
 
@@ -180,12 +183,18 @@ def _comparison(
     )
 
 
-def _cell(record: CellRecord, base: Mapping[str, str], folder: Path, protocol: str) -> StudyCell:
+def _scene_names(scenes: Sequence[str]) -> dict[str, str]:
+    """Name of each scene on the page: of a path its last folder, unless another scene has the same."""
+    short = {scene: scene.rstrip("/").rpartition("/")[2] for scene in scenes}
+    return {scene: name if list(short.values()).count(name) == 1 else scene for scene, name in short.items()}
+
+
+def _cell(record: CellRecord, scene: str, base: Mapping[str, str], folder: Path, protocol: str) -> StudyCell:
     own = {key: level_text(value) for key, value in record.levels.items()}
     amounts = (("seconds", record.budget_seconds), ("steps", record.budget_steps))
     return StudyCell(
         id=record.id,
-        scene=record.scene,
+        scene=scene,
         method=record.method,
         seed=record.seed,
         levels={METHOD: record.method} | dict(base) | own,
@@ -194,7 +203,7 @@ def _cell(record: CellRecord, base: Mapping[str, str], folder: Path, protocol: s
         error=record.error or ("no message" if record.status == "failed" else ""),
         seconds=record.seconds,
         run=read_run(inside(folder, record.run), protocol) if record.status == "done" else None,
-        label=record.label or f"{record.method} {record.scene}",
+        label=record.label or f"{record.method} {scene}",
         size=_size_text(record.size),
         budget=record.budget,
         amount=next(((unit, float(amount)) for unit, amount in amounts if amount is not None), None),

@@ -147,12 +147,8 @@ def write_verdict_report(study: Study, folder: Folder, source: Path) -> None:
 
 
 def _place(cell: StudyCell) -> str:
-    """Scene and size in words; a path is shortened to its last component."""
-    return f"{_scene(cell)}, {cell.size} px" if cell.size else _scene(cell)
-
-
-def _scene(cell: StudyCell) -> str:
-    return cell.scene if cell.scene.startswith("$") else cell.scene.rstrip("/").rpartition("/")[2]
+    """Scene and size in words."""
+    return f"{cell.scene}, {cell.size} px" if cell.size else cell.scene
 
 
 def _name(cell: StudyCell, study: Study) -> str:
