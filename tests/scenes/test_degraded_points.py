@@ -124,6 +124,24 @@ def test_the_start_is_declared(plane: Scene) -> None:
     assert empty.points is None and "too few: a random start" in empty.notes["points"]
 
 
+def test_photographs_in_which_nothing_matches_start_inside_their_silhouettes(plane: Scene) -> None:
+    alpha = torch.zeros(SIZE, SIZE)
+    alpha[SIZE // 4 : -SIZE // 4, SIZE // 4 : -SIZE // 4] = 1
+    grey = tuple(replace(view, image=torch.full_like(view.image, 99), alpha=alpha) for view in plane.train)
+    made = degrade(replace(plane, train=grey), TrainingData(init="sfm"), 0)
+    assert made.points is not None and 0 < len(made.points) <= ENOUGH_POINTS
+    assert "too few: " in made.notes["points"] and "inside the photographs' silhouettes" in made.notes["points"]
+    for view in grey:
+        place, z = view.camera.project(made.points.position)
+        shown = (z > 0) & (place >= 0).all(dim=1) & (place < SIZE).all(dim=1)
+        inside = (place - SIZE / 2).abs().amax(dim=1) <= SIZE / 4 + 1
+        assert bool((inside | ~shown).all())
+    nothing = tuple(replace(view, alpha=torch.zeros(SIZE, SIZE)) for view in grey)
+    seen = Bounds(torch.full((3,), -0.05), torch.full((3,), 0.05))
+    lost = degrade(replace(plane, train=nothing, bounds=seen), TrainingData(init="sfm"), 0)
+    assert lost.points is None and "too few: a random start" in lost.notes["points"]
+
+
 def test_points_are_cached_by_what_they_are_made_of(plane: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     first = sfm.triangulated(plane)
     monkeypatch.setattr(sfm, "triangulate", lambda scene: pytest.fail("computed again"))

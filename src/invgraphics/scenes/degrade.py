@@ -160,16 +160,18 @@ def _with_points(scene: Scene, data: TrainingData, seed: int) -> Scene:
 
     points = triangulated(scene)
     what = f"{len(points):,} from SfM on the training photographs as they are here"
-    if len(points) < FEWEST_POINTS:
-        return replace(scene, points=None, notes=scene.notes | {"points": f"{what}, too few: a random start"})
+    # Silhouettes at disturbed poses have little in common.
+    views = [] if data.pose_noise else [view for view in scene.train if view.alpha is not None]
     if len(points) < ENOUGH_POINTS:
         generator = _generator(seed, "points", 0)
-        # Silhouettes at disturbed poses have little in common.
-        views = () if data.pose_noise else scene.train
-        more = points_inside(scene.bounds, views, ENOUGH_POINTS, generator)
-        points = points.joined(Points(more, torch.rand(more.shape, generator=generator)))
-        where = "" if all(view.alpha is None for view in views) else " inside the photographs' silhouettes"
-        what = f"{what}, and {len(more):,} random ones{where}"
+        inside = points_inside(scene.bounds, views, ENOUGH_POINTS, generator)
+        few = len(points) < FEWEST_POINTS
+        if few and (not views or len(inside) == 0):
+            return replace(scene, points=None, notes=scene.notes | {"points": f"{what}, too few: a random start"})
+        more = Points(inside, torch.rand(inside.shape, generator=generator))
+        points = more if few else points.joined(more)
+        where = " inside the photographs' silhouettes" if views else ""
+        what = f"{what}, {'too few: ' if few else 'and '}{len(more):,} random ones{where}"
     return replace(scene, points=points, notes=scene.notes | {"points": what})
 
 
