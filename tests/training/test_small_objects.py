@@ -1,4 +1,7 @@
-"""Small objects off the middle: a distance starts as a ball that misses them, and must not end as empty space."""
+"""Small objects off the middle: most rays see none of them, a distance starts as a ball that misses them; none may be lost.
+
+Without masks and first rays on the object all of these fits end as empty space, at an overlap of 0.00.
+"""
 
 from dataclasses import replace
 
@@ -15,17 +18,18 @@ STEPS = 120
 
 @pytest.fixture(scope="module")
 def small_object() -> Scene:
-    """The toy scene in a corner of a box three times as large, a fifth as long in the pictures."""
+    """The toy scene off the middle of a box twice as large."""
     scene = toy_scene(views=12, size=32, zoom=0.6)
     return replace(scene, bounds=Bounds(torch.full((3,), -1.5), torch.full((3,), 2.5)))
 
 
-@pytest.mark.parametrize("name", SHRUNK)
+CONES = {"volumetric/mip-nerf-360": ["field.width=32", "renderer.sampler.counts=[16]"]}
+
+
+@pytest.mark.parametrize("name", [*SHRUNK, *CONES])
 def test_is_not_lost(name: str, small_object: Scene, make_fit) -> None:
     torch.manual_seed(0)
-    fit = make_fit(name, small_object, STEPS, 0, *SHRUNK[name], *BATCH)
-    before = toy_scores(fit)
+    fit = make_fit(name, small_object, STEPS, 0, *(SHRUNK | CONES)[name], *BATCH)
     fit.run(lambda _loss: False)
-    after = toy_scores(fit)
-    print(name, before, after)
-    assert after.overlap > 0.5
+    # A network of densities is still a fog after so few steps.
+    assert toy_scores(fit).overlap > (0.15 if name in CONES else 0.5)
