@@ -1,5 +1,7 @@
 """The sentence about methods that lose to the mean training image, on pictures made by hand."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -54,6 +56,19 @@ def test_says_why_and_what_to_try(method: str, colour: float, alpha: float, dept
         assert remedies.get(method, "") in found
     else:
         assert found == ""
+
+
+def test_says_when_a_small_object_has_vanished() -> None:
+    alpha = torch.zeros(16, 16)
+    alpha[4:8, 4:8] = 1
+    opaque, rules = scene(), protocol_named("default")
+    shown = replace(opaque, train=tuple(replace(view, alpha=alpha) for view in opaque.train))
+    for left, words in ((0.001, "its pictures are empty (mean alpha 0.001 instead of 0.062)"), (0.05, "budget ended")):
+        prediction, view = picture(0.0, left, 2.0), shown.test[0]
+        quality = {"psnr": Score(mean=1.0, unit="dB", higher_is_better=True, per_view=(1.0,))}
+        found = below_baseline("hybrid/neus", quality, [coverage_and_depth(prediction, view.camera, shown)], shown, rules)
+        assert words in found
+        assert ("Try --set batches.foreground=0.5" in found) == (left == 0.001)
 
 
 def test_says_nothing_where_there_is_nothing_to_compare_with() -> None:
