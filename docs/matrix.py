@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
 
@@ -26,7 +27,12 @@ def draw(folder: Path, out: Path, view: int = 0) -> None:
     rows = list(dict.fromkeys(field for field, _ in cells))
     columns = sorted(dict.fromkeys(renderer for _, renderer in cells), key=lambda name: (name != "volume rendering", name))
     shape = len(rows), len(columns)
-    figure, axes = plt.subplots(*shape, figsize=(1.5 * shape[1] + 1.2, 1.75 * shape[0] + 0.9), dpi=100, facecolor="white")
+    # A row is as high as its picture and the names under it.
+    heights = [1.5 + 0.13 * max(len(cells.get((row, column), [])) for column in columns) for row in rows]
+    size = (1.5 * shape[1] + 1.2, sum(heights) + 0.9)
+    figure, axes = plt.subplots(
+        *shape, figsize=size, dpi=100, facecolor="white", layout="constrained", gridspec_kw={"height_ratios": heights}
+    )
     for row, line in zip(rows, axes.reshape(shape), strict=True):
         for column, axis in zip(columns, line, strict=True):
             _cell(axis, sorted(cells.get((row, column), []), reverse=True))
@@ -35,7 +41,10 @@ def draw(folder: Path, out: Path, view: int = 0) -> None:
         axis.set_title(textwrap.fill(column, 16), fontsize=9, pad=10)
     caption = textwrap.fill(_caption(comparison), round(13 * figure.get_figwidth()))
     figure.text(0.01, 0.004, caption, fontsize=8.5, color="#555", va="bottom")
-    figure.tight_layout(rect=(0, 0.18 * (1 + caption.count("\n")) / figure.get_figheight(), 1, 1), h_pad=0.6, w_pad=0.6)
+    below = 0.18 * (1 + caption.count("\n")) / figure.get_figheight()
+    engine = figure.get_layout_engine()
+    assert isinstance(engine, ConstrainedLayoutEngine)
+    engine.set(rect=(0, below, 1, 1 - below), h_pad=0.06, w_pad=0.06)
     figure.savefig(out)
 
 
