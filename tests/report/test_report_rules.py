@@ -161,7 +161,7 @@ def gauntlet(tmp_path: Path) -> Path:
 def test_the_page_shows_every_standing(gauntlet: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = build_study_report(gauntlet).read_text()
     first = "1 of 6 cells are green; 1 red with a known cause, 2 red, 1 skipped, 1 not run yet."
-    told = ("Skipped: INVGRAPHICS_DATA is not set.", "fox, 400 px", "A cold grid. Issue 7.", "Out of &lt;memory&gt;.")
+    told = ("Skipped: INVGRAPHICS_DATA is not set.", ">fox<small>400 px", "A cold grid. Issue 7.", "Out of &lt;memory&gt;.")
     assert all(words in page for words in (first, *told))
     for standing in ("green", "known", "red", "skipped", "missing"):
         assert f'<td class="{standing}"' in page
