@@ -29,22 +29,19 @@ def draw(folder: Path, out: Path, view: int = 0) -> None:
     shape = len(rows), len(columns)
     # A row is as high as its picture and the names under it.
     heights = [1.5 + 0.13 * max(len(cells.get((row, column), [])) for column in columns) for row in rows]
-    size = (1.5 * shape[1] + 1.2, sum(heights) + 0.9)
-    figure, axes = plt.subplots(
-        *shape, figsize=size, dpi=100, facecolor="white", layout="constrained", gridspec_kw={"height_ratios": heights}
-    )
+    width, height = 1.5 * shape[1] + 1.2, sum(heights) + 0.9
+    caption = textwrap.fill(_caption(comparison), round(13 * width))
+    below = 0.18 * (1 + caption.count("\n")) / height
+    layout = ConstrainedLayoutEngine(rect=(0, below, 1, 1 - below), h_pad=0.06, w_pad=0.06)
+    figure = plt.figure(figsize=(width, height), dpi=100, facecolor="white", layout=layout)
+    axes = figure.subplots(*shape, gridspec_kw={"height_ratios": heights})
     for row, line in zip(rows, axes.reshape(shape), strict=True):
         for column, axis in zip(columns, line, strict=True):
             _cell(axis, sorted(cells.get((row, column), []), reverse=True))
         line[0].set_ylabel(textwrap.fill(row, 16), fontsize=9, rotation=0, ha="right", va="center", labelpad=8)
     for column, axis in zip(columns, axes.reshape(shape)[0], strict=True):
         axis.set_title(textwrap.fill(column, 16), fontsize=9, pad=10)
-    caption = textwrap.fill(_caption(comparison), round(13 * figure.get_figwidth()))
     figure.text(0.01, 0.004, caption, fontsize=8.5, color="#555", va="bottom")
-    below = 0.18 * (1 + caption.count("\n")) / figure.get_figheight()
-    engine = figure.get_layout_engine()
-    assert isinstance(engine, ConstrainedLayoutEngine)
-    engine.set(rect=(0, below, 1, 1 - below), h_pad=0.06, w_pad=0.06)
     figure.savefig(out)
 
 

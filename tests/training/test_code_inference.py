@@ -92,24 +92,25 @@ def test_methods_and_scenes_that_disagree_about_classes_are_refused(toy_class: S
     assert "chairs, mugs" in refusal.value.remedy
 
 
-def test_rays_on_the_foreground_are_the_share_asked_for(toy_class: Scene) -> None:
-    view = toy_class.train[0]
+@pytest.fixture
+def one_pixel(toy_class: Scene) -> Scene:
+    """One view that has alpha in one pixel of 144."""
     alpha = torch.zeros(12, 12)
-    alpha[3, 5] = 1.0  # one pixel in 144
-    scene = replace(toy_class, train=(replace(view, alpha=alpha),))
-    batches = Batches(BatchConfig(rays=200, views=1, foreground=0.75), scene, torch.Generator().manual_seed(0), CPU)
+    alpha[3, 5] = 1.0
+    return replace(toy_class, train=(replace(toy_class.train[0], alpha=alpha),))
+
+
+def test_rays_on_the_foreground_are_the_share_asked_for(one_pixel: Scene) -> None:
+    batches = Batches(BatchConfig(rays=200, views=1, foreground=0.75), one_pixel, torch.Generator().manual_seed(0), CPU)
     _, batch = batches.rays()
     assert 150 <= int((batch.alpha > 0).sum()) <= 156
-    _, batch = Batches(BatchConfig(rays=200, views=1), scene, torch.Generator().manual_seed(0), CPU).rays()
+    _, batch = Batches(BatchConfig(rays=200, views=1), one_pixel, torch.Generator().manual_seed(0), CPU).rays()
     assert int((batch.alpha > 0).sum()) < 8
 
 
-def test_the_foreground_has_its_share_until_then(toy_class: Scene) -> None:
-    alpha = torch.zeros(12, 12)
-    alpha[3, 5] = 1.0
-    scene = replace(toy_class, train=(replace(toy_class.train[0], alpha=alpha),))
+def test_the_foreground_has_its_share_until_then(one_pixel: Scene) -> None:
     config = BatchConfig(rays=200, views=1, foreground=0.5, foreground_until=0.3)
-    batches = Batches(config, scene, torch.Generator().manual_seed(0), CPU)
+    batches = Batches(config, one_pixel, torch.Generator().manual_seed(0), CPU)
     seen = [int((batches.rays(progress)[1].alpha > 0).sum()) for progress in (0.0, 0.29, 0.3, 1.0)]
     assert min(seen[:2]) >= 100
     assert max(seen[2:]) < 8

@@ -16,9 +16,8 @@ FLOATER_DEPTH = 0.6
 """Median depth, over the camera's distance to the scene's centre, below which floaters stand in front of the cameras."""
 SPARSE_ALPHA = 0.6
 """Mean alpha below which renderings of opaque photographs are mostly background."""
-
-VANISHED = 0.1
-"""Mean alpha, over that of photographs with alpha, below which what there was has vanished."""
+EMPTY_ALPHA = 0.1
+"""Mean alpha, over that of photographs with alpha, below which renderings are empty."""
 
 
 def coverage_and_depth(picture: Rendering, camera: Camera, scene: Scene) -> dict[str, float]:
@@ -68,14 +67,10 @@ def _diagnose(method: str, means: Mapping[str, float], scene: Scene) -> tuple[st
     if means["relative_depth"] < FLOATER_DEPTH:
         where = f"median depth {means['relative_depth']:.0%} of the way to the scene's middle"
         return f"fog hangs in front of the cameras ({where})", remedy
-    if scene.has_alpha and means["alpha"] < VANISHED * _true_alpha(scene):
-        cause = f"its pictures are empty (mean alpha {means['alpha']:.3f} instead of {_true_alpha(scene):.3f})"
+    covered = sum(float(view.opacity().mean()) for view in scene.train) / len(scene.train)
+    if scene.has_alpha and means["alpha"] < EMPTY_ALPHA * covered:
+        cause = f"its pictures are empty (mean alpha {means['alpha']:.3f} instead of {covered:.3f})"
         return cause, "--set batches.foreground=0.5, so that half of the rays meet the object, or lower rates of learning"
     if not scene.has_alpha and means["alpha"] < SPARSE_ALPHA:
         return f"its pictures are mostly empty (mean alpha {means['alpha']:.2f})", remedy
     return "the budget ended before its fog had cleared, or it overfits few photographs", remedy
-
-
-def _true_alpha(scene: Scene) -> float:
-    """Mean alpha of the training views."""
-    return sum(float(view.opacity().mean()) for view in scene.train) / len(scene.train)

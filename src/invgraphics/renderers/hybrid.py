@@ -24,7 +24,7 @@ from invgraphics.core import (
     Trace,
 )
 from invgraphics.renderers.distance_density import DistanceDensity
-from invgraphics.renderers.quadrature import sample_weights
+from invgraphics.renderers.quadrature import heaviest_of_rays, sample_weights
 from invgraphics.renderers.volumetric import Volumetric
 
 Change = Literal["learnt", "scheduled", "held"]
@@ -115,8 +115,8 @@ class WeightPruned(Sampler):
     """Another sampler's samples, in training without those of negligible weight by the densities that it found on the way.
 
     Few samples of a sharp surface weigh anything, and those that do not have no gradient worth its price either: the
-    derivative of a density's tail is as small as the tail. Each ray keeps its heaviest sample, however light: were all left
-    out, a ray through empty space could never say that there should be something.
+    derivative of a density's tail is as small as the tail. Each ray keeps its heaviest sample, however light: a ray without
+    samples has no gradient, and could not bring back a surface where a mask asks for one.
 
     Args:
         sampler: the other; samples that come without densities are all kept.
@@ -140,8 +140,7 @@ class WeightPruned(Sampler):
             return samples, levels
         with torch.no_grad():
             weights = sample_weights(samples.density, samples, len(rays))
-            heaviest = weights.new_zeros(len(rays)).scatter_reduce(0, samples.ray, weights, "amax")
-            seen = torch.nonzero((weights > self.threshold) | ((weights > 0) & (weights == heaviest[samples.ray])))[:, 0]
+            seen = torch.nonzero((weights > self.threshold) | heaviest_of_rays(weights, samples.ray, len(rays)))[:, 0]
         return samples[seen], levels
 
     @override

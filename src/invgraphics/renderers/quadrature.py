@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from invgraphics import kernels
@@ -21,6 +21,18 @@ def sample_weights(density: Float[Tensor, " m"], samples: Samples, rays: int) ->
     """
     weights, _, _ = kernels.composite(density * samples.delta, density[:, None], samples.ray, rays)
     return weights
+
+
+def heaviest_of_rays(weights: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int) -> Bool[Tensor, " m"]:
+    """Mark the samples that have the largest weight of their ray, if it is above zero.
+
+    Args:
+        weights: of the samples, as `sample_weights` gives them.
+        ray: index of each sample's ray.
+        rays: number of rays.
+    """
+    largest = weights.new_zeros(rays).scatter_reduce_(0, ray, weights, reduce="amax")
+    return (weights == largest[ray]) & (weights > 0)
 
 
 def integrate(

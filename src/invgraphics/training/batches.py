@@ -25,8 +25,8 @@ class BatchConfig:
         until: progress at which each phase but the last ends; one fewer than ``resolution``.
         foreground: share of the rays that are drawn among the pixels with alpha, where a view has such: what is small in
             its pictures is otherwise learnt from few rays, and a field that begins with empty space may stay empty.
-        foreground_until: progress at which that ends, and rays are drawn from all pixels alike. The start decides whether
-            there is a shape; NeRF's own code crops the middle of the pictures for it.
+        foreground_until: progress at which that ends, and rays are drawn from all pixels alike. It is early that a field
+            can become empty for good; NeRF's own code crops the pictures to their middle at first, for the same reason.
         opaque: whether opaque photographs of an unbounded scene are fitted over a random background too: every ray must then
             end at a surface, and dark surfaces cannot be learnt as empty space.
     """
@@ -57,7 +57,7 @@ class BatchConfig:
         return self.resolution[sum(progress >= end for end in self.until)]
 
     def foreground_at(self, progress: float) -> float:
-        """Share of rays among the pixels with alpha at a point of the fit."""
+        """Share of the rays drawn among the pixels with alpha, at a point of the fit."""
         return self.foreground if progress < self.foreground_until or self.foreground_until == 1 else 0.0
 
 
@@ -110,8 +110,8 @@ class Batches:
         shares = [self._rays // count + (i < self._rays % count) for i in range(count)]
         scale = config.scale_at(progress)
         views = [self._scaled(int(view), scale) for view in chosen]
-        solid = config.foreground_at(progress)
-        flat = [self._pixels_of(view, share, solid) for view, share in zip(views, shares, strict=True)]
+        foreground = config.foreground_at(progress)
+        flat = [self._pixels_of(view, share, foreground) for view, share in zip(views, shares, strict=True)]
         which = torch.repeat_interleave(torch.arange(count), torch.tensor(shares))
         wide = torch.tensor([view.camera.width for view in views])[which]
         index = torch.cat(flat)

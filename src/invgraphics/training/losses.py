@@ -20,7 +20,7 @@ Loss = Callable[[Rendering, Trace, Batch, Context], Tensor]
 `invgraphics.training.fit.Fit`; its ``alpha`` is still that of the scene alone."""
 
 LEAST_OPACITY = 1e-6
-"""Opacities are cut off here, and as far below 1, before a logarithm is taken."""
+"""Opacities are clamped to this, and to as much below 1, before a logarithm is taken."""
 
 Distance = Literal["mse", "l1", "huber", "charbonnier"]
 
@@ -165,9 +165,9 @@ class MaskLoss:
 
     Where sphere tracing says what its opacity is the sigmoid of, the loss is taken there and divided by the sigmoid's sharpness
     per half-extent of the box, as in IDR: its slope in the signed distance then neither grows with the sharpness nor vanishes
-    where the opacity saturates. Other opacities are cut off at 1e-6 and 1 - 1e-6, where NeuS takes 1e-3: the density of a
-    distance falls off exponentially, so the logarithm of what little opacity is left has a slope that calls back a shape which
-    has shrunk to nothing. Batches without a transparent pixel, such as those of opaque photographs, count nothing there.
+    where the opacity saturates. Other opacities are clamped to [1e-6, 1 - 1e-6], where NeuS takes 1e-3: a distance's density
+    falls off exponentially, so that the gradient of the logarithm is still large where a surface has vanished, and brings it
+    back. The loss is 0 of batches without a transparent pixel, such as those of opaque photographs.
 
     Attributes:
         weight: factor (IDR: 100; NeuS: 0.1).
@@ -178,10 +178,9 @@ class MaskLoss:
     def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
         """The weighted mean over pixels, in nats; over the sharpness where there is one."""
         if trace.surface is None:
-            if bool((batch.alpha >= 1).all()):
-                return batch.alpha.new_zeros(())
             alpha = rendering.alpha.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
-            return self.weight * torch.nn.functional.binary_cross_entropy(alpha, batch.alpha)
+            masked = (batch.alpha < 1).any()  # stays on the device
+            return self.weight * masked * torch.nn.functional.binary_cross_entropy(alpha, batch.alpha)
         logit, sharpness = trace.surface.logit, trace.surface.sharpness * float(ctx.bounds.half.mean())
         # Rays that miss the bounds are empty whatever the field is, and have a logit that is not finite.
         met = torch.nonzero(logit.isfinite())[:, 0]

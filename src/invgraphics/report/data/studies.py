@@ -184,8 +184,8 @@ def _comparison(
 
 
 def _scene_names(scenes: Sequence[str]) -> dict[str, str]:
-    """Name of each scene on the page: of a path its last folder, unless another scene has the same."""
-    short = {scene: scene.rstrip("/").rpartition("/")[2] for scene in scenes}
+    """Map scenes to their names on the page: of a path the last folder, unless another scene has the same."""
+    short = {scene: Path(scene).name for scene in scenes}
     return {scene: name if list(short.values()).count(name) == 1 else scene for scene, name in short.items()}
 
 

@@ -201,14 +201,9 @@ def _matrix(study: Study, fields: Sequence[Field]) -> tuple[tuple[str, str, tupl
         width = int(cell.size.partition(" ")[0]) if cell.size else 0
         order[key] = (study.scenes.index(cell.scene), width, cell.amount or ("", 0.0), cell.seed)
     return tuple(
-        (_scene_word(scene), rest, tuple(rows[scene, rest].get(method) for method in study.methods))
+        (scene, rest, tuple(rows[scene, rest].get(method) for method in study.methods))
         for scene, rest in sorted(rows, key=lambda key: order[key])
     )
-
-
-def _scene_word(scene: str) -> str:
-    """A built-in scene's name, or the last part of a path."""
-    return scene.rstrip("/").rpartition("/")[2]
 
 
 def _write_verdicts(page: VerdictPage, stem: Path) -> None:

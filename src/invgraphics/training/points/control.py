@@ -13,6 +13,7 @@ from typing_extensions import override
 from invgraphics.core import Context, Field, RayRenderer, Renderer
 from invgraphics.errors import InputError
 from invgraphics.kernels.near import near_points
+from invgraphics.renderers.quadrature import heaviest_of_rays
 from invgraphics.training.hooks import FitState
 from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.prune import trace_random_rays
@@ -129,9 +130,7 @@ def strongest_samples(state: FitState, renderer: RayRenderer, count: int) -> tup
     for trace in trace_random_rays(state, renderer, count):
         assert trace.samples is not None
         assert trace.weights is not None
-        ray = trace.samples.ray
-        largest = trace.weights.new_zeros(trace.rays).scatter_reduce_(0, ray, trace.weights, reduce="amax")
-        strongest = (trace.weights == largest[ray]) & (trace.weights > 0)
+        strongest = heaviest_of_rays(trace.weights, trace.samples.ray, trace.rays)
         positions.append(trace.samples.position[strongest])
         weights.append(trace.weights[strongest])
     return torch.cat(positions), torch.cat(weights)
