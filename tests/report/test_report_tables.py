@@ -205,6 +205,22 @@ def test_missing_metric_is_shown_with_its_reason(comparison_folder: Path, edit: 
     assert "<b>LPIPS</b> (the lpips extra is not installed)" in page
 
 
+def test_metrics_missing_for_one_reason_share_a_footnote(comparison_folder: Path, edit: Callable[..., None]) -> None:
+    def lose(table: dict[str, Any]) -> None:
+        for metric, reason in (("flip", "no display"), ("ssim", "no window"), ("psnr", "no display")):
+            del table["quality"][metric]
+            table["skipped"][metric] = reason
+
+    for seed in (0, 1):
+        edit(comparison_folder / f"runs/volumetric-nerf/seed-{seed}/scores.json", lose)
+    page = build_report(comparison_folder).read_text()
+    cells = Cells(page).cells
+    marks = {metric: cells[("volumetric/nerf", metric)][2] for metric in ("psnr", "ssim", "flip")}
+    assert marks["psnr"] == marks["flip"] != marks["ssim"]
+    notes = re.findall(r'<li id="[^"]*note-[^"]*">([^<]*)</li>', page)
+    assert sorted(notes) == ["PSNR, FLIP: no display", "SSIM: no window"]
+
+
 def test_protocol_settings_are_shown_in_words(pristine_comparison: Path) -> None:
     comparison = read_comparison(pristine_comparison)
 

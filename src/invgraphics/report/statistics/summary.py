@@ -122,19 +122,20 @@ def summarise(comparison: Comparison, tables: int = 1) -> Summary:
         tables: tables of the page, over which tests are corrected.
     """
     columns = table_columns(comparison)
-    notes: list[str] = []
+    absences: dict[str, list[str]] = {}
     rows = []
     most = max((len(comparison.runs_of(method)) for method in comparison.methods), default=0)
     for series, method in enumerate(comparison.methods):
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
-        cells = tuple(_method_cell(column, runs, notes) for column in columns)
+        cells = tuple(_method_cell(column, runs, absences) for column in columns)
         kind: Literal["method", "failed"] = "method" if runs else "failed"
         lost = frozenset(column.key for column in columns if any(diverged(run, column) for run in runs))
         rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs), lost))
     for name, quality in comparison.baselines.items():
         cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
         rows.append(Row(name, "baseline", -1, 1, (), cells))
-    return Summary(columns, _mark_best(comparison, columns, rows, tables), tuple(notes), _skipped(comparison))
+    notes = tuple(f"{', '.join(labels)}: {reason}" for reason, labels in absences.items())
+    return Summary(columns, _mark_best(comparison, columns, rows, tables), notes, _skipped(comparison))
 
 
 def quality_columns(comparison: Comparison) -> tuple[Quantity, ...]:
@@ -179,18 +180,20 @@ def _known(values: Sequence[float | None]) -> list[float]:
     return [value for value in values if value is not None and not math.isnan(value)]
 
 
-def _method_cell(column: Quantity, runs: Sequence[Run], notes: list[str]) -> Cell:
+def _method_cell(column: Quantity, runs: Sequence[Run], absences: dict[str, list[str]]) -> Cell:
+    """A method's cell in a column; why it lacks values is added to ``absences``, reason -> labels of the columns."""
     values = _known([value_of(run, column) for run in runs])
     reasons = [_absence(run, column) for run in runs if value_of(run, column) is None]
     reasons = list(dict.fromkeys(reason for reason in reasons if reason))
     if not reasons:
         return _cell(column, values)
-    text = f"{column.label}: {'; '.join(reasons)}"
+    reason = "; ".join(reasons)
     if values:
-        text += f" ({len(runs) - len(values)} of {len(runs)} seeds)"
-    if text not in notes:
-        notes.append(text)
-    return _cell(column, values, notes.index(text) + 1)
+        reason += f" ({len(runs) - len(values)} of {len(runs)} seeds)"
+    labels = absences.setdefault(reason, [])
+    if column.label not in labels:
+        labels.append(column.label)
+    return _cell(column, values, list(absences).index(reason) + 1)
 
 
 def _absence(run: Run, column: Quantity) -> str:
