@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from dots import GL, Eye, assert_dots_are_found, ring, save
+from PIL import Image
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.blender import Blender
@@ -53,6 +54,56 @@ def test_dots_are_found_after_resizing(folder: Path) -> None:
     assert_dots_are_found(scene)
     assert "160x120 to 80x60" in scene.notes["resize"]
     assert scene.notes["test_views"] == "2 of 4, evenly spaced"
+
+
+@pytest.mark.parametrize(("size", "place"), [(25.0, (300.0, -120.0, 40.0)), (0.02, (0.3, 0.1, -0.2))])
+def test_exports_of_any_size_and_place_get_a_box_of_one_size(
+    folder: Path, tmp_path: Path, size: float, place: tuple[float, float, float]
+) -> None:
+    usual = Blender().load(folder, SceneOptions())
+    for split in ("train", "val", "test"):
+        path = folder / f"transforms_{split}.json"
+        table = json.loads(path.read_text())
+        for frame in table["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, 3] = size * pose[:3, 3] + place
+            frame["transform_matrix"] = pose.tolist()
+        path.write_text(json.dumps(table))
+    scene = validate(Blender().load(folder, SceneOptions()))
+    assert scene.bounds.space == "box"
+    assert scene.bounds.hi.tolist() == [1.5, 1.5, 1.5]
+    # The ring's cameras look at the dots from 4 units, and show half a width of 80 pixels at a focal length of 170.
+    assert scene.scale == pytest.approx(size * 1.05 * 4 * 80 / FOCAL / 1.5, rel=0.01)
+    assert torch.allclose(scene.world_from_local[:3, 3], torch.tensor(place), atol=1e-3 * size)
+    for view, same in zip(scene.test, usual.test, strict=True):
+        dots = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.1, 0.3]])
+        pixels, _ = view.camera.project(dots * size / scene.scale)
+        assert torch.allclose(pixels, same.camera.project(dots)[0], atol=0.02)
+
+
+def opaque(folder: Path, background: np.ndarray, channels: int = 3) -> None:
+    for path in folder.rglob("*.png"):
+        rgba = np.array(Image.open(path)).astype(float)
+        cover = rgba[..., 3:] / 255
+        picture = np.full(rgba.shape, 255.0)
+        picture[..., :3] = rgba[..., :3] * cover + background * (1 - cover)
+        save(np.rint(picture).astype(np.uint8)[..., :channels], path)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_opaque_pictures_with_a_plain_border_show_an_object_before_it(folder: Path, channels: int) -> None:
+    opaque(folder, np.array([51.0, 102.0, 204.0]), channels)
+    scene = validate(Blender().load(folder, SceneOptions()))
+    assert not scene.has_alpha
+    assert scene.bounds.space == "box"
+    assert scene.background.tolist() == pytest.approx([0.2, 0.4, 0.8])
+
+
+def test_other_opaque_pictures_show_endless_space(folder: Path) -> None:
+    opaque(folder, np.random.default_rng(0).uniform(0, 255, (120, 160, 3)))
+    scene = validate(Blender().load(folder, SceneOptions()))
+    assert scene.bounds.space == "contracted"
+    assert scene.background.tolist() == [0, 0, 0]
 
 
 def test_digest_follows_the_pixels(folder: Path) -> None:

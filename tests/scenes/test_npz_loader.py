@@ -90,6 +90,32 @@ def test_geometry_moves_into_the_local_frame(tmp_path: Path) -> None:
     assert "dropped" in Npz().load(path, SceneOptions(size=80)).notes["geometry"]
 
 
+@pytest.mark.parametrize(("size", "place"), [(40.0, (90.0, -200.0, 10.0)), (0.01, (0.0, 0.0, 0.0)), (1.0, (500.0, 0.0, 0.0))])
+def test_a_box_of_any_size_and_place_is_scaled(tmp_path: Path, size: float, place: tuple[float, float, float]) -> None:
+    values = arrays()
+    poses = values["cam_to_world"].copy()
+    poses[:, :3, 3] = size * poses[:, :3, 3] + place
+    box = np.array([[-1.0, -1, -1], [1, 1, 2]])
+    values |= {
+        "cam_to_world": poses,
+        "points": size * POINTS + place,
+        "points_rgb": COLOURS,
+        "depth": np.full((9, 120, 160), 4.0 * size),
+        "bounds": size * box + np.array(place),
+    }
+    scene = validate(Npz().load(write(tmp_path, **values), SceneOptions()))
+    assert torch.allclose(scene.bounds.hi, torch.tensor([1.0, 1, 1.5]), atol=1e-3)
+    assert torch.allclose(scene.bounds.lo, -scene.bounds.hi, atol=1e-3)
+    assert scene.scale == pytest.approx(size, rel=1e-3)
+    assert scene.points is not None
+    assert torch.allclose(scene.points.position, torch.from_numpy(POINTS - [0, 0, 0.5]).float(), atol=1e-3)
+    view = scene.train[0]
+    assert view.depth is not None
+    assert float(view.depth.mean()) == pytest.approx(4.0, rel=1e-3)
+    pixels, _ = view.camera.project(scene.points.position)
+    assert np.allclose(pixels.numpy(), ring(9)[1].pixels(POINTS), atol=0.05)
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [

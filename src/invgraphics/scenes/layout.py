@@ -15,8 +15,9 @@ from torch import Tensor
 from invgraphics.core import Bounds, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity, transform_points
 from invgraphics.errors import InputError
+from invgraphics.scenes.border import background_of
 from invgraphics.scenes.images import RESIZE, Photo, file_exists, load_view, match_sizes, wanted_size
-from invgraphics.scenes.region import near_plane, subject_half
+from invgraphics.scenes.region import common_focus, near_plane, subject_half
 
 T = TypeVar("T")
 
@@ -26,12 +27,15 @@ HOLD_OUT = 8
 NEAR = 0.05
 """Closest sample to a camera in local units, where a data set does not say."""
 
+BOX_HALF = 1.5
+"""Longest half-edge in local units of a box that is scaled; NeRF-synthetic lies within it (instant-ngp and TensoRF use it)."""
+BOX_HALVES = (0.5, 4.0)
+"""Longest half-edges of boxes that are taken as they are, up to the same distance from the origin."""
+
 IMAGE_FOLDERS = ("images", "input", "images_2", "images_4", "images_8")
 """What people call the folder of a scene's photographs, the most telling first; a number is how much smaller they are."""
 
 _HOLDERS = ("sparse", "dense", "colmap", "undistorted", "distorted")  # folders of a COLMAP workspace, which name no scene
-
-_PARALLEL = 0.01  # mean squared sine of the angle between viewing directions (6°) below which they have no common focus
 
 
 @dataclass(frozen=True)
@@ -148,6 +152,28 @@ def existing_photos(photos: Sequence[Photo], source: Path) -> tuple[list[Photo],
     return found, {"missing": f"{len(absent)} of {len(photos)} listed files are absent: {shown}"}
 
 
+def box_frame(lo: Float[Tensor, 3], hi: Float[Tensor, 3], points: Points | None = None) -> Frame:
+    """Compute the local frame of an object in a box: the world itself, or the box moved to the origin and scaled to `BOX_HALF`.
+
+    Densities per length and the near distance are made for boxes of about that size; a box far smaller, larger or farther away
+    is not fitted as well in its own units.
+
+    Args:
+        lo: lowest corner, world frame, float64.
+        hi: highest corner.
+        points: known surface points, world frame; kept.
+    """
+    half, centre = float((hi - lo).max()) / 2, (lo + hi) / 2
+    least, most = BOX_HALVES
+    if least <= half <= most and float(centre.abs().max()) <= most:
+        return Frame(Bounds(lo.float(), hi.float()), points=points)
+    world_from_local = torch.eye(4, dtype=torch.float64)
+    world_from_local[:3, :3] *= half / BOX_HALF
+    world_from_local[:3, 3] = centre
+    corner = ((hi - lo) / 2 / half * BOX_HALF).float()
+    return Frame(Bounds(-corner, corner), world_from_local, points)
+
+
 def contracted_frame(
     poses: Float[Tensor, "n 4 4"], points: Points | None = None, distance: float | None = None, near: float | None = None
 ) -> Frame:
@@ -169,13 +195,10 @@ def contracted_frame(
         spread = (position - middle).norm(dim=1).max()
         known = points is not None and len(points) > 0
         distance = float((points.position.double() - middle).norm(dim=1).median() if known and points else 2 * spread)
-    # Sum of the projections onto the planes across the axes: its solution is the point closest to all of them.
-    across = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None, :]
-    normal_matrix = across.mean(dim=0)
-    if float(torch.linalg.eigvalsh(normal_matrix)[0]) < _PARALLEL:
+    focus = common_focus(poses)
+    if focus is None:
         centre = middle + distance * torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
     else:
-        focus = torch.linalg.solve(normal_matrix, (across @ position[:, :, None]).mean(dim=0)[:, 0])
         ahead = ((focus - position) * forward).sum(dim=1).median()
         centre = focus if float(ahead) > 0 else middle
     radius = float((position - centre).norm(dim=1).max()) or 1.0
@@ -207,7 +230,7 @@ def _turn_z_to(up: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:
 def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes: dict[str, str]) -> Scene:
     """Read the chosen photographs and compose the scene: cameras in the local frame, bounds, background, notes.
 
-    Scenes with alpha are declared to be on white, others on black (which then nothing shows through to).
+    Scenes with alpha are declared to be on white, those whose pictures have a plain border on its colour, others on black.
     """
     if not split.test:
         raise InputError(f"{name} has no photographs to score.")
@@ -229,7 +252,7 @@ def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes:
         train=tuple(views[:first_val]),
         val=tuple(views[first_val:first_test]),
         test=tuple(views[first_test:]),
-        background=torch.full((3,), float(any(view.alpha is not None for view in views))),
+        background=background_of(views),
         bounds=frame.bounds,
         points=local_points(frame),
         world_from_local=frame.world_from_local.float(),

@@ -37,8 +37,9 @@ from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.files import write_arrays
+from invgraphics.scenes.border import background_of
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
-from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, contracted_frame, evenly, local_points
+from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, box_frame, contracted_frame, evenly, local_points
 from invgraphics.scenes.poses import poses
 
 Arrays = Mapping[str, np.ndarray]
@@ -84,7 +85,7 @@ class Npz:
             val=tuple(views[i] for i in val),
             test=tuple(views[i] for i in chosen[2]),
             observed=tuple(views[i] for i in observed),
-            background=torch.full((3,), float(any(view.alpha is not None for view in views.values()))),
+            background=background_of(list(views.values())),
             bounds=frame.bounds,
             points=local_points(frame),
             world_from_local=frame.world_from_local.float(),
@@ -142,10 +143,10 @@ def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> Frame:
     if "bounds" not in arrays:
         return contracted_frame(world, points)
     with np.errstate(over="ignore"):  # infinite bounds are refused with the scene
-        lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32))
+        lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32)).double()
     if not bool((lo < hi).all()):
         raise InputError(f"'bounds' of {path} is {arrays['bounds'].tolist()}: the first corner must be below the second.")
-    return Frame(Bounds(lo, hi), points=points)
+    return box_frame(lo, hi, points)
 
 
 def _splits(arrays: Arrays, n: int, path: Path) -> tuple[list[int], list[int], list[int], list[int]]:
@@ -287,7 +288,7 @@ def _unsupported_parts(scene: Scene) -> str:
         "a mesh": scene.mesh is not None,
         f"{' and '.join(mixed)} for some views only": bool(mixed),
         "pictures of several sizes": len({(camera.width, camera.height) for camera in cameras}) > 1,
-        "a background other than the default": scene.background.tolist() != [float(scene.has_alpha)] * 3,
+        "a background other than the default": not torch.equal(scene.background, background_of(views)),
         "poses that are degraded on purpose": any(view.ground_truth_pose is not None for view in views),
     }
     return next((what for what, present in found.items() if present), "")

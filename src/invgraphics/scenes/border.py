@@ -1,0 +1,38 @@
+"""Background of a scene's pictures, which fields need not fill space for: under alpha, or the one colour around an object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from invgraphics.core import View
+
+BORDERS_OF = 8
+"""Pictures whose borders are looked at."""
+PLAIN_SHARE = 0.9
+"""Share of their border pixels that have the colour; an object may be cut off by some."""
+SAME_COLOUR = 10
+"""Largest difference to it in any channel, of 255: compression is not exact."""
+
+
+def plain_border(pictures: Sequence[UInt8[np.ndarray, "h w c"]]) -> Float[Tensor, 3] | None:
+    """Colour that the borders of pictures share, in [0, 1]; ``None`` where they do not."""
+    edges = [edge[:, :3] for pixels in pictures for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1])]
+    border = np.concatenate(edges).astype(np.float32)
+    colour = np.median(border, axis=0)
+    plain = (np.abs(border - colour) <= SAME_COLOUR).all(axis=1).mean() >= PLAIN_SHARE
+    return torch.from_numpy(colour) / 255 if plain else None
+
+
+def background_of(views: Sequence[View]) -> Float[Tensor, 3]:
+    """Background of views: white under alpha, the colour of a plain border, else black, which nothing shows through to."""
+    if any(view.alpha is not None for view in views):
+        return torch.ones(3)
+    colour = None
+    if all(view.mask is None for view in views):
+        colour = plain_border([view.image.cpu().numpy() for view in views[:: max(1, len(views) // BORDERS_OF)]])
+    return torch.zeros(3) if colour is None else colour
