@@ -1,6 +1,7 @@
 """``transforms.json`` of nerfstudio and instant-ngp, distorted lenses included."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -225,3 +226,40 @@ def test_the_dots_are_well_placed() -> None:
         pixels = eye.pixels(POINTS)
         assert (pixels > 8).all()
         assert (pixels < np.array(eye.size) - 8).all()
+
+
+def before(eye, colour: int) -> np.ndarray:
+    """The dots in front of a grey."""
+    rgba = eye.picture(with_alpha=True).astype(float)
+    cover = rgba[..., 3:] / 255
+    return np.rint(rgba[..., :3] * cover + colour * (1 - cover)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("grey", [None, 255, 90])
+def test_an_object_by_itself_is_in_a_box(tmp_path: Path, grey: int | None) -> None:
+    eyes = ring(14, distance=40.0)
+    path = write(tmp_path, eyes, {"camera_model": "PINHOLE"})
+    for index, eye in enumerate(eyes):
+        save(eye.picture(with_alpha=True) if grey is None else before(eye, grey), path / "images" / f"{index:04}.png")
+    scene = validate(Nerfstudio().load(path, SceneOptions()))
+    assert scene.bounds.space == "box"
+    assert scene.bounds.hi.tolist() == [1.5, 1.5, 1.5]
+    assert torch.allclose(scene.world_from_local[:3, 3], torch.zeros(3), atol=1e-4)
+    distance = 40 * np.hypot(0.9, 0.43)
+    assert scene.scale == pytest.approx(1.05 * distance * 80 / 150 / 1.5, rel=0.01)
+    assert scene.background.tolist() == pytest.approx([1.0 if grey is None else grey / 255] * 3)
+
+
+def test_a_black_border_may_be_the_rim_of_a_lens(tmp_path: Path) -> None:
+    scene = Nerfstudio().load(write(tmp_path, ring(14), {}), SceneOptions())
+    assert scene.bounds.space == "contracted"
+
+
+def test_transparent_pictures_without_a_common_focus_are_of_endless_space(tmp_path: Path) -> None:
+    eyes = [replace(ring(1)[0], t=ring(1)[0].t + np.array([0.1 * index, 0.0, 0.0])) for index in range(9)]
+    path = write(tmp_path, eyes, {})
+    for index, eye in enumerate(eyes):
+        save(eye.picture(with_alpha=True), path / "images" / f"{index:04}.png")
+    scene = validate(Nerfstudio().load(path, SceneOptions()))
+    assert scene.has_alpha
+    assert scene.bounds.space == "contracted"

@@ -39,6 +39,16 @@ def test_dots_are_where_the_cameras_say(tmp_path: Path, size: Any) -> None:
     assert scene.bounds.space == "contracted"
 
 
+@pytest.mark.parametrize("apart", [False, True])
+def test_an_object_by_itself_is_in_a_box(tmp_path: Path, apart: bool) -> None:
+    values = arrays(with_alpha=True)
+    if apart:
+        values |= {"images": values["images"][..., :3], "alpha": values["images"][..., 3]}
+    scene = validate(Npz().load(write(tmp_path, **values), SceneOptions()))
+    assert scene.bounds.space == "box"
+    assert_dots_are_found(scene)
+
+
 def test_everything_optional(tmp_path: Path) -> None:
     """Alpha apart, floats, per-view lenses, own split, a box, geometry and points in the world's frame."""
     values = arrays(with_alpha=True)

@@ -12,9 +12,10 @@ from invgraphics import plugins
 from invgraphics.core import Bounds, Camera, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.scenes import mitsuba
-from invgraphics.scenes.layout import contracted_frame, evenly
+from invgraphics.scenes.layout import evenly
 from invgraphics.scenes.open import SceneOptions, find_loader, open_scene, validate
 from invgraphics.scenes.poses import RIGID, pose, poses
+from invgraphics.scenes.region import contracted_frame
 
 
 def view(index: int) -> View:

@@ -7,9 +7,8 @@ import torch
 
 from invgraphics.core import Points
 from invgraphics.core.transforms import look_at
-from invgraphics.scenes.layout import NEAR, contracted_frame
 from invgraphics.scenes.open import space_note
-from invgraphics.scenes.region import CLEARANCE, MARGIN, near_plane, subject_half
+from invgraphics.scenes.region import CLEARANCE, MARGIN, NEAR, contracted_frame, near_plane, subject_half
 from invgraphics.testing import toy_scene
 
 F64 = torch.float64

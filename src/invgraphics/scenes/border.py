@@ -11,8 +11,8 @@ from torch import Tensor
 
 from invgraphics.core import View
 
-BORDERS_OF = 8
-"""Pictures whose borders are looked at."""
+LOOKED_AT = 8
+"""Pictures that are looked at, about."""
 PLAIN_SHARE = 0.9
 """Share of their border pixels that have the colour; an object may be cut off by some."""
 SAME_COLOUR = 10
@@ -28,11 +28,24 @@ def plain_border(pictures: Sequence[UInt8[np.ndarray, "h w c"]]) -> Float[Tensor
     return torch.from_numpy(colour) / 255 if plain else None
 
 
+def is_object(pictures: Sequence[UInt8[np.ndarray, "h w c"]], black: bool) -> bool:
+    """Whether pictures show an object by itself: they are transparent somewhere, or their borders share a colour.
+
+    Args:
+        pictures: straight colour, or colour and alpha.
+        black: whether that colour may be black.
+    """
+    if any(pixels.shape[2] == 4 and pixels[..., 3].min() < 255 for pixels in pictures):
+        return True
+    colour = plain_border(pictures)
+    return colour is not None and (black or float(colour.max()) > SAME_COLOUR / 255)
+
+
 def background_of(views: Sequence[View]) -> Float[Tensor, 3]:
     """Background of views: white under alpha, the colour of a plain border, else black, which nothing shows through to."""
     if any(view.alpha is not None for view in views):
         return torch.ones(3)
     colour = None
     if all(view.mask is None for view in views):
-        colour = plain_border([view.image.cpu().numpy() for view in views[:: max(1, len(views) // BORDERS_OF)]])
+        colour = plain_border([view.image.cpu().numpy() for view in views[:: max(1, len(views) // LOOKED_AT)]])
     return torch.zeros(3) if colour is None else colour

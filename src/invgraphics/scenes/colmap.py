@@ -14,10 +14,11 @@ from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap_workspace import find_model, model_folders
 from invgraphics.scenes.images import Photo
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, existing_photos, scene_name
+from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, existing_photos, scene_name
 from invgraphics.scenes.lens import Lens
 from invgraphics.scenes.photos.notes import pose_notes
 from invgraphics.scenes.poses import pose
+from invgraphics.scenes.region import photo_frame
 
 
 class Colmap:
@@ -46,8 +47,7 @@ class Colmap:
             "points": f"{model.reconstruction.num_points3D()} from SfM on all photographs, those that are scored too",
         } | pose_notes(path)
         notes |= {"model": model.note} if model.note else {}
-        poses = torch.stack([photo.camera.cam_to_world for photo in photos])
-        frame = contracted_frame(poses, _points(model.reconstruction))
+        frame = photo_frame(photos, _points(model.reconstruction))
         return compose(scene_name(path), every_eighth(photos), frame, options, notes)
 
 

@@ -18,8 +18,9 @@ from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.dtu import find_scan
 from invgraphics.scenes.images import Photo, image_files, image_size
-from invgraphics.scenes.layout import NEAR, Frame, SceneOptions, compose, every_eighth
+from invgraphics.scenes.layout import SceneOptions, compose, every_eighth
 from invgraphics.scenes.poses import pose
+from invgraphics.scenes.region import NEAR, Frame
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 

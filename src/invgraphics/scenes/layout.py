@@ -1,10 +1,9 @@
-"""From photographs with cameras to a scene: which views train, which are scored, and the frame in which fields live."""
+"""From photographs with cameras to a scene: which views train, which are scored, and how they are read."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,25 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core import Bounds, Points, Scene, View
+from invgraphics.core import Points, Scene, View
 from invgraphics.core.transforms import apply_similarity, transform_points
 from invgraphics.errors import InputError
 from invgraphics.scenes.border import background_of
 from invgraphics.scenes.images import RESIZE, Photo, file_exists, load_view, match_sizes, wanted_size
-from invgraphics.scenes.region import common_focus, near_plane, subject_half
+from invgraphics.scenes.region import Frame
 
 T = TypeVar("T")
 
 HOLD_OUT = 8
 """One photograph in eight is scored, the first included (LLFF's rule, which later work kept)."""
-
-NEAR = 0.05
-"""Closest sample to a camera in local units, where a data set does not say."""
-
-BOX_HALF = 1.5
-"""Longest half-edge in local units of a box that is scaled; NeRF-synthetic lies within it (instant-ngp and TensoRF use it)."""
-BOX_HALVES = (0.5, 4.0)
-"""Longest half-edges of boxes that are taken as they are, up to the same distance from the origin."""
 
 IMAGE_FOLDERS = ("images", "input", "images_2", "images_4", "images_8")
 """What people call the folder of a scene's photographs, the most telling first; a number is how much smaller they are."""
@@ -87,21 +78,6 @@ class Split:
         return [*self.train, *self.val, *self.test]
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """Local frame of a scene, its bounds and known points.
-
-    Attributes:
-        bounds: local.
-        world_from_local: similarity, float64.
-        points: known surface points, world frame.
-    """
-
-    bounds: Bounds
-    world_from_local: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
-    points: Points | None = None
-
-
 def is_image_folder(path: Path) -> bool:
     """Whether a folder's name is one that conventionally holds a scene's photographs."""
     return path.name in IMAGE_FOLDERS
@@ -150,81 +126,6 @@ def existing_photos(photos: Sequence[Photo], source: Path) -> tuple[list[Photo],
         return found, {}
     shown = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
     return found, {"missing": f"{len(absent)} of {len(photos)} listed files are absent: {shown}"}
-
-
-def box_frame(lo: Float[Tensor, 3], hi: Float[Tensor, 3], points: Points | None = None) -> Frame:
-    """Compute the local frame of an object in a box: the world itself, or the box moved to the origin and scaled to `BOX_HALF`.
-
-    Densities per length and the near distance are made for boxes of about that size; a box far smaller, larger or farther away
-    is not fitted as well in its own units.
-
-    Args:
-        lo: lowest corner, world frame, float64.
-        hi: highest corner.
-        points: known surface points, world frame; kept.
-    """
-    half, centre = float((hi - lo).max()) / 2, (lo + hi) / 2
-    least, most = BOX_HALVES
-    if least <= half <= most and float(centre.abs().max()) <= most:
-        return Frame(Bounds(lo.float(), hi.float()), points=points)
-    world_from_local = torch.eye(4, dtype=torch.float64)
-    world_from_local[:3, :3] *= half / BOX_HALF
-    world_from_local[:3, 3] = centre
-    corner = ((hi - lo) / 2 / half * BOX_HALF).float()
-    return Frame(Bounds(-corner, corner), world_from_local, points)
-
-
-def contracted_frame(
-    poses: Float[Tensor, "n 4 4"], points: Points | None = None, distance: float | None = None, near: float | None = None
-) -> Frame:
-    """Compute the local frame of an unbounded scene: +z is the mean up, the subject at the origin, cameras in the unit ball.
-
-    The subject is where the optical axes come closest to each other. Where they are too parallel for that it lies ``distance``
-    ahead of the cameras, and where it would be behind them (an inside-out rig) it is the middle of the cameras. The box is
-    fitted to most of the points (`subject_half`), if there are any.
-
-    Args:
-        poses: camera-to-world, float64.
-        points: known surface points, world frame; kept, and used for what is not given.
-        distance: how far ahead the subject is, world units.
-        near: closest thing in front of a camera, world units; by default somewhat less than the distance of the nearest points.
-    """
-    position, forward = poses[:, :3, 3], poses[:, :3, 2]
-    middle = position.mean(dim=0)
-    if distance is None:
-        spread = (position - middle).norm(dim=1).max()
-        known = points is not None and len(points) > 0
-        distance = float((points.position.double() - middle).norm(dim=1).median() if known and points else 2 * spread)
-    focus = common_focus(poses)
-    if focus is None:
-        centre = middle + distance * torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
-    else:
-        ahead = ((focus - position) * forward).sum(dim=1).median()
-        centre = focus if float(ahead) > 0 else middle
-    radius = float((position - centre).norm(dim=1).max()) or 1.0
-    if not math.isfinite(radius):
-        raise InputError("The cameras are farther apart than numbers reach.", "Check the positions of the poses.")
-    world_from_local = torch.eye(4, dtype=poses.dtype)
-    world_from_local[:3, :3] = radius * _turn_z_to(-poses[:, :3, 1].mean(dim=0))
-    world_from_local[:3, 3] = centre
-    known = torch.zeros(0, 3, dtype=poses.dtype) if points is None else points.position.to(poses.dtype)
-    near = near_plane(poses, known) if near is None else near
-    half = torch.full((3,), subject_half((known - centre) / radius))
-    bounds = Bounds(-half, half, "contracted", near=NEAR if near is None else near / radius)
-    return Frame(bounds, world_from_local, points)
-
-
-def _turn_z_to(up: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:
-    """Smallest rotation from +z to ``up``; identity where the cameras have no common up."""
-    length = float(up.norm())
-    if length < 0.1:
-        return torch.eye(3, dtype=up.dtype)
-    x, y, z = (up / length).tolist()
-    if z < -1 + 1e-9:
-        return torch.diag(up.new_tensor([1.0, -1.0, -1.0]))
-    # Rodrigues' formula for the axis z × up.
-    skew = up.new_tensor([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
-    return torch.eye(3, dtype=up.dtype) + skew + skew @ skew / (1 + z)
 
 
 def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes: dict[str, str]) -> Scene:

@@ -15,8 +15,9 @@ from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.images import Photo, image_files
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, scene_name
+from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, scene_name
 from invgraphics.scenes.poses import pose
+from invgraphics.scenes.region import contracted_frame
 
 
 class Llff:

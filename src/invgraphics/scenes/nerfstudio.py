@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from invgraphics.core import Scene
 from invgraphics.scenes.frames import Frames
-from invgraphics.scenes.layout import SceneOptions, compose, contracted_frame, every_eighth, existing_photos, scene_name
+from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, existing_photos, scene_name
+from invgraphics.scenes.region import photo_frame
 
 
 class Nerfstudio:
-    """Loader of ``transforms.json``: OpenGL axes, OPENCV lenses, an unbounded scene, every eighth photograph scored.
+    """Loader of ``transforms.json``: OpenGL axes, OPENCV lenses, every eighth photograph scored; an unbounded scene, or
+    an object in a box (see `object_frame`).
 
     Poses are taken as they are: an ``applied_transform`` has already been applied to them. Listed photographs that do not
     exist are skipped and named in the scene's notes.
@@ -23,7 +23,7 @@ class Nerfstudio:
         return _source(path).is_file()
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Load cameras, lenses and photographs as an unbounded scene.
+        """Load cameras, lenses and photographs.
 
         Raises:
             InputError: a file is missing or unusable.
@@ -36,8 +36,7 @@ class Nerfstudio:
             notes["points"] = f"{frames.table['ply_file_path']} is not read"
         if any("mask_path" in frame for frame in frames.frames):
             notes["masks"] = "the frames' mask_path is not read"
-        poses = torch.stack([photo.camera.cam_to_world for photo in photos])
-        return compose(scene_name(source.parent), every_eighth(photos), contracted_frame(poses), options, notes)
+        return compose(scene_name(source.parent), every_eighth(photos), photo_frame(photos), options, notes)
 
 
 def _source(path: Path) -> Path:

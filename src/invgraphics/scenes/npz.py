@@ -37,10 +37,11 @@ from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.files import write_arrays
-from invgraphics.scenes.border import background_of
+from invgraphics.scenes.border import LOOKED_AT, background_of
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
-from invgraphics.scenes.layout import HOLD_OUT, Frame, SceneOptions, box_frame, contracted_frame, evenly, local_points
+from invgraphics.scenes.layout import HOLD_OUT, SceneOptions, evenly, local_points
 from invgraphics.scenes.poses import poses
+from invgraphics.scenes.region import Frame, box_frame, contracted_frame, object_frame
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -77,7 +78,8 @@ class Npz:
         }
         if final != (width, height) and ("depth" in arrays or "normal" in arrays):
             notes["geometry"] = "depth and normals are dropped: they are one ray per pixel and cannot be averaged"
-        named = list(zip(_cameras(arrays, world, frame), _names(arrays), strict=True))
+        local = torch.vmap(apply_similarity, in_dims=(None, 0))(torch.linalg.inv(frame.world_from_local), world)
+        named = list(zip(_cameras(arrays, local), _names(arrays), strict=True))
         views = {i: _view(path, arrays, i, named[i], frame, final) for part in chosen for i in part}
         return Scene(
             name=path.stem,
@@ -141,7 +143,9 @@ def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> Frame:
             torch.from_numpy(position.astype(np.float64)), torch.from_numpy(_bytes(rgb, "points_rgb", path)).float() / 255
         )
     if "bounds" not in arrays:
-        return contracted_frame(world, points)
+        chosen = range(0, len(world), max(1, len(world) // LOOKED_AT))
+        pictures = [_pixels(arrays, i, path) for i in chosen]
+        return object_frame(_cameras(arrays, world), pictures, points) or contracted_frame(world, points)
     with np.errstate(over="ignore"):  # infinite bounds are refused with the scene
         lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32)).double()
     if not bool((lo < hi).all()):
@@ -183,13 +187,12 @@ def _booleans(arrays: Arrays, key: str, default: np.ndarray, path: Path) -> np.n
     return arrays.get(key, default)
 
 
-def _cameras(arrays: Arrays, world: Float[Tensor, "n 4 4"], frame: Frame) -> list[Camera]:
-    """Cameras of all views in the local frame, at the pictures' size."""
+def _cameras(arrays: Arrays, poses: Float[Tensor, "n 4 4"]) -> list[Camera]:
+    """Cameras of all views at ``poses``, at the pictures' size."""
     n, height, width = arrays["images"].shape[:3]
-    local = torch.vmap(apply_similarity, in_dims=(None, 0))(torch.linalg.inv(frame.world_from_local), world)
     centre = arrays.get("centre", np.array([width / 2, height / 2]))
     lens = [torch.from_numpy(np.broadcast_to(values, (n, 2)).astype(np.float64)) for values in (arrays["focal"], centre)]
-    return [Camera(pose, focal, middle, width, height) for pose, focal, middle in zip(local, *lens, strict=True)]
+    return [Camera(pose, focal, middle, width, height) for pose, focal, middle in zip(poses, *lens, strict=True)]
 
 
 def _names(arrays: Arrays) -> list[str]:
@@ -205,26 +208,26 @@ def _names(arrays: Arrays) -> list[str]:
 
 
 def _view(path: Path, arrays: Arrays, i: int, named: tuple[Camera, str], frame: Frame, final: tuple[int, int]) -> View:
-    pixels = _bytes(arrays["images"][i], "images", path)
-    if "alpha" in arrays:
-        pixels = np.concatenate([pixels[:, :, :3], _bytes(arrays["alpha"][i], "alpha", path)[:, :, None]], axis=2)
-    view = make_view(named[0], pixels, named[1], final)
+    view = make_view(named[0], _pixels(arrays, i, path), named[1], final)
     if "subject" in arrays:
         view = replace(view, subject=int(arrays["subject"][i]))
     if final != (named[0].width, named[0].height):
         return view
     depth, normal = arrays.get("depth"), arrays.get("normal")
     if depth is not None:
-        view = replace(view, depth=torch.from_numpy(depth[i].astype(np.float32)) / _scale(frame))
+        view = replace(view, depth=torch.from_numpy(depth[i].astype(np.float32)) / frame.scale)
     if normal is not None:
-        rotation = (frame.world_from_local[:3, :3] / _scale(frame)).float()
+        rotation = (frame.world_from_local[:3, :3] / frame.scale).float()
         view = replace(view, normal=torch.from_numpy(normal[i].astype(np.float32)) @ rotation)
     return view
 
 
-def _scale(frame: Frame) -> float:
-    """World length of one local unit."""
-    return float(np.linalg.det(frame.world_from_local[:3, :3].numpy()) ** (1 / 3))
+def _pixels(arrays: Arrays, i: int, path: Path) -> UInt8[np.ndarray, "h w c"]:
+    """Straight colour of a view, or colour and alpha."""
+    pixels = _bytes(arrays["images"][i], "images", path)
+    if "alpha" not in arrays:
+        return pixels
+    return np.concatenate([pixels[:, :, :3], _bytes(arrays["alpha"][i], "alpha", path)[:, :, None]], axis=2)
 
 
 def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shape"]:
