@@ -18,7 +18,8 @@ import pytest
 from invgraphics.metrics.conventions import PROTOCOLS, Protocol
 from invgraphics.report.build import build_report
 from invgraphics.report.data.comparison import read_comparison
-from invgraphics.report.pages.facts import protocol_facts
+from invgraphics.report.pages.facts import protocol_facts, start_fact
+from invgraphics.runs.run import Run
 
 HIGHER = {"psnr", "ssim", "alpha_iou", "render_fps"}
 LOWER = {"flip", "depth_abs_rel", "normal_deg", "peak_memory_bytes", "model_bytes"}
@@ -219,6 +220,16 @@ def test_metrics_missing_for_one_reason_share_a_footnote(comparison_folder: Path
     assert marks["psnr"] == marks["flip"] != marks["ssim"]
     notes = re.findall(r'<li id="[^"]*note-[^"]*">([^<]*)</li>', page)
     assert sorted(notes) == ["PSNR, FLIP: no display", "SSIM: no window"]
+
+
+def test_starts_that_differ_in_their_number_of_points_are_one_fact(pristine_comparison: Path) -> None:
+    def start(count: int, run: Run) -> Run:
+        words = f"1,{count:03} from SfM on these, and 1,{count:03} random ones inside the silhouettes"
+        return replace(run, provenance=replace(run.provenance, notes={"points": words}))
+
+    runs = read_comparison(pristine_comparison).runs
+    assert len(runs) > 1
+    assert start_fact([start(*each) for each in enumerate(runs)]) == "from SfM on these, and random ones inside the silhouettes"
 
 
 def test_protocol_settings_are_shown_in_words(pristine_comparison: Path) -> None:

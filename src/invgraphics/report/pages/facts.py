@@ -104,9 +104,9 @@ def start_fact(runs: Sequence[Run]) -> str:
 
 
 def _start(run: Run) -> str:
-    """Points of a run's scene in words, without their number, which differs between seeds."""
+    """Points of a run's scene in words, without their numbers, which differ between seeds."""
     words = run.provenance.notes.get("points", "")
-    return re.sub(r"^[\d,]+ (points )?", "", words)
+    return re.sub(r"^[\d,]+ (points )?|\b[\d,]+ (?=random ones)", "", words)
 
 
 def _grouped(pairs: Sequence[tuple[str, str]]) -> str:
