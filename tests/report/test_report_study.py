@@ -28,6 +28,7 @@ from invgraphics.report.data.variants import short_names
 from invgraphics.report.figures.effects import heat_map
 from invgraphics.report.pages.across import across_scenes
 from invgraphics.report.pages.study import design_words, study_facts
+from invgraphics.report.statistics.effects import contrasts_of
 from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.study import build_study_report, shown_variants, study_sentences
 from invgraphics.report.wording import quality_quantity
@@ -260,6 +261,19 @@ def test_variants_are_named_by_their_difference_from_the_base(tmp_path: Path) ->
     labels = [sentence.partition(":")[0] for sentence in study_sentences(tmp_path)]
     assert labels[0] == "no clone" and labels[1].startswith("isotropic")
     assert "clone, no isotropic, sh_degree 2" in dict(study_facts(study)).values()
+
+
+def test_levels_have_the_words_that_the_study_gives_them(tmp_path: Path) -> None:
+    factors = {"hooks.1.stop": [0.6, 0.0], "batches.rays": [1, 2, 3], "field.sh_degree": [2, 0]}
+    words = {"hooks.1.stop 0": "no growth", "hooks.1.stop 0.6": "growth", "batches.rays 2": "some", "batches.rays 3": "many"}
+    folder = bare_study(tmp_path, factors, lambda cell: [20.0 + cell["seed"]], words=words)
+    study = read_study(folder)
+    assert study.variants[0] == "base"
+    assert study.variants[-1] == "no growth, many, sh_degree 0"
+    assert "growth, rays 1, sh_degree 2" in dict(study_facts(study)).values()
+    labels = [contrast.label for contrast in contrasts_of(study.factors)]
+    assert labels == ["no growth", "some", "many", "many instead of some", "field.sh_degree 0 instead of 2"]
+    assert study_sentences(folder)[0].startswith("no growth")
 
 
 def test_a_full_factorial_is_called_one(tmp_path: Path) -> None:

@@ -127,6 +127,10 @@ def test_folders_are_named_by_what_defines_the_run(study, tmp_path: Path) -> Non
         (HEAD + 'each = "scene"\n', "the question names 'scene', which is no factor"),
         (HEAD + 'interactions = [["method", "method"]]\n', "cannot interact with itself"),
         (HEAD + "margins = { psnr = 0.0 }\n", "the margin of 'psnr' cannot be 0.0"),
+        (
+            HEAD + '[factors]\n"batches.rays" = [8, 9]\n[words]\n"batches.rays 7" = "few"\n',
+            r"\[words\] names 'batches.rays 7', which is no level. Did you mean 'batches.rays [89]'",
+        ),
         (HEAD + 'design = "list"\n', r"needs \[\[cells\]\]"),
         (HEAD + "[[cells]]\na = 1\n", r"needs \[\[cells\]\]"),
         (HEAD + 'design = "list"\n[[cells]]\na = 1\n[[cells]]\nb = 1\n', "cell 2 has no 'a'"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -142,6 +143,7 @@ class StudyRecord(Record):
         interactions: pairs of factors whose interaction is the question.
         margins: metric -> difference that is of no interest, stated before anything ran.
         predictions: statements made before anything ran, which the report judges.
+        words: ``factor level`` -> what the report calls that level.
         protocol: how scores were made: ``name``, ``summary`` and further facts.
         command: makes the study again.
         environment: machine and versions.
@@ -171,7 +173,17 @@ class StudyRecord(Record):
     interactions: tuple[tuple[str, str], ...] = ()
     margins: dict[str, float] = field(default_factory=dict)
     predictions: tuple[Prediction, ...] = ()
+    words: dict[str, str] = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
     command: str = ""
     environment: Environment = field(default_factory=Environment)
     cells: tuple[CellRecord, ...]
+
+
+def level_text(value: Any) -> str:
+    """Format a factor's level as text; equal values give equal text."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e6:
+        value = int(value)
+    return json.dumps(value, sort_keys=True)

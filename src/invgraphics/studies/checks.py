@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from invgraphics.errors import InputError
-from invgraphics.runs.study import Prediction
+from invgraphics.errors import InputError, did_you_mean
+from invgraphics.runs.study import Prediction, level_text
 from invgraphics.studies.analyses import check_analyses
 from invgraphics.studies.factors import BUDGET, NARROWING, PRESET, SETTINGS, SIZE, in_scope, levels_of, path_of
 from invgraphics.studies.study import Study
@@ -92,7 +92,7 @@ def checked(study: Study, where: str) -> Study:
 
 
 def _check_questions(study: Study, where: str) -> None:
-    """Check that what the report is to answer exists: factors of ``each`` and ``interactions``, and positive margins."""
+    """Check that what the report is to tell exists: factors of ``each`` and ``interactions``, levels of ``words``, margins."""
     known = {"method", *study.factors}
     for name in [study.each] * bool(study.each) + [name for pair in study.interactions for name in pair]:
         if name not in known:
@@ -102,6 +102,9 @@ def _check_questions(study: Study, where: str) -> None:
     for first, second in study.interactions:
         if first == second:
             raise InputError(f"{where}: '{first}' cannot interact with itself.")
+    levels = {f"{name} {level_text(level)}" for name, listed in study.factors.items() for level in listed}
+    if strange := [name for name in study.words if name not in levels]:
+        raise InputError(f"{where}: [words] names '{strange[0]}', which is no level.{did_you_mean(strange[0], sorted(levels))}")
     for metric, margin in study.margins.items():
         if not 0 < margin < math.inf:
             raise InputError(f"{where}: the margin of '{metric}' cannot be {margin}.", "Expected: a positive difference.")

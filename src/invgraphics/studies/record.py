@@ -132,6 +132,7 @@ def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resourc
         each=study.each,
         interactions=study.interactions,
         margins=study.margins,
+        words=study.words,
         predictions=study.predictions,
         protocol=job.protocol.record(),
         command=request.shell(),

@@ -64,6 +64,7 @@ class Study:
         margins: metric -> difference, in its stored unit, below which levels count as equal (the report's equivalence tests);
             others have the margins of `invgraphics.report.wording.MARGINS`.
         predictions: differences that are stated before anything runs, which the report judges.
+        words: ``factor level`` -> what the report calls that level, where its key says little.
     """
 
     question: str
@@ -89,6 +90,7 @@ class Study:
     interactions: tuple[tuple[str, str], ...] = ()
     margins: dict[str, float] = default(default_factory=dict)
     predictions: tuple[Prediction, ...] = ()
+    words: dict[str, str] = default(default_factory=dict)
 
     def points(self) -> list[Levels]:
         """List the design's combinations of levels, in the order of the factors; at least the base."""

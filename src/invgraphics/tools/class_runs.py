@@ -9,10 +9,10 @@ from typing import Any
 from invgraphics.core import Scene, View
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import Fitted, load_fitted
-from invgraphics.report.data.factors import level_text
 from invgraphics.report.data.variants import level_words, short_names
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.study import level_text
 from invgraphics.scenes.open import SceneOptions, open_scene
 
 MOST_WORDS = 3

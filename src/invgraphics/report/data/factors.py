@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import json
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from invgraphics.runs.run import Run
 from invgraphics.runs.study import Status
@@ -25,11 +24,13 @@ class Factor:
         path: dotted path of the key, or ``method``.
         levels: its values as written, in the order of the study.
         reference: the level that others are compared with.
+        words: level -> what the study calls it.
     """
 
     path: str
     levels: tuple[str, ...]
     reference: str
+    words: Mapping[str, str] = field(default_factory=dict)
 
     def pairs(self) -> list[tuple[str, str]]:
         """(from, to) pairs of levels that are compared, the reference first."""
@@ -37,6 +38,13 @@ class Factor:
         if len(ordered) <= ALL_PAIRS:
             return list(itertools.combinations(ordered, 2))
         return [(self.reference, level) for level in ordered[1:]]
+
+    def named(self, before: str, after: str) -> str:
+        """The study's own words for one level instead of another; empty where it has none."""
+        words = self.words.get(after, "")
+        if not words or before == self.reference:
+            return words
+        return f"{words} instead of {self.words.get(before) or f'{self.path} {before}'}"
 
 
 @dataclass(frozen=True)
@@ -93,12 +101,3 @@ class StudyCell:
     budget: str = ""
     amount: tuple[str, float] | None = None
     forecast: float | None = None
-
-
-def level_text(value: Any) -> str:
-    """Format a level as text; equal values give equal text."""
-    if isinstance(value, str):
-        return value
-    if isinstance(value, float) and value.is_integer() and abs(value) < 1e6:
-        value = int(value)
-    return json.dumps(value, sort_keys=True)

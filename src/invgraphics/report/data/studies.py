@@ -9,7 +9,7 @@ from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation, StudyCell, level_text
+from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation, StudyCell
 from invgraphics.report.data.variants import find_factors, variant_name
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.environment import Environment
@@ -17,7 +17,7 @@ from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.inside import inside
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.scores import DEFAULT
-from invgraphics.runs.study import Approximation, CellRecord, KnownDeviation, Prediction, StudyRecord
+from invgraphics.runs.study import Approximation, CellRecord, KnownDeviation, Prediction, StudyRecord, level_text
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def read_study(folder: Path) -> Study:
     protocol = str(record.protocol.get("name", DEFAULT))
     shown = _scene_names([*record.scenes, *(cell.scene for cell in record.cells)])
     cells = [_cell(cell, shown[cell.scene], base, folder, protocol) for cell in record.cells]
-    factors = find_factors(record.factors, base, cells)
+    factors = find_factors(record, base, cells)
     return Study(
         name=record.name,
         question=record.question,

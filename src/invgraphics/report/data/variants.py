@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatch
-from typing import Any
 
-from invgraphics.report.data.factors import METHOD, Factor, StudyCell, level_text
+from invgraphics.report.data.factors import METHOD, Factor, StudyCell
+from invgraphics.runs.study import StudyRecord, level_text
 
 
-def find_factors(declared: Mapping[str, Any], base: Mapping[str, str], cells: Sequence[StudyCell]) -> tuple[Factor, ...]:
+def find_factors(record: StudyRecord, base: Mapping[str, str], cells: Sequence[StudyCell]) -> tuple[Factor, ...]:
     """Factors with at least two observed levels: the method, declared factors, then others that vary between cells."""
     levels: dict[str, dict[str, None]] = {METHOD: {}}
-    for path, values in declared.items():
+    for path, values in record.factors.items():
         listed = values if isinstance(values, list | tuple) else [values]
         levels[str(path)] = dict.fromkeys(level_text(value) for value in listed)
     present: dict[str, set[str]] = {}
@@ -24,7 +24,8 @@ def find_factors(declared: Mapping[str, Any], base: Mapping[str, str], cells: Se
     for path, found in levels.items():
         kept = tuple(level for level in found if level in present.get(path, ()))
         if len(kept) > 1:
-            factors.append(Factor(path, kept, base[path] if base.get(path) in kept else kept[0]))
+            words = {level: record.words[name] for level in kept if (name := f"{path} {level}") in record.words}
+            factors.append(Factor(path, kept, base[path] if base.get(path) in kept else kept[0], words))
     return tuple(factors)
 
 
@@ -36,7 +37,7 @@ def variant_name(cell: StudyCell, factors: Sequence[Factor]) -> str:
     """Display name of a cell: its method, and in words what differs from the base; factors of other methods are left out."""
     names = short_names([factor.path for factor in factors])
     own = [f for f in factors if f.path != METHOD and f.path in cell.levels and _concerns(f.path, cell.method)]
-    changed = [level_words(names[f.path], cell.levels[f.path]) for f in own if cell.levels[f.path] != f.reference]
+    changed = [_words(f, cell.levels[f.path], names) for f in own if cell.levels[f.path] != f.reference]
     parts = [cell.method] if any(factor.path == METHOD for factor in factors) else []
     return ", ".join([*parts, *changed]) or (BASE if own else cell.method)
 
@@ -44,7 +45,12 @@ def variant_name(cell: StudyCell, factors: Sequence[Factor]) -> str:
 def base_words(factors: Sequence[Factor]) -> str:
     """The base in words: the reference level of every factor but the method."""
     names = short_names([factor.path for factor in factors])
-    return ", ".join(level_words(names[factor.path], factor.reference) for factor in factors if factor.path != METHOD)
+    return ", ".join(_words(factor, factor.reference, names) for factor in factors if factor.path != METHOD)
+
+
+def _words(factor: Factor, level: str, names: Mapping[str, str]) -> str:
+    """A factor's level as the study calls it, else by the factor's short name."""
+    return factor.words.get(level) or level_words(names[factor.path], level)
 
 
 def level_words(name: str, level: str) -> str:

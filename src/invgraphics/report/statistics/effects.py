@@ -174,7 +174,11 @@ def contrasts_of(
     ]
     for factor in factors:
         places = [{each: level} for level in among] if each and factor.path != each else [{}]
-        found += [Contrast(factor.path, *levels, where=where) for where in places for levels in factor.pairs()]
+        found += [
+            Contrast(factor.path, before, after, where=where, name=factor.named(before, after))
+            for where in places
+            for before, after in factor.pairs()
+        ]
     return found
 
 

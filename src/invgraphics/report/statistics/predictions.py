@@ -13,11 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from invgraphics.report.data.factors import METHOD, Lost, Observation, level_text
+from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
 from invgraphics.report.statistics.values import diverged, value_of
 from invgraphics.report.wording import ABSENT, Quantity, listing, quality_quantity
-from invgraphics.runs.study import Prediction
+from invgraphics.runs.study import Prediction, level_text
 
 PREDICTION_HEADS = ("Prediction", "Source", "Scenes", "Expected", "Measured", "95% interval", "Fits", "Verdict")
 """Columns of the table of predictions."""
