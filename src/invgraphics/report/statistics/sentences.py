@@ -34,7 +34,7 @@ def _verdict(effect: Effect) -> str:
         mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
         return f"{effect.label}: no common direction, {basis}; {mean}."
     if effect.scenes("higher") or effect.scenes("lower"):
-        return f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}; {_reserve(effect)}."
+        return f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}{_reserve(effect)}."
     if effect.equivalent:
         assert effect.quantity.margin is not None
         margin = effect.text(effect.quantity.margin)
@@ -115,10 +115,9 @@ def _contradict(effect: Effect) -> bool:
 
 
 def _reserve(effect: Effect) -> str:
-    """Why an effect that single scenes show is no finding about scenes."""
-    if effect.across is not None and effect.across.scenes < FEW_SCENES:
-        return f"{effect.across.scenes} scenes are too few to tell about others"
-    return "the scenes differ too much to tell about others"
+    """Why an effect that single scenes show is no finding about scenes, where their interval does not say so already."""
+    few = effect.across is not None and effect.across.scenes < FEW_SCENES
+    return "" if few else "; the scenes differ too much to tell about others"
 
 
 def detectable_words(effect: Effect) -> str:
