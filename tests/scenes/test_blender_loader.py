@@ -56,7 +56,7 @@ def test_dots_are_found_after_resizing(folder: Path) -> None:
     assert scene.notes["test_views"] == "2 of 4, evenly spaced"
 
 
-@pytest.mark.parametrize(("size", "place"), [(25.0, (300.0, -120.0, 40.0)), (0.02, (0.3, 0.1, -0.2))])
+@pytest.mark.parametrize(("size", "place"), [(25.0, (300.0, -120.0, 40.0)), (0.02, (0.3, 0.1, -0.2)), (1.0, (5.0, -3.0, 2.0))])
 def test_exports_of_any_size_and_place_get_a_box_of_one_size(
     folder: Path, tmp_path: Path, size: float, place: tuple[float, float, float]
 ) -> None:
@@ -99,8 +99,9 @@ def test_opaque_pictures_with_a_plain_border_show_an_object_before_it(folder: Pa
     assert scene.background.tolist() == pytest.approx([0.2, 0.4, 0.8])
 
 
-def test_other_opaque_pictures_show_endless_space(folder: Path) -> None:
-    opaque(folder, np.random.default_rng(0).uniform(0, 255, (120, 160, 3)))
+@pytest.mark.parametrize("channels", [3, 4])
+def test_other_opaque_pictures_show_endless_space(folder: Path, channels: int) -> None:
+    opaque(folder, np.random.default_rng(0).uniform(0, 255, (120, 160, 3)), channels)
     scene = validate(Blender().load(folder, SceneOptions()))
     assert scene.bounds.space == "contracted"
     assert scene.background.tolist() == [0, 0, 0]

@@ -1,13 +1,14 @@
 """``transforms.json`` of nerfstudio and instant-ngp, distorted lenses included."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from dots import GL, POINTS, assert_dots_are_found, ring, save
+from dots import GL, POINTS, Eye, assert_dots_are_found, ring, save
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
@@ -255,8 +256,22 @@ def test_a_black_border_may_be_the_rim_of_a_lens(tmp_path: Path) -> None:
     assert scene.bounds.space == "contracted"
 
 
-def test_transparent_pictures_without_a_common_focus_are_of_endless_space(tmp_path: Path) -> None:
-    eyes = [replace(ring(1)[0], t=ring(1)[0].t + np.array([0.1 * index, 0.0, 0.0])) for index in range(9)]
+def side_by_side() -> list[Eye]:
+    eye = ring(1)[0]
+    return [replace(eye, t=eye.t + np.array([0.1 * index, 0.0, 0.0])) for index in range(9)]
+
+
+def outwards() -> list[Eye]:
+    """The ring's cameras, turned around where they stand."""
+    turn = np.diag([-1.0, 1.0, -1.0])
+    return [replace(eye, R=turn @ eye.R, t=turn @ eye.t) for eye in ring(14)]
+
+
+@pytest.mark.parametrize("cameras", [side_by_side, outwards])
+def test_transparent_pictures_without_a_focus_before_them_are_of_endless_space(
+    tmp_path: Path, cameras: Callable[[], list[Eye]]
+) -> None:
+    eyes = cameras()
     path = write(tmp_path, eyes, {})
     for index, eye in enumerate(eyes):
         save(eye.picture(with_alpha=True), path / "images" / f"{index:04}.png")
