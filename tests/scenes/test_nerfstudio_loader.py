@@ -256,6 +256,16 @@ def test_a_black_border_may_be_the_rim_of_a_lens(tmp_path: Path) -> None:
     assert scene.bounds.space == "contracted"
 
 
+def test_transparent_corners_may_be_what_undistortion_left(tmp_path: Path) -> None:
+    path = write(tmp_path, ring(14), {})
+    for file in (path / "images").iterdir():
+        rgba = np.full((120, 160, 4), 255, np.uint8)
+        rgba[..., :3] = np.random.default_rng(0).uniform(0, 255, (120, 160, 3))
+        rgba[:20, :20, 3] = 0
+        save(rgba, file)
+    assert Nerfstudio().load(path, SceneOptions()).bounds.space == "contracted"
+
+
 def side_by_side() -> list[Eye]:
     eye = ring(1)[0]
     return [replace(eye, t=eye.t + np.array([0.1 * index, 0.0, 0.0])) for index in range(9)]

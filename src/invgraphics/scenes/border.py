@@ -13,6 +13,8 @@ from invgraphics.core import View
 
 LOOKED_AT = 8
 """Pictures that are looked at, about."""
+CLEAR_SHARE = 0.05
+"""Share of transparent pixels from which an object stands by itself; fewer are a window, or what undistortion left blank."""
 PLAIN_SHARE = 0.9
 """Share of their border pixels that have the colour; an object may be cut off by some."""
 SAME_COLOUR = 10
@@ -29,13 +31,13 @@ def plain_border(pictures: Sequence[UInt8[np.ndarray, "h w c"]]) -> Float[Tensor
 
 
 def is_object(pictures: Sequence[UInt8[np.ndarray, "h w c"]], black: bool) -> bool:
-    """Whether pictures show an object by itself: they are transparent somewhere, or their borders share a colour.
+    """Whether pictures show an object by itself: they are transparent around it, or their borders share a colour.
 
     Args:
         pictures: straight colour, or colour and alpha.
         black: whether that colour may be black.
     """
-    if any(pixels.shape[2] == 4 and pixels[..., 3].min() < 255 for pixels in pictures):
+    if np.mean([(pixels[..., 3] < 128).mean() if pixels.shape[2] == 4 else 0.0 for pixels in pictures]) >= CLEAR_SHARE:
         return True
     colour = plain_border(pictures)
     return colour is not None and (black or float(colour.max()) > SAME_COLOUR / 255)
