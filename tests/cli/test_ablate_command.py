@@ -94,4 +94,4 @@ def test_bad_arguments_are_refused(words: list[str], sentence: str, capsys) -> N
 def test_studies_are_listed(capsys) -> None:
     assert main.run(["list", "studies"]) == main.DONE
     lines = capsys.readouterr().out.splitlines()
-    assert any(line.split()[:1] == ["families"] and line.split()[-1] == "147" for line in lines)
+    assert any(line.split()[:1] == ["families"] and line.split()[-1] == "84" for line in lines)

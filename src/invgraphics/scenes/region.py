@@ -190,7 +190,8 @@ def box_frame(lo: Float[Tensor, 3], hi: Float[Tensor, 3], points: Points | None 
     """
     half, centre = float((hi - lo).max()) / 2, (lo + hi) / 2
     least, most = BOX_HALVES
-    if least <= half <= most and float(centre.abs().max()) <= most:
+    usual = least <= half <= most and float(centre.abs().max()) <= most
+    if usual or not math.isfinite(half):  # what is not finite is refused with the scene
         return Frame(Bounds(lo.float(), hi.float()), points=points)
     world_from_local = torch.eye(4, dtype=torch.float64)
     world_from_local[:3, :3] *= half / BOX_HALF
