@@ -56,6 +56,12 @@ class Eye:
         return np.rint(255 * np.concatenate([colour, weight.max(0)[..., None]], axis=-1)).astype(np.uint8)
 
 
+def composited(rgba: np.ndarray, background: np.ndarray | float) -> np.ndarray:
+    """Opaque 8-bit colours of a picture with straight alpha before a background of 0 to 255."""
+    cover = rgba[..., 3:] / 255
+    return np.rint(rgba[..., :3] * cover + background * (1 - cover)).astype(np.uint8)
+
+
 def ring(count: int = 9, distance: float = 4.0, **lens: object) -> list[Eye]:
     """Cameras on an arc above the dots, world +z up."""
     eyes = []

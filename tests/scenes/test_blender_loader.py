@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dots import GL, Eye, assert_dots_are_found, ring, save
+from dots import GL, Eye, assert_dots_are_found, composited, ring, save
 from PIL import Image
 
 from invgraphics.errors import InputError
@@ -58,7 +58,7 @@ def test_dots_are_found_after_resizing(folder: Path) -> None:
 
 @pytest.mark.parametrize(("size", "place"), [(25.0, (300.0, -120.0, 40.0)), (0.02, (0.3, 0.1, -0.2)), (1.0, (5.0, -3.0, 2.0))])
 def test_exports_of_any_size_and_place_get_a_box_of_one_size(
-    folder: Path, tmp_path: Path, size: float, place: tuple[float, float, float]
+    folder: Path, size: float, place: tuple[float, float, float]
 ) -> None:
     usual = Blender().load(folder, SceneOptions())
     for split in ("train", "val", "test"):
@@ -83,11 +83,8 @@ def test_exports_of_any_size_and_place_get_a_box_of_one_size(
 
 def opaque(folder: Path, background: np.ndarray, channels: int = 3) -> None:
     for path in folder.rglob("*.png"):
-        rgba = np.array(Image.open(path)).astype(float)
-        cover = rgba[..., 3:] / 255
-        picture = np.full(rgba.shape, 255.0)
-        picture[..., :3] = rgba[..., :3] * cover + background * (1 - cover)
-        save(np.rint(picture).astype(np.uint8)[..., :channels], path)
+        rgb = composited(np.array(Image.open(path)), background)
+        save(np.pad(rgb, ((0, 0), (0, 0), (0, channels - 3)), constant_values=255), path)
 
 
 @pytest.mark.parametrize("channels", [3, 4])

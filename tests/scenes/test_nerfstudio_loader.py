@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dots import GL, POINTS, Eye, assert_dots_are_found, ring, save
+from dots import GL, POINTS, Eye, assert_dots_are_found, composited, ring, save
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
@@ -229,19 +229,13 @@ def test_the_dots_are_well_placed() -> None:
         assert (pixels < np.array(eye.size) - 8).all()
 
 
-def before(eye, colour: int) -> np.ndarray:
-    """The dots in front of a grey."""
-    rgba = eye.picture(with_alpha=True).astype(float)
-    cover = rgba[..., 3:] / 255
-    return np.rint(rgba[..., :3] * cover + colour * (1 - cover)).astype(np.uint8)
-
-
 @pytest.mark.parametrize("grey", [None, 255, 90])
 def test_an_object_by_itself_is_in_a_box(tmp_path: Path, grey: int | None) -> None:
     eyes = ring(14, distance=40.0)
     path = write(tmp_path, eyes, {"camera_model": "PINHOLE"})
     for index, eye in enumerate(eyes):
-        save(eye.picture(with_alpha=True) if grey is None else before(eye, grey), path / "images" / f"{index:04}.png")
+        rgba = eye.picture(with_alpha=True)
+        save(rgba if grey is None else composited(rgba, grey), path / "images" / f"{index:04}.png")
     scene = validate(Nerfstudio().load(path, SceneOptions()))
     assert scene.bounds.space == "box"
     assert scene.bounds.hi.tolist() == [1.5, 1.5, 1.5]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -10,6 +11,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from invgraphics.core import View
+
+T = TypeVar("T")
 
 LOOKED_AT = 8
 """Pictures that are looked at, about."""
@@ -19,6 +22,11 @@ PLAIN_SHARE = 0.9
 """Share of their border pixels that have the colour; an object may be cut off by some."""
 SAME_COLOUR = 10
 """Largest difference to it in any channel, of 255: compression is not exact."""
+
+
+def looked_at(items: Sequence[T]) -> Sequence[T]:
+    """About `LOOKED_AT` of a scene's pictures, evenly spaced."""
+    return items[:: max(1, len(items) // LOOKED_AT)]
 
 
 def plain_border(pictures: Sequence[UInt8[np.ndarray, "h w c"]]) -> Float[Tensor, 3] | None:
@@ -49,5 +57,5 @@ def background_of(views: Sequence[View]) -> Float[Tensor, 3]:
         return torch.ones(3)
     colour = None
     if all(view.mask is None for view in views):
-        colour = plain_border([view.image.cpu().numpy() for view in views[:: max(1, len(views) // LOOKED_AT)]])
+        colour = plain_border([view.image.cpu().numpy() for view in looked_at(views)])
     return torch.zeros(3) if colour is None else colour

@@ -37,7 +37,7 @@ from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.files import write_arrays
-from invgraphics.scenes.border import LOOKED_AT, background_of
+from invgraphics.scenes.border import background_of, looked_at
 from invgraphics.scenes.images import RESIZE, make_view, wanted_size
 from invgraphics.scenes.layout import HOLD_OUT, SceneOptions, evenly, local_points
 from invgraphics.scenes.poses import poses
@@ -143,8 +143,7 @@ def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> Frame:
             torch.from_numpy(position.astype(np.float64)), torch.from_numpy(_bytes(rgb, "points_rgb", path)).float() / 255
         )
     if "bounds" not in arrays:
-        chosen = range(0, len(world), max(1, len(world) // LOOKED_AT))
-        pictures = [_pixels(arrays, i, path) for i in chosen]
+        pictures = [_pixels(arrays, i, path) for i in looked_at(range(len(world)))]
         return object_frame(_cameras(arrays, world), pictures, points) or contracted_frame(world, points)
     with np.errstate(over="ignore"):  # infinite bounds are refused with the scene
         lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32)).double()

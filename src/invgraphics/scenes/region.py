@@ -13,7 +13,7 @@ from torch import Tensor
 
 from invgraphics.core import Bounds, Camera, Points
 from invgraphics.errors import InputError
-from invgraphics.scenes.border import LOOKED_AT, is_object
+from invgraphics.scenes.border import is_object, looked_at
 from invgraphics.scenes.images import Photo, read_pixels
 
 NEAR = 0.05
@@ -85,6 +85,16 @@ def common_focus(poses: Float[Tensor, "n 4 4"]) -> Float[Tensor, 3] | None:
     return torch.linalg.solve(normal_matrix, (across @ position[:, :, None]).mean(dim=0)[:, 0])
 
 
+def ahead_of(poses: Float[Tensor, "n 4 4"], point: Float[Tensor, 3]) -> Float[Tensor, " n"]:
+    """Distance of a point along each camera's optical axis, negative behind it.
+
+    Args:
+        poses: camera-to-world.
+        point: in the same frame.
+    """
+    return ((point - poses[:, :3, 3]) * poses[:, :3, 2]).sum(dim=1)
+
+
 def pictured_ball(cameras: Sequence[Camera]) -> tuple[Float[Tensor, 3], float] | None:
     """Centre and radius of the ball around the cameras' common focus that their pictures just hold, in the median.
 
@@ -96,13 +106,10 @@ def pictured_ball(cameras: Sequence[Camera]) -> tuple[Float[Tensor, 3], float] |
     """
     poses = torch.stack([camera.cam_to_world for camera in cameras])
     focus = common_focus(poses)
-    if focus is None:
-        return None
-    offset = focus - poses[:, :3, 3]
-    if float((offset * poses[:, :3, 2]).sum(dim=1).median()) <= 0:
+    if focus is None or float(ahead_of(poses, focus).median()) <= 0:
         return None
     half_view = torch.stack([max(camera.width, camera.height) / 2 / camera.focal.min() for camera in cameras])
-    return focus, float((offset.norm(dim=1) * half_view).median())
+    return focus, float(((focus - poses[:, :3, 3]).norm(dim=1) * half_view).median())
 
 
 def subject_half(points: Float[Tensor, "n 3"]) -> float:
@@ -146,7 +153,7 @@ def photo_frame(photos: Sequence[Photo], points: Points | None = None, conventio
         InputError: a photograph cannot be read, or the cameras are farther apart than numbers reach.
     """
     cameras = [photo.camera for photo in photos]
-    pictures = [read_pixels(photo.path) for photo in photos[:: max(1, len(photos) // LOOKED_AT)]]
+    pictures = [read_pixels(photo.path) for photo in looked_at(photos)]
     frame = object_frame(cameras, pictures, points, conventional)
     return frame or contracted_frame(torch.stack([camera.cam_to_world for camera in cameras]), points)
 
@@ -225,8 +232,7 @@ def contracted_frame(
     if focus is None:
         centre = middle + distance * torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
     else:
-        ahead = ((focus - position) * forward).sum(dim=1).median()
-        centre = focus if float(ahead) > 0 else middle
+        centre = focus if float(ahead_of(poses, focus).median()) > 0 else middle
     radius = float((position - centre).norm(dim=1).max()) or 1.0
     if not math.isfinite(radius):
         raise InputError("The cameras are farther apart than numbers reach.", "Check the positions of the poses.")

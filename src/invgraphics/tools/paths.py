@@ -14,9 +14,8 @@ from torch import Tensor
 
 from invgraphics.core import Camera, Scene
 from invgraphics.core.transforms import look_at
+from invgraphics.scenes.region import ahead_of, common_focus
 
-PARALLEL = 1e-2
-"""Mean squared sine of the angles between optical axes and a common direction below which they have no common point."""
 STOPS = 8
 """Photographs that an interpolated path comes by."""
 WIDEST_GAP = 120.0
@@ -122,15 +121,11 @@ def orbit(scene: Scene, frames: int) -> list[Camera]:
 
 def _focus(cameras: Sequence[Camera], otherwise: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
     """Least-squares point nearest to all optical axes; a fallback where those are parallel or it lies behind a camera."""
-    forward = torch.stack([camera.cam_to_world[:3, 2] for camera in cameras]).double()
-    position = torch.stack([camera.position for camera in cameras]).double()
-    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
-    matrix = across.mean(dim=0)
-    if float(torch.linalg.eigvalsh(matrix)[0]) < PARALLEL:
+    poses = torch.stack([camera.cam_to_world for camera in cameras]).double()
+    point = common_focus(poses)
+    if point is None or bool((ahead_of(poses, point) <= 0).any()):
         return otherwise
-    point = torch.linalg.solve(matrix, (across @ position[:, :, None]).mean(dim=0)[:, 0])
-    seen = ((point - position) * forward).sum(dim=1) > 0
-    return point.to(otherwise) if bool(seen.all()) else otherwise
+    return point.to(otherwise)
 
 
 def interpolate(scene: Scene, frames: int) -> list[Camera]:
