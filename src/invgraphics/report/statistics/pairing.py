@@ -50,7 +50,7 @@ class Contrast:
         words = self.name or contrast_words(self.factor, self.before, self.after)
         if self.against is not None:
             factor, low, high = self.against
-            words = f"{words}, at {f'{factor} ' if factor != METHOD else ''}{high} rather than {low},"
+            words = f"{words}, at {f'{factor} ' if factor != METHOD else ''}{high} rather than {low}"
         return ", ".join(self.where.values()) + ": " + words if self.where else words
 
     @property

@@ -27,23 +27,28 @@ def _verdict(effect: Effect) -> str:
         return _unmeasured(effect, magnitude)
     basis = f"{value.size}{_scene_counts(effect)}"
     if effect.found:
-        return f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}."
+        return f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}."
     if effect.flattered:
         return f"{effect.label}: no verdict, {_signed(effect)}, {basis}."
     if _contradict(effect):
         mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
         return f"{effect.label}: no common direction, {basis}; {mean}."
     if effect.scenes("higher") or effect.scenes("lower"):
-        return f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}{_reserve(effect)}."
+        return f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}{_reserve(effect)}."
     if effect.equivalent:
         assert effect.quantity.margin is not None
         margin = effect.text(effect.quantity.margin)
         return f"{effect.label}: no effect beyond ±{margin} {unit} (equivalence test), {_signed(effect)}, {basis}."
     if effect.uncorrected:
         chance = f"with {effect.comparisons} comparisons in this study that may be chance"
-        words = f"{effect.label} {magnitude} {_intervals(effect, value.mean)}, {basis}"
+        words = f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}"
         return f"{words}; {chance} (corrected p = {effect.adjusted:.2g})."
     return f"{effect.label}: undecided, {_signed(effect)}, {basis}; {detectable_words(effect)}."
+
+
+def _subject(effect: Effect) -> str:
+    """The contrast as the subject of a sentence; the clause that names an interaction's levels is closed by a comma."""
+    return f"{effect.label}," if effect.contrast.against is not None else effect.label
 
 
 def _unmeasured(effect: Effect, magnitude: str) -> str:
@@ -51,8 +56,8 @@ def _unmeasured(effect: Effect, magnitude: str) -> str:
     if value.mean == 0 and (value.seeds[1] > 1 or value.scenes > 1):
         return f"{effect.label}: no difference at all, {value.size}."
     if value.seeds[1] == 1 and value.scenes == 1:
-        return f"{effect.label} {magnitude} in the one seed there is: an observation, which tells nothing from chance."
-    return f"{effect.label} {magnitude} by the same amount each time, {value.size}: no spread is known, so nothing is tested."
+        return f"{_subject(effect)} {magnitude} in the one seed there is: an observation, which tells nothing from chance."
+    return f"{_subject(effect)} {magnitude} by the same amount each time, {value.size}: no spread is known, so nothing is tested."
 
 
 def _signed(effect: Effect) -> str:
