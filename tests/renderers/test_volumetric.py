@@ -181,9 +181,10 @@ def test_updates_reach_the_sampler(make_scene: Callable[..., Scene]) -> None:
 
 
 def test_near_samples_pull_less_but_look_the_same(make_scene: Callable[..., Scene], make_camera: Callable[..., Camera]) -> None:
-    """A slab at a known distance: its colour's gradient is scaled by that distance squared, in endless space only."""
-    rays = Rays.make(torch.zeros(5, 3, dtype=F64), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(5, 3))
-    for space, scale in (("contracted", 0.5**2), ("box", 1.0)):
+    """A slab half a unit before the camera: its colour's gradient is scaled in endless space and from within a box only."""
+    forward = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(5, 3)
+    for space, start, scale in (("contracted", 0.0, 0.5**2), ("box", 0.0, (0.5 / 1.5) ** 2), ("box", -2.0, 1.0)):
+        rays = Rays.make(torch.tensor([[0.0, 0.0, start]], dtype=F64).expand(5, 3), forward)
         pictures, gradients = [], []
         for reach in (0.0, 1.0):
             field = Slab(20.0, 0.495, 0.505, colour=(0.2, 0.5, 0.8)).double()

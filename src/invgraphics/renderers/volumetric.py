@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from invgraphics.config import Slot
 from invgraphics.core import (
+    Bounds,
     Camera,
     Context,
     Field,
@@ -41,9 +42,10 @@ class VolumetricConfig:
 
     Attributes:
         sampler: where along the rays to look.
-        gradient_reach: in endless space, gradients of samples nearer to a camera than this are scaled by the square of their
-            distance over it, local units; 0 leaves them alone. Few pixels see what is near a camera, and each sees it large
-            (Philip and Deschaintre 2023, Floaters no more).
+        gradient_reach: gradients of samples nearer to a camera than this are scaled by the square of their distance over it;
+            0 leaves them alone. Few pixels see what is near a camera, and each sees it large (Philip and Deschaintre 2023,
+            Floaters no more). In endless space it is in local units; in a box in halves of its longest edge, and only for
+            rays that begin within it: seen from outside, nothing in it is near.
         colour_threshold: in training, samples that contribute no more than this to their ray are not asked for their colour,
             which counts as black (DVGO, TensoRF: 1e-4); 0 asks all.
     """
@@ -95,8 +97,8 @@ class Volumetric(RayRenderer):
         else:
             values = query(field, samples, want, ctx.chunk)
         assert values.density is not None
-        if self.gradient_reach > 0 and ctx.bounds.space == "contracted" and torch.is_grad_enabled():
-            values = _scale_gradients(values, (samples.mid.detach() / self.gradient_reach).square().clamp_max(1.0))
+        if self.gradient_reach > 0 and torch.is_grad_enabled():
+            values = _scale_near(values, samples, rays, ctx.bounds, self.gradient_reach)
             assert values.density is not None
         return integrate(rays, samples, values, values.density * samples.delta, levels)
 
@@ -127,6 +129,17 @@ class Volumetric(RayRenderer):
     def untrained(self) -> Volumetric:
         """Copy of the renderer with the sampler's constants in place of its learnt state."""
         return Volumetric(self.sampler.untrained(), self.gradient_reach, self.colour_threshold)
+
+
+def _scale_near(values: FieldValues, samples: Samples, rays: Rays, bounds: Bounds, reach: float) -> FieldValues:
+    """Scale the gradients of samples near a camera, as `VolumetricConfig.gradient_reach` says."""
+    if bounds.space == "contracted":
+        return _scale_gradients(values, (samples.mid.detach() / reach).square().clamp_max(1.0))
+    within = bounds.contains(rays.origins.detach())
+    if not bool(within.any()):
+        return values
+    scale = (samples.mid.detach() / (reach * float(bounds.half.max()))).square().clamp_max(1.0)
+    return _scale_gradients(values, torch.where(within[samples.ray], scale, torch.ones_like(scale)))
 
 
 def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldValues:
