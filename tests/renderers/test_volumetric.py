@@ -180,19 +180,31 @@ def test_updates_reach_the_sampler(make_scene: Callable[..., Scene]) -> None:
     assert {"sampler.ema", "sampler.occupied", "sampler.step"} == set(make.state_dict())
 
 
-def test_near_samples_pull_less_but_look_the_same(make_scene: Callable[..., Scene], make_camera: Callable[..., Camera]) -> None:
-    """A slab half a unit before the camera: its colour's gradient is scaled in endless space and from within a box only."""
-    forward = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(5, 3)
-    for space, start, scale in (("contracted", 0.0, 0.5**2), ("box", 0.0, (0.5 / 1.5) ** 2), ("box", -2.0, 1.0)):
-        rays = Rays.make(torch.tensor([[0.0, 0.0, start]], dtype=F64).expand(5, 3), forward)
-        pictures, gradients = [], []
-        for reach in (0.0, 1.0):
-            field = Slab(20.0, 0.495, 0.505, colour=(0.2, 0.5, 0.8)).double()
-            field.colour = torch.nn.Parameter(field.colour.detach().clone())
-            model = VolumetricConfig(StratifiedConfig(4000), gradient_reach=reach).build(make_scene(space))
-            rendering, _ = model.render_rays(field, rays, Context(box(space), training=True))
-            pictures.append(rendering.rgb.detach())
-            (gradient,) = torch.autograd.grad(rendering.rgb.sum(), field.colour)
-            gradients.append(gradient)
-        torch.testing.assert_close(pictures[1], pictures[0], atol=0.02, rtol=0.1)
-        torch.testing.assert_close(gradients[1] / gradients[0], torch.full((3,), scale, dtype=F64), rtol=0.1, atol=0)
+@pytest.mark.parametrize(
+    ("space", "starts", "reach", "scales"),
+    [
+        ("contracted", (0.0,), 1.0, (0.5**2,)),
+        ("box", (0.0,), 2.0, ((0.5 / 3.0) ** 2,)),
+        ("box", (-2.0,), 2.0, (1.0,)),
+        ("box", (0.0, -2.0), 2.0, ((0.5 / 3.0) ** 2, 1.0)),
+    ],
+)
+def test_near_samples_pull_less_but_look_the_same(
+    make_scene: Callable[..., Scene], space: str, starts: tuple[float, ...], reach: float, scales: tuple[float, ...]
+) -> None:
+    """A slab before cameras within and outside a box: its colour's gradient is scaled for those within, by their distance."""
+    origins = torch.tensor([[0.0, 0.0, start] for start in starts], dtype=F64)
+    rays = Rays.make(origins, torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(len(starts), 3))
+    pictures, gradients = [], []
+    for used in (0.0, reach):
+        field = Slab(20.0, 0.495, 0.505, colour=(0.2, 0.5, 0.8)).double()
+        field.colour = torch.nn.Parameter(field.colour.detach().clone())
+        model = VolumetricConfig(StratifiedConfig(4000), gradient_reach=used).build(make_scene(space))
+        rendering, _ = model.render_rays(field, rays, Context(box(space), training=True))
+        pictures.append(rendering.rgb.detach())
+        gradients.append(
+            torch.stack([torch.autograd.grad(rgb.sum(), field.colour, retain_graph=True)[0] for rgb in rendering.rgb])
+        )
+    torch.testing.assert_close(pictures[1], pictures[0], atol=0.02, rtol=0.1)
+    expected = torch.tensor(scales, dtype=F64)[:, None].expand(-1, 3)
+    torch.testing.assert_close(gradients[1] / gradients[0], expected, rtol=0.1, atol=0)

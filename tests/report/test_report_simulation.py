@@ -224,6 +224,16 @@ def test_an_interaction_is_what_is_tested_where_it_is_the_question(loss: float, 
     assert sentence in effect_sentence(effect)
 
 
+def test_an_interaction_is_named_in_the_words_of_its_study() -> None:
+    weight = Factor("tv.weight", ("0", "0.01"), "0", {"0.01": "smoothness"})
+    views = Factor("data.train_views", ("5", "40"), "5", {"5": "5 views", "40": "40 views"})
+    first, *_ = contrasts_of([weight, views], interactions=[(weight.path, views.path)])
+    assert first.label == "smoothness, at 40 views rather than 5 views"
+    plain = replace(views, words={})
+    first, *_ = contrasts_of([weight, plain], interactions=[(weight.path, plain.path)])
+    assert first.label == "smoothness, at data.train_views 40 rather than 5"
+
+
 def test_questions_that_say_each_are_answered_for_each() -> None:
     rng = np.random.default_rng(14)
     observations = []

@@ -98,7 +98,7 @@ class Volumetric(RayRenderer):
             values = query(field, samples, want, ctx.chunk)
         assert values.density is not None
         if self.gradient_reach > 0 and torch.is_grad_enabled():
-            values = _scale_near(values, samples, rays, ctx.bounds, self.gradient_reach)
+            values = _scale_near_gradients(values, samples, rays, ctx.bounds, self.gradient_reach)
             assert values.density is not None
         return integrate(rays, samples, values, values.density * samples.delta, levels)
 
@@ -131,15 +131,20 @@ class Volumetric(RayRenderer):
         return Volumetric(self.sampler.untrained(), self.gradient_reach, self.colour_threshold)
 
 
-def _scale_near(values: FieldValues, samples: Samples, rays: Rays, bounds: Bounds, reach: float) -> FieldValues:
-    """Scale the gradients of samples near a camera, as `VolumetricConfig.gradient_reach` says."""
+def _scale_near_gradients(values: FieldValues, samples: Samples, rays: Rays, bounds: Bounds, reach: float) -> FieldValues:
+    """Scale the gradients of samples near their camera by the squared distance; see `VolumetricConfig.gradient_reach`."""
     if bounds.space == "contracted":
-        return _scale_gradients(values, (samples.mid.detach() / reach).square().clamp_max(1.0))
+        return _scale_gradients(values, _gradient_scale(samples, reach))
     within = bounds.contains(rays.origins.detach())
     if not bool(within.any()):
         return values
-    scale = (samples.mid.detach() / (reach * float(bounds.half.max()))).square().clamp_max(1.0)
-    return _scale_gradients(values, torch.where(within[samples.ray], scale, torch.ones_like(scale)))
+    scale = _gradient_scale(samples, reach * float(bounds.half.max()))
+    return _scale_gradients(values, scale.where(within[samples.ray], 1.0))
+
+
+def _gradient_scale(samples: Samples, reach: float) -> Float[Tensor, " m"]:
+    """Squared distance of samples along their rays over ``reach``, at most 1."""
+    return (samples.mid.detach() / reach).square().clamp_max(1.0)
 
 
 def _scale_gradients(values: FieldValues, scale: Float[Tensor, " m"]) -> FieldValues:

@@ -44,7 +44,11 @@ class Factor:
         words = self.words.get(after, "")
         if not words or before == self.reference:
             return words
-        return f"{words} instead of {self.words.get(before) or f'{self.path} {before}'}"
+        return f"{words} instead of {self.word(before)}"
+
+    def word(self, level: str) -> str:
+        """The study's own words for a level; path and level where it has none, of a method its name."""
+        return self.words.get(level) or (level if self.path == METHOD else f"{self.path} {level}")
 
 
 @dataclass(frozen=True)

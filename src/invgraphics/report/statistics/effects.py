@@ -8,7 +8,7 @@ from typing import Literal
 
 from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
 from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, holm, over_scenes, over_seeds
-from invgraphics.report.statistics.pairing import Contrast, Sample, sample
+from invgraphics.report.statistics.pairing import Contrast, Sample, contrast_words, sample
 from invgraphics.report.wording import Quantity, significant_decimals
 
 ALPHA = 1 - CONFIDENCE
@@ -168,7 +168,7 @@ def contrasts_of(
     """
     by_path = {factor.path: factor for factor in factors}
     found = [
-        Contrast(one.path, one.levels[0], one.levels[-1], against=(two.path, two.levels[0], two.levels[-1]))
+        _interaction(one, two)
         for first, second in interactions
         if (one := by_path.get(first)) is not None and (two := by_path.get(second)) is not None
     ]
@@ -180,6 +180,14 @@ def contrasts_of(
             for before, after in factor.pairs()
         ]
     return found
+
+
+def _interaction(one: Factor, two: Factor) -> Contrast:
+    """How the difference between the outermost levels of one factor differs between those of another."""
+    before, after, low, high = one.levels[0], one.levels[-1], two.levels[0], two.levels[-1]
+    difference = one.named(before, after) or contrast_words(one.path, before, after)
+    name = f"{difference}, at {two.word(high)} rather than {two.words.get(low, low)}"
+    return Contrast(one.path, before, after, against=(two.path, low, high), name=name)
 
 
 def effects_on(

@@ -34,7 +34,7 @@ class Contrast:
         after: level that it is subtracted from.
         where: factor -> the only level that counts.
         against: (factor, level, level) for an interaction: the difference at the second level minus that at the first.
-        name: what the contrast is called, where the levels alone do not say.
+        name: what the contrast is called, where the levels of ``factor`` alone do not say, as of an interaction.
     """
 
     factor: str
@@ -48,9 +48,6 @@ class Contrast:
     def label(self) -> str:
         """The contrast in words."""
         words = self.name or contrast_words(self.factor, self.before, self.after)
-        if self.against is not None:
-            factor, low, high = self.against
-            words = f"{words}, at {f'{factor} ' if factor != METHOD else ''}{high} rather than {low}"
         return ", ".join(self.where.values()) + ": " + words if self.where else words
 
     @property
