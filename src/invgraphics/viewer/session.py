@@ -28,6 +28,7 @@ from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Con
 from invgraphics.viewer.crop import crop_note
 from invgraphics.viewer.crop_panel import CropPanel
 from invgraphics.viewer.film_export import RATE, FilmLook, export_film, film_cameras
+from invgraphics.viewer.journey import Journey
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.overlays import Overlays
 from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
@@ -37,11 +38,6 @@ from invgraphics.viewer.shared_state import SharedState
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
-
-NEAR_ENOUGH = 1e-3
-"""How far from a photograph's camera a browser may be to count as at it: radians, and of the scene's extent."""
-ARRIVAL = 10.0
-"""Seconds that a browser has to reach a photograph it was sent to."""
 
 RENDERING = "Rendering …"
 """Status until the first frame after a change."""
@@ -61,7 +57,7 @@ class Session:
         path = PathCallbacks(self._keyframe, self._move_to, self._export, self._stop_export, self._download)
         self._path = PathPanel(client.gui, client.scene, self._scene, path)
         self._view_index: int | None = None
-        self._arrived, self._deadline = False, 0.0
+        self._journey: Journey | None = None
         self._requested: tuple[int | None, float] | None = None
         self._overlays = Overlays(client.scene, shared.renderer.runs[0], shared.frustums, self._frustum_clicked)
         self._closed = False
@@ -80,7 +76,8 @@ class Session:
     def go_to_view(self, index: int) -> None:
         """Move the camera to a photograph's."""
         name, view = self._shared.views[index]
-        self._view_index, self._arrived, self._deadline = index, False, time.monotonic() + ARRIVAL
+        self._view_index = index
+        self._journey = Journey(self._camera.pose, view.camera.cam_to_world, self._scene.extent, time.monotonic())
         self._controls.view.value = name
         self._set_camera(view.camera.cam_to_world, self._letterbox().fov)
         self._submit("overlays", self._update_overlays())
@@ -140,10 +137,7 @@ class Session:
 
     async def _camera_changed(self, _: CameraHandle) -> None:
         if self._view_index is not None:
-            pose = self._shared.views[self._view_index][1].camera.cam_to_world
-            there = self._camera.is_at(pose, NEAR_ENOUGH * self._scene.extent, NEAR_ENOUGH)
-            self._arrived = self._arrived or there
-            if not there and (self._arrived or time.monotonic() > self._deadline):
+            if self._journey is not None and self._journey.has_left(self._camera, time.monotonic()):
                 self._view_index, self._notice = None, ""
                 self._controls.view.value = FREE_CAMERA
                 self._submit("overlays", self._update_overlays())

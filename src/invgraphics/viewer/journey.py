@@ -1,0 +1,48 @@
+"""Journey of a browser's camera to a photograph: tells late reports from a camera that was moved away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.viewer.cameras import ViewerCamera
+
+NEAR_ENOUGH = 1e-3
+"""How far from a photograph's camera a browser may be to count as at it: radians, and of the scene's extent."""
+ARRIVAL = 10.0
+"""Seconds for which whatever a browser reports on its way to a photograph is ignored."""
+
+
+@dataclass
+class Journey:
+    """A camera sent to ``destination`` at time ``start`` (seconds), from ``departure``.
+
+    A busy browser goes on reporting its old camera until it gets the new one, so that before arrival a report from the place
+    of departure never counts as leaving; one from anywhere else does once `ARRIVAL` has passed.
+
+    Attributes:
+        departure: camera-to-world where the browser was, in the scene's local frame.
+        destination: camera-to-world of the photograph.
+        extent: of the scene, in local units.
+        start: when the camera was sent, in seconds of the clock that `has_left` is given.
+    """
+
+    departure: Float[Tensor, "4 4"]
+    destination: Float[Tensor, "4 4"]
+    extent: float
+    start: float
+    _arrived: bool = field(default=False, init=False)
+
+    def has_left(self, camera: ViewerCamera, now: float) -> bool:
+        """Whether the reported camera was moved away from the photograph, or elsewhere before it got there."""
+        if self._is_at(camera, self.destination):
+            self._arrived = True
+            return False
+        if self._arrived:
+            return True
+        return now > self.start + ARRIVAL and not self._is_at(camera, self.departure)
+
+    def _is_at(self, camera: ViewerCamera, pose: Float[Tensor, "4 4"]) -> bool:
+        return camera.is_at(pose, NEAR_ENOUGH * self.extent, NEAR_ENOUGH)
