@@ -222,6 +222,17 @@ def test_metrics_missing_for_one_reason_share_a_footnote(comparison_folder: Path
     assert sorted(notes) == ["PSNR, FLIP: no display", "SSIM: no window"]
 
 
+def test_commands_in_footnotes_are_code(comparison_folder: Path, edit: Callable[..., None]) -> None:
+    def lose(table: dict[str, Any]) -> None:
+        del table["quality"]["flip"]
+        table["skipped"]["flip"] = "2 < 3; `invgraphics export RUN` tells"
+
+    for seed in (0, 1):
+        edit(comparison_folder / f"runs/volumetric-nerf/seed-{seed}/scores.json", lose)
+    page = build_report(comparison_folder).read_text()
+    assert "FLIP: 2 &lt; 3; <code>invgraphics export RUN</code> tells</li>" in page
+
+
 def test_starts_that_differ_in_their_number_of_points_are_one_fact(pristine_comparison: Path) -> None:
     def start(count: int, run: Run) -> Run:
         words = f"1,{count:03} from SfM on these, and 1,{count:03} random ones inside the silhouettes"
