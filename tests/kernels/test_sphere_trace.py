@@ -1,6 +1,7 @@
 """Sphere tracing in one pass against the plain loop, and against the field's own distances."""
 
 from dataclasses import replace
+from types import ModuleType
 
 import pytest
 import torch
@@ -87,6 +88,23 @@ def test_rays_do_not_depend_on_their_neighbours() -> None:
     part = numba.sdf_trace(rays[some], bounds, fused, LIMITS)
     for name in ("hit", "hit_t", "low_t", "low", "steps", "converged"):
         assert torch.equal(getattr(part, name), getattr(whole, name)[some]), name
+
+
+@pytest.mark.parametrize("kernels", [reference, numba], ids=["reference", "numba"])
+@pytest.mark.parametrize("relaxation", [1.0, 1.2, 1.6])
+def test_an_over_relaxed_step_out_of_the_box_does_not_jump_over_a_surface(kernels: ModuleType, relaxation: float) -> None:
+    # The half-space z < floor: the distance is z - floor, by a softplus so sharp that it is linear above 0.
+    first, last = (torch.zeros(8, 6), torch.zeros(8)), (torch.zeros(1, 8), torch.zeros(1))
+    first[0][0, 2], first[1][0], last[0][0, 0] = 1.0, 10.0, 1.0
+    bounds = Bounds(torch.full((3,), -1.0), torch.full((3,), 1.0))
+    rays = bounds.clip(Rays.make(torch.tensor([[0.0, 0.0, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]])))
+    limits = replace(LIMITS, relaxation=relaxation)
+    for floor in (0.5, -0.4, -0.7, -0.85, -0.99):
+        last[1][0] = -10 - floor
+        field = FusedSDF(torch.zeros(0, 2), None, 0, (first, last), 100.0, torch.ones(3), 1.0)
+        found = kernels.sdf_trace(rays, bounds, field, limits)
+        assert bool(found.hit), f"the floor at {floor}"
+        assert abs(float(found.hit_t) - (3 - floor)) < 1e-4
 
 
 def test_fields_without_a_kernel_have_no_parts() -> None:

@@ -74,7 +74,10 @@ def _march(
             break
         value = distance(going, state[_NEXT])
         _advance(state, value, limits)
-        done = (state[_F] < -limits.depth) | (state[_NEXT] > far)
+        # A step ends a ray only as far as its sphere reaches: behind that, an over-relaxed one has to be looked at first.
+        looked = state[_T] + state[_F].abs().clamp_min(limits.least)
+        done = (state[_F] < -limits.depth) | (looked > far) | (state[_T] >= far)
+        state[_NEXT] = torch.minimum(state[_NEXT], far)
         if count == limits.steps or bool(done.any()):
             finished = done | (count == limits.steps)
             whole[:, going[finished]], steps[going[finished]], ended[going[done]] = state[:, finished], count, True

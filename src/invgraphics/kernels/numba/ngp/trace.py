@@ -119,7 +119,10 @@ def _advance(state, p, value, phase, counts, far, limits):
     if phase == _MARCH:
         _march(state, p, value, limits)
         counts[0, p] += 1
-        ended = state[_F, p] < -limits[5] or state[_NEXT, p] > far
+        # A step ends a ray only as far as its sphere reaches: behind that, an over-relaxed one has to be looked at first.
+        t, value = state[_T, p], state[_F, p]
+        ended = value < -limits[5] or t + max(abs(value), limits[3]) > far or t >= far
+        state[_NEXT, p] = min(state[_NEXT, p], far)
         if not ended and counts[0, p] < most:
             return _MARCH
         counts[2, p] = 1 if ended else 0
