@@ -21,6 +21,9 @@ from invgraphics.core.scan import Scan
 
 Pixels = UInt8[Tensor, "h w c"] | Float[Tensor, "h w c"]
 
+ONE_PLACE = 0.01
+"""Spread of cameras over the bounds' radius up to which they stand in one place."""
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -174,9 +177,13 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """3DGS's scene extent: 1.1 times the largest distance of a training camera from their mean, local units."""
+        """3DGS's scene extent: 1.1 times the largest distance of a training camera from their mean, local units.
+
+        Of cameras that all stand in one place (one photograph, a panorama) that says nothing: it is 1.1 times the bounds' radius.
+        """
         positions = torch.stack([view.camera.position for view in self.train])
-        return 1.1 * max(float((positions - positions.mean(0)).norm(dim=1).max()), 1e-3)
+        spread = float((positions - positions.mean(0)).norm(dim=1).max())
+        return 1.1 * (spread if spread > ONE_PLACE * self.bounds.radius else self.bounds.radius)
 
     def with_views(self, **views: tuple[View, ...]) -> Scene:
         """The same scene with other views for ``train``, ``val`` or ``test``."""

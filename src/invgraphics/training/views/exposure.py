@@ -65,7 +65,8 @@ class Exposures(nn.Module):
         super().__init__()
         self.config = config
         shape = (3, 4) if config.model == "affine" else (3,)
-        # Of each view apart, so that Adam moves only the views that a step sees.
+        # `forward` stacks all of them, so that Adam's momentum goes on moving the views that a step does not see, as in 3DGS:
+        # a view is seen once in as many steps as there are views, and moved by those alone it is still on its way at the end.
         self.raw = nn.ParameterList([nn.Parameter(torch.zeros(shape)) for _ in range(views)])
 
     def forward(self) -> Float[Tensor, "n_plus_1 3 4"]:
