@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Batch, Bounds, Context, Rays, Rendering, Samples, Trace
+from invgraphics.core import Batch, Bounds, Context, Rays, Rendering, Samples, Scene, Trace
 from invgraphics.core.samples import FieldValues
 from invgraphics.errors import InputError
 from invgraphics.runs import checkpoint
@@ -185,6 +185,20 @@ def test_every_view_comes_once_before_any_comes_again(scene) -> None:
     drawn = [batches.image(0.5)[1].view for _ in range(2 * len(scene.train))]
     assert sorted(drawn[: len(scene.train)]) == list(range(len(scene.train)))
     assert sorted(drawn[len(scene.train) :]) == list(range(len(scene.train)))
+
+
+@pytest.mark.parametrize(("width", "scale"), [(101, 0.5), (101, 0.25), (100, 0.75), (64, 0.5)])
+def test_coarse_pictures_show_what_their_cameras_do_at_any_size(scene: Scene, width: int, scale: float) -> None:
+    """The mean of a linear ramp over a pixel is the ramp at its centre; a tenth of a pixel is for pixels that are cut."""
+    ramp = (torch.arange(width) + 0.5).expand(8, width)[..., None].expand(8, width, 3) / width
+    camera = replace(scene.train[0].camera, width=width, height=8)
+    view = replace(scene.train[0], camera=camera, image=ramp, alpha=None, depth=None, normal=None)
+    config = BatchConfig(resolution=(scale, 1.0), until=(0.5,))
+    batches = Batches(config, scene.with_views(train=(view,)), torch.Generator().manual_seed(0), torch.device("cpu"))
+    small, batch = batches.image(0.1)
+    assert small.width == round(scale * width)
+    centres = (torch.arange(small.width) + 0.5) / small.width
+    assert float((batch.target[1, :, 0] - centres).abs().max()) < 0.1 / width
 
 
 def test_lower_resolution_keeps_what_cameras_see(scene) -> None:

@@ -179,7 +179,7 @@ class Scene:
     def extent(self) -> float:
         """3DGS's scene extent: 1.1 times the largest distance of a training camera from their mean, local units.
 
-        Of cameras that all stand in one place (one photograph, a panorama) that says nothing: it is 1.1 times the bounds' radius.
+        Where all stand in one place (one photograph, a panorama), it is 1.1 times the bounds' radius instead.
         """
         positions = torch.stack([view.camera.position for view in self.train])
         spread = float((positions - positions.mean(0)).norm(dim=1).max())

@@ -21,6 +21,7 @@ from torch import Tensor
 from invgraphics.core import Points, Scene, View
 from invgraphics.core.colour import linear_to_srgb, srgb_to_linear
 from invgraphics.errors import InputError
+from invgraphics.scenes.images import wanted_size
 from invgraphics.scenes.scales import check_scales, like, resized_view, scene_at
 from invgraphics.scenes.silhouettes import points_inside
 
@@ -210,7 +211,7 @@ def _degraded(view: View, index: int, scene: Scene, data: TrainingData, seed: in
         wrong = view.camera.moved(pose.float())
         view = replace(view, camera=wrong, depth=None, normal=None, ground_truth_pose=view.true_pose)
     if data.size is not None:
-        view = resized_view(view, data.size)
+        view = resized_view(view, *wanted_size(view.camera.width, view.camera.height, data.size))
     if data.exposure:
         stops = data.exposure * float(torch.randn((), generator=_generator(seed, "exposure", index)))
         view = _recoloured(view, lambda colour: _exposed(colour, 2**stops, scene.colour == "linear"))

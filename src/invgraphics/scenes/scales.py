@@ -56,7 +56,8 @@ def scene_at(scene: Scene, divisor: int) -> Scene:
 
 
 def _smaller(view: View, divisor: int) -> View:
-    return resized_view(view, max(view.camera.width, view.camera.height) // divisor)
+    width, height = view.camera.width, view.camera.height
+    return resized_view(view, *wanted_size(width, height, max(width, height) // divisor))
 
 
 def like(colour: Float[Tensor, "h w 3"], view: View) -> Tensor:
@@ -64,9 +65,11 @@ def like(colour: Float[Tensor, "h w 3"], view: View) -> Tensor:
     return quantise(colour) if view.image.dtype == torch.uint8 else colour.clamp_min(0)
 
 
-def resized_view(view: View, size: int) -> View:
-    """Resize a view by area average of premultiplied colour; a pixel is masked unless all of it was valid."""
-    width, height = wanted_size(view.camera.width, view.camera.height, size)
+def resized_view(view: View, width: int, height: int) -> View:
+    """Downscale a view by area average of premultiplied colour, without its geometry.
+
+    A pixel is masked unless all of it was valid.
+    """
     alpha = view.opacity()[..., None]
     mask = torch.ones_like(alpha) if view.mask is None else view.mask[..., None].float()
     stacked = torch.cat([view.colour() * alpha, alpha, mask], dim=-1).numpy().astype(np.float64)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from invgraphics.core import Batch, Camera, Rays, Scene, View
 from invgraphics.core.camera import rays_through
+from invgraphics.scenes.scales import resized_view
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ class Batches:
         key = (index, scale)
         if key not in self._small:
             width, height = (max(1, round(edge * scale)) for edge in (view.camera.width, view.camera.height))
-            self._small[key] = scaled_view(view, width, height)
+            self._small[key] = resized_view(view, width, height)
         return self._small[key]
 
     def state(self) -> dict[str, Tensor]:
@@ -183,21 +184,6 @@ class Batches:
 def size_of(view: View) -> tuple[int, int]:
     """Width and height in pixels."""
     return view.camera.width, view.camera.height
-
-
-def scaled_view(view: View, width: int, height: int) -> View:
-    """A view at another size, area-averaged, without its geometry; masks keep pixels that are wholly inside."""
-    alpha = view.opacity()[..., None]
-    stacked = torch.cat([view.colour() * alpha, alpha], dim=-1).permute(2, 0, 1)[None]
-    shrunk = torch.nn.functional.interpolate(stacked, (height, width), mode="area")[0].permute(1, 2, 0)
-    straight = shrunk[..., :3] / shrunk[..., 3:].clamp_min(1e-6)
-    image = (straight.clamp(0, 1) * 255).round().to(torch.uint8) if view.image.dtype == torch.uint8 else straight
-    small_alpha = None if view.alpha is None else shrunk[..., 3]
-    mask = view.mask
-    if mask is not None:
-        mask = torch.nn.functional.interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0] > 1 - 1e-6
-    camera = view.camera.resized(width, height)
-    return replace(view, camera=camera, image=image, alpha=small_alpha, depth=None, normal=None, mask=mask)
 
 
 def _composited(views: list[View], flat: list[Tensor], background: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from invgraphics.core import Batch, Camera, Context, Model, RayRenderer, Scene, View
+from invgraphics.scenes.scales import resized_view
 from invgraphics.training.adam import DenseAdam
-from invgraphics.training.batches import scaled_view
 from invgraphics.training.poses import motion_about, pivot_depth
 
 
@@ -81,7 +81,7 @@ def photometric_error(model: Model, view: View, scene: Scene, scale: float = 1.0
 
 def _at_scale(view: View, scale: float) -> View:
     width, height = (max(1, round(edge * scale)) for edge in (view.camera.width, view.camera.height))
-    return view if (width, height) == (view.camera.width, view.camera.height) else scaled_view(view, width, height)
+    return view if (width, height) == (view.camera.width, view.camera.height) else resized_view(view, width, height)
 
 
 def _predicted_and_true(
