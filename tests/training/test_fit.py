@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from invgraphics.core import Scene, View
 from invgraphics.errors import NumericalError
 from invgraphics.experiments.recorder import Monitor
 from invgraphics.runs import checkpoint
@@ -50,6 +51,24 @@ def test_poses_matter(name: str, scene, make_fit) -> None:
     wrong = make_fit(name, scene.with_views(train=shuffled), STEPS[name], 0, *FAST[name])
     wrong.run(lambda loss: False)
     assert _psnr(fit) > _psnr(wrong) + 5
+
+
+@pytest.mark.parametrize("name", ["volumetric/hash", "splatting/gaussians"])
+def test_pixels_that_do_not_count_change_nothing(name: str, scene, make_fit) -> None:
+    def with_garbage(colour: float) -> Scene:
+        def garbage(view: View) -> View:
+            mask = torch.arange(view.camera.width).expand(view.camera.height, -1) < view.camera.width // 2
+            image = torch.where(mask[..., None], view.over(scene.background), colour)
+            return replace(view, image=image, alpha=None, mask=mask)
+
+        return scene.with_views(train=tuple(garbage(view) for view in scene.train))
+
+    states = []
+    for colour in (0.0, 0.9):
+        fit = make_fit(name, with_garbage(colour), 5)
+        fit.run(lambda loss: False)
+        states.append(fit.state())
+    assert _equal(*states)
 
 
 def test_the_monitor_sees_every_pixel_of_small_views_once(scene, make_fit, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
@@ -236,13 +236,16 @@ class Batch:
         alpha: true coverage.
         background: colour the prediction must be put in front of: one for all, or one per pixel.
         view: index of the training view, -1 for rays of several views.
+        mask: True where the pixel counts; ``None`` where all do, as of rays, which are drawn from such pixels only.
     """
 
     target: Float[Tensor, "*p 3"]
     alpha: Float[Tensor, "*p"]
     background: Tensor
     view: int = -1
+    mask: Bool[Tensor, "*p"] | None = None
 
     def to(self, device: torch.device) -> Batch:
         """Move all tensors."""
-        return Batch(self.target.to(device), self.alpha.to(device), self.background.to(device), self.view)
+        mask = None if self.mask is None else self.mask.to(device)
+        return Batch(self.target.to(device), self.alpha.to(device), self.background.to(device), self.view, mask)

@@ -156,7 +156,7 @@ class Batches:
             self._order = torch.randperm(len(self._scene.train), generator=self._generator)
         index, self._order = int(self._order[0]), self._order[1:]
         view = self._scaled(index, self._config.scale_at(progress))
-        batch = Batch(view.over(background), view.opacity(), background, index)
+        batch = _whole(view, background, index)
         camera = view.camera if self._refined is None else self._refined.camera(index).resized(*size_of(view))
         return camera.to(self._device), batch.to(self._device)
 
@@ -184,6 +184,15 @@ class Batches:
 def size_of(view: View) -> tuple[int, int]:
     """Width and height in pixels."""
     return view.camera.width, view.camera.height
+
+
+def _whole(view: View, background: Tensor, index: int) -> Batch:
+    """A batch of all pixels of a view; those that do not count are empty, lest windows that overlap them see them."""
+    colour, alpha = view.over(background), view.opacity()
+    if view.mask is None:
+        return Batch(colour, alpha, background, index)
+    mask = view.mask.bool()
+    return Batch(torch.where(mask[..., None], colour, background), alpha * mask, background, index, mask)
 
 
 def _composited(views: list[View], flat: list[Tensor], background: Tensor) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:

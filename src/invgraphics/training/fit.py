@@ -125,7 +125,7 @@ class Fit:
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
-        composited = replace(rendering, rgb=rendering.over(batch.background))
+        composited = _counted(replace(rendering, rgb=rendering.over(batch.background)), batch)
         terms = torch.stack(
             [loss(composited, trace, batch, ctx) for loss in plan.losses]
             + [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties]
@@ -229,3 +229,11 @@ class Fit:
         self._generator.set_state(state["random"]["fit"].cpu())
         torch.set_rng_state(state["random"]["global"].cpu())
         self.steps, self.seconds = int(state["fit"]["steps"]), seconds
+
+
+def _counted(rendering: Rendering, batch: Batch) -> Rendering:
+    """The rendering, as the truth where pixels do not count: no loss, not even one of windows, then has a gradient there."""
+    if batch.mask is None:
+        return rendering
+    rgb = torch.where(batch.mask[..., None], rendering.rgb, batch.target)
+    return replace(rendering, rgb=rgb, alpha=torch.where(batch.mask, rendering.alpha, batch.alpha))
