@@ -225,6 +225,11 @@ def check_renderer(renderer: Renderer, field: Field, scene: Scene) -> None:
     assert torch.equal(first.rgb, again.rgb), "evaluation must be deterministic"
     assert bool(first.rgb.isfinite().all()) and bool((first.alpha >= 0).all()) and bool((first.alpha <= 1 + 1e-4).all())
     assert bool((first.depth[first.alpha >= 0.5] > 0).all()), "depth must be positive where something is"
+    turned = camera.cam_to_world @ torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    away, _ = renderer.render_image(field, camera.moved(turned), ctx)
+    assert away.rgb.shape == (9, 12, 3) and bool(away.rgb.isfinite().all()) and bool(away.alpha.isfinite().all()), (
+        "a camera that looks away from the scene must get a picture"
+    )
     pose = camera.cam_to_world.clone().requires_grad_(True)
     training = Context(scene.bounds, training=True, generator=torch.Generator().manual_seed(0))
     picture, _ = renderer.render_image(field, camera.moved(pose), training)

@@ -149,10 +149,10 @@ class RayAttention(RayRenderer):
         features = query(field, samples, Quantity.FEATURES, ctx.chunk).features
         assert features is not None
         near, far = edges[:, :1], edges[:, -1:]
-        place = (to_spacing(samples.mid, ctx.bounds).view(len(hit), -1) - near) / (far - near)
+        place = (to_spacing(samples.mid, ctx.bounds).view(len(hit), self.config.samples) - near) / (far - near)
         phases = place[..., None] * math.pi * 2.0 ** torch.arange(self.config.octaves, device=place.device)
         where = torch.cat([place[..., None], phases.sin(), phases.cos()], dim=2)
-        tokens = torch.cat([features.view(*place.shape, -1), where], dim=2)
+        tokens = torch.cat([features.view(*place.shape, self.config.features), where], dim=2)
         return samples, self.norm(self.blocks(self.embed(tokens)))
 
     def _radiance(self, tokens: Float[Tensor, "k s w"], direction: Float[Tensor, "k 3"]) -> Float[Tensor, "k s 3"]:
