@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from invgraphics import kernels
-from invgraphics.core import Bounds, Context, Field, FieldValues, Model, Quantity, Samples, Scene, View
+from invgraphics.core import Bounds, Context, Field, FieldValues, Model, Quantity, RayRenderer, Samples, Scene, View
 from invgraphics.core.colour import quantise
 from invgraphics.core.ngp import HashGrid
 from invgraphics.core.transforms import se3_exp
@@ -26,10 +26,12 @@ from invgraphics.testing import toy_cameras
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
+from invgraphics.training.hooks import FitState, Hook
 from invgraphics.training.localise import PoseDescent, refine_pose
 from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import OptimiserConfig
 from invgraphics.training.poses import Poses, PosesConfig, coarse_to_fine_encodings, motion_about
+from invgraphics.training.prune import trace_random_rays
 
 CPU = torch.device("cpu")
 ON = "training.poses.optimise=true"
@@ -292,3 +294,44 @@ def test_a_photograph_finds_its_pose(blobs: Scene) -> None:
 def test_settings_that_make_no_sense_are_refused(settings: dict, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         PosesConfig(**settings)
+
+
+class RaysOfHooks(Hook):
+    """Notes where the rays begin that hooks trace."""
+
+    def after_step(self, state: FitState) -> None:
+        assert isinstance(state.renderer, RayRenderer)
+        traced = [trace.samples for trace in trace_random_rays(state, state.renderer, 60)]
+        middle = [
+            (each.position - 0.5 * (each.t0 + each.t1)[:, None] * each.direction)[0] for each in traced if each is not None
+        ]
+        self.hooks = torch.stack(middle)
+
+
+def test_rays_of_hooks_begin_where_the_fitted_cameras_are(blobs: Scene) -> None:
+    poses = Poses.of(PosesConfig(), blobs)
+    with torch.no_grad():
+        poses.translation[0].copy_(torch.tensor([0.0, 0.0, -0.3]))
+    hook = RaysOfHooks()
+    plan = Plan(
+        model=Model(Blobs(), VolumetricConfig(StratifiedConfig(4)).build(blobs), blobs.bounds),
+        scene=blobs,
+        losses=[PhotometricLoss()],
+        hooks=[hook],
+        optimiser=PosesConfig(rotation_lr=1e-9, translation_lr=1e-9).optimiser(OptimiserConfig(), view_share=1.0),
+        batches=BatchConfig(rays=64, views=6),
+        budget=Budget(steps=1),
+        poses=poses,
+    )
+    Fit(plan).run(lambda loss: False)
+    given = torch.stack([view.camera.position for view in blobs.train])
+    moved = (hook.hooks - given).norm(dim=1)
+    torch.testing.assert_close(moved, torch.tensor([0.3] + [0.0] * (len(given) - 1)), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("scales", "until"), [((0.5, 1.0), (0.5,)), ((0.25, 0.5, 1.0), (0.1, 0.5)), ((0.1, 0.2, 0.5, 1.0), (0.1, 0.3, 0.5))]
+)
+def test_image_scales_end_with_the_window(scales: tuple[float, ...], until: tuple[float, ...]) -> None:
+    config = PosesConfig(resolution=scales, window=(0.1, 0.5)).batches(BatchConfig())
+    assert config.resolution == scales and config.until == pytest.approx(until)

@@ -119,7 +119,7 @@ class Fit:
         """
         began, cpu_began = time.perf_counter(), time.process_time()
         plan, ctx = self.plan, self.context()
-        state = FitState(plan.model.field, plan.model.renderer, self._optimiser, plan.scene, ctx, self.steps)
+        state = FitState(plan.model.field, plan.model.renderer, self._optimiser, plan.scene, ctx, self.steps, poses=plan.poses)
         self._optimiser.set_progress(ctx.progress)
         self._set_coarse_to_fine(ctx.progress)
         for hook in plan.hooks:

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from invgraphics.core import Batch, Context, Field, Renderer, Rendering, Scene, Trace
+from invgraphics.core import Batch, Camera, Context, Field, Renderer, Rendering, Scene, Trace
 from invgraphics.training.optimiser import Optimiser
 from invgraphics.training.requirement import Requirement
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from invgraphics.training.poses import Poses
 
 
 @dataclass
@@ -31,6 +33,7 @@ class FitState:
         trace: trace of the current step; ``None`` before rendering.
         rendering: rendering of the current step, without background.
         batch: photographs of the current step.
+        poses: of the training views where they are fitted too; ``None`` where they are as given.
     """
 
     field: Field
@@ -42,6 +45,14 @@ class FitState:
     trace: Trace | None = None
     rendering: Rendering | None = None
     batch: Batch | None = None
+    poses: Poses | None = None
+
+    @torch.no_grad()
+    def cameras(self) -> list[Camera]:
+        """Cameras of the training views, as they are at this point of the fit."""
+        if self.poses is None:
+            return [view.camera for view in self.scene.train]
+        return self.poses.cameras(torch.arange(len(self.scene.train)))
 
 
 class Hook:

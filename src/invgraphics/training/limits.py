@@ -76,8 +76,8 @@ class Limits(Hook):
         field.opacity_logits.clamp_(_logit(config.min_opacity), _logit(config.max_opacity))
         if config.min_scale:
             if len(self._log_limit) != len(field.means) or state.step % config.every == 0:
-                cameras = [view.camera for view in state.scene.train]
-                self._log_limit = (config.min_scale * pixel_sizes(field.means, cameras)).clamp_min(SMALLEST).log()
+                sizes = pixel_sizes(field.means, state.cameras())
+                self._log_limit = (config.min_scale * sizes).clamp_min(SMALLEST).log()
             torch.maximum(field.log_scales, self._log_limit[:, None], out=field.log_scales)
 
     @override

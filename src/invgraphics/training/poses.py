@@ -98,8 +98,8 @@ class PosesConfig:
         if config.until or len(self.resolution) == 1:
             return config
         start, end = self.window
-        gaps = max(len(self.resolution) - 2, 1)
-        until = [start + (end - start) * i / gaps for i in range(len(self.resolution) - 1)]
+        gaps = len(self.resolution) - 2
+        until = [start + (end - start) * i / gaps for i in range(gaps + 1)] if gaps else [end]
         return replace(config, resolution=self.resolution, until=tuple(until))
 
 

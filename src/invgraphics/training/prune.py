@@ -86,12 +86,12 @@ class Prune(MilestoneHook):
 
 def trace_random_rays(state: FitState, renderer: RayRenderer, count: int) -> Iterator[Trace]:
     """Render ``count`` random training rays as evaluation does, an equal share per view; yields each share's trace."""
-    cameras = [view.camera for view in state.scene.train]
+    cameras = state.cameras()
     ctx = replace(state.ctx, training=False)
     share = -(-count // len(cameras))
     for camera in cameras:
         size = torch.tensor([camera.width, camera.height])
-        pixels = torch.rand(share, 2, generator=state.ctx.generator) * size
+        pixels = (torch.rand(share, 2, generator=state.ctx.generator) * size).to(camera.focal)
         _, trace = renderer.render_rays(state.field, camera.rays(pixels).to(ctx.bounds.lo.device), ctx)
         yield trace
 

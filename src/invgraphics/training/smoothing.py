@@ -73,8 +73,7 @@ class Smoothing(Hook):
         field, config = cast(SmoothedGaussians, state.field), self._config
         # A filter is positive everywhere; zeros are what a change in number leaves behind.
         if due or not bool(field.smoothing.any()):
-            cameras = [view.camera for view in state.scene.train]
-            spacing = pixel_distances(field.means, cameras, config.margin, config.near)
+            spacing = pixel_distances(field.means, state.cameras(), config.margin, config.near)
             field.smoothing.copy_(config.variance**0.5 * spacing)
 
 

@@ -62,7 +62,7 @@ class ViewRates(Hook):
             elif optimiser.row_rates(name) is None:
                 size = lattice.resolution
                 if size not in counted:
-                    counted[size] = _rates(lattice, field, [view.camera for view in state.scene.train])
+                    counted[size] = _rates(lattice, field, state.cameras())
                 optimiser.set_row_rates(name, counted[size])
 
 
