@@ -75,3 +75,10 @@ def test_a_comparison_reads_each_recipe_once(toy_folder: Path, tmp_path: Path, m
     overrides = tuple(item for item in SMALL[METHOD] if item in SMALL["volumetric/hash"])
     compare(CompareRequest(scene=str(toy_folder), out=str(tmp_path), methods=methods, seeds=(0, 1, 2), overrides=overrides))
     assert read == list(methods)
+
+
+def test_methods_whose_runs_would_share_a_folder_are_refused(tmp_path: Path) -> None:
+    """A recipe in one's own folder of the name of a built-in one, say."""
+    request = CompareRequest(scene="bricks", out=str(tmp_path), methods=(METHOD, f"{METHOD}.toml"))
+    with pytest.raises(InputError, match=r"'splatting/gaussians' and 'splatting/gaussians\.toml' would share the folder"):
+        compare(request)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from invgraphics.errors import InputError
@@ -134,3 +135,28 @@ def test_same_method_and_seed_twice_is_told_apart(comparison_folder: Path, tmp_p
     page = build_from_runs([comparison_folder / RUN, longer], tmp_path / "out").read_text()
     assert "volumetric/hash (60s)" in page
     assert "volumetric/hash (120s)" in page
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"recipe_sha256": "0" * 64}, {"budget": "120s"}, {"data": {"data.train_views": 6}}],
+    ids=["another recipe", "another budget", "other training data"],
+)
+def test_other_experiments_are_no_seeds_of_a_method(
+    comparison_folder: Path, tmp_path: Path, edit: Callable[..., None], change: dict[str, Any]
+) -> None:
+    """Two settings of one method with two seeds each are two methods with two seeds each, whatever the settings' names."""
+    seeds = [comparison_folder / f"runs/volumetric-nerf/seed-{seed}" for seed in (0, 1)]
+    others = [tmp_path / "other" / f"seed-{seed}" for seed in (0, 1)]
+    truth = next((comparison_folder / "truth").iterdir())
+    for run, other in zip(seeds, others, strict=True):
+        shutil.copytree(run, other)
+        edit(other / "provenance.json", lambda table: table.update(change, truth=str(truth)))
+
+    def reported(runs: Sequence[Path]) -> dict[str, set[int]]:
+        table = pd.read_csv(build_from_runs(runs, tmp_path / "out").parent / "results.csv").dropna(subset=["seed"])
+        return {str(method): set(rows["seed"]) for method, rows in table.groupby("method")}
+
+    assert sorted(reported([seeds[0], others[1]]).values(), key=min) == [{0}, {1}], "no repetitions of one experiment"
+    assert list(reported([*seeds, *others]).values()) == [{0, 1}, {0, 1}]
+    assert reported(seeds) == {"volumetric/nerf": {0, 1}}

@@ -70,7 +70,8 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
                     failures.append(Failure(method=fit.method, seed=fit.seed, error=outcome.error))
     except KeyboardInterrupt as error:
         interrupted = error
-    done = [fit for fit in request.fits() if RunFolder(Path(fit.out)).finished]
+    failed = {(failure.method, failure.seed) for failure in failures}
+    done = [fit for fit in request.fits() if (fit.method, fit.seed) not in failed and RunFolder(Path(fit.out)).finished]
     runs = tuple(Path(fit.out).relative_to(request.out).as_posix() for fit in done)
     seconds = round(time.monotonic() - began, 1)
     folder.write(replace(summary, runs=runs, failures=tuple(failures), wall_seconds=seconds))
@@ -106,6 +107,7 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     """
     if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
         raise InputError("A method or a seed is named twice.")
+    _check_folders(request)
     jobs, refused = _jobs(request)
     full = opened or open_with_progress(request.scene, jobs[0].options)
     if start := _start_for_all(request, jobs, full):
@@ -121,6 +123,22 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     request = replace(request, methods=tuple(job.request.method for job in jobs))
     check_variants(jobs[0].variants, [job.method for job in jobs], full)
     return request, jobs, scene, [*refused, *unsuitable]
+
+
+def _check_folders(request: CompareRequest) -> None:
+    """Refuse methods of other names whose runs would share a folder: a built-in method, and a file of that name.
+
+    Raises:
+        InputError: names two of them.
+    """
+    owners: dict[Path, str] = {}
+    for method in request.methods:
+        folder = request.folder(method, request.seeds[0]).parent
+        other = owners.setdefault(folder, method)
+        if other != method:
+            raise InputError(
+                f"The runs of '{other}' and '{method}' would share the folder {folder}.", "Rename the recipe's file."
+            )
 
 
 def _missing(request: CompareRequest, jobs: Sequence[Job]) -> list[FitRequest]:

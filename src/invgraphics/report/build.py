@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,21 +101,55 @@ def _common(values: Sequence[str]) -> str:
 
 
 def _with_unique_names(runs: Sequence[Run]) -> list[Run]:
-    """Make (method, seed) unique: append the preset, the budget or else the folder to the method's name."""
-    cells = [(run.method, run.seed) for run in runs]
-    if len(set(cells)) == len(cells):
-        return list(runs)
-    for detail in ("preset", "budget"):
-        details = [run.scores.preset if detail == "preset" else run.provenance.budget for run in runs]
-        named = [(f"{run.method} ({what})", run.seed) for run, what in zip(runs, details, strict=True)]
-        if len(set(named)) == len(named):
-            return [replace(run, method=name) for run, (name, _) in zip(runs, named, strict=True)]
-    return [replace(run, method=f"{run.method} ({_folder_name(run, runs)})") for run in runs]
+    """Name runs such that those of one name are repetitions of one experiment with other seeds.
+
+    Where a method has several experiments (recipe, budget or training data differ, or a seed is there twice), its name gets the
+    preset, the budget or else the folder.
+    """
+    experiments: dict[tuple[str, ...], list[list[Run]]] = {}
+    for run in runs:
+        alike = experiments.setdefault(_settings(run), [])
+        room = next((group for group in alike if all(run.seed != other.seed for other in group)), None)
+        if room is None:
+            alike.append([run])
+        else:
+            room.append(run)
+    of_method: dict[str, list[list[Run]]] = {}
+    for groups in experiments.values():
+        of_method.setdefault(groups[0][0].method, []).extend(groups)
+    names = {id(run): name for groups in of_method.values() for group, name in _named(groups) for run in group}
+    return [replace(run, method=names[id(run)]) for run in runs]
 
 
-def _folder_name(run: Run, runs: Sequence[Run]) -> str:
-    """Shortest suffix of a run's path that is unique among ``runs``."""
-    paths = [other.folder.resolve().parts for other in runs]
-    own = run.folder.resolve().parts
-    length = next(n for n in range(1, len(own) + 1) if sum(path[-n:] == own[-n:] for path in paths) == 1)
+def _settings(run: Run) -> tuple[str, ...]:
+    """Everything that runs of one name must share."""
+    data = json.dumps(run.provenance.data, sort_keys=True)
+    return run.method, run.provenance.recipe_sha256, run.scores.preset, run.provenance.budget, data
+
+
+def _named(groups: Sequence[list[Run]]) -> Iterator[tuple[list[Run], str]]:
+    """Each experiment of one method with a name of its own."""
+    method = groups[0][0].method
+    folders = [_folder_of(group) for group in groups]
+    if len(set(folders)) < len(folders):
+        folders = [group[0].folder.resolve() for group in groups]
+    details = (
+        [group[0].scores.preset for group in groups],
+        [group[0].provenance.budget for group in groups],
+        [_shortest_suffix(folder, folders) for folder in folders],
+    )
+    told = next(words for words in details if len(set(words)) == len(groups))
+    for group, words in zip(groups, told, strict=True):
+        yield group, method if len(groups) == 1 else f"{method} ({words})"
+
+
+def _folder_of(group: Sequence[Run]) -> Path:
+    return Path(os.path.commonpath([run.folder.resolve() for run in group]))
+
+
+def _shortest_suffix(folder: Path, folders: Sequence[Path]) -> str:
+    """Shortest end of a path that is unique among ``folders``."""
+    parts = [other.parts for other in folders]
+    own = folder.parts
+    length = next((n for n in range(1, len(own) + 1) if sum(path[-n:] == own[-n:] for path in parts) == 1), len(own))
     return "/".join(own[-length:]).lstrip("/")
