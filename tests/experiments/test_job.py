@@ -80,7 +80,5 @@ def test_a_comparison_reads_each_recipe_once(toy_folder: Path, tmp_path: Path, m
 def test_methods_whose_runs_would_share_a_folder_are_refused(tmp_path: Path) -> None:
     """A recipe in one's own folder of the name of a built-in one, say."""
     request = CompareRequest(scene="bricks", out=str(tmp_path), methods=(METHOD, f"{METHOD}.toml"))
-    with pytest.raises(
-        InputError, match=r"Runs of 'splatting/gaussians' and 'splatting/gaussians\.toml' would share the folder"
-    ):
+    with pytest.raises(InputError, match="would share the folder"):
         compare(request)
