@@ -100,6 +100,31 @@ def test_split_absent_files_and_missing_suffix(tmp_path: Path) -> None:
     assert scene.name == tmp_path.name
 
 
+def test_the_file_s_own_split_is_kept(tmp_path: Path) -> None:
+    write(tmp_path, ring(10), {})
+    name = "images/{:04}.png".format
+
+    def names(**lists: list[str]) -> tuple[list[str], ...]:
+        edit(tmp_path, lambda table: [table.pop(key, None) for key in ("train_filenames", "val_filenames", "test_filenames")])
+        edit(tmp_path, lambda table: table.update(lists))
+        scene = Nerfstudio().load(tmp_path, SceneOptions())
+        return tuple([view.name for view in views] for views in (scene.train, scene.val, scene.test))
+
+    rest = [name(index) for index in range(9, 2, -1)]  # in the order of the file's frames
+    split = {"val_filenames": [name(0)], "test_filenames": ["./" + name(1), name(2)]}
+    assert names(train_filenames=[name(5), name(4)], **split) == ([name(5), name(4)], [name(0)], [name(2), name(1)])
+    assert names(**split) == (rest, [name(0)], [name(2), name(1)])
+    assert names(val_filenames=[name(2), name(1), name(0)]) == (rest, [], [name(2), name(1), name(0)]), "val is scored"
+    for wrong, sentence in (
+        ({"test_filenames": ["images/none.png"]}, "which no frame has"),
+        ({"test_filenames": "images"}, "is not a list of file names"),
+        ({"train_filenames": rest, "test_filenames": [name(4)]}, "both to fit and to score"),
+        ({"train_filenames": rest}, "no photographs to score"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            names(**wrong)
+
+
 def test_local_frame(tmp_path: Path) -> None:
     """The subject is at the origin, cameras reach distance 1, their up is +z, and the similarity leads back to the world."""
     write(tmp_path, ring(12), {})

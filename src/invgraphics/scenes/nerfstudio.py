@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from invgraphics.core import Scene
+from invgraphics.errors import InputError
 from invgraphics.scenes.frames import Frames
-from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, existing_photos, scene_name
+from invgraphics.scenes.images import Photo
+from invgraphics.scenes.layout import SceneOptions, Split, compose, every_eighth, existing_photos, scene_name
 from invgraphics.scenes.region import photo_frame
+
+_LISTS = ("train_filenames", "val_filenames", "test_filenames")
 
 
 class Nerfstudio:
-    """Loader of ``transforms.json``: OpenGL axes, OPENCV lenses, every eighth photograph scored; an unbounded scene, or
-    an object in a box (see `object_frame`).
+    """Loader of ``transforms.json``: OpenGL axes, OPENCV lenses; endless space, or an object in a box (see `object_frame`).
 
-    Poses are taken as they are: an ``applied_transform`` has already been applied to them. Listed photographs that do not
-    exist are skipped and named in the scene's notes.
+    Photographs are split as the file's ``train_filenames``, ``val_filenames`` and ``test_filenames`` say; without these, every
+    eighth is scored. Poses are taken as they are: an ``applied_transform`` has already been applied to them. Listed
+    photographs that do not exist are skipped and named in the scene's notes.
     """
 
     def matches(self, path: Path) -> bool:
@@ -30,13 +35,54 @@ class Nerfstudio:
         """
         source = _source(path)
         frames = Frames.read(source)
-        photos, notes = existing_photos(frames.photos(), source)
+        listed = frames.photos()
+        photos, notes = existing_photos(listed, source)
         notes["loader"] = "nerfstudio"
         if "ply_file_path" in frames.table:
             notes["points"] = f"{frames.table['ply_file_path']} is not read"
         if any("mask_path" in frame for frame in frames.frames):
             notes["masks"] = "the frames' mask_path is not read"
-        return compose(scene_name(source.parent), every_eighth(photos), photo_frame(photos), options, notes)
+        split = _own_split(frames, listed, photos) or every_eighth(photos)
+        return compose(scene_name(source.parent), split, photo_frame(photos), options, notes)
+
+
+def _own_split(frames: Frames, listed: Sequence[Photo], photos: Sequence[Photo]) -> Split | None:
+    """The split that the file states; ``None`` where it states none. Without a list of test views, those of ``val`` are it.
+
+    Args:
+        frames: the file.
+        listed: photographs of all its frames.
+        photos: those of them that exist.
+
+    Raises:
+        InputError: a list is none, names what no frame has, or shares a photograph with the training list.
+    """
+    names = {key: _names(frames, key, {photo.name for photo in listed}) for key in _LISTS if key in frames.table}
+    if not names:
+        return None
+    train, val, test = (names.get(key, set[str]()) for key in _LISTS)
+    scored, val = (test, val) if test else (val, set[str]())
+    if "train_filenames" not in names:
+        train = {photo.name for photo in listed} - scored - val
+    if both := sorted(train & scored):
+        raise InputError(
+            f"{frames.path} lists {len(both)} photographs both to fit and to score, for instance '{both[0]}'.",
+            f"A photograph may stand in one of {', '.join(_LISTS)}.",
+        )
+    of = {"train": train, "test": scored, "val": val}
+    return Split(
+        **{key: [photo for photo in photos if photo.name in chosen] for key, chosen in of.items()}, rule="the file's own"
+    )
+
+
+def _names(frames: Frames, key: str, known: set[str]) -> set[str]:
+    names = frames.table[key]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"'{key}' of {frames.path} is not a list of file names.")
+    found = {name.replace("\\", "/").removeprefix("./") for name in names}
+    if unknown := sorted(found - known):
+        raise InputError(f"'{key}' of {frames.path} names '{unknown[0]}', which no frame has as its 'file_path'.")
+    return found
 
 
 def _source(path: Path) -> Path:
