@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -100,6 +101,19 @@ def test_scores_can_be_recomputed_from_the_saved_pictures(run: Path) -> None:
 def test_evaluating_again_gives_the_same_scores(run: Path) -> None:
     before = json.loads((run / "scores.json").read_text())["quality"]
     assert plain(evaluate_run(run))["quality"] == before
+
+
+def test_other_test_views_than_the_run_s_are_refused(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    """In a capture that has grown, they may be photographs that the run was fitted to."""
+    before = (run / "scores.json").read_bytes()
+    copy = Path(shutil.copytree(toy_folder, tmp_path / "copy"))
+    assert plain(evaluate_run(run, str(copy)))["quality"] == json.loads(before)["quality"]
+    scored, fitted = (sorted((copy / split).glob("*.png"))[0] for split in ("test", "train"))
+    shutil.copy(fitted, scored)
+    before = (run / "scores.json").read_bytes()
+    with pytest.raises(InputError, match="it may have been fitted to these"):
+        evaluate_run(run, str(copy))
+    assert (run / "scores.json").read_bytes() == before
 
 
 @pytest.mark.parametrize(("normals", "colour_only", "whole"), [(True, 2, 3), (False, 3, 0)])

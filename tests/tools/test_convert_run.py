@@ -163,7 +163,7 @@ def test_a_converted_run_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[
     """From a short fit of a hash grid to Gaussians, by the command; the folder opens, and knows where it comes from."""
     data = write_blender(toy_scene(views=6, size=20), tmp_path / "toy")
     native = tmp_path / "native"
-    overrides = tuple(SMALL["volumetric/hash"])
+    overrides = (*SMALL["volumetric/hash"], "data.train_views=4")
     request = FitRequest(scene=str(data), out=str(native), method="volumetric/hash", budget="100steps", overrides=overrides)
     fit_run(request)
     out = tmp_path / "gaussians"
@@ -175,6 +175,9 @@ def test_a_converted_run_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert origin is not None
     assert (origin.run, origin.method, origin.to) == (str(native), "volumetric/hash", "gaussians")
     assert origin.cell_sha256 == RunFolder(native).identity
+    seen, fitted = (RunFolder(folder).read(Provenance) for folder in (out, native))
+    assert seen.data == fitted.data == {"train_views": 4}
+    assert seen.train_sha256 == fitted.train_sha256, "the refit sees no other photographs than the fit did"
     scores = RunFolder(out).read_scores()
     assert origin.native_psnr == RunFolder(native).read_scores().quality["psnr"].mean
     assert scores.quality["psnr"].mean > origin.converted_psnr + 1

@@ -12,6 +12,7 @@ from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.job import Job
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
+from invgraphics.scenes.open import is_rendered
 from invgraphics.text import sha256_of
 
 
@@ -84,6 +85,29 @@ def check_replaceable(job: Job) -> None:
         if theirs != ours:
             sentence = f"{folder.root} holds another run: its {name} is {theirs}, not {ours}."
             raise InputError(sentence, "Choose another --out, or delete that folder.")
+
+
+def check_truth(folder: RunFolder, scene: Scene, spec: str | None) -> None:
+    """Check that a scene has the test views that a run was fitted beside: others may be its training photographs.
+
+    Args:
+        folder: of the run.
+        scene: as opened.
+        spec: the scene that was named in place of the run's own, if one was.
+
+    Raises:
+        InputError: pictures differ, or of a scene that is rendered, whose pixels another machine may round otherwise, cameras.
+    """
+    provenance = folder.read(Provenance)
+    name = spec or provenance.scene
+    if scene.digest("test") == provenance.truth_sha256:
+        return
+    if is_rendered(name) and scene.camera_digest() == provenance.cameras_sha256:
+        return
+    raise InputError(
+        f"The test views of {name} are not those that {folder.root} was fitted beside; it may have been fitted to these.",
+        "Give an unchanged copy of the scene, or fit again.",
+    )
 
 
 def define(job: Job) -> str:

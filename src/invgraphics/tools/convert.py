@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,14 +16,16 @@ from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate, score_model
 from invgraphics.experiments.fitted import Fitted, open_fitted
+from invgraphics.experiments.identity import check_truth
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.recorder import Recorder
-from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.request import DATA, FitRequest
 from invgraphics.experiments.run import describe
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import ConvertedRun, Provenance
 from invgraphics.runs.scores import Scores
+from invgraphics.scenes.degrade import degrade
 from invgraphics.text import sha256_of
 from invgraphics.tools.conversions import TARGETS, Target
 from invgraphics.training.fit import Fit
@@ -105,6 +108,7 @@ def convert_run(request: ConvertRequest) -> Converted:
         NumericalError: the refit left the finite numbers.
     """
     fitted = open_fitted(request.run, request.scene)
+    check_truth(fitted.folder, fitted.scene, request.scene)
     if fitted.poses is not None:
         sentence = f"{request.run} has refined its cameras' poses, which a converted run would not know."
         raise InputError(sentence, "Convert a run that was fitted without --optimise poses.")
@@ -113,10 +117,11 @@ def convert_run(request: ConvertRequest) -> Converted:
     _check_empty(folder)
     use_deterministic_algorithms(job.device)
     use_kernels(request.kernels)
-    plan = build_plan(job.method, fitted.scene, job.budget, request.seed, job.device)
+    shown = degrade(fitted.scene, job.data, fitted.folder.read(Provenance).seed)
+    plan = build_plan(job.method, shown, job.budget, request.seed, job.device)
     torch.manual_seed(request.seed)
     size = request.size or request.target.size
-    field = request.target.convert(fitted.model, fitted.scene, job.method, size).to(job.device)
+    field = request.target.convert(fitted.model, shown, job.method, size).to(job.device)
     plan = replace(plan, model=Model(field, plan.model.renderer, plan.model.bounds))
     native = fitted.folder.read_scores() if fitted.folder.finished else _scores(fitted.model, fitted, fitted.method.name)
     converted = _scores(plan.model, fitted, f"{job.method.name} as converted")
@@ -125,7 +130,7 @@ def convert_run(request: ConvertRequest) -> Converted:
         _check_empty(folder)
         folder.clear()
         origin = _origin(request, fitted, native, converted)
-        provenance = describe(job, (fitted.scene, fitted.scene), _identity(job, origin))
+        provenance = describe(job, (fitted.scene, shown), _identity(job, origin))
         folder.write(replace(provenance, command=request.shell(), converted=origin, threads=torch.get_num_threads()))
         with PeakMemory(job.device) as memory:
             fit = Fit(plan)
@@ -141,13 +146,15 @@ def _job(request: ConvertRequest, fitted: Fitted) -> Job:
     provenance, target = fitted.folder.read(Provenance), request.target
     size = request.size or target.size
     options = provenance.options
+    # The refit sees the photographs that the fit saw.
+    data = tuple(f"{DATA}{key}={json.dumps(value)}" for key, value in provenance.data.items())
     return Job.of(
         FitRequest(
             scene=request.scene or provenance.scene,
             out=str(request.out),
             method=request.method or target.method,
             budget=request.refit,
-            overrides=tuple(item.format(size=size, run=request.run) for item in target.overrides) + request.overrides,
+            overrides=tuple(item.format(size=size, run=request.run) for item in target.overrides) + data + request.overrides,
             size=options.size,
             test_views=options.test_views,
             spp=options.spp,
