@@ -11,8 +11,10 @@ from report_folders import PREDICTED
 from scipy import stats
 
 from invgraphics.errors import InputError
-from invgraphics.report.data.factors import Lost, Observation
+from invgraphics.report.data.factors import Factor, Lost, Observation
+from invgraphics.report.statistics.effects import effects_on
 from invgraphics.report.statistics.predictions import judge_predictions, predictions_sentence
+from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.scores import Score
 from invgraphics.runs.study import Prediction
 from invgraphics.studies.checks import checked, completed
@@ -102,6 +104,91 @@ def test_nothing_is_claimed_from_one_seed_or_after_losses() -> None:
     (fewer,) = judge_predictions([held], fits(), lost)
     assert (fewer.verdict, fewer.lost) == ("undecided", 1)
     assert predictions_sentence([single, fewer]) == "Of 2 predictions: 2 undecided."
+
+
+X, VIEWS = "field.isotropic", "data.train_views"
+SWITCH = Prediction(text="Isotropic Gaussians lose.", source="a paper", before={X: False}, after={X: True}, high=-0.1)
+
+
+def at(seed: int, psnr: float, method: str, levels: dict[str, str]) -> Observation:
+    run = made_up_run({"psnr": Score(mean=psnr, unit="dB", higher_is_better=True)}, method=method, seed=seed, truth="ball")
+    return Observation(run, "ball", {"method": method, **levels})
+
+
+def switch(seed: int, x: str, views: str) -> Observation:
+    """Views are worth 4 dB, which are no part of the switch's effect of 0.02 dB on average."""
+    psnr = 24.0 + 4.0 * (views == "12") + (0.01 + 0.02 * seed) * (x == "true")
+    return at(seed, psnr, SPLAT, {X: x, VIEWS: views})
+
+
+@pytest.mark.parametrize(
+    "planned",
+    [
+        [("false", "6"), ("true", "6"), ("false", "12")],  # one at a time
+        [("false", "12"), ("true", "6"), ("false", "6"), ("true", "24")],  # a list
+    ],
+)
+def test_levels_that_one_side_lacks_are_left_out(planned: list[tuple[str, str]]) -> None:
+    """As in the effects of the same study; with all fits of each side averaged it would be -2 dB."""
+    made = [switch(seed, *cell) for cell in planned for seed in (0, 1)]
+    (judged,) = judge_predictions([SWITCH], made)
+    assert judged.estimate is not None
+    assert judged.estimate.mean == pytest.approx(0.02)
+    quantity = quality_quantity("psnr", made[0].run.scores.quality["psnr"])
+    (effect,) = effects_on(quantity, [Factor(X, ("false", "true"), "false")], made)
+    assert (judged.estimate.mean, judged.estimate.p) == pytest.approx((effect.estimate.mean, effect.estimate.p))
+
+
+def test_an_unfinished_factorial_compares_what_is_done() -> None:
+    """Seed 1 lacks one fit: its pairs count, the fit without a partner does not."""
+    cells = [(seed, x, views) for seed in (0, 1) for views in ("6", "12") for x in ("false", "true")]
+    (judged,) = judge_predictions([SWITCH], [switch(*cell) for cell in cells[:-1]])
+    assert judged.estimate is not None
+    assert (judged.estimate.mean, judged.estimate.seeds) == (pytest.approx(0.02), (2, 2))
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_methods_are_compared_at_equal_levels(named: bool) -> None:
+    """A factor that one method has stays at its base for the other; of a cut study, seeds that lack a level are left out."""
+    scope = "gaussian-volume/*:renderer.opacity"
+    made = []
+    for seed in range(3):
+        for views, worth in (("6", 0.0), ("12", 4.0)):
+            for method, opacity, gain in ((SPLAT, "peak", 0.0), (EXACT, "peak", 0.5), (EXACT, "extinction", 3.0)):
+                made.append(at(seed, 24 + worth + gain + 0.01 * seed, method, {VIEWS: views, scope: opacity}))
+    wanted = replace(METHODS, after={"method": EXACT, scope: "extinction"}) if named else METHODS
+    (judged,) = judge_predictions([wanted], made[:-1])
+    assert judged.estimate is not None
+    assert judged.estimate.mean == pytest.approx(2.995 if named else 0.5, abs=1e-9)
+    assert judged.estimate.seeds == ((2, 3) if named else (3, 3))
+
+
+def test_growth_from_method_to_method_is_of_independent_groups() -> None:
+    """Each method's differences pair by seed; the two methods' do not."""
+    made = fits()
+    wanted = replace(
+        METHODS, before={N: 4}, after={N: 100}, where={"method": SPLAT}, against={"method": EXACT}, scenes=("fog",)
+    )
+    (judged,) = judge_predictions([wanted], made)
+    ours, theirs = (values(made, "fog", method, 100) - values(made, "fog", method, 4) for method in (EXACT, SPLAT))
+    expected = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval()
+    assert judged.estimate is not None
+    assert (judged.estimate.low, judged.estimate.high) == pytest.approx((expected.low, expected.high), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("made", "reason"),
+    [
+        ([(0, "false", "6"), (0, "true", "12")], "its sides have no level of data.train_views in common"),
+        ([(0, "false", "6"), (1, "true", "6")], "no seed has fits of all sides"),
+        ([(0, "false", "6")], "no finished fit at field.isotropic true"),
+        ([], "no finished fit has the metric psnr"),
+    ],
+)
+def test_what_was_not_measured_says_why(made: list[tuple[int, str, str]], reason: str) -> None:
+    (judged,) = judge_predictions([SWITCH], [switch(*cell) for cell in made])
+    assert (judged.verdict, judged.estimate) == ("open", None)
+    assert judged.cells[-1].startswith(f"not measured: {reason}")
 
 
 def test_the_page_states_the_verdict(built_study: Path) -> None:

@@ -48,6 +48,8 @@ class KnownDeviation:
 class Prediction:
     """A statement made before anything ran: how far two kinds of fits are apart, and between which bounds that should lie.
 
+    Factors that it does not name are held equal: the mean difference over those of their levels that both sides have counts.
+
     Attributes:
         text: the statement, one sentence.
         source: where it comes from.

@@ -1,7 +1,8 @@
 """Predictions of a study, judged: the predicted difference with its interval over seeds, and whether it lies within its bounds.
 
 The interval is the one over seeds of `invgraphics.report.statistics.intervals`: for new fits on the same scenes. Fits of one
-method pair by seed; fits of two methods are independent groups, as in all comparisons.
+method pair by seed; fits of two methods are independent groups, as in all comparisons. Factors that no side names are held
+equal: differences are taken at those of their levels that all sides have, a stratum each, and averaged over the strata.
 """
 
 from __future__ import annotations
@@ -9,9 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
@@ -24,6 +27,13 @@ PREDICTION_HEADS = ("Prediction", "Source", "Scenes", "Expected", "Measured", "9
 VERDICTS = {"held": "held", "failed": "did not hold", "undecided": "undecided", "open": "not measured"}
 
 Verdict = Literal["held", "failed", "undecided", "open"]
+
+Stratum = tuple[tuple[str, str], ...]
+"""(factor, level) of every factor that a prediction does not name."""
+Strata = dict[Stratum, dict[int, float]]
+"""Stratum -> seed -> score."""
+Terms = list[tuple[float, dict[str, str]]]
+"""(sign, named levels) of the kinds of fits whose signed sum is predicted."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +48,7 @@ class JudgedPrediction:
         lost: failed and diverged fits of both sides: with any, nothing is claimed.
         verdict: ``held`` or ``failed`` where the whole interval lies within or outside the bounds, ``undecided`` where an end
             of one lies within the other or there is no interval, ``open`` where fits are missing.
+        reason: why it is ``open``; empty otherwise.
     """
 
     prediction: Prediction
@@ -46,6 +57,7 @@ class JudgedPrediction:
     scenes: tuple[str, ...]
     lost: int
     verdict: Verdict
+    reason: str = ""
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -53,7 +65,7 @@ class JudgedPrediction:
         one, value = self.prediction, self.estimate
         stated = one.text, one.source, listing(self.scenes) or ABSENT, _bounds(one)
         if value is None or self.quantity is None:
-            return *stated, ABSENT, ABSENT, ABSENT, VERDICTS[self.verdict]
+            return *stated, ABSENT, ABSENT, ABSENT, f"{VERDICTS[self.verdict]}: {self.reason}"
         interval = ABSENT if value.unit == "none" else f"{_signed(value.low)} to {_signed(value.high)}"
         words = VERDICTS[self.verdict]
         if self.lost:
@@ -82,17 +94,19 @@ def predictions_sentence(judged: Sequence[JudgedPrediction]) -> str:
 def _judge(prediction: Prediction, observations: Sequence[Observation], failures: Sequence[Lost]) -> JudgedPrediction:
     scored = [one for one in observations if prediction.metric in one.run.scores.quality]
     if not scored:
-        return JudgedPrediction(prediction, None, None, (), 0, "open")
+        reason = f"no finished fit has the metric {prediction.metric}"
+        return JudgedPrediction(prediction, None, None, (), 0, "open", reason)
     quantity = quality_quantity(prediction.metric, scored[0].run.scores.quality[prediction.metric])
     names = prediction.scenes or tuple(dict.fromkeys(one.scene for one in observations))
-    groups = {name: _groups(prediction, quantity, [one for one in scored if one.scene == name]) for name in names}
-    known = {name: found for name, found in groups.items() if found}
+    terms = _terms(prediction)
+    found = {name: _groups(terms, quantity, [one for one in scored if one.scene == name]) for name in names}
+    known = {name: groups for name, (groups, _) in found.items() if groups}
     value = over_seeds(list(known.values()))
-    sides = [_levels(prediction, side, there) for side in ("before", "after") for there in _places(prediction)]
     gone = [one for one in failures if one.scene in names]
     gone += [Lost(one.scene, one.levels) for one in observations if one.scene in names and diverged(one.run, quantity)]
-    count = sum(any(_has(one.levels, side) for side in sides) for one in gone)
-    return JudgedPrediction(prediction, quantity, value, tuple(known), count, _verdict(prediction, value, count))
+    count = sum(any(_has(one.levels, levels) for _, levels in terms) for one in gone)
+    reason = "; ".join(dict.fromkeys(why for _, why in found.values())) if value is None else ""
+    return JudgedPrediction(prediction, quantity, value, tuple(known), count, _verdict(prediction, value, count), reason)
 
 
 def _verdict(prediction: Prediction, value: Estimate | None, lost: int) -> Verdict:
@@ -107,41 +121,98 @@ def _verdict(prediction: Prediction, value: Estimate | None, lost: int) -> Verdi
     return "failed" if value.high < low or value.low > high else "undecided"
 
 
-def _groups(prediction: Prediction, quantity: Quantity, here: Sequence[Observation]) -> Groups:
-    """Signed groups of one scene: differences paired by seed, or one group for each of two methods."""
-    sides = []
-    for side in ("after", "before"):
-        scores = [_by_seed(here, _levels(prediction, side, there), quantity) for there in _places(prediction)]
-        # With 'against', a side is its growth from 'where' to there; seeds that lack an end are left out.
-        sides.append(scores[0] if len(scores) == 1 else {s: scores[1][s] - scores[0][s] for s in scores[0] if s in scores[1]})
-    after, before = sides
-    if prediction.before.get(METHOD) != prediction.after.get(METHOD):
-        independent = [(1.0, np.array(list(after.values()))), (-1.0, np.array(list(before.values())))]
-        return independent if after and before else []
-    shared = np.array([after[seed] - before[seed] for seed in after if seed in before])
-    return [(1.0, shared)] if len(shared) else []
+def _terms(prediction: Prediction) -> Terms:
+    """The fits that are added and subtracted: two sides, or with 'against' what they grow by from 'where' to there."""
+    places = [(1.0, prediction.against), (-1.0, prediction.where)] if prediction.against else [(1.0, prediction.where)]
+    sides = ((1.0, prediction.after), (-1.0, prediction.before))
+    return [
+        (there * sign, {name: level_text(level) for name, level in {**place, **side}.items()})
+        for there, place in places
+        for sign, side in sides
+    ]
 
 
-def _places(prediction: Prediction) -> list[Mapping[str, Any]]:
-    return [prediction.where, prediction.against] if prediction.against else [prediction.where]
+def _groups(terms: Terms, quantity: Quantity, here: Sequence[Observation]) -> tuple[Groups, str]:
+    """Signed groups of one scene, one for each method that the terms name, and why there are none."""
+    named = frozenset(name for _, levels in terms for name in levels)
+    tables = [_strata(here, levels, named, quantity) for _, levels in terms]
+    for (_, levels), table in zip(terms, tables, strict=True):
+        if not table:
+            return [], f"no finished fit at {_level_words(levels)}"
+    if not set.intersection(*map(set, tables)):
+        return [], _apart(tables)
+    methods = [levels.get(METHOD) for _, levels in terms]
+    sums = []
+    for method in dict.fromkeys(methods):
+        own = [(sign, table) for (sign, _), table, its in zip(terms, tables, methods, strict=True) if its == method]
+        sums.append(_sums(own))
+    shared = [stratum for stratum in sums[0] if all(stratum in table for table in sums)]
+    groups = [(1.0, _by_seed(table, shared, whole=len(sums) > 1)) for table in sums]
+    if not all(len(values) for _, values in groups):
+        return [], "no seed has fits of all sides at the same levels of the factors that are not named"
+    return groups, ""
 
 
-def _levels(prediction: Prediction, side: str, there: Mapping[str, Any]) -> dict[str, str]:
-    return {name: level_text(level) for name, level in {**there, **getattr(prediction, side)}.items()}
+def _strata(here: Sequence[Observation], wanted: Mapping[str, str], named: frozenset[str], quantity: Quantity) -> Strata:
+    """Scores of the fits at some levels; over factors that other terms alone name they are means, where none is missing."""
+    found: dict[tuple[Stratum, int], dict[Stratum, float]] = {}
+    for one in here:
+        value = value_of(one.run, quantity) if _has(one.levels, wanted) and not diverged(one.run, quantity) else None
+        if value is not None and math.isfinite(value):
+            levels = sorted(one.levels.items())
+            others = tuple(pair for pair in levels if pair[0] not in named)
+            free = tuple(pair for pair in levels if pair[0] in named and pair[0] not in wanted)
+            found.setdefault((others, one.run.seed), {})[free] = value
+    most = len({free for values in found.values() for free in values})
+    strata: Strata = {}
+    for (others, seed), values in found.items():
+        if len(values) == most:
+            strata.setdefault(others, {})[seed] = sum(values.values()) / most
+    return strata
+
+
+def _sums(own: Sequence[tuple[float, Strata]]) -> Strata:
+    """Signed sums of the fits of one method, which pair by stratum and seed."""
+    first = own[0][1]
+    sums: Strata = {}
+    for stratum, seeds in first.items():
+        for seed in seeds:
+            if all(seed in table.get(stratum, ()) for _, table in own):
+                sums.setdefault(stratum, {})[seed] = sum(sign * table[stratum][seed] for sign, table in own)
+    return sums
+
+
+def _by_seed(table: Strata, shared: Sequence[Stratum], whole: bool) -> Float[ndarray, " seed"]:
+    """One value per seed, its mean over strata, since they add no independent seed.
+
+    Args:
+        table: of one method.
+        shared: the strata that all methods have.
+        whole: leave out seeds that lack one of them: only differences within a method may be averaged over fewer.
+    """
+    found: dict[int, list[float]] = {}
+    for stratum in shared:
+        for seed, value in table[stratum].items():
+            found.setdefault(seed, []).append(value)
+    return np.array([sum(values) / len(values) for values in found.values() if not whole or len(values) == len(shared)])
+
+
+def _apart(tables: Sequence[Strata]) -> str:
+    """Why sides have no stratum in common: the factors of which they have no level in common, where single ones say it."""
+    levels = [{pair for stratum in table for pair in stratum} for table in tables]
+    common = {name for name, _ in set.intersection(*levels)}
+    names = [name for name, _ in next(iter(tables[0])) if name not in common]
+    return (
+        f"its sides have no level of {listing(names)} in common" if names else "its sides differ in factors that are not named"
+    )
+
+
+def _level_words(levels: Mapping[str, str]) -> str:
+    return listing(level if name == METHOD else f"{name} {level}" for name, level in levels.items())
 
 
 def _has(levels: Mapping[str, str], wanted: Mapping[str, str]) -> bool:
     return all(levels.get(name) == level for name, level in wanted.items())
-
-
-def _by_seed(here: Sequence[Observation], wanted: Mapping[str, str], quantity: Quantity) -> dict[int, float]:
-    """Seed -> score of the fits at some levels; factors that are not named are averaged."""
-    found: dict[int, list[float]] = {}
-    for one in here:
-        value = value_of(one.run, quantity) if _has(one.levels, wanted) and not diverged(one.run, quantity) else None
-        if value is not None and math.isfinite(value):
-            found.setdefault(one.run.seed, []).append(value)
-    return {seed: sum(values) / len(values) for seed, values in found.items()}
 
 
 def _bounds(prediction: Prediction) -> str:
