@@ -288,6 +288,45 @@ def test_a_full_factorial_is_called_one(tmp_path: Path) -> None:
     assert design_words(read_study(star)).startswith("one factor at a time")
 
 
+def scoped_study(root: Path, **other: Any) -> Path:
+    """A factorial study of two methods, with a factor that only the first one has."""
+    factors = {"volumetric/*:a.x": [1, 2], "b.y": [1, 2]}
+    folder = bare_study(root, factors, lambda cell: [20.0 + cell["seed"]], methods=[METHODS[0], METHODS[2]], **other)
+    table = json.loads((folder / "study.json").read_text())
+    table["cells"] = [
+        cell for cell in table["cells"] if cell["method"] == METHODS[0] or cell["levels"]["volumetric/*:a.x"] == 1
+    ]
+    (folder / "study.json").write_text(json.dumps(table))
+    return folder
+
+
+def test_a_factorial_with_factors_of_single_methods_is_not_called_full(tmp_path: Path) -> None:
+    assert METHODS[0].startswith("volumetric/") and not METHODS[2].startswith("volumetric/")
+    assert design_words(read_study(scoped_study(tmp_path / "a"))).startswith("factorial within each method")
+    own = bare_study(tmp_path / "b", {"volumetric/*:a.x": [1, 2]}, lambda cell: [20.0])  # all methods are in its scope
+    assert design_words(read_study(own)).startswith("full factorial")
+
+
+def test_an_interaction_that_was_not_measured_is_told(tmp_path: Path) -> None:
+    """Of studies from before such questions were refused, and of unfinished ones."""
+    asked = [["volumetric/*:a.x", "method"], ["b.y", "c.z"], ["volumetric/*:a.x", "b.y"]]
+    folder = scoped_study(tmp_path, interactions=asked)
+    told = [sentence for sentence in study_sentences(folder) if "was not measured" in sentence]
+    assert told == [
+        "The interaction of volumetric/*:a.x and method, about which the study asks, was not measured: "
+        f"no finished fit has volumetric/*:a.x 2 and {METHODS[2]}.",
+        "The interaction of b.y and c.z, about which the study asks, was not measured: c.z has a single level here.",
+    ]
+    table = json.loads((folder / "study.json").read_text())
+    for cell in table["cells"]:
+        odd = cell["seed"] == 0 if list(cell["levels"].values()) == [2, 2] else cell["seed"] > 0
+        cell["status"] = "done" if odd else "missing"
+    (folder / "study.json").write_text(json.dumps(table))
+    assert "volumetric/*:a.x and b.y, about which the study asks, was not measured: no seed" in " ".join(
+        study_sentences(folder)
+    )
+
+
 def test_short_names_stay_distinct() -> None:
     assert short_names(["data.views", "field.levels"]) == {"data.views": "views", "field.levels": "levels"}
     assert short_names(["a.b.levels", "c.b.levels"]) == {"a.b.levels": "a.b.levels", "c.b.levels": "c.b.levels"}

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from invgraphics.core import Camera, Model, Rendering, Scene, View
+from invgraphics.metrics.keys import POSE_ROTATION, POSE_TRANSLATION
 from invgraphics.metrics.poses import PoseErrors, Similarity, pose_errors
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.scores import Score
@@ -118,8 +119,8 @@ class PosedEvaluation:
     def quality(self) -> dict[str, Score]:
         """Scores of the poses: medians over the training views, with their largest values."""
         found = {
-            "pose_rotation_deg": (self.errors.rotation_degrees, "deg"),
-            "pose_translation_percent": (self.errors.translation_per_cent, "%"),
+            POSE_ROTATION: (self.errors.rotation_degrees, "deg"),
+            POSE_TRANSLATION: (self.errors.translation_per_cent, "%"),
         }
         return {
             name: Score(

@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from invgraphics.core import Model, Scene
+from invgraphics.metrics.keys import SCALED, scaled_key
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.runs.scores import Score
 from invgraphics.scenes.scales import scene_at
-
-SCALED = ("psnr", "ssim")
-"""Metrics that are computed at other scales."""
 
 
 def scaled_scores(
@@ -32,16 +30,11 @@ def scaled_scores(
     rules, quality, skipped = protocol_named(protocol), {}, {}
     for divisor in data.get("test_scales", ()):
         if refined:
-            skipped |= {named(metric, divisor): "the fit has refined its poses" for metric in SCALED}
+            skipped |= {scaled_key(metric, divisor): "the fit has refined its poses" for metric in SCALED}
             continue
         smaller = scene_at(scene, divisor)
         scores = [score(model.render(view.camera, normals=False), view, smaller, rules) for view in smaller.test]
         found, missing = summarise(scores, rules)
-        quality |= {named(metric, divisor): found[metric] for metric in SCALED if metric in found}
-        skipped |= {named(metric, divisor): missing[metric] for metric in SCALED if metric in missing}
+        quality |= {scaled_key(metric, divisor): found[metric] for metric in SCALED if metric in found}
+        skipped |= {scaled_key(metric, divisor): missing[metric] for metric in SCALED if metric in missing}
     return quality, skipped
-
-
-def named(metric: str, divisor: int) -> str:
-    """Name of a metric at 1/``divisor`` of the test views' size."""
-    return f"{metric}_at_1_{divisor}"

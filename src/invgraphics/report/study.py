@@ -24,7 +24,7 @@ from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.predictions import judge_predictions
 from invgraphics.report.statistics.rules import headline, judge
-from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences
 from invgraphics.report.statistics.summary import quality_columns, table_columns
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity
@@ -75,6 +75,8 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
 def study_sentences(folder: Path) -> list[str]:
     """Factor effects on a study's first metric, a sentence per pair of levels; of a study of verdicts, its headline.
 
+    Before them stands a sentence per interaction that the study asks about and that was not measured.
+
     Raises:
         InputError: a file is missing or broken.
     """
@@ -82,7 +84,9 @@ def study_sentences(folder: Path) -> list[str]:
     if study.report == "verdicts":
         return headline(judge(study.cells, study.known))
     quantities = _quantities(study, scene_comparisons(study))
-    return [effect_sentence(effect) for effect in headline_effects(study, quantities[0])] if quantities else []
+    effects = headline_effects(study, quantities[0]) if quantities else []
+    missing = unmeasured_sentences(study.interactions, effects, study.factors, study.observations())
+    return [*missing, *map(effect_sentence, effects)]
 
 
 def headline_effects(study: Study, quantity: Quantity, clean: Callable[[str], str] = str) -> list[Effect]:

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from invgraphics.errors import InputError, did_you_mean
-from invgraphics.runs.study import Prediction, level_text
+from invgraphics.errors import InputError
 from invgraphics.studies.analyses import check_analyses
 from invgraphics.studies.factors import BUDGET, NARROWING, PRESET, SETTINGS, SIZE, in_scope, levels_of, path_of
+from invgraphics.studies.questions import check_questions
 from invgraphics.studies.study import Study
 from invgraphics.training.budget import Budget
 
@@ -77,9 +77,7 @@ def checked(study: Study, where: str) -> Study:
             raise InputError(
                 f"{where}: '{twice[0]}' is set by two entries for {method}.", "Let their scopes exclude each other."
             )
-    _check_questions(study, where)
-    for number, prediction in enumerate(study.predictions, 1):
-        _check_prediction(prediction, study, f"{where}: prediction {number}")
+    check_questions(study, where)
     check_analyses(study.analyses, where)
     for name in (name for pair in study.approximations for name in (pair.exact, pair.approximate)):
         if name not in study.render_with:
@@ -89,43 +87,6 @@ def checked(study: Study, where: str) -> Study:
     if any(seed < 0 for seed in study.seeds) or (views != "all" and views < 1):
         raise InputError(f"{where}: seeds must be 0 or more, and 'test_views' 1 or more or 'all'.")
     return study
-
-
-def _check_questions(study: Study, where: str) -> None:
-    """Check that what the report is to tell exists: factors of ``each`` and ``interactions``, levels of ``words``, margins."""
-    known = {"method", *study.factors}
-    for name in [study.each] * bool(study.each) + [name for pair in study.interactions for name in pair]:
-        if name not in known:
-            raise InputError(
-                f"{where}: the question names '{name}', which is no factor.", f"Expected: {', '.join(sorted(known))}."
-            )
-    for first, second in study.interactions:
-        if first == second:
-            raise InputError(f"{where}: '{first}' cannot interact with itself.")
-    levels = {f"{name} {level_text(level)}" for name, listed in study.factors.items() for level in listed}
-    if strange := [name for name in study.words if name not in levels]:
-        raise InputError(f"{where}: [words] names '{strange[0]}', which is no level.{did_you_mean(strange[0], sorted(levels))}")
-    for metric, margin in study.margins.items():
-        if not 0 < margin < math.inf:
-            raise InputError(f"{where}: the margin of '{metric}' cannot be {margin}.", "Expected: a positive difference.")
-
-
-def _check_prediction(prediction: Prediction, study: Study, where: str) -> None:
-    """Check that a prediction names scenes, factors and levels of the study, and that its two sides differ."""
-    levels: dict[str, Sequence[Any]] = {"method": study.methods, **study.factors}
-    for side in ("before", "after", "where", "against"):
-        for name, level in getattr(prediction, side).items():
-            if name not in levels:
-                raise InputError(f"{where} names '{name}', which is no factor.", f"Expected: {', '.join(sorted(levels))}.")
-            if level not in levels[name]:
-                listed = ", ".join(map(repr, levels[name]))
-                raise InputError(f"{where} names '{name}' = {level!r}, which is none of its levels.", f"Expected: {listed}.")
-    if strange := [scene for scene in prediction.scenes if scene not in study.scenes]:
-        raise InputError(f"{where} names {strange[0]!r}, which is none of the study's scenes.", ", ".join(study.scenes))
-    if prediction.before == prediction.after:
-        raise InputError(f"{where}: 'before' and 'after' are the same fits.")
-    if prediction.against and prediction.against.keys() != prediction.where.keys():
-        raise InputError(f"{where}: 'against' must name the factors of 'where', at other levels.")
 
 
 def _check_count(study: Study, where: str) -> None:

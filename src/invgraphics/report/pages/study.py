@@ -21,13 +21,14 @@ from invgraphics.report.pages.tables import escape_markdown, markdown_across, ma
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.intervals import CONFIDENCE, POWER
 from invgraphics.report.statistics.predictions import PREDICTION_HEADS, JudgedPrediction, predictions_sentence
-from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity, budget_words, listing
 from invgraphics.text import duration
 
 DESIGNS = {
     "factorial": "full factorial: every combination of all levels",
+    "scoped": "factorial within each method: every combination of its own factors' levels, the others at their base",
     "one-at-a-time": "one factor at a time: all others stay at their base level",
     "list": "an explicit list of combinations",
 }
@@ -60,9 +61,10 @@ class StudyPage:
     @property
     def headline(self) -> list[str]:
         """Unfinished cells, a sentence per comparison that the question asks for, and the population of the intervals."""
-        effects = [*self.crossed, *self.contrasts.first]
+        effects, study = [*self.crossed, *self.contrasts.first], self.study
         judged = [predictions_sentence(self.predictions)] if self.predictions else []
-        return [*_progress(self.study), *judged, *map(effect_sentence, effects), *_scope(self)]
+        missing = unmeasured_sentences(study.interactions, effects, study.factors, study.observations())
+        return [*_progress(study), *judged, *missing, *map(effect_sentence, effects), *_scope(self)]
 
 
 @dataclass(frozen=True)
@@ -108,11 +110,15 @@ def write_study_html(page: StudyPage, folder: Folder) -> None:
 
 
 def design_words(study: Study) -> str:
-    """The design in words: a full factorial where every combination of levels was planned, whatever the study calls itself."""
-    factors = [factor for factor in study.factors if ":" not in factor.path]
-    combined = {tuple(cell.levels.get(factor.path) for factor in factors) for cell in study.cells}
-    full = len(factors) == len(study.factors) and len(combined) == math.prod(len(factor.levels) for factor in factors)
-    return DESIGNS["factorial" if full and factors else study.design]
+    """The design in words: a full factorial where every combination of levels was planned, whatever the study calls itself.
+
+    Factors of some methods only leave combinations out, so that a study which calls itself factorial need not be a full one.
+    """
+    combined = {tuple(cell.levels.get(factor.path) for factor in study.factors) for cell in study.cells}
+    if study.factors and len(combined) == math.prod(len(factor.levels) for factor in study.factors):
+        return DESIGNS["factorial"]
+    scoped = study.design == "factorial" and any(":" in factor.path for factor in study.factors)
+    return DESIGNS["scoped" if scoped else study.design]
 
 
 def _margins(page: StudyPage) -> str:

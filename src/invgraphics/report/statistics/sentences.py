@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from invgraphics.report.data.factors import METHOD
+import itertools
+from collections.abc import Sequence
+
+from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.data.variants import level_words
 from invgraphics.report.statistics.effects import Effect, Verdict
 from invgraphics.report.statistics.intervals import POWER, Estimate
@@ -18,6 +21,31 @@ def effect_sentence(effect: Effect) -> str:
     if effect.truths_differ:
         parts.append("The factor changes the truth itself, so the two were scored against different pictures.")
     return " ".join(part for part in parts if part)
+
+
+def unmeasured_sentences(
+    asked: Sequence[tuple[str, str]], effects: Sequence[Effect], factors: Sequence[Factor], observations: Sequence[Observation]
+) -> list[str]:
+    """A sentence per interaction that a study asks about and that is not among its effects: that it is missing, and why."""
+    there = {(effect.contrast.factor, effect.contrast.against[0]) for effect in effects if effect.contrast.against is not None}
+    return [
+        f"The interaction of {first} and {second}, about which the study asks, was not measured: "
+        f"{_why_unmeasured(first, second, factors, observations)}."
+        for first, second in asked
+        if (first, second) not in there
+    ]
+
+
+def _why_unmeasured(first: str, second: str, factors: Sequence[Factor], observations: Sequence[Observation]) -> str:
+    by_path = {factor.path: factor for factor in factors}
+    if single := [name for name in (first, second) if name not in by_path]:
+        return f"{single[0]} has a single level here"
+    ends = [(by_path[name].levels[0], by_path[name].levels[-1]) for name in (first, second)]
+    for one, two in itertools.product(*ends):
+        if not any((fit.levels.get(first), fit.levels.get(second)) == (one, two) for fit in observations):
+            levels = [level if name == METHOD else f"{name} {level}" for name, level in ((first, one), (second, two))]
+            return f"no finished fit has {listing(levels)}"
+    return "no seed has finished fits at all four combinations of their outermost levels with the same other levels"
 
 
 def _verdict(effect: Effect) -> str:
