@@ -145,11 +145,15 @@ def _interaction(contrast: Contrast, quantity: Quantity, here: Sequence[Observat
     if contrast.factor == METHOD:  # the difference of differences is the same either way round
         swapped = Contrast(factor, low, high, contrast.where, (METHOD, contrast.before, contrast.after))
         return _interaction(swapped, quantity, here)
-    sides = []
+    corners = []
     for level in (high, low):
         kept = [one for one in here if one.levels.get(factor) == level]
-        before, after = (_table(contrast.factor, side, kept, drop=factor) for side in (contrast.before, contrast.after))
-        sides.append(_by_seed(before, after, quantity))
+        corners.append([_table(contrast.factor, side, kept, drop=factor) for side in (contrast.before, contrast.after)])
+    # Both differences are over the same levels of all other factors, of which a list or an unfinished study has not all.
+    shared = set.intersection(*(set(table) for tables in corners for table in tables))
+    if factor != METHOD or shared:  # a method may have factors that another has not
+        corners = [[{key: table[key] for key in table if key in shared} for table in tables] for tables in corners]
+    sides = [_by_seed(before, after, quantity) for before, after in corners]
     if not all(sides):
         return []
     if factor == METHOD:
