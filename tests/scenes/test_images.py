@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
@@ -82,6 +82,22 @@ def test_exif_orientation_is_applied_unless_the_camera_contradicts(tmp_path: Pat
     assert image_size(path, like=(300, 200)) == (3, 2), "calibrated on the pixels as they are stored"
     assert read_pixels(path, like=(300, 200)).shape == (2, 3, 3)
     assert image_size(path, like=(200, 300)) == (2, 3)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_calibrated_pixels_are_taken_as_stored(tmp_path: Path, orientation: int) -> None:
+    """As COLMAP reads them, whatever EXIF says; without a camera they are upright, as Pillow turns them."""
+    import pycolmap
+
+    rng, path = np.random.default_rng(0), tmp_path / "a.png"
+    for size in ((6, 6), (8, 6)):
+        picture = Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8))
+        exif = picture.getexif()
+        exif[0x0112] = orientation
+        picture.save(path, exif=exif)
+        assert image_size(path, like=size) == size
+        np.testing.assert_array_equal(read_pixels(path, like=size), pycolmap.Bitmap.read(str(path), True).to_array())
+        np.testing.assert_array_equal(read_pixels(path), np.asarray(ImageOps.exif_transpose(Image.open(path))))
 
 
 def test_truncated_png_is_named(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from dots import GL, POINTS, Eye, assert_dots_are_found, composited, ring, save
+from PIL import Image
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
@@ -160,6 +161,29 @@ def test_scaled_copies_of_the_photographs(tmp_path: Path) -> None:
     """Intrinsics for twice the size of the files on disk."""
     double = {"w": 320, "h": 240, "fl_x": 300.0, "fl_y": 310.0, "cx": 166.0, "cy": 116.0}
     write(tmp_path, ring(8, distortion=opencv), {**DISTORTED, **double})
+    assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+@pytest.mark.parametrize("sized", [True, False])
+def test_exif_turns_no_calibrated_photograph(tmp_path: Path, orientation: int, sized: bool) -> None:
+    write(tmp_path, ring(9), {})
+    for path in (tmp_path / "images").iterdir():
+        picture = Image.open(path)
+        exif = picture.getexif()
+        exif[0x0112] = orientation
+        picture.save(path, exif=exif)
+    edit(tmp_path, lambda table: None if sized else (table.pop("w"), table.pop("h")))
+    assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
+
+
+def test_exif_turns_photographs_whose_cameras_have_the_turned_shape_only(tmp_path: Path) -> None:
+    write(tmp_path, ring(9), {})
+    for path in (tmp_path / "images").iterdir():
+        picture = Image.open(path).transpose(Image.Transpose.ROTATE_90)
+        exif = picture.getexif()
+        exif[0x0112] = 6
+        picture.save(path, exif=exif)
     assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
 
 

@@ -14,7 +14,7 @@ from invgraphics.core import Camera
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import focal_from_fov, opengl_to_opencv
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import SUFFIXES, Photo, file_exists, image_size
+from invgraphics.scenes.images import SUFFIXES, Photo, file_exists, stored_size
 from invgraphics.scenes.lens import Lens
 from invgraphics.scenes.poses import pose
 from invgraphics.tables import read_json
@@ -98,7 +98,7 @@ class Frames:
         """Width and height stated by the file, else of the first existing photograph."""
         w, h = self._number(index, "w"), self._number(index, "h")
         if w is None or h is None:
-            return image_size(existing) if existing is not None else (1, 1)
+            return stored_size(existing) if existing is not None else (1, 1)
         if not (1 <= w <= LONGEST_SIDE and 1 <= h <= LONGEST_SIDE):
             raise InputError(f"'w' and 'h' of {self._where(index)} are {w:g} and {h:g}, not a size in pixels.")
         return round(w), round(h)

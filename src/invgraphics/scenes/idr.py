@@ -17,7 +17,7 @@ from invgraphics.core import Bounds, Camera, Scene
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.dtu import find_scan
-from invgraphics.scenes.images import Photo, image_files, image_size
+from invgraphics.scenes.images import Photo, image_files, stored_size
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth
 from invgraphics.scenes.poses import pose
 from invgraphics.scenes.region import NEAR, Frame
@@ -81,7 +81,7 @@ def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], lis
     for index, file in enumerate(files):
         if np.abs(_matrix(arrays, f"scale_mat_{index}", source) - sphere).max() > 1e-6 * np.abs(sphere).max():
             raise InputError(f"{source} has a scale_mat_{index} that differs from scale_mat_0.", "One sphere is expected.")
-        camera = decompose(_matrix(arrays, f"world_mat_{index}", source)[:3], image_size(file), f"{source}, world_mat_{index}")
+        camera = decompose(_matrix(arrays, f"world_mat_{index}", source)[:3], stored_size(file), f"{source}, world_mat_{index}")
         cameras.append(camera)
     return world_from_local, cameras
 

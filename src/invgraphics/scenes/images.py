@@ -70,15 +70,25 @@ def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, in
         return image.size[::-1] if _is_turned(image, like) else image.size
 
 
-def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w c"]:
-    """Read a photograph as 8-bit colour, upright.
+def stored_size(path: Path) -> tuple[int, int]:
+    """Read width and height in pixels as they are stored, for a camera whose file does not state them.
 
-    Sixteen-bit greys are rounded, palettes and greys become RGB. The EXIF orientation is applied unless that would
-    turn the picture away from the shape its camera was calibrated for.
+    Raises:
+        InputError: the file is missing or no picture.
+    """
+    with _open(path) as image:
+        return image.size
+
+
+def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w c"]:
+    """Read a photograph as 8-bit colour: upright, or, where its camera is known, as that was calibrated.
+
+    Sixteen-bit greys are rounded, palettes and greys become RGB. Structure from motion looks at pixels as they are stored
+    (COLMAP ignores EXIF): with a camera the EXIF orientation is applied only where the stored shape is not the camera's.
 
     Args:
         path: the file.
-        like: the camera's (width, height), if known.
+        like: the camera's (width, height), if it is known.
 
     Returns:
         Straight colour with 3 channels, or 4 where the file has an alpha channel.
@@ -91,7 +101,7 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
     with _open(path) as image, _naming_damaged_file(path, image):
         if wrong := png.damage(path):
             raise ValueError(wrong)
-        upright = ImageOps.exif_transpose(image) if _is_turned(image, like) or not _is_sideways(image) else image
+        upright = ImageOps.exif_transpose(image) if like is None or _is_turned(image, like) else image
         if upright.mode.startswith("I"):
             grey = (np.asarray(upright).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
             return np.repeat(grey[:, :, None], 3, axis=2)
@@ -122,15 +132,11 @@ def _open(path: Path) -> Any:
         raise InputError(f"{path} cannot be read as a picture: {type(error).__name__}.", "Copy or convert the file.") from error
 
 
-def _is_sideways(image: Any) -> bool:
-    return image.getexif().get(_ORIENTATION, 1) in _TURNED
-
-
 def _is_turned(image: Any, like: tuple[int, int] | None) -> bool:
-    """Whether reading exchanges width and height: EXIF says so, and the camera's shape does not contradict."""
-    if not _is_sideways(image):
+    """Whether reading exchanges width and height: EXIF says so, and the camera, if known, has the turned shape only."""
+    if image.getexif().get(_ORIENTATION, 1) not in _TURNED:
         return False
-    return like is None or (like[0] < like[1]) != (image.width < image.height) or like[0] == like[1]
+    return like is None or (like[0] - like[1]) * (image.width - image.height) < 0
 
 
 def area_resize(values: Float[np.ndarray, "h w c"], width: int, height: int) -> Float[np.ndarray, "height width c"]:
