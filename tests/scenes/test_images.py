@@ -71,6 +71,14 @@ def test_kinds_of_pixels(tmp_path: Path, mode: str, value: int, expected: int | 
     assert pixels[0, 0].tolist() == ([10, 20, 30] if expected is None else [expected] * 3)
 
 
+def test_floating_point_pixels_are_refused(tmp_path: Path) -> None:
+    """Nothing says whether white is 1, 255 or 65535, or whether light is linear."""
+    Image.fromarray(np.full((4, 4), 0.5, np.float32)).save(tmp_path / "a.tif")
+    for read in (read_pixels, image_size):
+        with pytest.raises(InputError, match=r"a\.tif has floating-point pixels, whose range is not known\.\nConvert it to 8"):
+            read(tmp_path / "a.tif")
+
+
 def test_exif_orientation_is_applied_unless_the_camera_contradicts(tmp_path: Path) -> None:
     picture = Image.fromarray(np.arange(6, dtype=np.uint8).reshape(2, 3) * 40)
     exif = picture.getexif()

@@ -94,7 +94,7 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
         Straight colour with 3 channels, or 4 where the file has an alpha channel.
 
     Raises:
-        InputError: the file is missing, no picture, or cut short.
+        InputError: the file is missing, no picture, cut short, or of floating-point numbers.
     """
     from PIL import ImageOps
 
@@ -125,7 +125,12 @@ def _open(path: Path) -> Any:
     try:
         if wrong := png.cut_off(path):
             raise InputError(f"{path} is damaged: {wrong}.", "Copy the file again.")
-        return Image.open(path)
+        image = Image.open(path)
+        if image.mode == "F":
+            image.close()
+            sentence = f"{path} has floating-point pixels, whose range is not known."
+            raise InputError(sentence, "Convert it to 8 or 16 bits per channel.")
+        return image
     except FileNotFoundError:
         raise InputError(f"{path} does not exist.") from None
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
