@@ -1,5 +1,6 @@
 """COLMAP models, written as text by hand and read back by the loader."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,16 @@ def test_dots_are_where_the_cameras_say(tmp_path: Path, place: str) -> None:
     assert [view.name for view in scene.test] == ["00.png", "08.png"]
     assert_dots_are_found(scene)
     assert "RADIAL, SIMPLE_RADIAL" in scene.notes["undistortion"]
+
+
+def test_two_photographs_are_a_scene(tmp_path: Path) -> None:
+    """Opposite cameras on an axis: one of their coordinates differs by rounding only."""
+    eye = ring(1)[0]
+    turns = [Rotation.from_euler("z", angle).as_matrix() for angle in (0.3, 0.3 - np.pi)]
+    eyes = [replace(eye, R=eye.R @ turn, t=eye.t * (1 - 0.2 * index)) for index, turn in enumerate(turns)]
+    scene = validate(Colmap().load(write(tmp_path, eyes, ["PINHOLE 160 120 150 155 83 58"] * 2), SceneOptions()))
+    assert (len(scene.train), len(scene.test)) == (1, 1)
+    assert_dots_are_found(scene)
 
 
 def test_points_are_kept_in_the_local_frame(tmp_path: Path) -> None:

@@ -27,6 +27,8 @@ MOST_STRETCH = 10.0
 """Ratio of the focal lengths of a pixel's sides."""
 FARTHEST_CAMERA = 1e4
 """Distance of a camera over the median one's, from the middle of all; and, in a box, over the box's radius."""
+ONE_PLACE = 1e-6
+"""Distance of places that float32 does not tell apart, with room; over that from the origin, or the radius of the bounds."""
 FARTHEST = 1e9
 """Largest coordinate and length, local units, whose square float32 holds with room."""
 THINNEST = 1e-5
@@ -123,14 +125,17 @@ def _check_positions(scene: Scene) -> None:
     """Cameras in relation to each other and to the bounds; none may be so far that the others become one point."""
     views = [*scene.train, *scene.val, *scene.test, *scene.observed]
     position = torch.stack([view.camera.position for view in views]).double()
-    middle = position.median(dim=0).values
+    # Of an even number the mean of the two in the middle: of two cameras none is the middle from which the other is far.
+    middle = position.quantile(0.5, dim=0)
     distance = (position - middle).norm(dim=1)
-    farthest, typical = float(distance.max()), float(distance.median())
-    most = max(FARTHEST_CAMERA * typical, FARTHEST_CAMERA * scene.bounds.radius if typical == 0 else 0.0)
-    if farthest > most:
-        name = views[int(distance.argmax())].name
+    farthest, typical, radius = float(distance.max()), float(distance.quantile(0.5)), scene.bounds.radius
+    # Of most cameras in one place, as on a tripod, the median distance is rounding noise, and no measure of the others'.
+    apart = typical > ONE_PLACE * max(radius, float(position.norm(dim=1).quantile(0.5)))
+    times = farthest / (typical if apart else radius)
+    if times > FARTHEST_CAMERA:
+        name, what = views[int(distance.argmax())].name, "times as far away as" if apart else "radii of the bounds away from"
         raise InputError(
-            f"The view '{name}' of '{scene.name}' is {farthest / max(typical, 1e-30):.2g} times as far away as most others.",
+            f"The view '{name}' of '{scene.name}' is {times:.2g} {what} most others.",
             "Remove the view or estimate its pose again.",
         )
     if scene.bounds.space == "box":
