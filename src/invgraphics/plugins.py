@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from typing import Any
@@ -103,7 +103,7 @@ def load(registry: str, name: str) -> Any:
     """Import and return the object registered as ``name``.
 
     Raises:
-        InputError: unknown name (the known ones are listed), or a plug-in that fails to import.
+        InputError: unknown name (the known ones are listed), or a plug-in that fails to import, however it fails.
     """
     target = names(registry).get(name)
     if target is None:
@@ -114,9 +114,36 @@ def load(registry: str, name: str) -> Any:
     module, _, attribute = target.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except (Exception, SystemExit) as error:  # a stranger's module may raise anything, or leave
         source = origin(registry, name)
-        raise InputError(f"'{name}' of the {registry} ({target}, {source}) cannot be imported: {error}.") from error
+        if source == "built in" and not isinstance(error, ImportError | AttributeError):
+            raise
+        said = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
+        raise InputError(f"'{name}' of the {registry} ({target}, {source}) cannot be imported: {said}.") from error
+
+
+def load_all(registry: str, known: Iterable[str] | None = None) -> Iterator[tuple[str, Any]]:
+    """Import objects of a registry one by one, as (name, object); a stranger's that fails is left out with a warning.
+
+    Args:
+        registry: that holds them.
+        known: their names; ``None`` for all.
+    """
+    for name in names(registry) if known is None else known:
+        try:
+            found = load(registry, name)
+        except InputError as error:
+            if name in _own(registry):
+                raise
+            leave_out(error.sentence)
+        else:
+            yield name, found
+
+
+@cache
+def leave_out(sentence: str) -> None:
+    """Print once on stderr that a stranger's broken part is left out, so that what does not need it goes on."""
+    print(f"Left out: {sentence}", file=sys.stderr)
 
 
 def name_of(registry: str, kind: type) -> str:
@@ -125,7 +152,7 @@ def name_of(registry: str, kind: type) -> str:
     for name, target in names(registry).items():
         if target == wanted:
             return name
-    for name in _foreign(registry):
-        if load(registry, name) is kind:
+    for name, found in load_all(registry, _foreign(registry)):
+        if found is kind:
             return name
     raise InputError(f"{wanted} is not registered among the {registry}.")

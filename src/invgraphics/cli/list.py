@@ -74,15 +74,14 @@ def _print_matrix() -> None:
 
 def _list_methods() -> None:
     from invgraphics.recipes.presets import preset_summary
-    from invgraphics.recipes.recipe import methods, source
+    from invgraphics.recipes.recipe import is_built_in, methods, source
 
-    ours = find("renderers")
     rows = [
         (
             name,
             summary,
             preset_summary(source(name).get("presets", {})),
-            "built in" if (ours / f"{name}.toml").is_file() else plugins.origin("recipes", name),
+            "built in" if is_built_in(name) else plugins.origin("recipes", name),
         )
         for name, summary in methods().items()
     ]

@@ -78,12 +78,12 @@ def read_gaussians(path: Path) -> tuple[str, Splats]:
         raise InputError(f"There is no file '{path}'." if not path.exists() else f"'{path}' is not a file.")
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
-    known = plugins.names("formats")
-    for name in known:
-        form: Format = plugins.load("formats", name)()
+    for name, kind in plugins.load_all("formats"):
+        form: Format = kind()
         if form.matches(path, head):
             return name, checked(form.read(path), path)
-    raise InputError(f"'{path}' is no file of 3D Gaussians in a known format.", f"Known formats: {', '.join(known)}.")
+    known = ", ".join(plugins.names("formats"))
+    raise InputError(f"'{path}' is no file of 3D Gaussians in a known format.", f"Known formats: {known}.")
 
 
 def write_gaussians(path: Path, name: str, splats: Splats) -> None:

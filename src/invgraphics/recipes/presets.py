@@ -81,8 +81,13 @@ def preset_summary(known: Mapping[str, Any]) -> str:
     """
     order = [name for name, _ in LADDER]
     names = sorted(known, key=lambda name: (order.index(name) if name in order else len(order), name))
-    scenes = {name: ", ".join(map(str, known[name].get(CHOSEN_ON, []))) for name in names}
+    scenes = {name: _listed(known[name].get(CHOSEN_ON, [])) for name in names}
     return ", ".join(f"{name} ({scenes[name]})" if scenes[name] else name for name in names)
+
+
+def _listed(scenes: Any) -> str:
+    """Scenes as a recipe names them, in a line; what is no list is shown as it stands, and refused where the preset is used."""
+    return ", ".join(map(str, scenes)) if isinstance(scenes, list) else str(scenes)
 
 
 def announcements(choices: Iterable[tuple[str, str, str]]) -> list[str]:

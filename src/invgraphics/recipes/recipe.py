@@ -59,13 +59,20 @@ class Method:
 
 
 def methods() -> dict[str, str]:
-    """List all known methods, name -> summary, built-in ones first; imports no implementation."""
+    """List all known methods, name -> summary, built-in ones first; imports no implementation.
+
+    A stranger's recipe that cannot be read is left out, with a warning.
+    """
     root = find("renderers")
     found = {}
     for path in sorted(root.glob("*/*.toml")):
         found[f"{path.parent.name}/{path.stem}"] = str(_parse(path.read_text(), str(path)).get("summary", ""))
     for name in plugins.names("recipes"):
-        found.setdefault(name, str(_parse(_foreign_text(name), name).get("summary", "")))
+        if name not in found:
+            try:
+                found[name] = str(_foreign_source(name).get("summary", ""))
+            except InputError as error:
+                plugins.leave_out(error.sentence)
     return found
 
 
@@ -177,15 +184,20 @@ def source(name: str) -> dict[str, Any]:
     else:
         path = find("renderers") / f"{name}.toml"
         if name in plugins.names("recipes") and not path.is_file():
-            return _parse(_foreign_text(name), name)
+            return _foreign_source(name)
         if not path.is_file():
             sentence = f"There is no method '{name}'.{did_you_mean(name, methods())}"
             raise InputError(sentence, f"Known methods: {', '.join(methods())}; or the path of a .toml.")
     return _parse(read_text(path, LIMITS.toml_bytes), str(path))
 
 
-def _foreign_text(name: str) -> str:
-    return str(plugins.load("recipes", name))
+def is_built_in(name: str) -> bool:
+    """Whether a method of `methods` is one of ours; a stranger's recipe cannot take its name."""
+    return (find("renderers") / f"{name}.toml").is_file()
+
+
+def _foreign_source(name: str) -> dict[str, Any]:
+    return _parse(str(plugins.load("recipes", name)), f"{name} of {plugins.origin('recipes', name)}")
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:

@@ -6,14 +6,24 @@ from collections.abc import Mapping
 from typing import Any
 
 from invgraphics import plugins
-from invgraphics.recipes.recipe import methods, source
+from invgraphics.recipes.recipe import is_built_in, methods, source
 
 
 def matrix() -> tuple[list[str], list[str], dict[tuple[str, str], list[str]]]:
-    """Build the matrix of methods: fields as rows, renderers as columns, methods in each cell in the order of `methods`."""
+    """Build the matrix of methods: fields as rows, renderers as columns, methods in each cell in the order of `methods`.
+
+    A stranger's recipe that names no usable field or renderer is left out, with a warning.
+    """
     cells: dict[tuple[str, str], list[str]] = {}
     for name in methods():
-        cells.setdefault(cell_of(source(name)), []).append(name)
+        try:
+            cell = cell_of(source(name))
+        except Exception as error:
+            if is_built_in(name):
+                raise
+            plugins.leave_out(f"'{name}' of {plugins.origin('recipes', name)}: {type(error).__name__}: {error}.")
+        else:
+            cells.setdefault(cell, []).append(name)
     rows = list(dict.fromkeys(row for row, _ in cells))
     columns = list(dict.fromkeys(column for _, column in cells))
     return rows, columns, cells

@@ -115,16 +115,15 @@ def find_loader(path: Path) -> Loader:
     Raises:
         InputError: none fits; the sentence says what was looked for.
     """
-    formats = plugins.names("scenes")
-    for name in formats:
-        loader: Loader = plugins.load("scenes", name)()
+    for _, kind in plugins.load_all("scenes"):
+        loader: Loader = kind()
         if loader.matches(path):
             return loader
     what = "is an empty folder" if path.is_dir() and not any(path.iterdir()) else "is not a data set of a known format"
     raise InputError(
         f"{path} {what}.",
         "Looked for truth.json, transforms_train.json, transforms.json, poses_bounds.npy, sparse/0/cameras.bin, cameras*.npz "
-        f"and .npz (formats: {', '.join(formats)}).",
+        f"and .npz (formats: {', '.join(plugins.names('scenes'))}).",
     )
 
 
