@@ -132,7 +132,7 @@ def compare(
     expanded, optional = expand([method for method in given if isinstance(method, str)])
     others = [method for method in given if not isinstance(method, str)]
     ordered = [*expanded, *others] if optional else given
-    names = [name_of(method, folder / "methods" / f"{index}.toml", budget)[0] for index, method in enumerate(ordered)]
+    names = [name_of(method, folder / "methods") for method in ordered]
     _, place = reopenable_scene(scene, folder)
     settings: dict[str, Any] = {"budget": budget, "device": device, "render_with": tuple(render_with), **place}
     request = CompareRequest(methods=tuple(names), seeds=tuple(seeds), optional=optional, out=str(folder), **settings)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal, overload
 
-from invgraphics.api.loading import MethodLike, as_scene, name_of, reopenable_scene
+from invgraphics.api.loading import MethodLike, as_scene, reopenable_scene, resolved
 from invgraphics.core import Model, Scene
 from invgraphics.experiments.evaluate import score_model
 from invgraphics.experiments.fitted import load_fitted
@@ -16,7 +16,7 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import make_run
 from invgraphics.experiments.session import FolderRun, MemoryRun, OnStep, ScoreTable
 from invgraphics.interruption import Terminated
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import RECIPE, RunFolder
 from invgraphics.scenes.open import source_of
 
 
@@ -86,19 +86,19 @@ def fit(
     scene = as_scene(scene)
     if out is None:
         source = source_of(scene)
-        name, table = name_of(method, None, budget)
+        name, table = resolved(method, budget)
         where = scene.name if source is None else source.spec
         request = FitRequest(method=name, scene=where, out="", budget=budget, seed=seed, device=device)
         return MemoryRun(Job.of(request, table), scene, on_step)
     folder = RunFolder(Path(out))
     folder.create()
     existing: Literal["resume", "refuse"] = "resume" if folder.identity else "refuse"
-    name, _ = name_of(method, folder.root / "method.toml", budget)
+    name, table = resolved(method, budget, str(folder.root / RECIPE))  # which the run writes, once the folder is its own
     settings: dict[str, Any] = {"budget": budget, "seed": seed, "device": device, "snapshots": snapshots}
     scene, place = reopenable_scene(scene, folder.root)
     request = FitRequest(method=name, out=str(out), existing=existing, **settings, **place)
     try:
-        make_run(Job.of(request), scene, on_step)
+        make_run(Job.of(request, table), scene, on_step)
     except KeyboardInterrupt as error:
         if isinstance(error, Terminated) or not folder.resumable:
             raise

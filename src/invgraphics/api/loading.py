@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,6 +23,7 @@ from invgraphics.recipes.recipe import Method
 from invgraphics.scenes.npz import save_npz
 from invgraphics.scenes.open import SceneOptions, open_scene, source_of, validate
 from invgraphics.studies.factors import override
+from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
 MethodLike: TypeAlias = str | os.PathLike[str] | Mapping[str, Any] | Method
@@ -139,28 +142,46 @@ def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
     return validate(scene) if isinstance(scene, Scene) else load_scene(scene)
 
 
-def name_of(method: MethodLike, file: Path | None, budget: str) -> tuple[str, Method | None]:
-    """Name by which other processes load a method, and the method itself where it has no such name.
+def resolved(method: MethodLike, budget: str, name: str = "recipe") -> tuple[str, Method | None]:
+    """Name by which other processes load a method, and of a method without one the method itself, called ``name``.
 
     Args:
         method: of any kind.
-        file: where a recipe is written that has no name; ``None`` writes nothing.
         budget: that chooses a table's preset.
+        name: for a table, such as the path where its recipe will be.
+
+    Raises:
+        InputError: the table is no recipe.
     """
+    known = _name_or_table(method)
+    if isinstance(known, str):
+        return known, None
+    return name, replace(recipe.method_from(known, "recipe", budget=Budget.parse(budget)), name=name)
+
+
+def name_of(method: MethodLike, folder: Path) -> str:
+    """Name by which other processes load a method: a table's is its file in ``folder``, which is called after the content.
+
+    So another table never replaces a file that the provenance of a run names.
+    """
+    known = _name_or_table(method)
+    if isinstance(known, str):
+        return known
+    text = tomlkit.dumps(known)
+    file = folder / f"{sha256_of(tomlkit.parse(text).unwrap())[:12]}.toml"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(file, text)
+    return str(file)
+
+
+def _name_or_table(method: MethodLike) -> str | dict[str, Any]:
     if isinstance(method, str | os.PathLike):
-        return os.fspath(method), None
+        return os.fspath(method)
     if isinstance(method, Method):
-        try:
+        with suppress(InputError):  # a name that was given to a table
             if recipe.load_method(method.name, method.preset or None).digest == method.digest:
-                return method.name, None
-        except InputError:  # a name that was given to a table
-            pass
-    table = dict(method.table if isinstance(method, Method) else method)
-    if file is None:
-        return "recipe", recipe.method_from(table, "recipe", budget=Budget.parse(budget))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_text(file, tomlkit.dumps(table))
-    return str(file), None
+                return method.name
+    return dict(method.table if isinstance(method, Method) else method)
 
 
 def reopenable_scene(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:

@@ -1,0 +1,51 @@
+"""Methods as tables in `import invgraphics as ig`: where their recipes are kept, and values that are set in them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import invgraphics as ig
+from invgraphics.errors import InputError
+from invgraphics.scenes.npz import save_npz
+from invgraphics.testing import toy_scene
+
+SPLATS = ig.load_method("splatting/gaussians", set={"field.count": 60, "field.max_init": 60, "field.sh_degree": 0})
+ONE, TWO = ({**SPLATS.table, "batches": {"views": views}} for views in (1, 2))
+
+
+@pytest.fixture(autouse=True)
+def _toy_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_npz(toy_scene(views=8, size=16), tmp_path / "toy.npz")
+    monkeypatch.chdir(tmp_path)
+
+
+def _check_named_recipe(run: Path, views: int) -> None:
+    """The method that a run's provenance names loads, and to the recipe that was fitted."""
+    provenance = json.loads((run / "provenance.json").read_text())
+    method = ig.load_method(provenance["method"])
+    assert method.recipe.batches.views == views and method.digest == provenance["recipe_sha256"]
+    assert provenance["command"].startswith(f"invgraphics fit {provenance['method']} ")
+
+
+def test_a_refused_fit_leaves_the_finished_run_as_it_is() -> None:
+    kept = ig.fit(ONE, "toy.npz", "2steps", out="run")
+    before = {path: path.read_bytes() for path in Path("run").rglob("*") if path.is_file()}
+    for method in (TWO, {**ONE, "batches": {"veiws": 1}}):
+        with pytest.raises(InputError, match=r"holds another run|Unknown key"):
+            ig.fit(method, "toy.npz", "2steps", out="run")
+    assert before == {path: path.read_bytes() for path in Path("run").rglob("*") if path.is_file()}
+    _check_named_recipe(Path("run"), 1)
+    seen = []
+    again = ig.fit(ONE, "toy.npz", "2steps", out="run", on_step=seen.append)
+    assert not seen and again.scores["psnr"] == kept.scores["psnr"]
+
+
+def test_a_comparison_keeps_each_table_under_its_own_name(in_process) -> None:
+    (first,) = ig.compare("toy.npz", [ONE], "2steps", out="report").methods
+    report = ig.compare("toy.npz", [TWO, ONE], "2steps", out="report")
+    assert report.methods[1] == first != report.methods[0]  # at another place of the list the same method, whose run is kept
+    for method, views in zip(report.methods, (2, 1), strict=True):
+        _check_named_recipe(report._run_folder(method, 0), views)
+    with pytest.raises(InputError, match="named twice"):
+        ig.compare("toy.npz", [ONE, dict(reversed(ONE.items()))], "2steps", out="report")
