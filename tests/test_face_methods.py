@@ -3,11 +3,15 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 import invgraphics as ig
 from invgraphics.errors import InputError
 from invgraphics.scenes.npz import save_npz
+from invgraphics.studies.factors import override
+from invgraphics.tables import parse_toml
 from invgraphics.testing import toy_scene
 
 SPLATS = ig.load_method("splatting/gaussians", set={"field.count": 60, "field.max_init": 60, "field.sh_degree": 0})
@@ -49,3 +53,40 @@ def test_a_comparison_keeps_each_table_under_its_own_name(in_process) -> None:
         _check_named_recipe(report._run_folder(method, 0), views)
     with pytest.raises(InputError, match="named twice"):
         ig.compare("toy.npz", [ONE, dict(reversed(ONE.items()))], "2steps", out="report")
+
+
+def test_lists_of_tables_and_numpys_values_can_be_set() -> None:
+    """The name that comes of it makes the same method again, here and in the processes of a comparison."""
+    losses = [{"type": "photometric", "weight": 0.5}, {"type": "opacity", "weight": np.float32(0.25)}]
+    values = {"losses": losses, "field.width": np.int64(64), "batches.rays": torch.tensor(32), "field.encoding.type": "hash"}
+    method = ig.load_method("volumetric/hash", set=values)
+    assert [loss["weight"] for loss in method.table["losses"]] == [0.5, 0.25]
+    assert (method.recipe.field.width, method.recipe.batches.rays) == (64, 32)
+    assert ig.load_method(method.name).digest == method.digest
+    with pytest.raises(InputError, match=r"'field\.width' cannot be set to None: TOML has no NoneType"):
+        ig.load_method("volumetric/hash", set={"field.width": None})
+    table = {**SPLATS.table, "batches": {"views": np.int64(2)}}
+    assert ig.fit(table, "toy.npz", "1steps").method.recipe.batches.views == 2
+    with pytest.raises(InputError, match="The table is no recipe: TOML has no NoneType"):
+        ig.fit({**table, "summary": None}, "toy.npz", "1steps")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        3,
+        -0.5,
+        1e-7,
+        float("inf"),
+        True,
+        'a "b"\n\x7f\\é',
+        [],
+        [1, [2, 3]],
+        {},
+        [{"a": 1, "b c": [{"d": {}}]}, {}],
+        {"x": {"y": "="}},
+    ],
+)
+def test_values_on_one_line_of_toml_read_as_they_were(value: object) -> None:
+    text = override("a", value).removeprefix("a=")
+    assert "\n" not in text and parse_toml(f"value = {text}", "it")["value"] == value

@@ -7,8 +7,10 @@ plain values (`invgraphics.config.fill`).
 from __future__ import annotations
 
 import json
+import os
 import re
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,6 +100,40 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     except RecursionError:
         raise InputError(f"{where} is not valid TOML: {_TOO_DEEP}.") from None
     return table
+
+
+def inline_toml(value: Any) -> str:
+    """Format a value as TOML on one line, tables within braces (inverse of `parse_toml`); numpy's values as plain ones.
+
+    Raises:
+        ValueError: TOML has no such value.
+    """
+    import tomlkit  # here, as listing needs none
+
+    table = tomlkit.inline_table()  # within which lists of tables are inline too
+    table["value"] = plain(value)
+    return table.as_string().removeprefix("{value = ").removesuffix("}")
+
+
+def plain(value: Any) -> Any:
+    """Convert numpy scalars and arrays, tensors and paths within tables and lists to the plain values that TOML knows.
+
+    Raises:
+        ValueError: TOML has no such value.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if callable(getattr(value, "tolist", None)):
+        value = value.tolist()
+    if isinstance(value, list):
+        return plain(value)
+    if isinstance(value, str | bool | int | float):
+        return value
+    raise ValueError(f"TOML has no {type(value).__name__}")
 
 
 def read_text(path: Path, most: int) -> str:

@@ -23,6 +23,7 @@ from invgraphics.recipes.recipe import Method
 from invgraphics.scenes.npz import save_npz
 from invgraphics.scenes.open import SceneOptions, open_scene, source_of, validate
 from invgraphics.studies.factors import override
+from invgraphics.tables import plain
 from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
@@ -167,10 +168,9 @@ def name_of(method: MethodLike, folder: Path) -> str:
     known = _name_or_table(method)
     if isinstance(known, str):
         return known
-    text = tomlkit.dumps(known)
-    file = folder / f"{sha256_of(tomlkit.parse(text).unwrap())[:12]}.toml"
+    file = folder / f"{sha256_of(known)[:12]}.toml"
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(file, text)
+    write_text(file, tomlkit.dumps(known))
     return str(file)
 
 
@@ -181,7 +181,10 @@ def _name_or_table(method: MethodLike) -> str | dict[str, Any]:
         with suppress(InputError):  # a name that was given to a table
             if recipe.load_method(method.name, method.preset or None).digest == method.digest:
                 return method.name
-    return dict(method.table if isinstance(method, Method) else method)
+    try:
+        return plain(method.table if isinstance(method, Method) else method)
+    except ValueError as error:
+        raise InputError(f"The table is no recipe: {error}.") from error
 
 
 def reopenable_scene(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:

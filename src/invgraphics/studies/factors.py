@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from fnmatch import fnmatch
 from typing import Any
+
+from invgraphics.errors import InputError
+from invgraphics.tables import inline_toml
 
 Levels = dict[str, Any]
 """Factor -> level."""
@@ -41,5 +43,14 @@ def covers(cell: Mapping[str, Any], scene: str, method: str, seed: int) -> bool:
 
 
 def override(path: str, level: Any) -> str:
-    """Format a level for ``--set``: ``path=value`` in TOML, which for plain values is JSON."""
-    return f"{path}={json.dumps(level, ensure_ascii=False)}"
+    """Format a level for ``--set``: ``path=value`` in TOML, on one line.
+
+    Raises:
+        InputError: TOML has no such value.
+    """
+    try:
+        return f"{path}={inline_toml(level)}"
+    except ValueError as error:
+        raise InputError(
+            f"'{path}' cannot be set to {level!r}: {error}.", "Expected: what a recipe in TOML can hold."
+        ) from error
