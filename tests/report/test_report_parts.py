@@ -19,10 +19,14 @@ import pytest
 from PIL import Image
 
 from invgraphics.report.data.comparison import read_comparison
+from invgraphics.report.data.factors import METHOD, Observation
 from invgraphics.report.figures import views as pictures
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
 from invgraphics.report.figures.tradeoffs import draw_tradeoffs
-from invgraphics.report.statistics.summary import pareto_front, summarise
+from invgraphics.report.statistics.effects import effects_of
+from invgraphics.report.statistics.intervals import Estimate
+from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.summary import pareto_front, quality_columns, summarise
 from invgraphics.report.statistics.time_to_quality import seconds_to_reach, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import budget_words, listing, significant_decimals, times
@@ -69,6 +73,26 @@ def test_a_time_is_told_as_exactly_as_the_monitor_looked(built_report: Path) -> 
 
     assert told(6.0) == {"36–42 s"}
     assert told(0.2) == {"1.4 s"}
+
+
+def test_methods_of_a_comparison_are_compared_as_the_page_says(built_report: Path) -> None:
+    """On the same views, seeds as independent groups: a seed of one method says nothing of the same seed of another."""
+    comparison = read_comparison(built_report)
+    first, second = comparison.methods[:2]
+
+    def compared(runs: tuple[Run, ...]) -> Estimate:
+        observed = [Observation(run, comparison.scene, {METHOD: run.method}) for run in runs]
+        (effect,) = effects_of([Contrast(METHOD, first, second)], quality_columns(comparison)[0], observed)
+        return effect.estimate
+
+    seeds = {0: 1, 1: 0}
+    mixed = tuple(
+        replace(run, seed=seeds.get(run.seed, run.seed) if run.method == first else run.seed) for run in comparison.runs
+    )
+    assert mixed != comparison.runs and compared(mixed) == compared(comparison.runs)
+    page = (built_report / "index.html").read_text()
+    lead = page.partition("<h2>Differences between methods</h2>")[2].partition("</p>")[0]
+    assert "on the same test views" in lead and "independent groups" in lead and "aired" not in lead
 
 
 def test_error_maps_average_to_the_reported_flip(built_report: Path) -> None:
