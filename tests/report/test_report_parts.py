@@ -75,6 +75,39 @@ def test_a_time_is_told_as_exactly_as_the_monitor_looked(built_report: Path) -> 
     assert told(0.2) == {"1.4 s"}
 
 
+@pytest.mark.parametrize(
+    ("seconds", "told"),
+    [
+        ((10.0, 30.0, None), "30.0 s"),
+        ((None, 10.0, 30.0, 20.0), "25.0 s"),
+        ((10.0, 20.0, None, None), "not reached"),
+        ((10.0, None, None), "not reached"),
+        ((None, 10.0, 20.0, None, 30.0), "30.0 s"),
+    ],
+)
+def test_the_median_time_counts_seeds_that_never_got_there(
+    built_report: Path, seconds: tuple[float | None, ...], told: str
+) -> None:
+    """Looks every tenth of a second, and PSNR jumps from 10 to 20 dB; by hand, a seed that never does comes last."""
+    comparison = read_comparison(built_report)
+    first = comparison.runs[0]
+
+    def run(seed: int, reached: float | None) -> Run:
+        when = 40.0 if reached is None else reached
+        moments = (0.0, when - 0.1, when)
+        values = (10.0, 10.0, 10.5 if reached is None else 20.0)
+        history = tuple(replace(first.history[0], seconds=at, psnr=psnr) for at, psnr in zip(moments, values, strict=True))
+        return replace(first, seed=seed, history=history)
+
+    other = run(9, 5.0)  # of another method, so that the levels lie in between whatever the first one reaches
+    runs = [run(seed, reached) for seed, reached in enumerate(seconds)]
+    names = comparison.methods[:2]
+    runs = (*(replace(one, method=names[0]) for one in runs), replace(other, method=names[1]))
+    reach = time_to_quality(replace(comparison, methods=names, runs=runs))
+    assert reach is not None and reach.levels[-1] == 20
+    assert reach.rows[0][2][-1] == told and reach.rows[1][2][-1] == "5.0 s"
+
+
 def test_methods_of_a_comparison_are_compared_as_the_page_says(built_report: Path) -> None:
     """On the same views, seeds as independent groups: a seed of one method says nothing of the same seed of another."""
     comparison = read_comparison(built_report)
