@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.figures.style import INK, MUTED, PAGE, Figure, canvas, save, series_style
 from invgraphics.report.statistics.effects import Effect
+from invgraphics.report.statistics.intervals import Estimate
 from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity
@@ -78,16 +79,22 @@ def _parts(effect: Effect) -> dict[str, float]:
 
 
 def _limits(effects: Sequence[Effect]) -> tuple[float, float]:
-    """Axis limits of an interval plot: all means and zero, and intervals unless far wider than others (two seeds)."""
+    """Axis limits of an interval plot: all means and zero, and both intervals unless far wider than others (two seeds)."""
     scale = effects[0].quantity.scale
     means = [effect.estimate.mean * scale for effect in effects]
     means += [mean * scale for effect in effects for mean in _parts(effect).values()]
     reach = max([abs(mean) for mean in means] + [1e-12])
-    halves = sorted(effect.estimate.half_width * scale for effect in effects)
-    room = min(halves[-1], max(2 * reach, 3 * statistics.median(halves)))
-    low, high = min(0.0, *means) - room, max(0.0, *means) + room
+    bars = [(bar.mean * scale, bar.half_width * scale) for effect in effects for bar in _bars(effect)]
+    cap = max(2 * reach, 3 * statistics.median(max(bar.half_width for bar in _bars(effect)) * scale for effect in effects))
+    low = min(0.0, *means, *(mean - min(half, cap) for mean, half in bars))
+    high = max(0.0, *means, *(mean + min(half, cap) for mean, half in bars))
     pad = 0.05 * (high - low) or 1.0
     return low - pad, high + pad
+
+
+def _bars(effect: Effect) -> list[Estimate]:
+    """Intervals of an effect from the thick bar to the thin one, on which the verdict rests where there are several scenes."""
+    return [effect.estimate] if effect.across is None else [effect.estimate, effect.across]
 
 
 def _draw_row(axes: Axes, line: int, effect: Effect, look: tuple[int, Sequence[str]], letters: int) -> None:
@@ -98,10 +105,13 @@ def _draw_row(axes: Axes, line: int, effect: Effect, look: tuple[int, Sequence[s
     low, high = axes.get_xlim()
     for where, names in _clusters(_parts(effect), 2.5 * (high - low) / letters / scale):
         axes.text(where * scale, line + 0.1, " ".join(str(order.index(name) + 1) for name in names), clip_on=True, **small)
-    if effect.across is not None:
-        ends = [effect.across.low * scale, effect.across.high * scale]
-        axes.plot(ends, [line, line], color=style.colour, linewidth=0.9, zorder=3)
-    axes.plot([value.low * scale, value.high * scale], [line, line], color=style.colour, linewidth=3.2, zorder=3)
+    for bar, width in zip(_bars(effect), (3.2, 0.9), strict=False):
+        ends = [bar.low * scale, bar.high * scale]
+        axes.plot(ends, [line, line], color=style.colour, linewidth=width, zorder=3)
+        for side, edge, arrow, beyond in (("low", low, "<", ends[0] < low), ("high", high, ">", ends[1] > high)):
+            if beyond:  # or a bar that goes on would look like one that ends
+                head: dict[str, Any] = {"markersize": 7, "clip_on": False, "zorder": 3, "gid": f"beyond-{side}-{line}"}
+                axes.plot(edge, line, arrow, color=style.colour, **head)
     filled: dict[str, Any] = {} if effect.found else {"markerfacecolor": PAGE.light, "markeredgewidth": 1.8}
     axes.plot(value.mean * scale, line, style.marker, color=style.colour, markersize=9, zorder=4, **filled)
     unit = f" {effect.quantity.unit}" if effect.quantity.unit else ""
