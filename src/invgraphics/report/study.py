@@ -21,6 +21,7 @@ from invgraphics.report.pages.tables import effects_caption, write_latex, write_
 from invgraphics.report.pages.verdicts import write_verdict_report
 from invgraphics.report.statistics.cross_render import cross_effects
 from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
+from invgraphics.report.statistics.leaders import lead_contrasts
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.predictions import judge_predictions
 from invgraphics.report.statistics.rules import headline, judge
@@ -92,14 +93,18 @@ def study_sentences(folder: Path) -> list[str]:
 def headline_effects(study: Study, quantity: Quantity, clean: Callable[[str], str] = str) -> list[Effect]:
     """The effects that answer a study's question: of approximations on the same fits where it names some, then of levels."""
     crossed = cross_effects(study.observations(), study.approximations, clean)
-    return [*crossed, *effects_of(study_contrasts(study), quantity, study.observations(), study.lost())]
+    return [*crossed, *effects_of(study_contrasts(study, quantity), quantity, study.observations(), study.lost())]
 
 
-def study_contrasts(study: Study) -> list[Contrast]:
-    """The comparisons that a study's question asks for."""
+def study_contrasts(study: Study, quantity: Quantity | None) -> list[Contrast]:
+    """The comparisons that a study's question asks for, and what leads in the first quantity where there are many levels."""
     among = study.methods if study.each == METHOD else ()
     among = among or next((factor.levels for factor in study.factors if factor.path == study.each), ())
-    return contrasts_of(study.factors, study.each if among else "", study.interactions, among)
+    each = study.each if among else ""
+    asked = contrasts_of(study.factors, each, study.interactions, among)
+    if quantity is None:
+        return asked
+    return [*asked, *lead_contrasts(study.factors, quantity, study.observations(), study.lost(), (each, among))]
 
 
 def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
@@ -112,7 +117,8 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
     )
     observations = study.observations()
     quantities = _quantities(study, comparisons)
-    contrasts = draw_contrasts(quantities, study_contrasts(study), observations, study.lost(), folder)
+    asked = study_contrasts(study, quantities[0] if quantities else None)
+    contrasts = draw_contrasts(quantities, asked, observations, study.lost(), folder)
     clean = folder.redactor.text if folder.redactor is not None else str
     crossed = cross_effects(observations, study.approximations, clean)
     heat = draw_heat_maps(study.factors, quantities[0], observations, folder.figures) if quantities else []

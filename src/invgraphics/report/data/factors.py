@@ -13,7 +13,7 @@ METHOD = "method"
 """The method is a factor like any other, under this name."""
 
 ALL_PAIRS = 4
-"""Factors with more levels are compared with their reference level only: every further pair costs all others power."""
+"""Factors with more levels are compared with their reference level, and the best with the next: more pairs cost all power."""
 
 
 @dataclass(frozen=True)

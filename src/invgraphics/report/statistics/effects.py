@@ -173,13 +173,17 @@ def contrasts_of(
         if (one := by_path.get(first)) is not None and (two := by_path.get(second)) is not None
     ]
     for factor in factors:
-        places = [{each: level} for level in among] if each and factor.path != each else [{}]
         found += [
             Contrast(factor.path, before, after, where=where, name=factor.named(before, after))
-            for where in places
+            for where in places_of(factor, each, among)
             for before, after in factor.pairs()
         ]
     return found
+
+
+def places_of(factor: Factor, each: str, among: Sequence[str]) -> list[dict[str, str]]:
+    """Where a factor is answered: at one level of ``each`` after the other, or once over everything."""
+    return [{each: level} for level in among] if each and factor.path != each else [{}]
 
 
 def _interaction(one: Factor, two: Factor) -> Contrast:

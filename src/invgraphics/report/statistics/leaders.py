@@ -1,14 +1,15 @@
-"""Which method leads a column of a table by more than chance: what is printed bold."""
+"""Which method leads a column of a table by more than chance, which is printed bold; which level of a factor leads a study."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Observation
-from invgraphics.report.statistics.effects import ALPHA, Effect, effects_of
+from invgraphics.report.data.factors import ALL_PAIRS, METHOD, Factor, Lost, Observation
+from invgraphics.report.statistics.effects import ALPHA, Effect, effects_of, places_of
 from invgraphics.report.statistics.intervals import holm
-from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.pairing import Contrast, contrast_words
 from invgraphics.report.wording import TIMES, Quantity
 
 
@@ -43,6 +44,42 @@ def leaders(
             p_values.append(max(known))
     corrected = holm([min(1.0, tables * p) for p in p_values])
     return {key: (name, lead) for (key, name, lead), p in zip(found, corrected, strict=True) if p is not None and p <= ALPHA}
+
+
+def lead_contrasts(
+    factors: Sequence[Factor],
+    quantity: Quantity,
+    observations: Sequence[Observation],
+    lost: Iterable[Lost] = (),
+    places: tuple[str, Sequence[str]] = ("", ()),
+) -> list[Contrast]:
+    """Best level against the next best, of factors with too many levels for all pairs, in the family of a study's comparisons.
+
+    Without it such a study says who differs from the reference, but not whether anyone leads. Which levels these are is known
+    only afterwards; that makes no false leaders, since of equals the best two lie closer together than two named beforehand.
+
+    Args:
+        factors: of the study.
+        quantity: whose best is sought.
+        observations: finished runs.
+        lost: fits that failed; a level that lost any is not ranked.
+        places: factor whose levels are answered one by one, and its levels (see `effects.contrasts_of`).
+    """
+    found, failed = [], tuple(lost)
+    many = [factor for factor in factors if len(factor.levels) > ALL_PAIRS and quantity.better != "none"]
+    for factor in many:
+        for where in places_of(factor, *places):
+            # Levels are ranked by their differences from the reference, each on the runs that both have.
+            own = [Contrast(factor.path, before, after, where=where) for before, after in factor.pairs()]
+            effects = effects_of(own, quantity, observations, failed)
+            means = {effect.after: effect.estimate.mean for effect in effects if not effect.lost[1]}
+            means |= {} if any(effect.lost[0] for effect in effects) else {factor.reference: 0.0}
+            known = [level for level, mean in means.items() if math.isfinite(mean)]
+            first, second = (*sorted(known, key=lambda level: quantity.sort_key(means[level])), "", "")[:2]
+            if second and factor.reference not in (first, second):  # with which all are compared anyway
+                words = factor.named(second, first) or contrast_words(factor.path, second, first)
+                found.append(Contrast(factor.path, second, first, where=where, name=f"best against next: {words}"))
+    return found
 
 
 def _p(effect: Effect) -> float | None:
