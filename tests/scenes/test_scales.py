@@ -56,6 +56,16 @@ def test_a_scene_that_was_opened_is_opened_at_the_smaller_size(scene: Scene, mon
     assert asked == [("bricks", SceneOptions(size=12, test_views=5))]
 
 
+def test_pictures_of_several_sizes_are_each_scaled(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Opened again, all would have at most the largest one's new size: the small ones would stay as they are."""
+    monkeypatch.setattr(scales, "source_of", lambda scene: SceneSource("bricks", SceneOptions()))
+    monkeypatch.setattr(scales, "open_scene", lambda spec, options: pytest.fail("opened again"))
+    large = toy_scene(views=3, size=48)
+    mixed = scene.with_views(train=(scene.train[0], large.train[1]), test=(large.test[0],), val=(large.test[1],))
+    smaller = scene_at(mixed, 2)
+    assert [view.camera.width for view in (*smaller.train, *smaller.val, *smaller.test)] == [12, 24, 24, 24]
+
+
 def test_scores_at_a_scale_are_those_of_smaller_pictures(scene: Scene) -> None:
     ball = Sphere(9.0, 0.6, colour=(0.2, 0.5, 0.7))
     model = Model(ball, Volumetric(StratifiedConfig(16).build(scene)), scene.bounds)

@@ -32,9 +32,10 @@ def check_scales(scales: tuple[int, ...], name: str) -> None:
 def scene_at(scene: Scene, divisor: int) -> Scene:
     """The scene with all views 1/``divisor`` as large, in the same order.
 
-    A scene that was opened is opened again at that size. A rendered one is then a rendering at that size, or the mean of a
-    larger one's linear light, which is the same (see `invgraphics.scenes.mitsuba.average`), with depth and normals of that
-    size; photographs are averaged over each new pixel's area.
+    A scene that was opened is opened again at that size, unless its pictures have several: a size to open is one for all. A
+    rendered one is then a rendering at that size, or the mean of a larger one's linear light, which is the same (see
+    `invgraphics.scenes.mitsuba.average`), with depth and normals of that size; photographs are averaged over each new pixel's
+    area.
 
     Raises:
         InputError: pictures would be smaller than `SMALLEST` pixels.
@@ -48,11 +49,13 @@ def scene_at(scene: Scene, divisor: int) -> Scene:
             f"The least is {SMALLEST}: leave that scale away, or give a larger --size.",
         )
     source = source_of(scene)
-    if source is not None:
-        smaller = open_scene(source.spec, replace(source.options, size=max(sides) // divisor))
+    longest = {max(view.camera.width, view.camera.height) for view in (*scene.train, *scene.val, *scene.test)}
+    if source is not None and len(longest) == 1:
+        smaller = open_scene(source.spec, replace(source.options, size=longest.pop() // divisor))
         return replace(smaller, bounds=scene.bounds, world_from_local=scene.world_from_local)
-    train, test = (tuple(_smaller(view, divisor) for view in views) for views in (scene.train, scene.test))
-    return scene.with_views(train=train, test=test)
+    return scene.with_views(
+        **{name: tuple(_smaller(view, divisor) for view in getattr(scene, name)) for name in ("train", "val", "test")}
+    )
 
 
 def _smaller(view: View, divisor: int) -> View:
