@@ -26,6 +26,7 @@ from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.testing import TwoBalls, toy_scene
 from invgraphics.tools.conversions import (
+    TARGETS,
     quaternions_to,
     surface_points,
     to_gaussians,
@@ -122,6 +123,15 @@ class Tinted(TwoBalls):
         )
 
 
+class Faint(TwoBalls):
+    """The balls as thin fog."""
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        values = super().query(samples, want)
+        assert values.density is not None
+        return FieldValues(density=1e-4 * values.density, radiance=values.radiance)
+
+
 def lattice_settings(size: int) -> list[str]:
     return [f"field.encoding.resolution={size}", f"field.appearance.resolution={size}", "hooks=[]"]
 
@@ -157,6 +167,22 @@ def test_a_mesh_is_the_surface_of_the_density(scene: Scene) -> None:
     assert float(distance.max()) < 0.05  # a voxel
     shown = Model(field, method.recipe.renderer.build(scene), scene.bounds)
     assert psnr(shown, model_of(balls, scene), scene) > 17
+
+
+def test_a_density_too_faint_for_a_mesh_is_told_what_convert_can_do(scene: Scene) -> None:
+    method = load_method("surface/mesh", "laptop", ["field.source='run'", "field.resolution=16"])
+    with pytest.raises(InputError, match="has no level") as caught:
+        to_mesh(model_of(Faint(), scene), scene, method, 16)
+    assert "--set field.level=" in caught.value.remedy and " --level" not in caught.value.remedy
+
+
+def test_help_names_the_sizes_that_are_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main.run(["convert", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert ConvertRequest(run=Path("a"), to="points", out=Path("b")).target.size == 15_000
+    for target in TARGETS.values():
+        assert not target.size or f"{target.size:,} " in shown
 
 
 def test_a_converted_run_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,6 +11,10 @@ from tyro.conf import Positional, UseAppendAction, arg
 from invgraphics.cli.output import show_table
 from invgraphics.recipes.recipe import presets
 from invgraphics.runs.folder import check_run
+from invgraphics.tools import CONVERSION_SIZES
+
+SIZES = ", ".join(f"{count:,} {what}" for count, what in CONVERSION_SIZES.values())
+"""The default sizes in words, which no help text repeats by hand."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,19 +24,18 @@ class Convert:
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of a run."""
     to: Annotated[str, arg(metavar="gaussians|lattice|mesh|mpi|points")]
-    """What to make: Gaussians on the surfaces that training views see; a voxel grid of density and spherical harmonics; the
-    mesh of an isosurface; or a multi-plane image, for scenes seen from one side. All but the first need a density, or a mesh
-    a distance."""
+    """What to make: Gaussians or neural points on the surfaces that training views see; a voxel grid of density and spherical
+    harmonics; the mesh of an isosurface; or a multi-plane image, for scenes seen from one side. All but Gaussians and points
+    need a density, or a mesh a distance."""
     out: Annotated[Path, arg(metavar="RUN2")]
     """Folder of the new run."""
     method: Annotated[str, arg(metavar="METHOD", help_behavior_hint="(default: one that suits the target)")] = ""
     """Method whose field is made, and which refits it."""
     refit: Annotated[str, arg(metavar="10s|500steps")] = "10s"
     """Budget of the refit."""
-    size: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 20000 Gaussians, 96 vertices, 128 voxels)")] = (
-        None
-    )
-    """Number of Gaussians, or of vertices or voxels along the longest edge of a lattice or of what a mesh is cut from."""
+    size: Annotated[int | None, arg(metavar="N", help_behavior_hint=f"(default: {SIZES})")] = None
+    """Number of Gaussians or points, or of vertices or voxels along the longest edge of a lattice or of what a mesh is cut
+    from."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
     """Change one value of the method's recipe."""
     seed: int = 0

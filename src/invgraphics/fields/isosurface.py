@@ -26,6 +26,8 @@ LIPSCHITZ = 2.0
 """Bound on the gradient of a fitted distance: blocks with centres farther away than this times their radius are uniform."""
 CHUNK = 1 << 16
 """Points that are handed to the field at once."""
+REMEDY = "Fit it for longer."
+"""What to do about a volume without the level; callers with a level of their own to choose say so."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,7 @@ def default_level(bounds: Bounds) -> float:
 
 
 @torch.no_grad()
-def extract_mesh(field: Field, bounds: Bounds, resolution: int, level: float | None = None) -> Extracted:
+def extract_mesh(field: Field, bounds: Bounds, resolution: int, level: float | None = None, remedy: str = REMEDY) -> Extracted:
     """Extract an isosurface of a field's signed distance, or else of its density, closed at the box.
 
     Vertices have normals, and, where the field has radiance, the colour that is seen from outside along the normal.
@@ -86,6 +88,7 @@ def extract_mesh(field: Field, bounds: Bounds, resolution: int, level: float | N
         bounds: what is looked at.
         resolution: voxels along the longest edge.
         level: density per local unit (``None``: `default_level`), or signed distance (``None``: 0).
+        remedy: what the user can do where the level is nowhere.
 
     Raises:
         InputError: the field has neither density nor signed distance, or nowhere the level.
@@ -103,7 +106,7 @@ def extract_mesh(field: Field, bounds: Bounds, resolution: int, level: float | N
         level = default_level(bounds) if level is None else level
         volume, what, outside = _densities(field, grid), "The density", 0.0
     volume = torch.nn.functional.pad(volume, (1,) * 6, value=outside)
-    vertices, faces = marching_cubes(volume, level, what)
+    vertices, faces = marching_cubes(volume, level, what, remedy)
     extracted = without_specks(Mesh(grid.origin + grid.step * (vertices.to(grid.origin) - 1), faces.to(grid.origin.device)))
     return replace(extracted, mesh=with_attributes(extracted.mesh, field))
 
@@ -152,13 +155,16 @@ def _sdf(field: Field, grid: VoxelGrid, flat: Int[Tensor, " n"]) -> Float[Tensor
     return torch.cat(parts)
 
 
-def marching_cubes(volume: Float[Tensor, "x y z"], level: float, what: str) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
+def marching_cubes(
+    volume: Float[Tensor, "x y z"], level: float, what: str, remedy: str = REMEDY
+) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     """Marching cubes (Lewiner et al. 2003): isosurface around values above the level.
 
     Args:
         volume: values at voxel centres.
         level: of the surface.
         what: the volume's name, for the sentence of an error.
+        remedy: what the user can do, for its second line.
 
     Returns:
         Vertices, in voxels, and outward faces.
@@ -172,7 +178,7 @@ def marching_cubes(volume: Float[Tensor, "x y z"], level: float, what: str) -> t
     if min(values.shape) < 2 or not values.min() < level < values.max():
         raise InputError(
             f"{what} has no level {abs(level):.4g}: it runs from {abs(values).min():.4g} to {abs(values).max():.4g}.",
-            "Choose another --level, or fit for longer.",
+            remedy,
         )
     # "ascent" turns its triangles outwards for objects that are higher than what is around them.
     vertices, faces, *_ = march(values, level, gradient_direction="ascent", allow_degenerate=False)

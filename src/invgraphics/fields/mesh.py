@@ -74,7 +74,8 @@ class MeshFieldConfig:
         if Quantity.MESH in source.provides:
             mesh: Mesh = source.primitives(Quantity.MESH, Context(scene.bounds))
         elif (Quantity.SDF | Quantity.DENSITY) & source.provides:
-            mesh = extract_mesh(source, scene.bounds, self.resolution, self.level).mesh
+            remedy = "Say --set field.level=LEVEL, or fit the run that the mesh is made of for longer."
+            mesh = extract_mesh(source, scene.bounds, self.resolution, self.level, remedy).mesh
         else:
             remedy = "Export it with `invgraphics export RUN --to mesh` first, and give that file as field.source."
             raise InputError(f"field.source: {type(source).__name__} has no density whose surface could be extracted.", remedy)

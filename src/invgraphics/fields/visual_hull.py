@@ -55,7 +55,8 @@ def visual_hull(scene: Scene, resolution: int) -> Extracted:
             coverage[part] = torch.where(inside, torch.minimum(coverage[part], alpha), coverage[part])
             seen[part] |= inside
     volume = pad(torch.where(seen, coverage, 0.0).view(grid.shape), (1,) * 6)
-    vertices, faces = marching_cubes(volume, 0.5, "The visual hull of the training views")
+    remedy = "Check the photographs' transparency and poses, or say --set field.source=RUN."
+    vertices, faces = marching_cubes(volume, 0.5, "The visual hull of the training views", remedy)
     return without_specks(Mesh(grid.origin + grid.step * (vertices - 1), faces))
 
 

@@ -27,6 +27,7 @@ from invgraphics.fields.planes import PlanesConfig
 from invgraphics.fields.points.field import PointField, PointFieldConfig
 from invgraphics.fields.slicing import slice_density
 from invgraphics.recipes.recipe import Method
+from invgraphics.tools import CONVERSION_SIZES
 
 CHUNK = 1 << 16
 FLATNESS = 0.3
@@ -273,17 +274,23 @@ class Target:
     overrides: tuple[str, ...] = ()
 
 
+def _size(to: str) -> int:
+    return CONVERSION_SIZES[to][0]
+
+
 TARGETS = {
-    "gaussians": Target("splatting/gaussians", "surface points with normals", 10_000, to_gaussians, QUICK_RATES),
+    "gaussians": Target("splatting/gaussians", "surface points with normals", _size("gaussians"), to_gaussians, QUICK_RATES),
     "lattice": Target(
         "volumetric/plenoxels",
         "density and colour",
-        96,
+        _size("lattice"),
         to_lattice,
         ("field.encoding.resolution={size}", "field.appearance.resolution={size}", "hooks=[]"),
     ),
-    "mesh": Target("surface/mesh", "density or distance", 128, to_mesh, ("field.source='{run}'", "field.resolution={size}")),
+    "mesh": Target(
+        "surface/mesh", "density or distance", _size("mesh"), to_mesh, ("field.source='{run}'", "field.resolution={size}")
+    ),
     "mpi": Target("planes/mpi", "density and colour", 0, to_planes, ("field.init='uniform'",)),
-    "points": Target("volumetric/point-nerf", "surface points with normals", 15_000, to_points),
+    "points": Target("volumetric/point-nerf", "surface points with normals", _size("points"), to_points),
 }
 """Targets by the name that ``convert --to`` takes."""

@@ -76,7 +76,8 @@ def _own_mesh(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
 def _marching_cubes(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
     """Extract the surface by marching cubes; also names the method in words."""
     bounds = fitted.model.bounds
-    extracted = extract_mesh(fitted.model.field, bounds, request.resolution, request.level)
+    remedy = "Choose another --level, or fit for longer."
+    extracted = extract_mesh(fitted.model.field, bounds, request.resolution, request.level, remedy)
     if Quantity.SDF in fitted.model.field.provides:
         return extracted, f"signed distance {request.level or 0:g}, {request.resolution} voxels along the longest edge"
     level = default_level(bounds) if request.level is None else request.level
