@@ -9,6 +9,7 @@ import pytest
 import torch
 from training_fixtures import SMALL
 
+from invgraphics.core import Camera, Model, Rendering
 from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import open_fitted
@@ -155,6 +156,27 @@ def test_paths_become_films(run: Path, tmp_path: Path, path) -> None:
     assert frames.shape == (6, 24, 24, 3)
     # A sixth of the path on: a closed spiral of two turns is back at its first camera half-way.
     assert float(np.abs(frames[0].astype(float) - frames[1]).mean()) > 0.5
+
+
+@pytest.mark.parametrize("size", [(64, 32), (16, 48), (24, 24)])
+def test_films_of_another_shape_are_not_stretched(run: Path, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """They show the square photograph's view in their middle, and more along the longer side."""
+    seen: list[Camera] = []
+
+    def render(model: Model, camera: Camera, **more: bool) -> Rendering:
+        seen.append(camera)
+        empty = torch.zeros(camera.height, camera.width)
+        return Rendering(torch.zeros(*empty.shape, 3), empty, empty)
+
+    own = open_fitted(run).in_its_frame().scene.test[0].camera
+    monkeypatch.setattr(Model, "render", render)
+    film(FilmRequest(run, run.parent / "shaped.mp4", "orbit", frames=2, size=size))
+    scale = min(size) / 24
+    for camera in seen:
+        assert (camera.width, camera.height) == size
+        torch.testing.assert_close(camera.focal, own.focal * scale)
+        torch.testing.assert_close(camera.centre - torch.tensor(size) / 2, (own.centre - 12) * scale)
+    assert len(seen) == 2
 
 
 def test_bad_requests_are_refused(run: Path, toy_folder: Path, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ class FilmRequest:
         frames: pictures of a path; a time-lapse has one for each snapshot. ``None`` for 90, or as many as a camera path's
             duration holds.
         rate: pictures per second.
-        size: of the pictures, the longest side or (width, height); ``None`` for the run's own.
+        size: of the pictures, the longest side or (width, height), which may have another shape; ``None`` for the run's own.
         view: test view that a time-lapse shows.
         scene: another copy of the run's scene.
         show: colours, depth, or normals; a time-lapse shows colours.
@@ -181,13 +181,20 @@ def _ellipsoids(fitted: Fitted, camera: Camera) -> np.ndarray:
 
 
 def _sized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
-    """Resize a camera; one number is the longest side in pixels."""
+    """Resize a camera; one number is the longest side in pixels.
+
+    Pixels keep their shape: a picture of another shape than the photograph's shows all that this does in its middle, and more
+    along the side that is longer beside the other.
+    """
     if size is None:
         return camera
-    if isinstance(size, tuple):
-        return camera.resized(*size)
-    scale = size / max(camera.width, camera.height)
-    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    if isinstance(size, int):
+        scale = size / max(camera.width, camera.height)
+        return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    new, old = camera.focal.new_tensor(size), camera.focal.new_tensor([camera.width, camera.height])
+    scale = (new / old).min()
+    centre = new / 2 + (camera.centre - old / 2) * scale
+    return replace(camera, focal=camera.focal * scale, centre=centre, width=size[0], height=size[1])
 
 
 class FilmWriter:
