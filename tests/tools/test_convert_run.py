@@ -179,10 +179,10 @@ def test_a_density_too_faint_for_a_mesh_is_told_what_convert_can_do(scene: Scene
 def test_help_names_the_sizes_that_are_taken(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main.run(["convert", "--help"])
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    shown = capsys.readouterr().out
     assert ConvertRequest(run=Path("a"), to="points", out=Path("b")).target.size == 15_000
     for target in TARGETS.values():
-        assert not target.size or f"{target.size:,} " in shown
+        assert not target.size or str(target.size) in shown
 
 
 def test_a_converted_run_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

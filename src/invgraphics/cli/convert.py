@@ -13,8 +13,8 @@ from invgraphics.recipes.recipe import presets
 from invgraphics.runs.folder import check_run
 from invgraphics.tools import CONVERSION_SIZES
 
-SIZES = ", ".join(f"{count:,} {what}" for count, what in CONVERSION_SIZES.values())
-"""The default sizes in words, which no help text repeats by hand."""
+SIZES = ", ".join(f"{count} {what}" for count, what in CONVERSION_SIZES.values())
+"""The default sizes in words, without commas in the numbers: help texts are wrapped there."""
 
 
 @dataclass(frozen=True, kw_only=True)
