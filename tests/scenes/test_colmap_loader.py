@@ -1,5 +1,6 @@
 """COLMAP models, written as text by hand and read back by the loader."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -165,6 +166,16 @@ def test_photographs_lie_beside_the_model_or_below(tmp_path: Path, place: str) -
         photo.rename(root / place / photo.name)
     scene = Colmap().load(root, SceneOptions())
     assert scene.name == "garden" and len(scene.train) + len(scene.test) == 9
+    assert_dots_are_found(scene)
+
+
+def test_the_fullest_folder_of_photographs_is_taken(tmp_path: Path) -> None:
+    root = mixed(tmp_path / "garden")
+    (root / "images").rename(root / "input")
+    (root / "images").mkdir()
+    shutil.copy(root / "input" / "04.png", root / "images" / "04.png")
+    scene = Colmap().load(root, SceneOptions())
+    assert len(scene.train) + len(scene.test) == 9
     assert_dots_are_found(scene)
 
 

@@ -13,7 +13,16 @@ from PIL import Image, ImageOps
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import Photo, area_resize, image_size, load_view, match_sizes, read_pixels, wanted_size
+from invgraphics.scenes.images import (
+    Photo,
+    area_resize,
+    image_files,
+    image_size,
+    load_view,
+    match_sizes,
+    read_pixels,
+    wanted_size,
+)
 from invgraphics.scenes.lens import Lens, straighten, undistort
 
 
@@ -121,6 +130,12 @@ def test_truncated_png_is_named(tmp_path: Path) -> None:
         read_pixels(path)
     with pytest.raises(InputError, match=r"gone\.png does not exist"):
         read_pixels(tmp_path / "gone.png")
+
+
+def test_shadow_files_of_macos_are_no_photographs(tmp_path: Path) -> None:
+    for name in ("b.JPG", "._b.JPG", "a.png", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [path.name for path in image_files(tmp_path)] == ["a.png", "b.JPG"]
 
 
 def test_wanted_size() -> None:

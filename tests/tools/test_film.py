@@ -118,6 +118,22 @@ def test_spiral_stays_in_the_window_and_looks_at_the_subject() -> None:
     assert float(steps.max()) < 2 * float(steps.mean())
 
 
+def test_headings_that_cancel_leave_a_way_up() -> None:
+    """A drone that looks straight down and turns round at every other photograph."""
+    down = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    turned = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+    scene = toy_scene(views=4, size=8)
+    views = []
+    for index, x in enumerate((-0.6, -0.2, 0.2, 0.6)):
+        pose = down @ turned if index % 2 else down.clone()
+        pose[:3, 3] = torch.tensor([x, 0.0, 3.0])
+        views.append(replace(scene.train[0], camera=scene.train[0].camera.moved(pose)))
+    for path in (spiral, orbit):
+        for camera in path(scene.with_views(train=tuple(views)), 6):
+            rotation = camera.cam_to_world[:3, :3]
+            torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
+
+
 def test_film_says_why_it_takes_its_path(run: Path, tmp_path: Path, capsys) -> None:
     film(FilmRequest(run, tmp_path / "new" / "folder" / "a.mp4", frames=2))
     assert (tmp_path / "new" / "folder" / "a.mp4").is_file()

@@ -113,11 +113,9 @@ def _read(folder: Path) -> Model:
         names = [image.name for image in bare.registered]
     except UnicodeDecodeError as error:
         raise InputError(f"The COLMAP model {folder} has an image whose name is no text in UTF-8.", "Rename it.") from error
-    for images in _image_folders(folder):
-        present = _present(images, names)
-        if present:
-            return replace(bare, images=images, present=present)
-    return bare
+    candidates = [replace(bare, images=images, present=_present(images, names)) for images in _image_folders(folder)]
+    fullest = max(candidates, key=lambda model: model.present, default=bare)  # of equal ones, the nearest
+    return fullest if fullest.present else bare
 
 
 def _present(folder: Path, names: Sequence[str]) -> int:

@@ -49,10 +49,10 @@ class Photo:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """List the photographs directly in ``folder``, sorted by name."""
+    """List the photographs directly in ``folder``, sorted by name, without macOS's `._` files of the same names."""
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith("._"))
 
 
 def file_exists(path: Path) -> bool:

@@ -20,6 +20,8 @@ STOPS = 8
 """Photographs that an interpolated path comes by."""
 WIDEST_GAP = 120.0
 """Degrees of azimuth without a camera up to which cameras surround what they look at."""
+LEAST_UP = 1e-3
+"""Length of the mean of unit directions up to which they cancel."""
 ONE_WAY = 30.0
 """Degrees from the mean viewing direction within which nine cameras in ten of a forward-facing capture look."""
 SPIRAL_TURNS = 2
@@ -66,7 +68,9 @@ def _axis(cameras: Sequence[Camera], column: int) -> Float[Tensor, "n 3"]:
 
 
 def _mean_up(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
-    return torch.nn.functional.normalize(-_axis(cameras, 1).mean(dim=0), dim=0)
+    """Mean upward direction; the first camera's where headings cancel, as of a drone that looks straight down."""
+    mean = -_axis(cameras, 1).mean(dim=0)
+    return torch.nn.functional.normalize(mean if float(mean.norm()) > LEAST_UP else -cameras[0].cam_to_world[:3, 1], dim=0)
 
 
 def _widest_gap(offset: Float[Tensor, "n 3"], up: Float[Tensor, " 3"]) -> float:

@@ -142,7 +142,7 @@ def _files(folder: Path, skipped: dict[str, str]) -> list[_Source]:
         suffix = path.suffix.lower()
         if suffix in RAW:
             skipped[path.name] = "raw sensor data; export it as JPEG or PNG"
-        elif suffix in SUFFIXES + PHONE and path.is_file():
+        elif suffix in SUFFIXES + PHONE and path.is_file() and not path.name.startswith("._"):
             exif = _exif(path)
             group = "/".join(str(exif.get(tag, "")) for tag in _LENS_TAGS)
             found.append(_Source(path.name, lambda path=path: read_pixels(path), group, _focal_share(path)))
