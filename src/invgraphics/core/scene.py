@@ -21,7 +21,7 @@ from invgraphics.core.scan import Scan
 
 Pixels = UInt8[Tensor, "h w c"] | Float[Tensor, "h w c"]
 
-ONE_PLACE = 0.01
+LEAST_SPREAD = 0.01
 """Spread of cameras over the bounds' radius up to which they stand in one place."""
 
 
@@ -183,7 +183,7 @@ class Scene:
         """
         positions = torch.stack([view.camera.position for view in self.train])
         spread = float((positions - positions.mean(0)).norm(dim=1).max())
-        return 1.1 * (spread if spread > ONE_PLACE * self.bounds.radius else self.bounds.radius)
+        return 1.1 * (spread if spread > LEAST_SPREAD * self.bounds.radius else self.bounds.radius)
 
     def with_views(self, **views: tuple[View, ...]) -> Scene:
         """The same scene with other views for ``train``, ``val`` or ``test``."""

@@ -91,8 +91,7 @@ class Frames:
         focal, centre = [fx, fy], [width / 2 if cx is None else cx, height / 2 if cy is None else cy]
         number = torch.float64
         camera = Camera(cam_to_world, torch.tensor(focal, dtype=number), torch.tensor(centre, dtype=number), width, height)
-        name = self._text(index).replace("\\", "/").removeprefix("./")
-        return Photo(file, camera, name, self._lens(index, (*focal, *centre), (width, height)))
+        return Photo(file, camera, photo_name(self._text(index)), self._lens(index, (*focal, *centre), (width, height)))
 
     def _size(self, index: int, existing: Path | None) -> tuple[int, int]:
         """Width and height stated by the file, else of the first existing photograph."""
@@ -134,6 +133,11 @@ class Frames:
             remedy = "Known: OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL, RADIAL, FULL_OPENCV, PINHOLE, SIMPLE_PINHOLE."
             raise InputError(f"{self.path} has the camera model '{model}', which is not supported.", remedy)
         return None if lens.is_pinhole() else lens
+
+
+def photo_name(file_path: str) -> str:
+    """Name of the photograph at a ``file_path``, whichever way its folders are separated."""
+    return file_path.replace("\\", "/").removeprefix("./")
 
 
 def _find(folder: Path, file_path: str) -> Path:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.scenes.frames import Frames
+from invgraphics.scenes.frames import Frames, photo_name
 from invgraphics.scenes.images import Photo
 from invgraphics.scenes.layout import SceneOptions, Split, compose, every_eighth, existing_photos, scene_name
 from invgraphics.scenes.region import photo_frame
@@ -69,17 +69,15 @@ def _own_split(frames: Frames, listed: Sequence[Photo], photos: Sequence[Photo])
             f"{frames.path} lists {len(both)} photographs both to fit and to score, for instance '{both[0]}'.",
             f"A photograph may stand in one of {', '.join(_LISTS)}.",
         )
-    of = {"train": train, "test": scored, "val": val}
-    return Split(
-        **{key: [photo for photo in photos if photo.name in chosen] for key, chosen in of.items()}, rule="the file's own"
-    )
+    fitted, tested, watched = ([photo for photo in photos if photo.name in chosen] for chosen in (train, scored, val))
+    return Split(fitted, tested, watched, rule="the file's own")
 
 
 def _names(frames: Frames, key: str, known: set[str]) -> set[str]:
     names = frames.table[key]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"'{key}' of {frames.path} is not a list of file names.")
-    found = {name.replace("\\", "/").removeprefix("./") for name in names}
+    found = set(map(photo_name, names))
     if unknown := sorted(found - known):
         raise InputError(f"'{key}' of {frames.path} names '{unknown[0]}', which no frame has as its 'file_path'.")
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import ConvertedRun, Provenance
 from invgraphics.runs.scores import Scores
 from invgraphics.scenes.degrade import degrade
+from invgraphics.tables import inline_toml
 from invgraphics.text import sha256_of
 from invgraphics.tools.conversions import TARGETS, Target
 from invgraphics.training.fit import Fit
@@ -147,7 +147,7 @@ def _job(request: ConvertRequest, fitted: Fitted) -> Job:
     size = request.size or target.size
     options = provenance.options
     # The refit sees the photographs that the fit saw.
-    data = tuple(f"{DATA}{key}={json.dumps(value)}" for key, value in provenance.data.items())
+    data = tuple(f"{DATA}{key}={inline_toml(value)}" for key, value in provenance.data.items())
     return Job.of(
         FitRequest(
             scene=request.scene or provenance.scene,
