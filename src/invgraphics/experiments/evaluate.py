@@ -43,14 +43,26 @@ TIMED = 6
 """Test views that are timed where the truth has normals, at most: there the timed picture is one more than the scored one."""
 
 
+PICTURE_SECONDS = 0.2
+"""A picture that took longer is not tried at the next size to forecast the time of an evaluation."""
+
+
 def expected_seconds(model: Model, scene: Scene) -> float:
-    """Estimate the seconds to render all test views, extrapolated from one small picture of the unfitted model."""
+    """Estimate the seconds to render all test views, from pictures of the first one that grow while they are cheap.
+
+    A picture's cost has a part that does not grow with its pixels, and the first one's also has compilation.
+    """
     camera = scene.test[0].camera
-    small = camera.resized(max(8, camera.width // 8), max(8, camera.height // 8))
-    began = time.perf_counter()
-    model.render(small)
-    seconds = time.perf_counter() - began
-    return seconds * len(scene.test) * (camera.width * camera.height) / (small.width * small.height)
+    sizes = [(max(8, camera.width // divisor), max(8, camera.height // divisor)) for divisor in (8, 4, 2, 1)]
+    model.render(camera.resized(*sizes[0]))
+    pixels, seconds = 1, 0.0
+    for width, height in sizes:
+        began = time.perf_counter()
+        model.render(camera.resized(width, height))
+        pixels, seconds = width * height, time.perf_counter() - began
+        if seconds > PICTURE_SECONDS:
+            break
+    return seconds * len(scene.test) * (camera.width * camera.height) / pixels
 
 
 def evaluate(

@@ -1,4 +1,4 @@
-"""Cost forecast of a study, measured by two training steps and a small picture of each method."""
+"""Cost forecast of a study, measured by the first seconds of a fit and pictures of each method."""
 
 from __future__ import annotations
 
@@ -21,6 +21,12 @@ from invgraphics.training.fit import Fit
 
 START_SECONDS = 6.0
 """Until a process has loaded torch, the compiled kernels and a scene; measured on two laptop cores."""
+
+TRIAL_SECONDS = 3.0
+"""Of each method's fit, before its pictures are timed: occupancy grids begin full, and show their first picture ten times slower."""
+
+TRIAL_SHARE = 0.1
+"""Of a fit's budget, at most."""
 
 PIXEL_BYTES = 20
 """A test view's colour, alpha and normal (float16), depth (float32) and 8-bit picture, before compression."""
@@ -92,10 +98,7 @@ def try_method(job: Job, scene: Scene) -> Cost:
     shown = degrade(scene, job.data, seed)
     try:
         fit = Fit(build_plan(job.method, shown, job.budget, seed, device))
-        fit.step()  # the first compiles and allocates
-        began = time.perf_counter()
-        fit.step()
-        step = time.perf_counter() - began
+        step = _try_steps(fit)
         evaluation = expected_seconds(fit.plan.model, scene)
         for variant in job.variants:
             evaluation += expected_seconds(build_model(with_renderer(job.method, variant), scene, seed, device), scene)
@@ -105,6 +108,16 @@ def try_method(job: Job, scene: Scene) -> Cost:
     except (NumericalError, MemoryError, RuntimeError):  # its cell will fail with a sentence, and the others go on
         return Cost(0.0, START_SECONDS, 0)
     return Cost(step, START_SECONDS + evaluation, size + PIXEL_BYTES * pixels * (1 + len(job.variants)))
+
+
+def _try_steps(fit: Fit) -> float:
+    """Run the first steps of a fit, at least two; returns the mean seconds of a step after the first."""
+    fit.step()  # compiles and allocates
+    began, taken, spent = time.perf_counter(), 0, 0.0
+    while taken == 0 or (spent < TRIAL_SECONDS and fit.progress < TRIAL_SHARE):
+        fit.step()
+        taken, spent = taken + 1, time.perf_counter() - began
+    return spent / taken
 
 
 def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int, later: int = 0) -> Forecast:
