@@ -34,8 +34,9 @@ class GaussianFieldConfig:
     Attributes:
         sh_degree: degree of the colour's spherical harmonics, 0 to 3.
         count: random Gaussians where the scene has no points, or ``init`` is ``random``.
-        init: start from the scene's points, at random in its bounds, from the training views' depth maps, or from the
-            fitted ``field`` of the run that ``source`` names.
+        init: start from the scene's points, from points that multi-view ``stereo`` finds in the training photographs (see
+            `stereo_points`), at random in its bounds, from the training views' depth maps, or from the fitted ``field`` of the
+            run that ``source`` names.
         source: folder of a run of a density field on the same scene; for ``init = "field"``.
         max_init: most points to start from; a random subset if there are more.
         backdrop: in endless space, Gaussians that start behind the subject besides those, in the colours of opaque training
@@ -49,7 +50,7 @@ class GaussianFieldConfig:
 
     sh_degree: int = 3
     count: int = 10_000
-    init: Literal["scene", "random", "depth", "field"] = "scene"
+    init: Literal["scene", "stereo", "random", "depth", "field"] = "scene"
     source: str = ""
     max_init: int = 100_000
     backdrop: int = 0

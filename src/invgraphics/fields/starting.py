@@ -13,6 +13,7 @@ from invgraphics.core.bounds import Bounds
 from invgraphics.core.colour import srgb_to_linear
 from invgraphics.core.scene import Points, Scene, View
 from invgraphics.errors import InputError
+from invgraphics.fields.points.stereo import stereo_points
 
 NEIGHBOURS = 3
 """A Gaussian starts as wide as the mean distance to this many nearest neighbours (3DGS, §5.1)."""
@@ -22,6 +23,8 @@ FAR_REACH = 30.0
 """How far out those go, in half-extents of the box; log-uniformly, so that every shell gets its share."""
 BACKDROP_REACH = (1.5, 10.0)
 """How far from its camera a backdrop's point lies, over the distance of the subject; log-uniformly."""
+LEAST_MATCHED = 500
+"""Points that stereo must find for a start from them: fewer are chance."""
 SCALE_RANGE = (1e-5, 0.5)
 """Limits of a starting scale, relative to the scene's radius (or to the distance from its centre, where that is larger)."""
 
@@ -156,7 +159,8 @@ def initial_points(scene: Scene, init: str, count: int, most: int) -> Points:
 
     Args:
         scene: what is to be fitted.
-        init: ``depth`` for the training views' depth maps, ``scene`` for its own points where it has some; else random ones.
+        init: ``depth`` for the training views' depth maps, ``scene`` for its own points where it has some, ``stereo`` for those
+            that its photographs show or, if these are fewer than `LEAST_MATCHED`, as ``scene``; else random ones.
         count: number of random points.
         most: largest number of the others.
 
@@ -165,5 +169,7 @@ def initial_points(scene: Scene, init: str, count: int, most: int) -> Points:
     """
     if init == "depth":
         return depth_points(scene, most)
-    known = init == "scene" and scene.points is not None
+    if init == "stereo" and len(matched := stereo_points(scene, most)) >= min(LEAST_MATCHED, most):
+        return matched
+    known = init in ("scene", "stereo") and scene.points is not None
     return scene_points(scene, most) if known else random_points(scene.bounds, count)

@@ -23,7 +23,7 @@ START_SECONDS = 6.0
 """Until a process has loaded torch, the compiled kernels and a scene; measured on two laptop cores."""
 
 TRIAL_SECONDS = 3.0
-"""Of each method's fit, before its pictures are timed: occupancy grids begin full, and show their first picture ten times slower."""
+"""Of each fit, before its pictures are timed: occupancy grids begin full, with pictures ten times slower than later ones."""
 
 TRIAL_SHARE = 0.1
 """Of a fit's budget, at most."""

@@ -47,8 +47,9 @@ class PointFieldConfig:
         direction_degree: bands of spherical harmonics of the direction, 1 to 4.
         density_scale: density of a neighbour whose network says 1, per radius.
         confidence: of each point at the start, in (0, 1).
-        init: start from the scene's points, at random in its bounds, from the training views' depth maps, or from the fitted
-            ``field`` of the run that ``source`` names: centres of its Gaussians, or visible points of its density.
+        init: start from points that multi-view ``stereo`` finds in the training photographs (see `stereo_points`), from the
+            scene's points, at random in its bounds, from the training views' true depth maps, or from the fitted ``field`` of
+            the run that ``source`` names: centres of its Gaussians, or visible points of its density.
         source: folder of that run.
         count: random points where the scene has none, or ``init`` is ``random``.
         max_init: most points to start from; a random subset if there are more.
@@ -67,7 +68,7 @@ class PointFieldConfig:
     direction_degree: int = 4
     density_scale: float = 30.0
     confidence: float = 0.15
-    init: Literal["scene", "random", "depth", "field"] = "scene"
+    init: Literal["scene", "stereo", "random", "depth", "field"] = "scene"
     source: str = ""
     count: int = 10_000
     max_init: int = 100_000
