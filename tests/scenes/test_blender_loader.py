@@ -56,6 +56,19 @@ def test_dots_are_found_after_resizing(folder: Path) -> None:
     assert scene.notes["test_views"] == "2 of 4, evenly spaced"
 
 
+def test_an_angle_of_view_holds_for_photographs_of_other_sizes(folder: Path) -> None:
+    """Cameras have the size of their own photograph, not of the first: each dot is found in the enlarged one too."""
+    path = folder / "train" / "r_1.png"
+    with Image.open(path) as small:
+        small.resize((320, 240), Image.Resampling.BICUBIC).save(path)
+    scene = Blender().load(folder, SceneOptions())
+    camera = scene.train[1].camera
+    assert (camera.width, camera.height) == (320, 240)
+    assert camera.focal.tolist() == pytest.approx([2 * FOCAL, 2 * FOCAL], rel=1e-5)
+    assert camera.centre.tolist() == pytest.approx([160.0, 120.0])
+    assert scene.train[0].camera.width == 160
+
+
 @pytest.mark.parametrize(("size", "place"), [(25.0, (300.0, -120.0, 40.0)), (0.02, (0.3, 0.1, -0.2)), (1.0, (5.0, -3.0, 2.0))])
 def test_exports_of_any_size_and_place_get_a_box_of_one_size(
     folder: Path, size: float, place: tuple[float, float, float]
@@ -121,9 +134,9 @@ def test_no_test_split_is_a_sentence(folder: Path) -> None:
         Blender().load(folder, SceneOptions())
 
 
-def test_unequal_sizes_are_a_sentence(folder: Path) -> None:
-    save(np.zeros((60, 80, 4), np.uint8), folder / "train" / "r_1.png")
-    with pytest.raises(InputError, match=r"r_1\.png has 80x60 pixels, which is scaled unlike r_0\.png"):
+def test_unequal_shapes_are_a_sentence(folder: Path) -> None:
+    save(np.zeros((80, 60, 4), np.uint8), folder / "train" / "r_1.png")
+    with pytest.raises(InputError, match=r"r_1\.png has 60x80 pixels and r_0\.png 160x120: one angle of view cannot"):
         Blender().load(folder, SceneOptions())
 
 

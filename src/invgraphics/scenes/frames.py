@@ -60,8 +60,8 @@ class Frames:
             InputError: a key is missing or a value unusable; the sentence names the file, the frame and the key.
         """
         files = [_find(self.path.parent, self._text(index)) for index in range(len(self.frames))]
-        existing = next((file for file in files if file_exists(file)), None)
-        return [self._photo(index, file, existing) for index, file in enumerate(files)]
+        first = next((file for file in files if file_exists(file)), None)
+        return [self._photo(index, file, first) for index, file in enumerate(files)]
 
     def _where(self, index: int) -> str:
         return f"{self.path}, frame {index} ('{self.frames[index].get('file_path', '?')}')"
@@ -81,11 +81,11 @@ class Frames:
             raise InputError(f"'{key}' of {self._where(index)} is {value!r}, not a finite number.")
         return float(value)
 
-    def _photo(self, index: int, file: Path, existing: Path | None) -> Photo:
+    def _photo(self, index: int, file: Path, first: Path | None) -> Photo:
         if "transform_matrix" not in self.frames[index]:
             raise InputError(f"{self._where(index)} has no 'transform_matrix'.")
         cam_to_world = opengl_to_opencv(pose(self.frames[index]["transform_matrix"], self._where(index)))
-        width, height = self._size(index, existing)
+        width, height = self._size(index, file, first)
         fx, fy = self._focal(index, width, height)
         cx, cy = self._number(index, "cx"), self._number(index, "cy")
         focal, centre = [fx, fy], [width / 2 if cx is None else cx, height / 2 if cy is None else cy]
@@ -93,11 +93,19 @@ class Frames:
         camera = Camera(cam_to_world, torch.tensor(focal, dtype=number), torch.tensor(centre, dtype=number), width, height)
         return Photo(file, camera, photo_name(self._text(index)), self._lens(index, (*focal, *centre), (width, height)))
 
-    def _size(self, index: int, existing: Path | None) -> tuple[int, int]:
-        """Width and height stated by the file, else of the first existing photograph."""
+    def _size(self, index: int, file: Path, first: Path | None) -> tuple[int, int]:
+        """Width and height stated by the file, else of the frame's photograph, or where that is missing of the first one."""
         w, h = self._number(index, "w"), self._number(index, "h")
         if w is None or h is None:
-            return stored_size(existing) if existing is not None else (1, 1)
+            if first is None:
+                return 1, 1
+            like = stored_size(first)
+            width, height = stored_size(file) if file_exists(file) else like
+            if self._number(index, "fl_x") is None and abs(width * like[1] - height * like[0]) > max(width, height, *like):
+                sizes = f"{width}x{height} pixels and {first.name} {like[0]}x{like[1]}"
+                remedy = "Give each frame its 'w', 'h' and 'fl_x'."
+                raise InputError(f"{file} has {sizes}: one angle of view cannot be that of both shapes.", remedy)
+            return width, height
         if not (1 <= w <= LONGEST_SIDE and 1 <= h <= LONGEST_SIDE):
             raise InputError(f"'w' and 'h' of {self._where(index)} are {w:g} and {h:g}, not a size in pixels.")
         return round(w), round(h)

@@ -44,7 +44,8 @@ class RecipeCheck:
         if not self.runs:
             return f"{self.folder}: holds no run whose recipe can be compared."
         if self.current:
-            return f"{self.folder}: all {self.runs} runs were made by today's recipes."
+            runs = "its one run was" if self.runs == 1 else f"all {self.runs} runs were"
+            return f"{self.folder}: {runs} made by today's recipes."
         reasons = "; ".join(f"{method} ({why})" for method, why in self.stale.items())
         return f"{self.folder}: made by other recipes than today's: {reasons}."
 
