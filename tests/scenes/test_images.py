@@ -13,17 +13,10 @@ from PIL import Image, ImageOps
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import (
-    Photo,
-    area_resize,
-    image_files,
-    image_size,
-    load_view,
-    match_sizes,
-    read_pixels,
-    wanted_size,
-)
-from invgraphics.scenes.lens import Lens, straighten, undistort
+from invgraphics.scenes.pictures.images import Photo, image_files, image_size, match_sizes, read_pixels
+from invgraphics.scenes.pictures.lens import Lens, straighten, undistort
+from invgraphics.scenes.pictures.resize import area_resize, wanted_size
+from invgraphics.scenes.pictures.views import load_view
 
 
 def camera(width: int, height: int) -> Camera:

@@ -6,7 +6,7 @@ import sys
 SCRIPT = """
 import os, signal, time
 signal.signal(signal.SIGTERM, signal.default_int_handler)
-from invgraphics.scenes.lens import Lens
+from invgraphics.scenes.pictures.lens import Lens
 assert Lens("PINHOLE", (8.0, 8.0, 4.0, 4.0), 8, 8).is_pinhole()
 try:
     os.kill(os.getpid(), signal.SIGTERM)

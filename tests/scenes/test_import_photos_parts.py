@@ -12,12 +12,12 @@ from dots import save
 from PIL import Image
 
 from invgraphics.errors import InputError
-from invgraphics.scenes.lens import Lens
 from invgraphics.scenes.photos import PhotoJob
 from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
 from invgraphics.scenes.photos.prepare import Preparation, natural, prepare
 from invgraphics.scenes.photos.result import max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
+from invgraphics.scenes.pictures.lens import Lens
 from invgraphics.scenes.process import run_worker
 
 

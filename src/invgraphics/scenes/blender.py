@@ -6,8 +6,8 @@ from pathlib import Path
 
 from invgraphics.core import Scene
 from invgraphics.scenes.frames import Frames
-from invgraphics.scenes.images import Photo
 from invgraphics.scenes.layout import SceneOptions, Split, compose, evenly, existing_photos
+from invgraphics.scenes.pictures.images import Photo
 from invgraphics.scenes.region import BOX_HALF, photo_frame
 
 _VAL_VIEWS = 4  # looked at during a fit, never scored

@@ -13,10 +13,11 @@ from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap_workspace import find_model, model_folders
-from invgraphics.scenes.images import Photo
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, existing_photos, scene_name
-from invgraphics.scenes.lens import Lens
 from invgraphics.scenes.photos.notes import pose_notes
+from invgraphics.scenes.pictures.images import Photo
+from invgraphics.scenes.pictures.lens import Lens
+from invgraphics.scenes.pictures.masks import with_masks_beside
 from invgraphics.scenes.poses import pose
 from invgraphics.scenes.region import photo_frame
 
@@ -41,7 +42,8 @@ class Colmap:
         """
         model = find_model(path)
         folder = model.images or path
-        photos, notes = existing_photos([_photo(image, folder) for image in model.registered], model.folder)
+        listed = with_masks_beside([_photo(image, folder) for image in model.registered], folder)
+        photos, notes = existing_photos(listed, model.folder)
         notes |= {
             "loader": "colmap",
             "points": f"{model.reconstruction.num_points3D()} from SfM on all photographs, those that are scored too",

@@ -9,8 +9,8 @@ from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap_sizes import check_sizes
-from invgraphics.scenes.images import file_exists
 from invgraphics.scenes.layout import IMAGE_FOLDERS, is_image_folder
+from invgraphics.scenes.pictures.images import file_exists
 
 PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse", "colmap/sparse/*", ".", "[0-9]")
 UNDISTORTED = ("dense/sparse", "dense/*/sparse", "undistorted/sparse", "[0-9]/sparse", "dense/*", "dense")

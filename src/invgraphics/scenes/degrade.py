@@ -21,7 +21,7 @@ from torch import Tensor
 from invgraphics.core import Points, Scene, View
 from invgraphics.core.colour import linear_to_srgb, srgb_to_linear
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import wanted_size
+from invgraphics.scenes.pictures.resize import wanted_size
 from invgraphics.scenes.scales import check_scales, like, resized_view, scene_at
 from invgraphics.scenes.silhouettes import points_inside
 

@@ -14,8 +14,8 @@ from invgraphics.core import Camera
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import focal_from_fov, opengl_to_opencv
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import SUFFIXES, Photo, file_exists, stored_size
-from invgraphics.scenes.lens import Lens
+from invgraphics.scenes.pictures.images import SUFFIXES, Photo, file_exists, stored_size
+from invgraphics.scenes.pictures.lens import Lens
 from invgraphics.scenes.poses import pose
 from invgraphics.tables import read_json
 
@@ -67,9 +67,12 @@ class Frames:
         return f"{self.path}, frame {index} ('{self.frames[index].get('file_path', '?')}')"
 
     def _text(self, index: int) -> str:
-        value = self.frames[index].get("file_path")
+        return self._path(index, "file_path")
+
+    def _path(self, index: int, key: str) -> str:
+        value = self.frames[index].get(key)
         if not isinstance(value, str) or not value.strip("./\\") or "\0" in value or len(value) > _LONGEST_PATH:
-            raise InputError(f"{self.path}, frame {index}, has no 'file_path' that could be one.")
+            raise InputError(f"{self.path}, frame {index}, has no '{key}' that could be one.")
         return value
 
     def _number(self, index: int, key: str) -> float | None:
@@ -91,7 +94,14 @@ class Frames:
         focal, centre = [fx, fy], [width / 2 if cx is None else cx, height / 2 if cy is None else cy]
         number = torch.float64
         camera = Camera(cam_to_world, torch.tensor(focal, dtype=number), torch.tensor(centre, dtype=number), width, height)
-        return Photo(file, camera, photo_name(self._text(index)), self._lens(index, (*focal, *centre), (width, height)))
+        lens = self._lens(index, (*focal, *centre), (width, height))
+        return Photo(file, camera, photo_name(self._text(index)), lens, mask=self._mask(index))
+
+    def _mask(self, index: int) -> Path | None:
+        """The frame's ``mask_path`` (nerfstudio)."""
+        if self.frames[index].get("mask_path") is None:
+            return None
+        return self.path.parent / self._path(index, "mask_path").replace("\\", "/")
 
     def _size(self, index: int, file: Path, first: Path | None) -> tuple[int, int]:
         """Width and height stated by the file, else of the frame's photograph, or where that is missing of the first one."""

@@ -17,8 +17,8 @@ from invgraphics.core import Bounds, Camera, Scene
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
 from invgraphics.scenes.dtu import find_scan
-from invgraphics.scenes.images import Photo, image_files, stored_size
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth
+from invgraphics.scenes.pictures.images import Photo, image_files, stored_size
 from invgraphics.scenes.poses import pose
 from invgraphics.scenes.region import NEAR, Frame
 

@@ -15,7 +15,10 @@ from invgraphics.core import Points, Scene, View
 from invgraphics.core.transforms import apply_similarity, transform_points
 from invgraphics.errors import InputError
 from invgraphics.scenes.border import background_of
-from invgraphics.scenes.images import RESIZE, Photo, file_exists, load_view, match_sizes, wanted_size
+from invgraphics.scenes.pictures.images import Photo, file_exists, match_sizes
+from invgraphics.scenes.pictures.masks import masks_note
+from invgraphics.scenes.pictures.resize import RESIZE, wanted_size
+from invgraphics.scenes.pictures.views import load_view
 from invgraphics.scenes.region import Frame
 
 T = TypeVar("T")
@@ -146,6 +149,7 @@ def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes:
     lenses = sorted({photo.lens.model for photo in photos if photo.lens is not None})
     if lenses:
         notes["undistortion"] = f"{', '.join(lenses)} removed at full size (bilinear), zoomed in until no pixel is blank"
+    notes |= masks_note(photos)
     notes["resize"] = _resize_note(photos, views)
     first_test, first_val = len(views) - len(chosen.test), len(chosen.train)
     return Scene(

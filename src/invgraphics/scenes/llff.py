@@ -14,8 +14,8 @@ from invgraphics.core import Camera, Scene
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import Photo, image_files
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, scene_name
+from invgraphics.scenes.pictures.images import Photo, image_files
 from invgraphics.scenes.poses import pose
 from invgraphics.scenes.region import contracted_frame
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.scenes.frames import Frames, photo_name
-from invgraphics.scenes.images import Photo
 from invgraphics.scenes.layout import SceneOptions, Split, compose, every_eighth, existing_photos, scene_name
+from invgraphics.scenes.pictures.images import Photo
 from invgraphics.scenes.region import photo_frame
 
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")
@@ -40,8 +40,6 @@ class Nerfstudio:
         notes["loader"] = "nerfstudio"
         if "ply_file_path" in frames.table:
             notes["points"] = f"{frames.table['ply_file_path']} is not read"
-        if any("mask_path" in frame for frame in frames.frames):
-            notes["masks"] = "the frames' mask_path is not read"
         split = _own_split(frames, listed, photos) or every_eighth(photos)
         return compose(scene_name(source.parent), split, photo_frame(photos), options, notes)
 

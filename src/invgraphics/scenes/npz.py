@@ -38,8 +38,9 @@ from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.files import write_arrays
 from invgraphics.scenes.border import background_of, looked_at
-from invgraphics.scenes.images import RESIZE, make_view, wanted_size
 from invgraphics.scenes.layout import HOLD_OUT, SceneOptions, evenly, local_points
+from invgraphics.scenes.pictures.resize import RESIZE, wanted_size
+from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.poses import poses
 from invgraphics.scenes.region import Frame, box_frame, contracted_frame, object_frame
 

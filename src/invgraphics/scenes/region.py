@@ -14,7 +14,7 @@ from torch import Tensor
 from invgraphics.core import Bounds, Camera, Points
 from invgraphics.errors import InputError
 from invgraphics.scenes.border import is_object, looked_at
-from invgraphics.scenes.images import Photo, read_pixels
+from invgraphics.scenes.pictures.images import Photo, read_pixels
 
 NEAR = 0.05
 """Closest sample to a camera in local units, where a data set does not say."""

@@ -12,8 +12,8 @@ from torch import Tensor
 from invgraphics.core import Scene, View
 from invgraphics.core.colour import quantise
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import area_resize, wanted_size
 from invgraphics.scenes.open import open_scene, source_of
+from invgraphics.scenes.pictures.resize import area_resize, wanted_size
 
 SMALLEST = 12
 """Shortest side in pixels that pictures can be scaled down to: SSIM's window has 11."""

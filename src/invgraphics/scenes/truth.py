@@ -14,10 +14,12 @@ from invgraphics.arrays import read_arrays
 from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
 from invgraphics.core.believable import FARTHEST
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import RESIZE, Photo, load_view
 from invgraphics.scenes.layout import SceneOptions, evenly
 from invgraphics.scenes.mitsuba import cache, ply
 from invgraphics.scenes.npz import Npz
+from invgraphics.scenes.pictures.images import Photo
+from invgraphics.scenes.pictures.resize import RESIZE
+from invgraphics.scenes.pictures.views import load_view
 from invgraphics.scenes.poses import pose
 
 LINEAR_RESIZE = "area average of linear light"

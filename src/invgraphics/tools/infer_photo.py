@@ -17,7 +17,8 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display
 from invgraphics.files import write_arrays, write_picture
 from invgraphics.runs.folder import output_file
-from invgraphics.scenes.images import make_view, read_pixels
+from invgraphics.scenes.pictures.images import read_pixels
+from invgraphics.scenes.pictures.views import make_view
 from invgraphics.tools.class_runs import open_class_runs
 from invgraphics.tools.inference_pictures import shown_normals
 from invgraphics.training.codes.inference import CodeInference, infer_codes

@@ -22,7 +22,8 @@ from invgraphics.files import write_picture
 from invgraphics.metrics.poses import Similarity, rotation_angle
 from invgraphics.runs.folder import output_file
 from invgraphics.runs.location import Location, PoseError, Start
-from invgraphics.scenes.images import make_view, read_pixels
+from invgraphics.scenes.pictures.images import read_pixels
+from invgraphics.scenes.pictures.views import make_view
 from invgraphics.training.localise import PoseDescent, photometric_error, refine_pose
 
 COARSEST = 32

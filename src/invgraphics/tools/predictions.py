@@ -18,7 +18,7 @@ from invgraphics.metrics.conventions import BLACK, Colour
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.inside import inside
 from invgraphics.runs.provenance import Provenance
-from invgraphics.scenes.images import image_files, read_pixels
+from invgraphics.scenes.pictures.images import image_files, read_pixels
 from invgraphics.tools.saved_pictures import has_transparency, is_baked, read_picture, read_saved, read_truth
 
 LAYOUTS = (("renders", "gt"), ("color", "gt-color"))

@@ -12,7 +12,7 @@ from invgraphics.arrays import read_numbers
 from invgraphics.core import Camera, Rendering, Scene, View
 from invgraphics.core.colour import srgb_to_linear
 from invgraphics.errors import InputError
-from invgraphics.scenes.images import read_pixels
+from invgraphics.scenes.pictures.images import read_pixels
 
 
 def read_truth(path: Path, scene: Scene) -> View:

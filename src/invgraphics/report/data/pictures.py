@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from invgraphics.arrays import read_numbers
 from invgraphics.errors import InputError
-from invgraphics.scenes import png
+from invgraphics.scenes.pictures import png
 
 Arrays = dict[str, Float[ndarray, "..."]]
 """What an ``.npz`` holds: alpha, depth, normal and so on."""

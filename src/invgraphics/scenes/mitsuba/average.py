@@ -23,12 +23,12 @@ from jaxtyping import Float
 from invgraphics.arrays import read_arrays
 from invgraphics.core import Camera
 from invgraphics.files import write_text
-from invgraphics.scenes.images import area_resize
 from invgraphics.scenes.mitsuba import cache, render, stage
 from invgraphics.scenes.mitsuba import folder as folders
 from invgraphics.scenes.mitsuba.gbuffer import trace, trace_fog
 from invgraphics.scenes.mitsuba.job import Job, Source
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split, cameras, make_rig
+from invgraphics.scenes.pictures.resize import area_resize
 from invgraphics.scenes.process import worker_main, write_progress
 from invgraphics.tables import read_json
 

@@ -15,10 +15,11 @@ from jaxtyping import UInt8
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_picture, write_text
-from invgraphics.scenes import png
-from invgraphics.scenes.images import SUFFIXES, image_files, make_view, read_pixels
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
+from invgraphics.scenes.pictures import png
+from invgraphics.scenes.pictures.images import SUFFIXES, image_files, read_pixels
+from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
 from invgraphics.tables import read_json
 

@@ -13,9 +13,10 @@ from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import copy_file, write_picture
 from invgraphics.scenes.colmap_sizes import check_sizes
-from invgraphics.scenes.images import make_view, read_pixels
-from invgraphics.scenes.lens import Lens, Straight, straighten
 from invgraphics.scenes.photos.prepare import PHOTOS, Prepared
+from invgraphics.scenes.pictures.images import read_pixels
+from invgraphics.scenes.pictures.lens import Lens, Straight, straighten
+from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
 
 STRAIGHT = 0.25

@@ -1,8 +1,7 @@
-"""Photographs from disk: reading, undistortion at full size and area-averaged resizing, one picture at a time."""
+"""Photographs on disk: which there are, their sizes and their pixels, one picture at a time."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,19 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
-from invgraphics.core import Camera, View
+from invgraphics.core import Camera
 from invgraphics.errors import InputError
-from invgraphics.scenes import png
-from invgraphics.scenes.lens import Lens, straighten, undistort
+from invgraphics.scenes.pictures import png
+from invgraphics.scenes.pictures.lens import Lens
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """What counts as a photograph, in lower case."""
-
-RESIZE = "area average (exact box filter, colour weighted by alpha)"
-"""The filter, as recorded in a scene's notes."""
 
 _ORIENTATION = 0x0112  # EXIF tag
 _TURNED = (5, 6, 7, 8)  # orientations that exchange width and height
@@ -39,6 +34,7 @@ class Photo:
         name: what the data set calls it.
         lens: the lens whose distortion has to be removed; replaces the camera's intrinsics.
         alpha: a second file whose brightness is the coverage.
+        mask: a second file that is dark where pixels do not count.
     """
 
     path: Path
@@ -46,6 +42,7 @@ class Photo:
     name: str
     lens: Lens | None = None
     alpha: Path | None = None
+    mask: Path | None = None
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -144,55 +141,6 @@ def _is_turned(image: Any, like: tuple[int, int] | None) -> bool:
     return like is None or (like[0] - like[1]) * (image.width - image.height) < 0
 
 
-def area_resize(values: Float[np.ndarray, "h w c"], width: int, height: int) -> Float[np.ndarray, "height width c"]:
-    """Downscale by exact area average; pixels that are cut contribute by their covered share.
-
-    Args:
-        values: picture, colours premultiplied where it has alpha.
-        width: new width in pixels, at most the present one.
-        height: new height, likewise.
-    """
-    return _average(_average(values, height).swapaxes(0, 1), width).swapaxes(0, 1)
-
-
-def _average(values: Float[np.ndarray, "n m c"], count: int) -> Float[np.ndarray, "count m c"]:
-    n = len(values)
-    if count == n:
-        return values
-    edges = np.arange(count + 1) * (n / count)
-    whole = np.floor(edges).astype(np.int64)
-    part = (edges - whole).astype(values.dtype)[:, None, None]
-    part[-1] = 0.0  # the last edge is the border, whatever its rounding
-    # Sum from whole edge to whole edge, less the part before the new pixel's beginning, plus the part up to its end.
-    sums = np.add.reduceat(values, whole[:-1], axis=0)
-    cut = values[np.minimum(whole, n - 1)] * part
-    return (sums - cut[:-1] + cut[1:]) * values.dtype.type(count / n)
-
-
-def wanted_size(width: int, height: int, size: int | tuple[int, int] | None) -> tuple[int, int]:
-    """Compute the (width, height) to which a photograph is resized; never enlarged.
-
-    Args:
-        width: present width in pixels.
-        height: present height.
-        size: the longest side, or (width, height), or ``None`` for no change.
-
-    Raises:
-        InputError: the wanted shape would squash or enlarge the picture.
-    """
-    if size is None:
-        return width, height
-    if isinstance(size, int):
-        scale = min(1.0, size / max(width, height))
-        return max(1, round(width * scale)), max(1, round(height * scale))
-    if abs(math.log((size[0] / size[1]) / (width / height))) > 0.05:
-        remedy = "Give one number, the longest side, to keep the shape."
-        raise InputError(f"Size {size[0]}x{size[1]} would squash photographs of {width}x{height} pixels.", remedy)
-    if size[0] > width or size[1] > height:
-        raise InputError(f"Size {size[0]}x{size[1]} is larger than the photographs ({width}x{height}).")
-    return size
-
-
 def match_sizes(photos: Sequence[Photo]) -> list[Photo]:
     """Scale each camera to its file's size: photographs downscaled as a whole keep their calibration.
 
@@ -230,69 +178,3 @@ def _rescaled(photo: Photo, width: int, height: int) -> Photo:
         camera.rescale(width, height)
         lens = Lens(lens.model, tuple(float(value) for value in camera.params), width, height)
     return replace(photo, camera=photo.camera.resized(width, height), lens=lens)
-
-
-def load_view(photo: Photo, size: int | tuple[int, int] | None = None) -> View:
-    """Read, undistort and resize one photograph whose camera fits its file (see `match_sizes`)."""
-    return make_view(photo.camera, _with_alpha(photo), photo.name, size, photo.lens)
-
-
-def make_view(
-    camera: Camera,
-    pixels: UInt8[np.ndarray, "h w c"],
-    name: str,
-    size: int | tuple[int, int] | None = None,
-    lens: Lens | None = None,
-) -> View:
-    """Make a view from pixels in memory, undistorted and resized: 8-bit colours, float32 camera.
-
-    Args:
-        camera: of these pixels; its focal lengths and principal point are replaced if there is a ``lens``.
-        pixels: straight colour, or colour and alpha.
-        name: the view's name.
-        size: as in `wanted_size`.
-        lens: the distortion to remove.
-    """
-    height, width = pixels.shape[:2]
-    final = wanted_size(width, height, size)
-    if lens is not None or final != (width, height):
-        values = _premultiplied(pixels)
-        if lens is not None:
-            straight = straighten(lens)
-            values = undistort(values, straight)
-            new = camera.focal.new_tensor
-            camera = replace(camera, focal=new(straight.focal), centre=new(straight.centre))
-        pixels = _straight(area_resize(values, *final))
-        camera = camera.resized(*final)
-    image = torch.from_numpy(np.ascontiguousarray(pixels[:, :, :3]))
-    alpha = None
-    if pixels.shape[2] == 4 and pixels[:, :, 3].min() < 255:
-        alpha = torch.from_numpy(np.ascontiguousarray(pixels[:, :, 3]))
-    return View(camera.to(torch.float32), image, name, alpha=alpha)
-
-
-def _with_alpha(photo: Photo) -> UInt8[np.ndarray, "h w c"]:
-    like = (photo.camera.width, photo.camera.height)
-    pixels = read_pixels(photo.path, like)
-    if photo.alpha is None:
-        return pixels
-    coverage = read_pixels(photo.alpha, like)[:, :, :3].max(axis=2, keepdims=True)
-    if coverage.shape[:2] != pixels.shape[:2]:
-        (h, w), (mask_h, mask_w) = pixels.shape[:2], coverage.shape[:2]
-        raise InputError(f"{photo.alpha} has {mask_w}x{mask_h} pixels, its photograph has {w}x{h}.")
-    return np.concatenate([pixels[:, :, :3], coverage], axis=2)
-
-
-def _premultiplied(pixels: UInt8[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
-    values = pixels.astype(np.float32)
-    if values.shape[2] == 4:
-        values[:, :, :3] *= values[:, :, 3:] / 255
-    return values
-
-
-def _straight(values: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
-    if values.shape[2] == 4:
-        alpha = values[:, :, 3:]
-        colour = np.divide(values[:, :, :3] * 255, alpha, out=np.zeros_like(values[:, :, :3]), where=alpha > 0)
-        values = np.concatenate([colour, alpha], axis=2)
-    return (values.clip(0, 255) + 0.5).astype(np.uint8)

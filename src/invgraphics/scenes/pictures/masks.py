@@ -1,0 +1,63 @@
+"""Masks of photographs: pixels that neither a fit nor a score looks at, such as people who walk past."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from invgraphics.errors import InputError
+from invgraphics.scenes.pictures.images import Photo, file_exists, read_pixels
+
+FOLDER = "masks"
+"""Where masks lie beside a folder of photographs."""
+
+
+def with_masks_beside(photos: Sequence[Photo], images: Path) -> list[Photo]:
+    """Give photographs the masks in `FOLDER` beside their folder, named as by COLMAP, ``NAME.jpg.png``, or ``NAME.png``.
+
+    Args:
+        photos: without masks.
+        images: their folder, to which their names are relative.
+    """
+    folder = images.parent / FOLDER
+    if not folder.is_dir():
+        return list(photos)
+    return [replace(photo, mask=_named_like(photo, folder)) for photo in photos]
+
+
+def _named_like(photo: Photo, folder: Path) -> Path | None:
+    name = folder / photo.name
+    candidates = (name.with_name(name.name + ".png"), name.with_suffix(".png"), name)
+    return next((path for path in candidates if file_exists(path)), None)
+
+
+def counting(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Read a mask as a picture of a size: 255 where pixels count, which is where it is brighter than half of its maximum.
+
+    Args:
+        mask: the file; where its size is not the photograph's, its nearest pixels are taken.
+        width: of the photograph in pixels.
+        height: of the photograph.
+
+    Raises:
+        InputError: it is missing or no picture, has another shape than the photograph, or masks all of it.
+    """
+    values = read_pixels(mask, (width, height))[:, :, :3].max(axis=2)
+    high, wide = values.shape
+    if abs(wide * height - high * width) > max(width, height, wide, high):
+        raise InputError(f"{mask} has {wide}x{high} pixels, its photograph has {width}x{height}.")
+    if not values.any():
+        raise InputError(f"{mask} is black: no pixel of its photograph counts.", "Leave the photograph out, or its mask.")
+    bright = values > values.max() // 2
+    rows, columns = ((np.arange(count) * stored) // count for count, stored in ((height, high), (width, wide)))
+    return np.repeat(np.where(bright, np.uint8(255), np.uint8(0))[rows][:, columns, None], 3, axis=2)
+
+
+def masks_note(photos: Sequence[Photo]) -> dict[str, str]:
+    """A scene's note on masks; empty where no photograph has one."""
+    masked = sum(photo.mask is not None for photo in photos)
+    return {"masks": f"{masked} of {len(photos)} photographs have one: dark pixels do not count"} if masked else {}
