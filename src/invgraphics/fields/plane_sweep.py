@@ -44,7 +44,7 @@ def plane_sweep(
         # The third coordinate of the inverse is positive where that of the map is: before the view, on planes before it.
         maps = torch.linalg.inv(homographies(camera, depths, view.camera))
         for plane, to_view in enumerate(maps):
-            values, inside, _ = warp(_premultiplied(view)[None], to_view[None], size)
+            values, inside, _ = warp(premultiplied(view)[None], to_view[None], size)
             rgb, alpha = values[0, :3], values[0, 3]
             total[plane, :3] += inside[0] * rgb
             total[plane, 3] += inside[0] * alpha
@@ -59,6 +59,7 @@ def plane_sweep(
     return colour.clamp(0, 1), weights_to_alphas(weights)
 
 
-def _premultiplied(view: View) -> Float[Tensor, "4 h w"]:
+def premultiplied(view: View) -> Float[Tensor, "4 h w"]:
+    """Return a view's colour times alpha, and alpha, as a layer to warp."""
     alpha = view.opacity()
     return torch.cat([(view.colour() * alpha[..., None]).permute(2, 0, 1), alpha[None]])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +60,18 @@ class Frames:
         Raises:
             InputError: a key is missing or a value unusable; the sentence names the file, the frame and the key.
         """
-        files = [_find(self.path.parent, self._text(index)) for index in range(len(self.frames))]
-        first = next((file for file in files if file_exists(file)), None)
-        return [self._photo(index, file, first) for index, file in enumerate(files)]
+        return [self._photo(index) for index in range(len(self.frames))]
+
+    @cached_property
+    def _files(self) -> list[Path]:
+        """The frames' photographs, whether they exist or not."""
+        return [_find(self.path.parent, self._text(index)) for index in range(len(self.frames))]
+
+    @cached_property
+    def _first(self) -> tuple[Path, tuple[int, int]] | None:
+        """The first photograph that exists, and its stored width and height."""
+        file = next((file for file in self._files if file_exists(file)), None)
+        return None if file is None else (file, stored_size(file))
 
     def _where(self, index: int) -> str:
         return f"{self.path}, frame {index} ('{self.frames[index].get('file_path', '?')}')"
@@ -84,18 +94,18 @@ class Frames:
             raise InputError(f"'{key}' of {self._where(index)} is {value!r}, not a finite number.")
         return float(value)
 
-    def _photo(self, index: int, file: Path, first: Path | None) -> Photo:
+    def _photo(self, index: int) -> Photo:
         if "transform_matrix" not in self.frames[index]:
             raise InputError(f"{self._where(index)} has no 'transform_matrix'.")
         cam_to_world = opengl_to_opencv(pose(self.frames[index]["transform_matrix"], self._where(index)))
-        width, height = self._size(index, file, first)
+        width, height = self._size(index)
         fx, fy = self._focal(index, width, height)
         cx, cy = self._number(index, "cx"), self._number(index, "cy")
         focal, centre = [fx, fy], [width / 2 if cx is None else cx, height / 2 if cy is None else cy]
         number = torch.float64
         camera = Camera(cam_to_world, torch.tensor(focal, dtype=number), torch.tensor(centre, dtype=number), width, height)
         lens = self._lens(index, (*focal, *centre), (width, height))
-        return Photo(file, camera, photo_name(self._text(index)), lens, mask=self._mask(index))
+        return Photo(self._files[index], camera, photo_name(self._text(index)), lens, mask=self._mask(index))
 
     def _mask(self, index: int) -> Path | None:
         """The frame's ``mask_path`` (nerfstudio)."""
@@ -103,22 +113,25 @@ class Frames:
             return None
         return self.path.parent / self._path(index, "mask_path").replace("\\", "/")
 
-    def _size(self, index: int, file: Path, first: Path | None) -> tuple[int, int]:
+    def _size(self, index: int) -> tuple[int, int]:
         """Width and height stated by the file, else of the frame's photograph, or where that is missing of the first one."""
         w, h = self._number(index, "w"), self._number(index, "h")
         if w is None or h is None:
-            if first is None:
-                return 1, 1
-            like = stored_size(first)
-            width, height = stored_size(file) if file_exists(file) else like
-            if self._number(index, "fl_x") is None and abs(width * like[1] - height * like[0]) > max(width, height, *like):
-                sizes = f"{width}x{height} pixels and {first.name} {like[0]}x{like[1]}"
-                remedy = "Give each frame its 'w', 'h' and 'fl_x'."
-                raise InputError(f"{file} has {sizes}: one angle of view cannot be that of both shapes.", remedy)
-            return width, height
+            return self._stored_size(index)
         if not (1 <= w <= LONGEST_SIDE and 1 <= h <= LONGEST_SIDE):
             raise InputError(f"'w' and 'h' of {self._where(index)} are {w:g} and {h:g}, not a size in pixels.")
         return round(w), round(h)
+
+    def _stored_size(self, index: int) -> tuple[int, int]:
+        if self._first is None:
+            return 1, 1
+        file, (first, like) = self._files[index], self._first
+        width, height = stored_size(file) if file_exists(file) else like
+        if self._number(index, "fl_x") is None and abs(width * like[1] - height * like[0]) > max(width, height, *like):
+            sizes = f"{width}x{height} pixels and {first.name} {like[0]}x{like[1]}"
+            remedy = "Give each frame its 'w', 'h' and 'fl_x'."
+            raise InputError(f"{file} has {sizes}: one angle of view cannot be that of both shapes.", remedy)
+        return width, height
 
     def _focal(self, index: int, width: int, height: int) -> tuple[float, float]:
         fx, fy = self._number(index, "fl_x"), self._number(index, "fl_y")

@@ -15,12 +15,14 @@ from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.planes import homographies, warp
 from invgraphics.core.scene import Points, Scene, View
+from invgraphics.fields.plane_sweep import premultiplied
 
 MOST_VIEWS = 32
 """Training views that get a depth map, evenly spaced; others are only matched with."""
 MOST_PIXELS = 160 * 160
 """Pixels of a picture that is matched; larger ones are averaged."""
 PLANES = 64
+"""Of a sweep; depths between them are those of the parabola through the three costs."""
 NEIGHBOURS = 4
 """Views that each view is matched with."""
 BEST = 2
@@ -29,9 +31,9 @@ WINDOW = 5
 """Pixels along the edge of the window whose colours are compared."""
 IDEAL_PARALLAX, NARROWER, WIDER, WIDEST = 5.0, 1.0, 10.0, 60.0
 """Degrees between views that match best, scores' widths below and above (MVSNet, Yao et al. 2018, §4.1), and the most."""
-AGREEMENT = 1.5
+TOLERANCE = 1.5
 """Depths agree that differ by at most so many planes."""
-LEAST_AGREEING = 2
+LEAST_CONSISTENT = 2
 """Other depth maps that must agree with a point."""
 MIN_ALPHA = 0.5
 NEAREST, FARTHEST = 0.05, 20.0
@@ -68,20 +70,26 @@ def stereo_points(scene: Scene, most: int) -> Points:
     Returns:
         Positions, and the colours of their pixels in the scene's colour space; none where nothing matches.
     """
-    pictures = [_picture(view, scene.bounds) for view in scene.train]
+    pictures = [_shrunk(view, scene.bounds) for view in scene.train]
     count = min(MOST_VIEWS, len(pictures))
     chosen = [index * len(pictures) // count for index in range(count)]
     parallax = _parallax([picture.camera for picture in pictures], scene.bounds)
-    depths = {index: _sweep(pictures, index, _best(parallax[index], range(len(pictures)), NEIGHBOURS)) for index in chosen}
-    parts = [_agreeing(pictures, index, depths, _best(parallax[index], chosen, 2 * NEIGHBOURS)) for index in chosen]
+    depths = {
+        index: _depth_map(pictures, index, _matching_views(parallax[index], range(len(pictures)), NEIGHBOURS))
+        for index in chosen
+    }
+    parts = [
+        _consistent_points(pictures, index, depths, _matching_views(parallax[index], chosen, 2 * NEIGHBOURS))
+        for index in chosen
+    ]
     position, rgb = (torch.cat([getattr(part, name) for part in parts]) for name in ("position", "rgb"))
     subset = torch.randperm(len(position))[:most]
     return Points(position[subset], rgb[subset])
 
 
-def _picture(view: View, bounds: Bounds) -> _Picture:
+def _shrunk(view: View, bounds: Bounds) -> _Picture:
     camera, alpha = view.camera, view.opacity()
-    layers = torch.cat([(view.colour() * alpha[..., None]).permute(2, 0, 1), alpha[None]])
+    layers = premultiplied(view)
     counts = torch.ones_like(alpha) if view.mask is None else view.mask.to(alpha)
     shrink = math.sqrt(MOST_PIXELS / alpha.numel())
     if shrink < 1:
@@ -106,7 +114,7 @@ def _parallax(cameras: Sequence[Camera], bounds: Bounds) -> Float[Tensor, "n n"]
     return degrees.fill_diagonal_(torch.inf)
 
 
-def _best(parallax: Float[Tensor, " n"], candidates: Sequence[int], count: int) -> list[int]:
+def _matching_views(parallax: Float[Tensor, " n"], candidates: Sequence[int], count: int) -> list[int]:
     """Indices of at most ``count`` views to match a view with, best first."""
     among = torch.tensor(candidates)
     off = parallax[among] - IDEAL_PARALLAX
@@ -115,7 +123,7 @@ def _best(parallax: Float[Tensor, " n"], candidates: Sequence[int], count: int) 
     return among[order[parallax[among[order]] <= WIDEST]].tolist()
 
 
-def _sweep(pictures: Sequence[_Picture], index: int, others: Sequence[int]) -> Float[Tensor, "h w"]:
+def _depth_map(pictures: Sequence[_Picture], index: int, others: Sequence[int]) -> Float[Tensor, "h w"]:
     """Depth along the optical axis of each of a view's pixels, where ``others`` differ least; NaN where there is none."""
     here = pictures[index]
     if not others:
@@ -132,14 +140,13 @@ def _sweep(pictures: Sequence[_Picture], index: int, others: Sequence[int]) -> F
     best = cost.argmin(dim=0)
     inner = (best > 0) & (best < PLANES - 1)
     before, at, after = (cost.gather(0, (best.clamp(1, PLANES - 2) + step)[None])[0] for step in (-1, 0, 1))
-    # The least of the parabola through the three.
     shift = (before - after) / (2 * (before - 2 * at + after)).clamp_min(1e-9)
     depth = 1 / (1 / here.planes[0] - (best + shift.clamp(-0.5, 0.5)) * here.spacing)
     return torch.where(here.solid & inner, depth, torch.nan)
 
 
-def _agreeing(pictures: Sequence[_Picture], index: int, depths: dict[int, Tensor], others: Sequence[int]) -> Points:
-    """Points of a view's depth map with which at least `LEAST_AGREEING` of the others agree (one, if there is only one)."""
+def _consistent_points(pictures: Sequence[_Picture], index: int, depths: dict[int, Tensor], others: Sequence[int]) -> Points:
+    """Geometric consistency: points of a view's depth map that `LEAST_CONSISTENT` of the others show too (one of only one)."""
     here, depth = pictures[index], depths[index].flatten()
     flat = torch.isfinite(depth).nonzero()[:, 0]
     rays = here.camera.rays(torch.stack([flat % here.camera.width, flat // here.camera.width], dim=1) + 0.5)
@@ -151,8 +158,8 @@ def _agreeing(pictures: Sequence[_Picture], index: int, depths: dict[int, Tensor
         pixel, distance = there.camera.project(position)
         grid = 2 * pixel / torch.tensor([there.camera.width, there.camera.height]) - 1
         seen = grid_sample(depths[other][None, None], grid[None, None], mode="nearest", align_corners=False)[0, 0, 0]
-        agrees = (1 / distance - 1 / seen).abs() <= AGREEMENT * there.spacing
+        agrees = (1 / distance - 1 / seen).abs() <= TOLERANCE * there.spacing
         votes += agrees & (distance > 0) & (grid.abs() <= 1).all(dim=1)
-    kept = votes >= max(1, min(LEAST_AGREEING, len(others)))
+    kept = votes >= max(1, min(LEAST_CONSISTENT, len(others)))
     rgb = here.layers[:3].flatten(1).T[flat[kept]] / here.layers[3].flatten()[flat[kept], None]
     return Points(position[kept], rgb)

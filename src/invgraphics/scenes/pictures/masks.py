@@ -35,7 +35,7 @@ def _named_like(photo: Photo, folder: Path) -> Path | None:
     return next((path for path in candidates if file_exists(path)), None)
 
 
-def counting(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     """Read a mask as a picture of a size: 255 where pixels count, which is where it is brighter than half of its maximum.
 
     Args:

@@ -12,7 +12,7 @@ from invgraphics.core import Camera, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.pictures.images import Photo, read_pixels
 from invgraphics.scenes.pictures.lens import Lens, straighten, undistort
-from invgraphics.scenes.pictures.masks import counting
+from invgraphics.scenes.pictures.masks import read_mask
 from invgraphics.scenes.pictures.resize import area_resize, wanted_size
 
 
@@ -24,7 +24,7 @@ def load_view(photo: Photo, size: int | tuple[int, int] | None = None) -> View:
     view = make_view(photo.camera, _with_alpha(photo), photo.name, size, photo.lens)
     if photo.mask is None:
         return view
-    pixels = counting(photo.mask, photo.camera.width, photo.camera.height)
+    pixels = read_mask(photo.mask, photo.camera.width, photo.camera.height)
     mask = make_view(photo.camera, pixels, photo.name, size, photo.lens).image[..., 0] == 255
     return view if bool(mask.all()) else replace(view, mask=mask)
 
