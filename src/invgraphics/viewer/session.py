@@ -59,6 +59,7 @@ class Session:
         self._view_index: int | None = None
         self._journey: Journey | None = None
         self._requested: tuple[int | None, float] | None = None
+        self._sent_at = 0.0
         self._overlays = Overlays(client.scene, shared.renderer.runs[0], shared.frustums, self._frustum_clicked)
         self._closed = False
         self._notice = ""
@@ -94,6 +95,7 @@ class Session:
             camera.wxyz = np.array(rotation_quaternion(pose))
             camera.look_at = turning.numpy()
             camera.fov = fov
+        self._sent_at = camera.update_timestamp
 
     def refresh(self) -> None:
         """Show a reloaded model; called by the render thread."""
@@ -135,7 +137,10 @@ class Session:
         photograph = self._shared.views[self._view_index][1].camera
         return LetterboxedView.fit(limit_size(photograph, int(self._controls.max_size.value)), self._client.camera.aspect)
 
-    async def _camera_changed(self, _: CameraHandle) -> None:
+    async def _camera_changed(self, camera: CameraHandle) -> None:
+        # The report that connects a browser gets here after the first photograph's camera has taken its place.
+        if camera.update_timestamp == self._sent_at:
+            return
         if self._view_index is not None:
             if self._journey is not None and self._journey.has_left(self._camera, time.monotonic()):
                 self._view_index, self._notice = None, ""
