@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 import torch
@@ -24,6 +24,7 @@ from invgraphics.viewer.server import Viewer  # noqa: E402
 from invgraphics.viewer.session import Session  # noqa: E402
 
 PATIENCE = 30
+Found = TypeVar("Found")
 
 
 @pytest.fixture
@@ -57,15 +58,16 @@ def _report(socket: Connection, width: int, pose: torch.Tensor) -> None:
 
 
 def _session(viewer: Viewer, width: int) -> Session:
-    """The session whose browser reported a window of this width."""
+    """The session whose browser reported a window of this width; the handlers of its earlier reports have run."""
+    return _until(lambda: next((one for one in tuple(viewer._sessions.values()) if one._window[0] == width), None))
+
+
+def _until(found: Callable[[], Found | None]) -> Found:
     deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
-        for session in tuple(viewer._sessions.values()):
-            if session._window[0] == width:
-                time.sleep(0.1)  # its handler runs after the report is stored
-                return session
+    while (value := found()) is None:
+        assert time.monotonic() < deadline, "the viewer did not get there"
         time.sleep(0.02)
-    raise AssertionError(f"no report of a window of {width} pixels arrived")
+    return value
 
 
 def test_reports_from_before_the_first_photograph_do_not_leave_it(viewer: Viewer) -> None:
@@ -75,8 +77,9 @@ def test_reports_from_before_the_first_photograph_do_not_leave_it(viewer: Viewer
     ) as socket:
         _report(socket, 700, _pose(3))
         _report(socket, 701, _pose(3))  # its panel has opened
-        assert _session(viewer, 701)._view_index == 0, "it is on its way to the photograph"
         _report(socket, 702, photograph)
-        assert _session(viewer, 702)._view_index == 0
-        _report(socket, 703, _pose(3))
-        assert _session(viewer, 703)._view_index is None, "its user has turned away"
+        _report(socket, 703, photograph)
+        session = _session(viewer, 703)
+        assert session._view_index == 0, "it was on its way to the photograph, and is there"
+        _report(socket, 704, _pose(3))
+        _until(lambda: True if session._view_index is None else None)  # its user has turned away
