@@ -50,6 +50,31 @@ def test_a_report_is_current_until_its_recipe_changes(tmp_path: Path, capsys: py
     assert "volumetric/forgotten" in told and "2 of 3 reports are not current: gone and old." in told
 
 
+@pytest.mark.parametrize(
+    ("scene", "options", "is_current"),
+    [
+        ("anything", {"size": 128}, True),
+        ("anything", {"size": [160, 200]}, True),
+        ("anything", {"size": 400}, False),
+        ("anything", {}, False),
+        ("bricks", {}, True),  # 128 px
+    ],
+)
+def test_a_key_that_small_pictures_do_not_notice_is_no_difference(
+    tmp_path: Path, scene: str, options: dict[str, Any], is_current: bool
+) -> None:
+    """Published runs of splats are older than ``start_size``, which changes no bit of them."""
+    method = "splatting/gaussians"
+    before = load_method(method, "laptop", ["batches.start_size=0"], Budget.parse("60s"))
+    assert before.digest != load_method(method, "laptop", (), Budget.parse("60s")).digest
+    command = f"invgraphics fit {method} {scene} --budget 60s --out x"
+    record = {"method": method, "recipe_sha256": before.digest, "command": command, "scene": scene, "options": options}
+    write(tmp_path / "runs" / "0", **record)
+    assert check_recipes(tmp_path).current is is_current
+    write(tmp_path / "other" / "0", **(record | {"recipe_sha256": "0" * 64}))
+    assert not check_recipes(tmp_path).current
+
+
 def test_the_commit_of_a_working_copy(tmp_path: Path) -> None:
     assert commit(tmp_path / "nowhere") == ""
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]

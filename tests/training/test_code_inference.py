@@ -26,7 +26,6 @@ from invgraphics.tools import infer as module
 from invgraphics.tools import inference_pictures
 from invgraphics.tools.infer import InferRequest
 from invgraphics.tools.recipe_check import check_recipes
-from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.codes.inference import CodeInference, infer_codes
 from invgraphics.training.codes.penalty import CodePenalty
 
@@ -90,32 +89,6 @@ def test_methods_and_scenes_that_disagree_about_classes_are_refused(toy_class: S
     with pytest.raises(InputError, match=r"prior/srn learns a prior .* 'toy' shows one subject") as refusal:
         build_model(load_method("prior/srn"), toy_scene(views=2, size=8), 0, CPU)
     assert "chairs, mugs" in refusal.value.remedy
-
-
-@pytest.fixture
-def one_pixel(toy_class: Scene) -> Scene:
-    """One view that has alpha in one pixel of 144."""
-    alpha = torch.zeros(12, 12)
-    alpha[3, 5] = 1.0
-    return replace(toy_class, train=(replace(toy_class.train[0], alpha=alpha),))
-
-
-def test_rays_on_the_foreground_are_the_share_asked_for(one_pixel: Scene) -> None:
-    batches = Batches(BatchConfig(rays=200, views=1, foreground=0.75), one_pixel, torch.Generator().manual_seed(0), CPU)
-    _, batch = batches.rays()
-    assert 150 <= int((batch.alpha > 0).sum()) <= 156
-    _, batch = Batches(BatchConfig(rays=200, views=1), one_pixel, torch.Generator().manual_seed(0), CPU).rays()
-    assert int((batch.alpha > 0).sum()) < 8
-
-
-def test_the_foreground_has_its_share_until_then(one_pixel: Scene) -> None:
-    config = BatchConfig(rays=200, views=1, foreground=0.5, foreground_until=0.3)
-    batches = Batches(config, one_pixel, torch.Generator().manual_seed(0), CPU)
-    seen = [int((batches.rays(progress)[1].alpha > 0).sum()) for progress in (0.0, 0.29, 0.3, 1.0)]
-    assert min(seen[:2]) >= 100
-    assert max(seen[2:]) < 8
-    with pytest.raises(ValueError, match="foreground_until"):
-        BatchConfig(foreground_until=1.5)
 
 
 @pytest.fixture(scope="module")

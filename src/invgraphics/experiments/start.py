@@ -103,8 +103,10 @@ def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
         raise InputError(sentence, "Choose a lower --max-primitives.")
     growth = (most - now) * (COPIES * row + SCREEN_BYTES)
     parameters = model_bytes(plan.modules.values()) + (most - now) * row
-    pixels = max(view.camera.width * view.camera.height for view in plan.scene.train)
-    pictures = 0 if isinstance(plan.model.renderer, RayRenderer) or plan.batches.resolution[0] == 1 else pixels * PICTURE_BYTES
+    edges = [(view.camera.width, view.camera.height) for view in plan.scene.train]
+    starts_small = any(plan.batches.scale_at(0.0, max(edge)) < 1 for edge in edges)
+    grows = starts_small and not isinstance(plan.model.renderer, RayRenderer)
+    pictures = max(width * height for width, height in edges) * PICTURE_BYTES if grows else 0
     rays = Batches.MAX_RAYS * RAY_BYTES if isinstance(plan.model.renderer, RayRenderer) and plan.batches.samples else 0
     total = MARGIN * held + growth + pictures + rays + CHECKPOINT_COPIES * parameters + BASE_BYTES
     return MemoryForecast(round(total), most)

@@ -35,7 +35,7 @@ ADDED_KEYS: dict[str, dict[str, Any]] = {
     "field.neural": _ADDED_TO_NEURAL,
     "renderer.sampler.proposal.neural": _ADDED_TO_NEURAL,
     "renderer.volumetric": {"colour_threshold": 0.0},
-    "batches": {"foreground_until": 1.0},
+    "batches": {"foreground_until": 1.0, "foreground_least": 0.0, "start_size": 0, "start_until": 0.5},
 }
 """Part of a recipe -> keys that later versions added, with the values that change nothing."""
 

@@ -10,11 +10,15 @@ from pathlib import Path
 
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import DATA
-from invgraphics.recipes.recipe import load_method
+from invgraphics.recipes.recipe import Method, load_method
 from invgraphics.report.wording import listing
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
+from invgraphics.scenes.mitsuba.spec import description_path, read
 from invgraphics.training.budget import Budget
+
+UNTOUCHED = {"start_size": 0, "start_until": 0.5}
+"""Keys of ``batches`` that pictures below ``start_size`` do not notice, with the values of recipes that lack them."""
 
 
 @dataclass(frozen=True)
@@ -60,23 +64,46 @@ def check_recipes(folder: Path) -> RecipeCheck:
         raise InputError(f"'{folder}' is no folder.", "Give the folder of a report.")
     records = [RunFolder(path.parent).read(Provenance) for path in sorted(folder.rglob(Provenance.FILE))]
     stale: dict[str, str] = {}
-    seen: dict[tuple[str, ...], str] = {}
+    seen: dict[tuple[str, ...], tuple[str, ...]] = {}
     for record in records:
         overrides = _overrides(record.command)
-        key = record.method, record.preset or "", record.budget, *overrides
+        key = record.method, record.preset or "", record.budget, str(record.options.size), *overrides
         if key not in seen:
-            seen[key] = _todays_digest(record, overrides)
-        if seen[key] != record.recipe_sha256:
-            stale[record.method] = "differs" if len(seen[key]) == len(record.recipe_sha256) else seen[key]
+            seen[key] = _todays_digests(record, overrides)
+        if record.recipe_sha256 not in seen[key]:
+            today = seen[key][0]
+            stale[record.method] = "differs" if len(today) == len(record.recipe_sha256) else today
     return RecipeCheck(folder, len(records), stale)
 
 
-def _todays_digest(record: Provenance, overrides: Sequence[str]) -> str:
-    """SHA-256 of the recipe that the same request makes today; the reason where it makes none."""
+def _todays_digests(record: Provenance, overrides: Sequence[str]) -> tuple[str, ...]:
+    """SHA-256 of each recipe that the same request may make today; the reason where it makes none.
+
+    There are two where pictures were too small for ``batches.start_size`` to do anything: with it and without.
+    """
+
+    def made(*more: str) -> Method:
+        return load_method(record.method, record.preset or None, [*overrides, *more], Budget.parse(record.budget))
+
     try:
-        return load_method(record.method, record.preset or None, overrides, Budget.parse(record.budget)).digest
+        method = made()
+        edge = _longest_edge(record)
+        if edge is None or method.recipe.batches.halvings(edge):
+            return (method.digest,)
+        return method.digest, made(*(f"batches.{key}={value}" for key, value in UNTOUCHED.items())).digest
     except InputError as error:
-        return error.sentence.rstrip(".")
+        return (error.sentence.rstrip("."),)
+
+
+def _longest_edge(record: Provenance) -> int | None:
+    """Longest edge of a run's photographs in pixels: as asked for, or a built-in scene's own; ``None`` of other scenes."""
+    size = record.options.size
+    if size is None:
+        try:
+            size = read(description_path(record.scene)).size
+        except InputError:
+            return None
+    return size if isinstance(size, int) else max(size)
 
 
 def _overrides(command: str) -> list[str]:

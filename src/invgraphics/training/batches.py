@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -24,9 +25,15 @@ class BatchConfig:
         samples: target number of samples per step: the ray count follows what is kept (Instant-NGP); 0 keeps ``rays``.
         resolution: image scale of each phase of the fit; the last should be 1.
         until: progress at which each phase but the last ends; one fewer than ``resolution``.
+        start_size: longest edge in pixels near which a fit begins where its photographs are larger: these are halved while
+            that brings them closer to it (on a logarithmic scale), and doubled step by step. 0 begins with all pixels. What
+            few steps can do depends on their number, which pixels must not decide.
+        start_until: progress from which on all pixels are fitted; each size before has an equal part of what precedes.
         foreground: share of the rays that are drawn among the pixels with alpha, where a view has such: what is small in
             its pictures is otherwise learnt from few rays, and a field that begins with empty space may stay empty.
-        foreground_until: progress at which that ends, and rays are drawn from all pixels alike. It is early that a field
+        foreground_least: least share of a view's rays that meet pixels with alpha. Where an object fills more of its
+            pictures than that, all pixels are drawn alike.
+        foreground_until: progress at which both end, and rays are drawn from all pixels alike. It is early that a field
             can become empty for good; NeRF's own code crops the pictures to their middle at first, for the same reason.
         opaque: whether opaque photographs of an unbounded scene are fitted over a random background too: every ray must then
             end at a surface, and dark surfaces cannot be learnt as empty space.
@@ -37,8 +44,11 @@ class BatchConfig:
     samples: int = 0
     resolution: tuple[float, ...] = (1.0,)
     until: tuple[float, ...] = ()
+    start_size: int = 0
+    start_until: float = 0.5
     opaque: bool = False
     foreground: float = 0.0
+    foreground_least: float = 0.0
     foreground_until: float = 1.0
 
     def __post_init__(self) -> None:
@@ -48,18 +58,33 @@ class BatchConfig:
             raise ValueError("'until' must hold one rising progress value fewer than 'resolution' has entries.")
         if not all(0 < scale <= 1 for scale in self.resolution):
             raise ValueError("'resolution' must hold scales in (0, 1].")
+        if self.start_size < 0 or not 0 < self.start_until <= 1:
+            raise ValueError("'start_size' must be at least 0, and 'start_until' in (0, 1].")
         if not 0 <= self.foreground <= 1:
             raise ValueError(f"'foreground' must be in [0, 1], not {self.foreground}.")
+        if not 0 <= self.foreground_least <= 1:
+            raise ValueError(f"'foreground_least' must be in [0, 1], not {self.foreground_least}.")
         if not 0 <= self.foreground_until <= 1:
             raise ValueError(f"'foreground_until' must be in [0, 1], not {self.foreground_until}.")
 
-    def scale_at(self, progress: float) -> float:
-        """Image scale at a point of the fit."""
-        return self.resolution[sum(progress >= end for end in self.until)]
+    def scale_at(self, progress: float, edge: int) -> float:
+        """Image scale at a point of the fit, of a photograph whose longer edge is ``edge`` pixels."""
+        scale = self.resolution[sum(progress >= end for end in self.until)]
+        halvings = self.halvings(edge)
+        done = int(progress / self.start_until * halvings)
+        return scale if done >= halvings else min(scale, 0.5 ** (halvings - done))
 
-    def foreground_at(self, progress: float) -> float:
-        """Share of the rays drawn among the pixels with alpha, at a point of the fit."""
-        return self.foreground if progress < self.foreground_until or self.foreground_until == 1 else 0.0
+    def halvings(self, edge: int) -> int:
+        """How often ``start_size`` halves a photograph whose longer edge is ``edge`` pixels, at the start of a fit."""
+        return max(0, round(math.log2(edge / self.start_size))) if self.start_size else 0
+
+    def foreground_at(self, progress: float, covered: float) -> float:
+        """Share of a view's rays drawn among its pixels with alpha, which are the share ``covered`` of all its pixels."""
+        if progress >= self.foreground_until != 1:
+            return 0.0
+        # Of the rays that are drawn from all pixels, the share `covered` meets the object as well.
+        missing = (self.foreground_least - covered) / (1 - covered) if covered < self.foreground_least else 0.0
+        return max(self.foreground, missing)
 
 
 class RefinedCameras(Protocol):
@@ -91,7 +116,7 @@ class Batches:
         self._config, self._scene, self._generator, self._device = config, scene, generator, device
         self._order = torch.zeros(0, dtype=torch.int64)
         self._rays = config.rays
-        self._small: dict[tuple[int, float], View] = {}
+        self._small: dict[int, tuple[float, View]] = {}
 
     def background(self) -> Float[Tensor, 3]:
         """Background of a step: random where photographs have alpha, so that empty space must be learnt; else the scene's.
@@ -109,10 +134,8 @@ class Batches:
         count = min(config.views, len(train), self._rays)
         chosen = torch.randperm(len(train), generator=self._generator)[:count]
         shares = [self._rays // count + (i < self._rays % count) for i in range(count)]
-        scale = config.scale_at(progress)
-        views = [self._scaled(int(view), scale) for view in chosen]
-        foreground = config.foreground_at(progress)
-        flat = [self._pixels_of(view, share, foreground) for view, share in zip(views, shares, strict=True)]
+        views = [self._scaled(int(view), progress) for view in chosen]
+        flat = [self._pixels_of(view, share, progress) for view, share in zip(views, shares, strict=True)]
         which = torch.repeat_interleave(torch.arange(count), torch.tensor(shares))
         wide = torch.tensor([view.camera.width for view in views])[which]
         index = torch.cat(flat)
@@ -128,14 +151,18 @@ class Batches:
         batch = Batch(*_composited(views, flat, background), background)
         return rays.to(self._device), batch.to(self._device)
 
-    def _pixels_of(self, view: View, count: int, foreground: float) -> Tensor:
-        """Flat indices of random pixels within the view's mask, the share ``foreground`` of them where it has alpha."""
-        if foreground > 0 and view.alpha is not None:
-            solid = torch.nonzero((view.alpha > 0 if view.mask is None else (view.alpha > 0) & view.mask).reshape(-1))[:, 0]
-            inside = round(foreground * count) if len(solid) else 0
-            chosen = solid[torch.randint(max(len(solid), 1), (inside,), generator=self._generator)]
-            return torch.cat([chosen, self._anywhere(view, count - inside)])
-        return self._anywhere(view, count)
+    def _pixels_of(self, view: View, count: int, progress: float) -> Tensor:
+        """Flat indices of random pixels within the view's mask, with the share of those with alpha that is asked for."""
+        config = self._config
+        if view.alpha is None or max(config.foreground, config.foreground_least) == 0:
+            return self._anywhere(view, count)
+        solid = (view.alpha > 0 if view.mask is None else (view.alpha > 0) & view.mask).reshape(-1).nonzero()[:, 0]
+        if len(solid) == 0:
+            return self._anywhere(view, count)
+        valid = view.alpha.numel() if view.mask is None else int(view.mask.count_nonzero())
+        inside = round(config.foreground_at(progress, len(solid) / valid) * count)
+        chosen = solid[torch.randint(len(solid), (inside,), generator=self._generator)]
+        return torch.cat([chosen, self._anywhere(view, count - inside)])
 
     def _anywhere(self, view: View, count: int) -> Tensor:
         if view.mask is None:
@@ -155,22 +182,22 @@ class Batches:
         if len(self._order) == 0:
             self._order = torch.randperm(len(self._scene.train), generator=self._generator)
         index, self._order = int(self._order[0]), self._order[1:]
-        view = self._scaled(index, self._config.scale_at(progress))
+        view = self._scaled(index, progress)
         batch = _whole(view, background, index)
         camera = view.camera if self._refined is None else self._refined.camera(index).resized(*size_of(view))
         return camera.to(self._device), batch.to(self._device)
 
-    def _scaled(self, index: int, scale: float) -> View:
-        """A training view at an image scale, area-averaged; cached as bytes for the phase."""
+    def _scaled(self, index: int, progress: float) -> View:
+        """A training view at the image scale of a point of the fit, area-averaged; the last scale's are kept as bytes."""
         view = self._scene.train[index]
+        scale = self._config.scale_at(progress, max(size_of(view)))
         if scale == 1:
-            self._small.clear()
+            self._small.pop(index, None)
             return view
-        key = (index, scale)
-        if key not in self._small:
-            width, height = (max(1, round(edge * scale)) for edge in (view.camera.width, view.camera.height))
-            self._small[key] = resized_view(view, width, height)
-        return self._small[key]
+        if index not in self._small or self._small[index][0] != scale:
+            width, height = (max(1, round(edge * scale)) for edge in size_of(view))
+            self._small[index] = scale, resized_view(view, width, height)
+        return self._small[index][1]
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that a resumed fit needs."""

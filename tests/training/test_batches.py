@@ -1,0 +1,111 @@
+"""Shares of a step's rays that meet the foreground, and sizes of the pictures that a fit begins with."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from invgraphics.core import Batch, Scene
+from invgraphics.testing import toy_scene
+from invgraphics.training.batches import BatchConfig, Batches
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def toy() -> Scene:
+    return toy_scene(views=1, size=12)
+
+
+@pytest.fixture
+def one_pixel(toy: Scene) -> Scene:
+    """One view that has alpha in one pixel of 144."""
+    alpha = torch.zeros(12, 12)
+    alpha[3, 5] = 1.0
+    return replace(toy, train=(replace(toy.train[0], alpha=alpha),))
+
+
+def test_rays_on_the_foreground_are_the_share_asked_for(one_pixel: Scene) -> None:
+    batches = Batches(BatchConfig(rays=200, views=1, foreground=0.75), one_pixel, torch.Generator().manual_seed(0), CPU)
+    _, batch = batches.rays()
+    assert 150 <= int((batch.alpha > 0).sum()) <= 156
+    _, batch = Batches(BatchConfig(rays=200, views=1), one_pixel, torch.Generator().manual_seed(0), CPU).rays()
+    assert int((batch.alpha > 0).sum()) < 8
+
+
+def test_the_foreground_has_its_share_until_then(one_pixel: Scene) -> None:
+    config = BatchConfig(rays=200, views=1, foreground=0.5, foreground_until=0.3)
+    batches = Batches(config, one_pixel, torch.Generator().manual_seed(0), CPU)
+    seen = [int((batches.rays(progress)[1].alpha > 0).sum()) for progress in (0.0, 0.29, 0.3, 1.0)]
+    assert min(seen[:2]) >= 100
+    assert max(seen[2:]) < 8
+    with pytest.raises(ValueError, match="foreground_until"):
+        BatchConfig(foreground_until=1.5)
+
+
+def test_the_least_share_counts_the_rays_that_meet_the_foreground_anyway(toy: Scene) -> None:
+    alpha = torch.zeros(12, 12)
+    alpha[:3] = 1.0  # a quarter
+    scene = replace(toy, train=(replace(toy.train[0], alpha=alpha),))
+
+    def rays(**values: float) -> Batch:
+        config = BatchConfig(rays=40_000, views=1, **values)
+        return Batches(config, scene, torch.Generator().manual_seed(0), CPU).rays(0.1)[1]
+
+    assert float((rays(foreground_least=0.4).alpha > 0).float().mean()) == pytest.approx(0.4, abs=0.01)
+    assert float((rays(foreground=0.4).alpha > 0).float().mean()) == pytest.approx(0.4 + 0.6 / 4, abs=0.01)
+    assert torch.equal(rays(foreground_least=0.25).target, rays().target)  # where it is there already, the same rays
+    assert torch.equal(rays(foreground_least=0.4, foreground_until=0.1).target, rays().target)
+    with pytest.raises(ValueError, match="foreground_least"):
+        BatchConfig(foreground_least=-0.1)
+
+
+def test_the_least_share_is_of_the_pixels_within_the_mask(toy: Scene) -> None:
+    alpha, mask = torch.zeros(12, 12), torch.zeros(12, 12, dtype=torch.bool)
+    alpha[:3] = 1.0
+    mask[:6] = True  # of which half has alpha
+    scene = replace(toy, train=(replace(toy.train[0], alpha=alpha, mask=mask),))
+    config = BatchConfig(rays=40_000, views=1, foreground_least=0.4)
+    _, batch = Batches(config, scene, torch.Generator().manual_seed(0), CPU).rays()
+    assert float((batch.alpha > 0).float().mean()) == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("edge", "sizes"),
+    [(16, [16]), (22, [22]), (24, [12, 24]), (40, [20, 40]), (48, [12, 24, 48]), (64, [16, 32, 64]), (100, [12, 25, 50, 100])],
+)
+def test_large_pictures_begin_near_the_size_asked_for(edge: int, sizes: list[int]) -> None:
+    """Halved until within a factor of the square root of two of 16 px; every size has an equal part of the first 60 %."""
+    scene = toy_scene(views=2, size=edge)
+    batches = Batches(BatchConfig(start_size=16, start_until=0.6), scene, torch.Generator().manual_seed(0), CPU)
+    parts = len(sizes) - 1
+    for part, size in enumerate(sizes[:-1]):
+        for progress in (0.6 * part / parts + 1e-6, 0.6 * (part + 1) / parts - 1e-6):
+            assert batches.image(progress)[0].width == size
+    for progress in (0.6 if parts else 0.0, 1.0):
+        assert batches.image(progress)[0].width == edge
+
+
+def test_pictures_of_different_sizes_begin_alike() -> None:
+    small, large = toy_scene(views=1, size=32), toy_scene(views=1, size=64)
+    scene = large.with_views(train=(small.train[0], large.train[0]))
+    batches = Batches(BatchConfig(start_size=16), scene, torch.Generator().manual_seed(0), CPU)
+
+    def widths(progress: float) -> list[int]:
+        drawn = [batches.image(progress) for _ in range(4)]
+        return [camera.width for camera, _ in sorted(drawn, key=lambda pair: pair[1].view)]
+
+    assert widths(0.0) == [16, 16, 16, 16]
+    assert widths(0.3) == [16, 16, 32, 32]
+    assert widths(0.5) == [32, 32, 64, 64]
+    with pytest.raises(ValueError, match="start_size"):
+        BatchConfig(start_size=-1)
+    with pytest.raises(ValueError, match="start_until"):
+        BatchConfig(start_until=0.0)
+
+
+def test_of_two_schedules_the_smaller_picture_counts() -> None:
+    config = BatchConfig(resolution=(0.5, 1.0), until=(0.1,), start_size=16, start_until=0.4)
+    scales = [config.scale_at(progress, 64) for progress in (0.05, 0.15, 0.25, 0.4)]
+    assert scales == [0.25, 0.25, 0.5, 1.0]
+    assert [config.scale_at(progress, 16) for progress in (0.05, 0.15)] == [0.5, 1.0]
