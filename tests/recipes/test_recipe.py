@@ -103,16 +103,20 @@ def test_a_cap_reaches_the_field_and_the_hooks_that_make_primitives() -> None:
     assert load_method("volumetric/hash", overrides=["max_primitives=123"]).recipe.field.layers == 1
 
 
+LATER_IN_BATCHES = ("foreground_until", "foreground_least", "start_size", "start_until")
+
+
 def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
     """With the keys as they were first called; the digest, by which runs are found again, is over those names."""
-    method = load_method("splatting/gaussians", "long")
+    method = load_method("splatting/gaussians", "long", ["batches.start_size=0", "batches.start_until=0.5"])
     table = copy.deepcopy(method.table)
     (hook,) = [hook for hook in table["hooks"] if hook["type"] == "density_control"]
     for new, old in {"revised_opacity": "share_opacity", "cap_ramp": "pace", "latest_start_step": "start_steps"}.items():
         hook[old] = hook.pop(new)
     for new, old in {"antialiased": "compensate", "max_grad_splats": "receivers"}.items():
         table["renderer"][old] = table["renderer"].pop(new)
-    del table["batches"]["foreground_until"]  # which came later, and changes nothing at 1
+    for key in LATER_IN_BATCHES:
+        del table["batches"][key]
     assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
     again = resolve(method.name, "long", table)
     assert again.recipe == method.recipe and again.table == method.table
@@ -126,7 +130,7 @@ def test_keys_that_came_later_leave_the_digest_alone(preset: str) -> None:
     """While they have the values that change nothing; neural fields and the volumetric renderer had these keys first."""
     fields = "type encoding geometry layers width skip geometry_features colour_layers colour_width direction direction_degree"
     known = {*fields.split(), "density_activation", "density_bias", "density_per"}
-    method = load_method("volumetric/nerf", preset)
+    method = load_method("volumetric/nerf", preset, ["batches.foreground_least=0", "batches.foreground_until=1"])
     table = copy.deepcopy(method.table)
     parts = [table["field"], *([table["renderer"]["sampler"]["proposal"]] if preset == "paper" else [])]
     for part in parts:
@@ -135,13 +139,15 @@ def test_keys_that_came_later_leave_the_digest_alone(preset: str) -> None:
             del part[key]
     for key in table["renderer"].keys() - {"type", "sampler", "gradient_reach"}:
         del table["renderer"][key]
-    del table["batches"]["foreground_until"]
+    for key in LATER_IN_BATCHES:
+        del table["batches"][key]
     assert resolve(method.name, preset, table).digest == method.digest
     text = json.dumps(table, sort_keys=True)
     assert method.digest == hashlib.sha256(text.encode()).hexdigest()
     assert load_method(method.name, preset, ["field.density_scale=2.0"]).digest != method.digest
     assert load_method(method.name, preset, ["renderer.colour_threshold=0.1"]).digest != method.digest
-    assert load_method(method.name, preset, ["batches.foreground_until=0.5"]).digest != method.digest
+    for key in LATER_IN_BATCHES:
+        assert load_method(method.name, preset, [f"batches.{key}={0.3 if key != 'start_size' else 7}"]).digest != method.digest
 
 
 def test_renderers_of_older_runs_still_resolve() -> None:
