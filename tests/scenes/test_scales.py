@@ -15,7 +15,7 @@ from invgraphics.scenes import scales
 from invgraphics.scenes.degrade import TrainingData, degrade
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.open import SceneSource
-from invgraphics.scenes.scales import scene_at
+from invgraphics.scenes.scales import resized_view, scene_at
 from invgraphics.testing import toy_scene
 
 
@@ -64,6 +64,28 @@ def test_pictures_of_several_sizes_are_each_scaled(scene: Scene, monkeypatch: py
     mixed = scene.with_views(train=(scene.train[0], large.train[1]), test=(large.test[0],), val=(large.test[1],))
     smaller = scene_at(mixed, 2)
     assert [view.camera.width for view in (*smaller.train, *smaller.val, *smaller.test)] == [12, 24, 24, 24]
+
+
+@pytest.mark.parametrize("opaque", [False, True])
+@pytest.mark.parametrize(("width", "height"), [(12, 8), (9, 8), (12, 7)])
+def test_colours_are_averaged_with_their_coverage(scene: Scene, opaque: bool, width: int, height: int) -> None:
+    """Sums over a picture are kept, whether new pixels are blocks of old ones or cut them; one masked pixel masks its own."""
+    generator = torch.Generator().manual_seed(0)
+    mask = torch.ones(24, 36, dtype=torch.bool)
+    mask[23, 35] = False
+    alpha = None if opaque else torch.rand(24, 36, generator=generator)
+    camera = replace(scene.train[0].camera, width=36, height=24)
+    colour = torch.rand(24, 36, 3, generator=generator)
+    view = replace(scene.train[0], camera=camera, image=colour, alpha=alpha, mask=mask, depth=None, normal=None)
+    small = resized_view(view, width, height)
+    area = 36 * 24 / (width * height)
+    before, after = view.colour() * view.opacity()[..., None], small.colour() * small.opacity()[..., None]
+    assert torch.allclose(after.sum((0, 1)) * area, before.sum((0, 1)), rtol=1e-5)
+    assert float(small.opacity().sum()) * area == pytest.approx(float(view.opacity().sum()), rel=1e-5)
+    assert small.mask is not None and int((~small.mask).sum()) == 1 and not small.mask[-1, -1]
+    if (width, height) == (12, 8):
+        expected = before.view(8, 3, 12, 3, 3).mean(dim=(1, 3))
+        assert torch.allclose(after, expected, atol=1e-6)
 
 
 def test_scores_at_a_scale_are_those_of_smaller_pictures(scene: Scene) -> None:
