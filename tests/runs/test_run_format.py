@@ -16,6 +16,7 @@ import pytest
 
 import invgraphics
 from invgraphics import runs
+from invgraphics.runs.environment import Environment
 from invgraphics.runs.history import Moment
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.schema import Record, stored_fields
@@ -143,6 +144,14 @@ def test_published_tables_say_what_published_runs_say(path: Path) -> None:
     assert told and set(told) == set(held)
 
 
+def test_packages_beside_the_other_facts_of_a_machine_are_read(tmp_path: Path) -> None:
+    """As schema 1 had them."""
+    facts = {"python": "3.11.7", "threads": 2, "numpy": "2.4.6", "mitsuba": None}
+    (tmp_path / "environment.json").write_text(json.dumps(facts | {"schema": 1}))
+    found = Environment.read(tmp_path / "environment.json")
+    assert (found.python, found.threads, found.packages) == ("3.11.7", 2, {"numpy": "2.4.6", "mitsuba": None})
+
+
 def test_published_studies_are_read() -> None:
     paths = sorted(REPORTS.rglob("study.json"))
     assert paths
@@ -151,4 +160,5 @@ def test_published_studies_are_read() -> None:
         assert [(cell.id, cell.status, cell.levels) for cell in study.cells] == [
             (cell["id"], cell["status"], cell["levels"]) for cell in table["cells"]
         ]
-        assert study.environment.packages["numpy"] == table["environment"]["numpy"]
+        environment = table["environment"]
+        assert study.environment.packages["numpy"] == environment.get("packages", environment)["numpy"]

@@ -11,13 +11,14 @@ from pathlib import Path
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import DATA
 from invgraphics.recipes.recipe import Method, load_method
+from invgraphics.recipes.renamed import ADDED_KEYS
 from invgraphics.report.wording import listing
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.mitsuba.spec import description_path, read
 from invgraphics.training.budget import Budget
 
-UNTOUCHED = {"start_size": 0, "start_until": 0.5}
+UNNOTICED = {key: ADDED_KEYS["batches"][key] for key in ("start_size", "start_until")}
 """Keys of ``batches`` that pictures below ``start_size`` do not notice, with the values of recipes that lack them."""
 
 
@@ -90,7 +91,7 @@ def _todays_digests(record: Provenance, overrides: Sequence[str]) -> tuple[str, 
         edge = _longest_edge(record)
         if edge is None or method.recipe.batches.halvings(edge):
             return (method.digest,)
-        return method.digest, made(*(f"batches.{key}={value}" for key, value in UNTOUCHED.items())).digest
+        return method.digest, made(*(f"batches.{key}={value}" for key, value in UNNOTICED.items())).digest
     except InputError as error:
         return (error.sentence.rstrip("."),)
 
