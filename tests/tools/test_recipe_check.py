@@ -60,7 +60,7 @@ def test_a_report_is_current_until_its_recipe_changes(tmp_path: Path, capsys: py
         ("bricks", {}, True),  # 128 px
     ],
 )
-def test_a_key_that_small_pictures_do_not_notice_is_no_difference(
+def test_keys_without_effect_at_the_size_of_a_run_are_no_difference(
     tmp_path: Path, scene: str, options: dict[str, Any], is_current: bool
 ) -> None:
     """Published runs of splats are older than ``start_size``, which changes no bit of them."""

@@ -43,6 +43,21 @@ def test_the_foreground_has_its_share_until_then(one_pixel: Scene) -> None:
         BatchConfig(foreground_until=1.5)
 
 
+def test_the_foreground_is_not_looked_for_once_its_share_has_ended(one_pixel: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes as long as a step's rays, or ten times that where photographs are large."""
+
+    def looked(config: BatchConfig, covered: float) -> float:
+        raise AssertionError("looked for the foreground")
+
+    monkeypatch.setattr(BatchConfig, "foreground_share", looked)
+    config = BatchConfig(rays=20, views=1, foreground_least=0.5, foreground_until=0.3)
+    batches = Batches(config, one_pixel, torch.Generator().manual_seed(0), CPU)
+    with pytest.raises(AssertionError, match="looked"):
+        batches.rays(0.29)
+    batches.rays(0.3)
+    Batches(BatchConfig(rays=20, views=1), one_pixel, torch.Generator().manual_seed(0), CPU).rays(0.0)
+
+
 def test_the_least_share_counts_the_rays_that_meet_the_foreground_anyway(toy: Scene) -> None:
     alpha = torch.zeros(12, 12)
     alpha[:3] = 1.0  # a quarter

@@ -18,7 +18,7 @@ from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.runs.provenance import Provenance
-from invgraphics.training.batches import Batches
+from invgraphics.training.batches import Batches, size_of
 from invgraphics.training.fit import Plan
 
 SCREEN_BYTES = 300
@@ -103,11 +103,11 @@ def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
         raise InputError(sentence, "Choose a lower --max-primitives.")
     growth = (most - now) * (COPIES * row + SCREEN_BYTES)
     parameters = model_bytes(plan.modules.values()) + (most - now) * row
-    edges = [(view.camera.width, view.camera.height) for view in plan.scene.train]
-    starts_small = any(plan.batches.scale_at(0.0, max(edge)) < 1 for edge in edges)
-    grows = starts_small and not isinstance(plan.model.renderer, RayRenderer)
-    pictures = max(width * height for width, height in edges) * PICTURE_BYTES if grows else 0
-    rays = Batches.MAX_RAYS * RAY_BYTES if isinstance(plan.model.renderer, RayRenderer) and plan.batches.samples else 0
+    on_rays = isinstance(plan.model.renderer, RayRenderer)
+    sizes = [size_of(view) for view in plan.scene.train]
+    starts_small = any(plan.batches.scale_at(0.0, max(size)) < 1 for size in sizes)
+    pictures = max(width * height for width, height in sizes) * PICTURE_BYTES if starts_small and not on_rays else 0
+    rays = Batches.MAX_RAYS * RAY_BYTES if on_rays and plan.batches.samples else 0
     total = MARGIN * held + growth + pictures + rays + CHECKPOINT_COPIES * parameters + BASE_BYTES
     return MemoryForecast(round(total), most)
 

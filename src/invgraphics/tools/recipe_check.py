@@ -18,8 +18,8 @@ from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.mitsuba.spec import description_path, read
 from invgraphics.training.budget import Budget
 
-UNNOTICED = {key: ADDED_KEYS["batches"][key] for key in ("start_size", "start_until")}
-"""Keys of ``batches`` that pictures below ``start_size`` do not notice, with the values of recipes that lack them."""
+WITHOUT_EFFECT = {key: ADDED_KEYS["batches"][key] for key in ("start_size", "start_until")}
+"""Keys of ``batches`` without effect on pictures near or below ``start_size``, with the values of recipes that lack them."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def _todays_digests(record: Provenance, overrides: Sequence[str]) -> tuple[str, 
         edge = _longest_edge(record)
         if edge is None or method.recipe.batches.halvings(edge):
             return (method.digest,)
-        return method.digest, made(*(f"batches.{key}={value}" for key, value in UNNOTICED.items())).digest
+        return method.digest, made(*(f"batches.{key}={value}" for key, value in WITHOUT_EFFECT.items())).digest
     except InputError as error:
         return (error.sentence.rstrip("."),)
 

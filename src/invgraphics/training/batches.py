@@ -26,8 +26,8 @@ class BatchConfig:
         resolution: image scale of each phase of the fit; the last should be 1.
         until: progress at which each phase but the last ends; one fewer than ``resolution``.
         start_size: longest edge in pixels near which a fit begins where its photographs are larger: these are halved while
-            that brings them closer to it (on a logarithmic scale), and doubled step by step. 0 begins with all pixels. What
-            few steps can do depends on their number, which pixels must not decide.
+            that brings them closer to it (on a logarithmic scale), and doubled step by step; 0 begins with all pixels. Steps
+            on small pictures are cheap, so that a short budget holds many (Kerbl et al. 2023, section 7.1, begin at a quarter).
         start_until: progress from which on all pixels are fitted; each size before has an equal part of what precedes.
         foreground: share of the rays that are drawn among the pixels with alpha, where a view has such: what is small in
             its pictures is otherwise learnt from few rays, and a field that begins with empty space may stay empty.
@@ -78,10 +78,13 @@ class BatchConfig:
         """How often ``start_size`` halves a photograph whose longer edge is ``edge`` pixels, at the start of a fit."""
         return max(0, round(math.log2(edge / self.start_size))) if self.start_size else 0
 
-    def foreground_at(self, progress: float, covered: float) -> float:
+    def favours_foreground(self, progress: float) -> bool:
+        """Whether pixels with alpha may be drawn more often than others, at a point of the fit."""
+        asked = max(self.foreground, self.foreground_least) > 0
+        return asked and (progress < self.foreground_until or self.foreground_until == 1)
+
+    def foreground_share(self, covered: float) -> float:
         """Share of a view's rays drawn among its pixels with alpha, which are the share ``covered`` of all its pixels."""
-        if progress >= self.foreground_until != 1:
-            return 0.0
         # Of the rays that are drawn from all pixels, the share `covered` meets the object as well.
         missing = (self.foreground_least - covered) / (1 - covered) if covered < self.foreground_least else 0.0
         return max(self.foreground, missing)
@@ -135,7 +138,8 @@ class Batches:
         chosen = torch.randperm(len(train), generator=self._generator)[:count]
         shares = [self._rays // count + (i < self._rays % count) for i in range(count)]
         views = [self._scaled(int(view), progress) for view in chosen]
-        flat = [self._pixels_of(view, share, progress) for view, share in zip(views, shares, strict=True)]
+        draw = self._favouring_foreground if config.favours_foreground(progress) else self._anywhere
+        flat = [draw(view, share) for view, share in zip(views, shares, strict=True)]
         which = torch.repeat_interleave(torch.arange(count), torch.tensor(shares))
         wide = torch.tensor([view.camera.width for view in views])[which]
         index = torch.cat(flat)
@@ -151,16 +155,15 @@ class Batches:
         batch = Batch(*_composited(views, flat, background), background)
         return rays.to(self._device), batch.to(self._device)
 
-    def _pixels_of(self, view: View, count: int, progress: float) -> Tensor:
+    def _favouring_foreground(self, view: View, count: int) -> Tensor:
         """Flat indices of random pixels within the view's mask, with the share of those with alpha that is asked for."""
-        config = self._config
-        if view.alpha is None or max(config.foreground, config.foreground_least) == 0:
+        if view.alpha is None:
             return self._anywhere(view, count)
         solid = (view.alpha > 0 if view.mask is None else (view.alpha > 0) & view.mask).reshape(-1).nonzero()[:, 0]
         if len(solid) == 0:
             return self._anywhere(view, count)
         valid = view.alpha.numel() if view.mask is None else int(view.mask.count_nonzero())
-        inside = round(config.foreground_at(progress, len(solid) / valid) * count)
+        inside = round(self._config.foreground_share(len(solid) / valid) * count)
         chosen = solid[torch.randint(len(solid), (inside,), generator=self._generator)]
         return torch.cat([chosen, self._anywhere(view, count - inside)])
 
