@@ -14,8 +14,12 @@ from torch import nn
 STATM = Path("/proc/self/statm")
 """Linux: sizes of this process in pages; the second number is the resident set."""
 
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+"""Linux: the kernel's record of the largest resident set (``VmHWM``), and the file that sets it back to today's."""
+_RESET = "5"
+
 SAMPLING_SECONDS = 0.02
-"""How often the resident set is read. Shorter peaks can be missed."""
+"""How often the resident set is read where the kernel's record cannot be set back. Shorter peaks are then missed."""
 
 
 def resident_bytes() -> int:
@@ -28,10 +32,29 @@ def resident_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
+def _reset_peak() -> bool:
+    """Set the kernel's record of the largest resident set back; ``False`` where that is not possible."""
+    try:
+        CLEAR.write_text(_RESET)
+    except OSError:
+        return False
+    return _recorded_peak() is not None
+
+
+def _recorded_peak() -> int | None:
+    """Largest resident set in bytes since the record was set back; ``None`` where the kernel keeps none."""
+    try:
+        lines = STATUS.read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM:")), None)
+
+
 class PeakMemory:
     """Peak memory within a ``with`` block, above that at its start.
 
-    On a CPU this is the process's resident set, sampled by a thread; on CUDA, torch's allocator.
+    On a CPU this is the process's resident set: Linux records its peak, elsewhere a thread samples it. On CUDA it is that of
+    torch's allocator. Blocks must not overlap in time.
 
     Args:
         device: where the work happens.
@@ -43,6 +66,7 @@ class PeakMemory:
         self._thread = threading.Thread(target=self._watch, name="peak-memory", daemon=True)
         self._start = 0
         self._peak = 0
+        self._recorded = self._closed = False
 
     def __enter__(self) -> PeakMemory:
         if self._device.type == "cuda":
@@ -50,7 +74,9 @@ class PeakMemory:
             torch.cuda.reset_peak_memory_stats(self._device)
         self._start = self._peak = self._held()
         if self._device.type != "cuda":
-            self._thread.start()
+            self._recorded = _reset_peak()
+            if not self._recorded:
+                self._thread.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
@@ -58,17 +84,23 @@ class PeakMemory:
         if self._thread.ident is not None:
             self._thread.join()
         self._read()
+        self._closed = True
 
     @property
     def peak_bytes(self) -> int:
-        """Peak bytes above the level at the start; complete once the block has been left."""
+        """Peak bytes above the level at the start, so far."""
+        self._read()
         return self._peak - self._start
 
     def _held(self) -> int:
-        return torch.cuda.max_memory_allocated(self._device) if self._device.type == "cuda" else resident_bytes()
+        if self._device.type == "cuda":
+            return torch.cuda.max_memory_allocated(self._device)
+        recorded = _recorded_peak() if self._recorded else None
+        return resident_bytes() if recorded is None else recorded
 
     def _read(self) -> None:
-        self._peak = max(self._peak, self._held())
+        if not self._closed:
+            self._peak = max(self._peak, self._held())
 
     def _watch(self) -> None:
         while not self._stop.wait(SAMPLING_SECONDS):

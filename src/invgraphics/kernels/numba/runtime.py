@@ -85,8 +85,8 @@ event.register("numba:compile", _compiler)
 
 
 def source_digest() -> str:
-    """SHA-256 over the names and texts of all modules of kernels."""
-    digest, root = hashlib.sha256(), Path(__file__).parent
+    """SHA-256 over the names and texts of all modules of kernels, the references too: their constants are compiled in."""
+    digest, root = hashlib.sha256(), Path(__file__).parents[1]
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes())
     return digest.hexdigest()

@@ -16,8 +16,13 @@ from invgraphics.kernels.reference.gaussian_rays import MAX_DEVIATIONS, Intersec
 Weights = tuple[Float[Tensor, " p"], Float[Tensor, " p"] | None]
 """Each Gaussian's share of a ray's light; and the same times the distance from which it comes, or ``None``."""
 
-EDGES = (-3.6, -2.7, -1.8, -0.9, 0.0, 0.9, 1.8, 2.7, 3.6)
-"""Standard deviations between which a Gaussian is taken for constant while intervals are being placed."""
+EDGES = (-3.6, -1.5, 0.0, 1.5, 3.6)
+"""Standard deviations between which a Gaussian is taken for constant while intervals are being placed.
+
+Nine of them place no better intervals: with 16, 32 and 64 of these the light of fitted `bricks`, `materials` and `cloud`, and
+of 4,000 random Gaussians, is as far from that of 600, within 10 %. They are wide enough that what lies beyond, mixed over the
+gap between two Gaussians, is below 1e-6.
+"""
 MAX_OPTICAL_DEPTH = 9.2
 """Optical depth behind which less than 1/10000 of the light comes from: nothing there is worth a short interval."""
 MOST_AT_ONCE = 1 << 18

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.gaussians.integrals import STRIDE, all_shares, colour_of, seen_colour, shares_origin
+from invgraphics.kernels.numba.gaussians.integrals import STRIDE, colour_of, seen_colour, shares_origin
 from invgraphics.kernels.numba.gaussians.pairs import restrict
+from invgraphics.kernels.numba.gaussians.shares import FALLS, LIGHT, ROWS, SLOPES, WANTED, all_shares
 from invgraphics.kernels.numba.harmonics import harmonics_gradient
-from invgraphics.kernels.numba.runtime import exp2, inlined, parallel, prange
+from invgraphics.kernels.numba.runtime import LANES, exp2, index, inlined, parallel, prange
+from invgraphics.kernels.numba.simd.lanes import broadcast, load, reduce_sum, store
+from invgraphics.kernels.numba.simd.partial import unowned
 from invgraphics.kernels.types import ALPHA_MAX
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -23,34 +26,54 @@ def cut_off(rgb, gradient):
 
 
 @inlined
-def _depths_gradient(nodes, light, falls, wanted, slopes):
+def _depths_gradient(lights):
     """Gradients in the optical depths of the intervals, given the summed ones in their light."""
     behind = _ZERO
-    for k in range(len(light)):
-        s = len(light) - 1 - k
+    for k in range(lights.shape[1]):
+        s = lights.shape[1] - 1 - k
         # A denser interval absorbs more itself and attenuates what is behind.
-        slopes[s] = wanted[s] * falls[s] - behind
-        behind += wanted[s] * light[s]
+        lights[SLOPES, s] = lights[WANTED, s] * lights[FALLS, s] - behind
+        behind += lights[WANTED, s] * lights[LIGHT, s]
 
 
 @inlined
-def _shape_gradient(nodes, t, sigma, own, bells, limits, given, slopes, light):
+def _weights_gradients(gaussian, begin, end, depth, grad_sums, room, width, colours, weights, given):
+    """Weights of a ray's Gaussians, gradients in them, and the sums of those in the light of the intervals."""
+    rows, limits, _, lights = room
+    for q in range(width // LANES):
+        store(lights, WANTED * width + LANES * q, broadcast(_ZERO))
+    for p in range(begin, end):
+        i, g = p - begin, gaussian[p]
+        if limits[i, 0] == limits[i, 1]:
+            continue
+        value = grad_sums[0]
+        for c in range(3):
+            value += grad_sums[1 + c] * max(colours[g, c], _ZERO)
+        given[i] = value
+        scaled, place, total = depth[p] * value, index(ROWS) * width * index(i), broadcast(_ZERO)
+        for q in range(limits[i, 0], limits[i, 1]):
+            own, wanted = load(rows, place + LANES * q), WANTED * width + LANES * q
+            total += load(lights, LIGHT * width + LANES * q) * own
+            store(lights, wanted, load(lights, wanted) + scaled * own)
+        weights[i] = reduce_sum(total) * depth[p]
+
+
+@inlined
+def _shape_gradient(rows, place, width, lights, limits, given, inverse):
     """Gradients of one Gaussian's light in its optical depth, and times that depth in its distance and width.
 
-    ``given`` is the gradient in its weight, ``slopes`` those in the intervals' depths.
+    ``given`` is the gradient in its weight, ``inverse`` one over its width.
     """
-    first, last = limits
-    along = _ZERO
-    for s in range(first, last):
-        along += own[s] * (given * light[s] + slopes[s])
-    shift, widen, inverse = _ZERO, _ZERO, _ONE / sigma
-    for e in range(first, last + 1):
-        before = given * light[e - 1] + slopes[e - 1] if e > 0 else _ZERO
-        after = given * light[e] + slopes[e] if e < len(light) else _ZERO
-        moved = bells[e] * (before - after)
-        shift -= moved
-        widen -= moved * (nodes[e] - t) * inverse
-    return along, shift * _ROOT * inverse, widen * _ROOT * inverse
+    thicken, shift, widen = broadcast(_ZERO), broadcast(_ZERO), broadcast(_ZERO)
+    for q in range(limits[0], limits[1]):
+        at = LANES * q
+        # Of the light in the Gaussian's share of each interval, per unit of its optical depth.
+        slope = given * load(lights, LIGHT * width + at) + load(lights, SLOPES * width + at)
+        thicken += slope * load(rows, place + at)
+        shift += slope * load(rows, place + width + at)
+        widen += slope * load(rows, place + width + width + at)
+    scale = -_ROOT * inverse
+    return reduce_sum(thicken), scale * reduce_sum(shift), scale * reduce_sum(widen)
 
 
 @inlined
@@ -116,26 +139,6 @@ def place_gradient(table, strength, reading, g, o, d, found, given, grad):
 
 
 @inlined
-def _weights_gradients(gaussian, begin, end, depth, grad_sums, room, colours, weights, given):
-    """Weights of a ray's Gaussians, gradients in them, and the sums of those in the light of the intervals."""
-    wanted, light = room[3][3], room[3][1]
-    wanted[:] = _ZERO
-    for p in range(begin, end):
-        i, g = p - begin, gaussian[p]
-        if room[2][i, 0] == room[2][i, 1]:
-            continue
-        value = grad_sums[0]
-        for c in range(3):
-            value += grad_sums[1 + c] * max(colours[g, c], _ZERO)
-        given[i] = value
-        weight = _ZERO
-        for s in range(room[2][i, 0], room[2][i, 1]):
-            weight += light[s] * room[0][i, s]
-            wanted[s] += depth[p] * value * room[0][i, s]
-        weights[i] = weight * depth[p]
-
-
-@inlined
 def spread_colour_gradients(sh, table, o, touched, count, work, basis, buffer, grad, grad_sh):
     """Pass the summed colour gradients of one origin on to coefficients and centres; returns the centres' sum."""
     sums, rgb = work[1], np.empty(3, np.float32)
@@ -163,13 +166,15 @@ def integrate_backward(rays, primitives, reading, pairs, first_ray, kept, grad_s
     table, strength, sh = primitives
     gaussian, starts = pairs
     t, sigma, depth, nodes, stops = kept
+    edges = index(nodes.shape[1])
+    width = edges - index(1)
     for job in prange(len(first_ray) - 1):
         basis, buffer = np.empty(STRIDE * STRIDE, np.float32), np.empty(STRIDE * STRIDE, np.float32)
-        room = rooms[0][job], rooms[1][job], rooms[2][job], rooms[3][job]
-        weights, given = rooms[4][job, 0], rooms[4][job, 1]
-        light, slopes = room[3][1], room[3][4]
+        rows, limits, lights = unowned(rooms[0][job]), rooms[1][job], unowned(rooms[2][job])
+        room = rows, limits, rooms[2][job], lights
+        weights, given = rooms[3][job, 0], rooms[3][job, 1]
         grad, grad_sh = grads[0][job], grads[1][job]
-        stamps, touched, work = rooms[5][job, 0], rooms[5][job, 1], (rooms[6][job], rooms[7][job])
+        stamps, touched, work = rooms[4][job, 0], rooms[4][job, 1], (rooms[5][job], rooms[6][job])
         colours, colour_sums = work
         group, count, by_ray = np.int32(0), 0, len(grads[2]) > 0
         for r in range(first_ray[job], first_ray[job + 1]):
@@ -181,23 +186,21 @@ def integrate_backward(rays, primitives, reading, pairs, first_ray, kept, grad_s
             if begin == end:
                 continue
             o, d = origins[r], directions[r]
-            all_shares(nodes[r], stops[r], t, sigma, depth, begin, end, room)
+            all_shares(unowned(nodes), index(r) * edges, stops[r], (t, sigma, depth), (begin, end), True, room)
             for p in range(begin, end):
                 g = gaussian[p]
-                if room[2][p - begin, 0] < room[2][p - begin, 1] and stamps[g] != group:
+                if limits[p - begin, 0] < limits[p - begin, 1] and stamps[g] != group:
                     touched[count] = g
                     count += 1
                     seen_colour(sh, table, g, o, group, stamps, colours, basis)
-            _weights_gradients(gaussian, begin, end, depth, grad_sums[r], room, colours, weights, given)
-            _depths_gradient(nodes[r], light, room[3][2], room[3][3], slopes)
+            _weights_gradients(gaussian, begin, end, depth, grad_sums[r], room, width, colours, weights, given)
+            _depths_gradient(rooms[2][job])
             for p in range(begin, end):
                 i, g = p - begin, gaussian[p]
-                limits = room[2][i, 0], room[2][i, 1]
-                if limits[0] == limits[1]:
+                if limits[i, 0] == limits[i, 1]:
                     continue
-                thicken, shift, widen = _shape_gradient(
-                    nodes[r], t[p], sigma[p], room[0][i], room[1][i], limits, given[i], slopes, light
-                )
+                place, reached = index(ROWS) * width * index(i), (limits[i, 0], limits[i, 1])
+                thicken, shift, widen = _shape_gradient(rows, place, width, lights, reached, given[i], _ONE / sigma[p])
                 found, moved = (sigma[p], depth[p]), (shift * depth[p], widen * depth[p], thicken)
                 offset, direction = place_gradient(table, strength, reading, g, o, d, found, moved, grad)
                 for c in range(3):

@@ -15,9 +15,15 @@ from invgraphics.kernels.numba.gaussians.backward import integrate_backward
 from invgraphics.kernels.numba.gaussians.integrals import integrate
 from invgraphics.kernels.numba.gaussians.nodes import COUNT, PASSES
 from invgraphics.kernels.numba.gaussians.pairs import gaussian_pairs
-from invgraphics.kernels.numba.runtime import array, once_differentiable, scratch, split_by_work, threads
+from invgraphics.kernels.numba.gaussians.shares import ROWS
+from invgraphics.kernels.numba.runtime import GROUP, array, once_differentiable, scratch, split_by_work, threads
 from invgraphics.kernels.reference import gaussian_quadrature as reference
 from invgraphics.kernels.reference.gaussian_rays import Primitives
+
+
+def whole_registers(count: int) -> int:
+    """Round a count up to whole SIMD registers."""
+    return -(-count // GROUP) * GROUP
 
 
 class _Work:
@@ -35,21 +41,22 @@ class _Work:
         split_by_work(counts, jobs, self.first_ray)
         self.most = max(1, int(counts.max(initial=0)))
 
-    def rooms(self, edges: int) -> tuple[np.ndarray, ...]:
-        """Shares and bells of each Gaussian at all edges, its first and last interval, and rows of light."""
+    def rooms(self, width: int) -> tuple[np.ndarray, ...]:
+        """Shares of each Gaussian in intervals, the first and last registers of these, and rows of light."""
         jobs, most = len(self.first_ray) - 1, self.most
-        shapes = (jobs, most, edges), (jobs, most, edges), (jobs, 5, edges - 1)
-        shares, bells, light = (
+        shapes = (jobs, most, ROWS * width), (jobs, 5, width)
+        shares, light = (
             scratch(f"gaussians.{i}", int(np.prod(shape)))[: int(np.prod(shape))].reshape(shape)
             for i, shape in enumerate(shapes)
         )
-        limits = scratch("gaussians.limits", 2 * jobs * most, np.int64)[: 2 * jobs * most].reshape(jobs, most, 2)
-        return shares, bells, limits, light
+        limits = scratch("gaussians.limits", 2 * jobs * most, np.uintp)[: 2 * jobs * most].reshape(jobs, most, 2)
+        return shares, limits, light
 
     def sorting(self) -> tuple[np.ndarray, np.ndarray]:
         """Arrays in which quadrature nodes are placed."""
-        jobs, size = len(self.first_ray) - 1, 6 * COUNT * self.most
-        rows = scratch("gaussians.nodes", jobs * size)[: jobs * size].reshape(jobs, 6, COUNT * self.most)
+        jobs, most = len(self.first_ray) - 1, whole_registers(COUNT * self.most)
+        size = 6 * most
+        rows = scratch("gaussians.nodes", jobs * size)[: jobs * size].reshape(jobs, 6, most)
         return rows, np.empty((jobs, PASSES, 256), np.int32)
 
     def colours(self, gaussians: int, columns: int) -> tuple[np.ndarray, ...]:
@@ -71,14 +78,14 @@ class _Integrate(torch.autograd.Function):
         sums = torch.zeros(rays, width)
         kept = (
             *(np.empty(p, np.float32) for _ in range(3)),
-            np.empty((rays, steps + 1), np.float32),
+            np.empty((rays, whole_registers(steps) + 1), np.float32),
             np.empty(rays, np.float32),
         )
         given = tuple(array(x) for x in (table, strength, sh, normals))
         along = (array(origins), array(directions), *(array(x) for x in limits))
         stamps, colours = work.colours(len(table), 1)
-        rooms = (*work.rooms(steps + 1), *work.sorting(), stamps[:, 0], colours)
-        integrate(along, given, reading, work.pairs, work.first_ray, kept, sums.numpy(), rooms)
+        rooms = (*work.rooms(whole_registers(steps)), *work.sorting(), stamps[:, 0], colours)
+        integrate(along, given, reading, work.pairs, work.first_ray, steps, kept, sums.numpy(), rooms)
         ctx.save_for_backward(table, strength, sh, origins, directions)
         ctx.work, ctx.kept, ctx.reading = work, kept, reading
         return sums
@@ -87,14 +94,14 @@ class _Integrate(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         table, strength, sh, origins, directions = ctx.saved_tensors
-        work, edges = ctx.work, ctx.kept[3].shape[1]
+        work, width = ctx.work, ctx.kept[3].shape[1] - 1
         jobs = len(work.first_ray) - 1
         rows, coefficients = torch.zeros(jobs, len(table), 13), torch.zeros(jobs, *sh.shape)
         # Without a row for each ray, gradients of colours are summed over rays of one origin.
         grad_origins = torch.zeros(len(origins) if ctx.needs_input_grad[3] else 0, 3)
         grad_directions = torch.zeros(len(origins), 3)
         colour_sums = np.zeros((jobs, len(table), 3), np.float32)
-        rooms = *work.rooms(edges), np.empty((jobs, 2, work.most), np.float32), *work.colours(len(table), 2), colour_sums
+        rooms = *work.rooms(width), np.empty((jobs, 2, work.most), np.float32), *work.colours(len(table), 2), colour_sums
         integrate_backward(
             (array(origins), array(directions)),
             (array(table), array(strength), array(sh)),

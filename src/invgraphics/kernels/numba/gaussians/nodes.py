@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from invgraphics.kernels.numba.runtime import exp2, inlined
+from invgraphics.kernels.numba.runtime import GROUP, exp2, index, inlined
+from invgraphics.kernels.numba.simd.lanes import exp2_of, load, store, where
+from invgraphics.kernels.numba.simd.partial import unowned
 from invgraphics.kernels.reference.gaussian_quadrature import EDGES, MAX_OPTICAL_DEPTH, phi
 
 _EDGES = np.array(EDGES, np.float32)
@@ -23,6 +25,7 @@ def _rises() -> np.ndarray:
 
 _RISES = _rises()
 _LOG2E = np.float32(1 / np.log(2.0))
+_HALF, _ONE, _SIXTH, _THIN = np.float32(0.5), np.float32(1.0), np.float32(1 / 6), np.float32(0.02)
 _MOST = np.float32(MAX_OPTICAL_DEPTH)
 _TINY, _EPS = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
 _BITS, _BUCKETS, PASSES = np.uint32(8), 256, 2
@@ -52,18 +55,17 @@ def _sort(keys, rises, keys_swap, rises_swap, n, counts):
 
 
 @inlined
-def place_nodes(t, sigma, depth, begin, end, near, far, nodes, scratch, counts):
-    """Fill ``nodes`` with edges from near to far for the Gaussians ``begin`` to ``end - 1`` of a ray.
+def place_nodes(t, sigma, depth, begin, end, near, far, steps, nodes, scratch, counts):
+    """Fill ``nodes`` with edges of ``steps`` intervals from near to far, for the Gaussians ``begin`` to ``end - 1`` of a ray.
 
-    ``scratch`` holds six rows of at least `COUNT` entries per Gaussian: keys, rises, both once more, and two sums. Returns the
-    distance behind which no light comes from, infinite where the ray is not blocked.
+    Further nodes are far. ``scratch`` holds six rows, whole registers, of at least `COUNT` entries per Gaussian: keys, rises,
+    both once more, and two sums. Returns the distance behind which no light comes from, infinite where the ray is not blocked.
     """
-    steps = len(nodes) - 1
     n = 0
     counts[:] = 0
     scale = _LAST_KEY / max(far - near, _TINY)
     step = max(far - near, _TINY) / _LAST_KEY
-    keys, swap = scratch[0].view(np.uint32), scratch[2].view(np.uint32)
+    keys, swap, flat, width = scratch[0].view(np.uint32), scratch[2].view(np.uint32), unowned(scratch), scratch.shape[1]
     for i in range(begin, end):
         height = depth[i] / sigma[i]
         for e in range(COUNT):
@@ -90,9 +92,12 @@ def place_nodes(t, sigma, depth, begin, end, near, far, nodes, scratch, counts):
     last = max(np.float32(total), _TINY)
     whole = np.float32(1.0) / _one_minus_exp(last)
     deepest = np.float32(1.0) / min(last, _MOST)
-    for i in range(n):
-        grown[i] = _one_minus_exp(reached[i]) * whole + min(reached[i], _MOST) * deepest
-    nodes[0], nodes[steps] = near, far
+    for i in range(0, n, GROUP):
+        depths = load(flat, index(4 * width + i))
+        thin = depths * (_ONE - depths * (_HALF - depths * _SIXTH))
+        alpha = where(depths < _THIN, thin, _ONE - exp2_of(-_LOG2E * depths))
+        store(flat, index(5 * width + i), alpha * whole + min(depths, _MOST) * deepest)
+    nodes[0], nodes[steps:] = near, far
     after = 1
     for s in range(1, steps):
         wanted = np.float32(2.0) * np.float32(s) / np.float32(steps)
@@ -107,6 +112,6 @@ def place_nodes(t, sigma, depth, begin, end, near, far, nodes, scratch, counts):
 @inlined
 def _one_minus_exp(x):
     """1 - exp(-x) for x >= 0; a series where the difference would cancel."""
-    if x < np.float32(0.02):
-        return x * (np.float32(1.0) - x * (np.float32(0.5) - x * np.float32(1 / 6)))
-    return np.float32(1.0) - exp2(-x * _LOG2E)
+    if x < _THIN:
+        return x * (_ONE - x * (_HALF - x * _SIXTH))
+    return _ONE - exp2(-x * _LOG2E)

@@ -12,8 +12,9 @@ from torch import Tensor
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.extinction import is_density
 from invgraphics.kernels.numba.gaussians.backward import cut_off, place_gradient, spread_colour_gradients
-from invgraphics.kernels.numba.gaussians.integrals import STRIDE, normal_tail, optical_depths, seen_colour, shares_origin
+from invgraphics.kernels.numba.gaussians.integrals import STRIDE, optical_depths, seen_colour, shares_origin
 from invgraphics.kernels.numba.gaussians.pairs import gaussian_pairs
+from invgraphics.kernels.numba.gaussians.shares import normal_distribution
 from invgraphics.kernels.numba.runtime import (
     array,
     exp2,
@@ -25,16 +26,15 @@ from invgraphics.kernels.numba.runtime import (
     threads,
 )
 from invgraphics.kernels.reference import gaussian_order as reference
-from invgraphics.kernels.reference.gaussian_rays import MAX_DEVIATIONS, Primitives
+from invgraphics.kernels.reference.gaussian_rays import Primitives
 from invgraphics.kernels.types import ALPHA_MIN
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-_EIGHT = np.float32(MAX_DEVIATIONS)
 _FAINTEST = np.float32(-np.log1p(-ALPHA_MIN))
 """Optical depth of the faintest alpha of a splat that counts."""
 _LEAST = np.float32(1e-6)
 """Transmittance behind which nothing is composited."""
-_LOG2E, _HALF_LOG2E = np.float32(1 / np.log(2.0)), np.float32(0.5 / np.log(2.0))
+_LOG2E = np.float32(1 / np.log(2.0))
 _ROOT = np.float32(1 / np.sqrt(2 * np.pi))
 
 
@@ -42,12 +42,8 @@ _ROOT = np.float32(1 / np.sqrt(2 * np.pi))
 def _limit(limit, t, sigma):
     """Standardised limit of a ray, the normal distribution function there, and the slope of that: 0 beyond the deviations."""
     z = (limit - t) / sigma
-    if z <= -_EIGHT:
-        return z, _ZERO, _ZERO
-    if z >= _EIGHT:
-        return z, _ONE, _ZERO
-    bell = exp2(-_HALF_LOG2E * z * z)
-    return z, normal_tail(z, bell), bell * _ROOT
+    value, bell = normal_distribution(z)
+    return z, value, bell * _ROOT
 
 
 @inlined
