@@ -240,3 +240,37 @@ def test_what_gaussians_do_not_have_is_refused(make_scene):
         field.query(Samples.at(torch.zeros(1, 3)), Quantity.DENSITY | Quantity.SDF)
     with pytest.raises(NotComposableError, match="planes"):
         field.primitives(Quantity.PLANES, Context(make_scene().bounds))
+
+
+def test_dropout_makes_a_growing_share_transparent_in_training_only(make_scene):
+    scene = make_scene(points=_points(20_000))
+    config = GaussianFieldConfig(opacity=0.3, dropout=0.4)
+    field = config.build(scene)
+
+    def opacities(progress: float, training: bool = True) -> torch.Tensor:
+        ctx = Context(scene.bounds, training=training, progress=progress, generator=torch.Generator().manual_seed(0))
+        return field.primitives(Quantity.GAUSSIANS, ctx).opacities
+
+    whole = torch.full((20_000,), 0.3)
+    torch.testing.assert_close(opacities(1.0, training=False), whole)
+    torch.testing.assert_close(opacities(0.0), whole)
+    for progress, share in ((0.5, 0.2), (1.0, 0.4)):
+        shown = opacities(progress)
+        assert float((shown == 0).float().mean()) == pytest.approx(share, abs=0.02)
+        # As much is absorbed on average.
+        assert shown.mean().item() == pytest.approx(0.3, abs=0.01)
+        torch.testing.assert_close(shown[shown > 0], whole[shown > 0] / (1 - share))
+    assert torch.equal(opacities(1.0), opacities(1.0))
+    opacities(1.0).sum().backward()
+    assert torch.equal(field.opacity_logits.grad == 0, opacities(1.0) == 0)
+
+
+def test_dropout_is_for_few_photographs(make_scene):
+    scene = make_scene(points=_points())
+    scene = replace(scene, train=scene.train * 3)
+    few = len(scene.train)
+    given = {views: replace(GaussianFieldConfig(dropout=0.2), dropout_views=views) for views in (0, few - 1, few)}
+    assert {views: config.build(scene).dropout for views, config in given.items()} == {0: 0.2, few - 1: 0.0, few: 0.2}
+    for wrong in ({"dropout": 1.0}, {"dropout": -0.1}, {"dropout_views": -1}):
+        with pytest.raises(ValueError, match="dropout"):
+            GaussianFieldConfig(**wrong)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import textwrap
 import time
 
 import numpy as np
@@ -35,6 +36,26 @@ def test_peak_memory_sees_what_was_freed_again() -> None:
     if cost.CLEAR.exists():
         # However short, where the kernel keeps the record.
         assert 90 * MB < peak("cost.SAMPLING_SECONDS = 60", 0.0) < 130 * MB
+
+
+def test_peak_memory_excludes_a_nested_block() -> None:
+    code = """
+        import torch
+        from invgraphics.kernels.allocator import keep_freed_memory
+        from invgraphics.metrics import cost
+        keep_freed_memory()
+        with cost.PeakMemory() as memory:
+            with memory.excluding():
+                block = torch.ones(96 << 20, dtype=torch.uint8)
+                del block
+            before = memory.peak_bytes
+            block = torch.ones(32 << 20, dtype=torch.uint8)
+            del block
+        print(before, memory.peak_bytes)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
+    before, peak = map(int, done.stdout.split())
+    assert before < 20 * MB < 30 * MB < peak < 60 * MB
 
 
 def test_peak_memory_leaves_out_what_was_there_before() -> None:

@@ -117,6 +117,8 @@ def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
         table["renderer"][old] = table["renderer"].pop(new)
     for key in LATER_IN_BATCHES:
         del table["batches"][key]
+    for key in ("dropout", "dropout_views"):
+        del table["field"][key]
     assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
     again = resolve(method.name, "long", table)
     assert again.recipe == method.recipe and again.table == method.table

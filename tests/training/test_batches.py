@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from invgraphics.core import Batch, Scene
+from invgraphics.scenes.scales import resized_view
 from invgraphics.testing import toy_scene
 from invgraphics.training.batches import BatchConfig, Batches
 
@@ -117,6 +118,23 @@ def test_pictures_of_different_sizes_begin_alike() -> None:
         BatchConfig(start_size=-1)
     with pytest.raises(ValueError, match="start_until"):
         BatchConfig(start_until=0.0)
+
+
+def test_small_pictures_lie_together_and_not_between_what_they_were_made_from(toy: Scene) -> None:
+    large = replace(toy, train=tuple(resized_view(view, 96, 96) for view in toy.train) * 3)
+    batches = Batches(BatchConfig(start_size=24), large, torch.Generator().manual_seed(0), CPU)
+    storages, shown = set(), {}
+    for _ in large.train:
+        _, batch = batches.image(0.0)
+        storages.add(batches._small[batch.view][1].image.untyped_storage().data_ptr())
+        shown[batch.view] = batches._small[batch.view][1]
+    assert len(shown) == len(large.train) > 1
+    assert len(storages) == 1
+    for index, view in shown.items():
+        direct = resized_view(large.train[index], 24, 24)
+        assert torch.equal(view.image, direct.image)
+        assert view.alpha is not None and direct.alpha is not None
+        assert torch.equal(view.alpha, direct.alpha)
 
 
 def test_of_two_schedules_the_smaller_picture_counts() -> None:

@@ -109,7 +109,9 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
             folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
             if "inconsistent_poses" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
-            for sentence in (*announcements([method.choice]), _prediction(job, fit, forecast)):
+            with memory.excluding():  # pictures that are rendered to forecast the evaluation's time are no part of the fit
+                prediction = _prediction(job, fit, forecast)
+            for sentence in (*announcements([method.choice]), prediction):
                 print(sentence, file=sys.stderr)
             Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots, on_step).run()
         load = LoadAverage(start=began_at, end=load_average())

@@ -44,6 +44,9 @@ class GaussianFieldConfig:
         opacity: opacity at the start.
         scale_factor: multiplies the starting scales.
         isotropic: whether all three axes of a Gaussian stay equal.
+        dropout: share of Gaussians left out of a training step at the fit's end, rising linearly from none; the others absorb
+            as much more (DropGaussian, Park et al. 2025). Against learning few photographs by heart.
+        dropout_views: most training photographs with which Gaussians are left out; 0 for any number.
     """
 
     title: ClassVar[str] = "anisotropic 3D Gaussians"
@@ -57,6 +60,8 @@ class GaussianFieldConfig:
     opacity: float = 0.1
     scale_factor: float = 1.0
     isotropic: bool = False
+    dropout: float = 0.0
+    dropout_views: int = 0
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= harmonics.MAX_DEGREE:
@@ -69,6 +74,10 @@ class GaussianFieldConfig:
             raise ValueError(f"opacity must lie between 0 and 1, not be {self.opacity}.")
         if not self.scale_factor > 0:
             raise ValueError(f"scale_factor must be positive, not {self.scale_factor}.")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout must be at least 0 and below 1, not {self.dropout}.")
+        if self.dropout_views < 0:
+            raise ValueError(f"dropout_views must not be negative, not {self.dropout_views}.")
         if (self.init == "field") != bool(self.source):
             raise ValueError("init = 'field' needs the folder of a run as 'source', and nothing else does.")
 
@@ -111,7 +120,8 @@ class GaussianFieldConfig:
             "sh_dc": ((rgb - 0.5) / harmonics.BAND_0)[:, None, :],
             "sh_rest": torch.zeros(n, harmonics.count(self.sh_degree) - 1, 3),
         }
-        return GaussianField(tensors, self.isotropic)
+        few = not self.dropout_views or len(scene.train) <= self.dropout_views
+        return GaussianField(tensors, self.isotropic, self.dropout if few else 0.0)
 
 
 class GaussianField(Field):
@@ -123,6 +133,7 @@ class GaussianField(Field):
     Args:
         tensors: one per name in `PARAMETERS`, all with n rows.
         isotropic: whether all three axes of a Gaussian are kept equal (their mean log-scale counts).
+        dropout: share of Gaussians left out of a training step at the end of a fit.
     """
 
     provides = Quantity.GAUSSIANS | Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL
@@ -135,9 +146,10 @@ class GaussianField(Field):
     sh_active: Tensor
     smoothing: Tensor
 
-    def __init__(self, tensors: Mapping[str, Tensor], isotropic: bool = False) -> None:
+    def __init__(self, tensors: Mapping[str, Tensor], isotropic: bool = False, dropout: float = 0.0) -> None:
         super().__init__()
         self.isotropic = isotropic
+        self.dropout = dropout
         for name in PARAMETERS:
             setattr(self, name, nn.Parameter(tensors[name]))
         self.register_buffer("sh_active", torch.tensor(self.sh_degree))
@@ -170,10 +182,10 @@ class GaussianField(Field):
         return query_density(self._smoothed(self._gaussians(harmonics.count(self.active_degree))), samples, want)
 
     def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
-        """The activated Gaussians, smoothed, with the active bands of their colour."""
+        """The activated Gaussians, smoothed, with the active bands of their colour; in training those that are not left out."""
         if want != Quantity.GAUSSIANS:
             return super().primitives(want, ctx)
-        return self._smoothed(self._gaussians(harmonics.count(self.active_degree)))
+        return self._thinned(self._smoothed(self._gaussians(harmonics.count(self.active_degree))), ctx)
 
     def primitive_count(self) -> int:
         """Number of Gaussians."""
@@ -214,6 +226,15 @@ class GaussianField(Field):
             return gaussians
         scales = (gaussians.scales.square() + self.smoothing[:, None].square()).sqrt()
         return replace(gaussians, scales=scales, opacities=gaussians.opacities * (gaussians.scales / scales).prod(dim=1))
+
+    def _thinned(self, gaussians: Gaussians, ctx: Context) -> Gaussians:
+        """Make a random share of the Gaussians transparent, and the others that much more opaque (DropGaussian, eq. 6)."""
+        share = self.dropout * ctx.progress
+        if not ctx.training or share <= 0:
+            return gaussians
+        device = gaussians.opacities.device if ctx.generator is None else ctx.generator.device
+        kept = torch.rand(len(gaussians), generator=ctx.generator, device=device).to(gaussians.opacities) >= share
+        return replace(gaussians, opacities=(gaussians.opacities * kept / (1 - share)).clamp_max(1.0))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Resize to the checkpoint's number of Gaussians first, which density control may have changed."""

@@ -1,4 +1,4 @@
-"""Memory reuse by the C library's allocator across training steps."""
+"""Memory reuse by the C library's allocator across training steps, and its end."""
 
 from __future__ import annotations
 
@@ -22,3 +22,11 @@ def keep_freed_memory() -> bool:
     except (AttributeError, OSError, TypeError):
         return False
     return all(mallopt(setting, value) == 1 for setting, value in _LARGEST.items())
+
+
+def return_freed_memory() -> bool:
+    """Return freed memory to the system at once; whether there was any. ``False`` where the C library is not glibc."""
+    try:
+        return ctypes.CDLL(None).malloc_trim(0) == 1
+    except (AttributeError, OSError, TypeError):
+        return False

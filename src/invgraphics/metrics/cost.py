@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
 import torch
 from torch import nn
+
+from invgraphics.kernels.allocator import return_freed_memory
 
 STATM = Path("/proc/self/statm")
 """Linux: sizes of this process in pages; the second number is the resident set."""
@@ -69,14 +72,11 @@ class PeakMemory:
         self._recorded = self._closed = False
 
     def __enter__(self) -> PeakMemory:
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-            torch.cuda.reset_peak_memory_stats(self._device)
+        return_freed_memory()  # else what the process did before would be room that nobody sees being taken
+        self._restart()
         self._start = self._peak = self._held()
-        if self._device.type != "cuda":
-            self._recorded = _reset_peak()
-            if not self._recorded:
-                self._thread.start()
+        if self._device.type != "cuda" and not self._recorded:
+            self._thread.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
@@ -86,11 +86,31 @@ class PeakMemory:
         self._read()
         self._closed = True
 
+    @contextmanager
+    def excluding(self) -> Iterator[None]:
+        """Exclude what a nested block needs: memory that it freed goes back to the system, and the record starts anew."""
+        self._read()
+        self._closed = True
+        try:
+            yield
+        finally:
+            return_freed_memory()
+            self._restart()
+            self._closed = False
+
     @property
     def peak_bytes(self) -> int:
         """Peak bytes above the level at the start, so far."""
         self._read()
         return self._peak - self._start
+
+    def _restart(self) -> None:
+        """Set the record of the largest amount back to what is held now."""
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+            torch.cuda.reset_peak_memory_stats(self._device)
+        else:
+            self._recorded = _reset_peak()
 
     def _held(self) -> int:
         if self._device.type == "cuda":
