@@ -58,6 +58,22 @@ def test_peak_memory_excludes_a_nested_block() -> None:
     assert before < 20 * MB < 30 * MB < peak < 60 * MB
 
 
+def test_peak_memory_counts_room_that_was_freed_before() -> None:
+    code = """
+        import torch
+        from invgraphics.kernels.allocator import keep_freed_memory
+        from invgraphics.metrics import cost
+        keep_freed_memory()
+        block = torch.ones(96 << 20, dtype=torch.uint8)
+        del block
+        with cost.PeakMemory() as memory:
+            block = torch.ones(64 << 20, dtype=torch.uint8)
+        print(memory.peak_bytes)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True)
+    assert 60 * MB < int(done.stdout) < 80 * MB
+
+
 def test_peak_memory_leaves_out_what_was_there_before() -> None:
     block = np.ones(96 * MB, dtype=np.uint8)
     with cost.PeakMemory() as memory:
