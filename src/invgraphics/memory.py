@@ -1,13 +1,17 @@
-"""Memory of the machine and of the container around the process, bytes."""
+"""Memory of the machine, of the container around the process, and of the process itself, bytes."""
 
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 from invgraphics.errors import InputError
 
 _CGROUP = Path("/sys/fs/cgroup")
+STATM, STATUS, CLEAR = (Path("/proc/self") / name for name in ("statm", "status", "clear_refs"))
+"""Linux: sizes of this process in pages, its peaks, and the file that sets the resident set's peak back to the present."""
+_RESET = "5"
 _SHARE = 0.8  # of the available memory that one request may take: the rest is for what it forgets to count
 
 
@@ -30,6 +34,34 @@ def available_bytes() -> int:
     if limit is not None and used is not None:
         free.append(limit - used)
     return max(0, min(free))
+
+
+def resident_bytes() -> int:
+    """Resident set size of this process; where there is no ``/proc``, its peak so far."""
+    import resource
+
+    if STATM.exists():
+        return int(STATM.read_text().split()[1]) * resource.getpagesize()
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def reset_peak() -> bool:
+    """Set `peak_resident_bytes` back to the present resident set; ``False`` where that is not possible."""
+    try:
+        CLEAR.write_text(_RESET)
+    except OSError:
+        return False
+    return peak_resident_bytes() is not None
+
+
+def peak_resident_bytes() -> int | None:
+    """Largest resident set of this process since `reset_peak`, as Linux records it; ``None`` where none is recorded."""
+    try:
+        lines = STATUS.read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM:")), None)
 
 
 def check_fits(needed: float, what: str, remedy: str) -> None:

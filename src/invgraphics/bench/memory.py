@@ -7,18 +7,13 @@ Torch and Numba allocate outside of Python, so the operating system's peak resid
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from invgraphics.bench.results import PeakMemory, Results, Skipped
-
-STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-RESET_PEAK = "5"
-"""Written to `CLEAR`, resets the peak resident set to the current one (Linux 4.0)."""
+from invgraphics.memory import peak_resident_bytes, reset_peak, resident_bytes
 
 GAUSSIANS, WIDTH = 50_000, 100
 """Many primitives on few pixels, so that the image's memory is negligible."""
@@ -54,7 +49,7 @@ MEMORY_CASES = {
 
 def measure_memory(implementations: tuple[str, ...], results: Results) -> None:
     """Measure every case with every implementation, into ``results.memory``."""
-    if not (STATUS.exists() and CLEAR.exists()):
+    if not reset_peak():
         results.skipped.append(Skipped("memory", "this system keeps no high-water mark that can be put back (Linux does)"))
         return
     for name, case in MEMORY_CASES.items():
@@ -78,17 +73,10 @@ def measure(name: str, kernels: str) -> tuple[int, int]:
     dispatch.use(kernels)
     dispatch.warm_up()
     run = _PREPARE[name]()
-    before = status_bytes("VmRSS")
-    CLEAR.write_text(RESET_PEAK)
+    before = resident_bytes()
+    reset_peak()
     count = run()
-    return status_bytes("VmHWM") - before, count
-
-
-def status_bytes(entry: str) -> int:
-    """Bytes of an entry of ``/proc/self/status``."""
-    found = re.search(rf"^{entry}:\s+(\d+) kB", STATUS.read_text(), re.MULTILINE)
-    assert found is not None, entry
-    return int(found.group(1)) * 1024
+    return (peak_resident_bytes() or 0) - before, count
 
 
 def _splats() -> Callable[[], int]:
@@ -117,7 +105,7 @@ def _case(operation: str, count: int, **sizes: int) -> Callable[[], Callable[[],
 
 def _counted(run: Callable[[], object], count: int) -> Callable[[], int]:
     def once() -> int:
-        kept = run()  # the gradients are part of what is status_bytes
+        kept = run()  # the gradients are part of what is measured
         del kept
         return count
 

@@ -128,7 +128,7 @@ _STEPS = (
 _GROWTH = "The exponent p of time ~ size^p, fitted where one size varies and all else stays: 1 is proportional."
 _THREADS = "One size of each kernel, forward and backward, with fewer threads."
 _MEMORY = (
-    "High-water mark of the resident set in a process of its own, beyond what it status_bytes with its input made and its code "
+    "High-water mark of the resident set in a process of its own, beyond what it held with its input made and its code "
     "loaded; whole steps include parameters, gradients and Adam's moments."
 )
 _PEERS = (

@@ -2,55 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import TracebackType
 
 import torch
 from torch import nn
 
 from invgraphics.kernels.allocator import return_freed_memory
-
-STATM = Path("/proc/self/statm")
-"""Linux: sizes of this process in pages; the second number is the resident set."""
-
-STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-"""Linux: the kernel's record of the largest resident set (``VmHWM``), and the file that sets it back to today's."""
-_RESET = "5"
+from invgraphics.memory import peak_resident_bytes, reset_peak, resident_bytes
 
 SAMPLING_SECONDS = 0.02
 """How often the resident set is read where the kernel's record cannot be set back. Shorter peaks are then missed."""
-
-
-def resident_bytes() -> int:
-    """Resident set size of this process in bytes; where there is no ``/proc``, its peak so far."""
-    import resource
-
-    if STATM.exists():
-        return int(STATM.read_text().split()[1]) * resource.getpagesize()
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-
-
-def _reset_peak() -> bool:
-    """Set the kernel's record of the largest resident set back; ``False`` where that is not possible."""
-    try:
-        CLEAR.write_text(_RESET)
-    except OSError:
-        return False
-    return _recorded_peak() is not None
-
-
-def _recorded_peak() -> int | None:
-    """Largest resident set in bytes since the record was set back; ``None`` where the kernel keeps none."""
-    try:
-        lines = STATUS.read_text().splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM:")), None)
 
 
 class PeakMemory:
@@ -110,12 +74,12 @@ class PeakMemory:
             torch.cuda.synchronize(self._device)
             torch.cuda.reset_peak_memory_stats(self._device)
         else:
-            self._recorded = _reset_peak()
+            self._recorded = reset_peak()
 
     def _held(self) -> int:
         if self._device.type == "cuda":
             return torch.cuda.max_memory_allocated(self._device)
-        recorded = _recorded_peak() if self._recorded else None
+        recorded = peak_resident_bytes() if self._recorded else None
         return resident_bytes() if recorded is None else recorded
 
     def _read(self) -> None:
