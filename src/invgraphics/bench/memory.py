@@ -76,7 +76,9 @@ def measure(name: str, kernels: str) -> tuple[int, int]:
     before = resident_bytes()
     reset_peak()
     count = run()
-    return (peak_resident_bytes() or 0) - before, count
+    peak = peak_resident_bytes()
+    assert peak is not None
+    return peak - before, count
 
 
 def _splats() -> Callable[[], int]:

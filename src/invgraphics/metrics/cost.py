@@ -33,7 +33,7 @@ class PeakMemory:
         self._thread = threading.Thread(target=self._watch, name="peak-memory", daemon=True)
         self._start = 0
         self._peak = 0
-        self._recorded = self._closed = False
+        self._recorded = self._paused = False
 
     def __enter__(self) -> PeakMemory:
         return_freed_memory()  # else what the process did before would be room that nobody sees being taken
@@ -48,19 +48,19 @@ class PeakMemory:
         if self._thread.ident is not None:
             self._thread.join()
         self._read()
-        self._closed = True
+        self._paused = True
 
     @contextmanager
     def excluding(self) -> Iterator[None]:
         """Exclude what a nested block needs: memory that it freed goes back to the system, and the record starts anew."""
         self._read()
-        self._closed = True
+        self._paused = True
         try:
             yield
         finally:
             return_freed_memory()
             self._restart()
-            self._closed = False
+            self._paused = False
 
     @property
     def peak_bytes(self) -> int:
@@ -83,7 +83,7 @@ class PeakMemory:
         return resident_bytes() if recorded is None else recorded
 
     def _read(self) -> None:
-        if not self._closed:
+        if not self._paused:
             self._peak = max(self._peak, self._held())
 
     def _watch(self) -> None:
