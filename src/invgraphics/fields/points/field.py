@@ -24,6 +24,7 @@ from invgraphics.fields.encodings.frequency import frequencies, frequency_width
 from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.starting import initial_points, median_spacing
 from invgraphics.kernels.near import near_points
+from invgraphics.kernels.segments import segment_sums
 
 ROWS = ("positions", "features", "raw_rgb", "confidence_logits")
 """Names of a `PointField`'s tensors whose first axis is the point; all but the first are parameters."""
@@ -201,22 +202,22 @@ class PointField(Field):
         self, position: Float[Tensor, "m 3"], index: Int[Tensor, "m k"]
     ) -> tuple[Float[Tensor, " m"], Float[Tensor, "m f"]]:
         """Density at positions with neighbours, and their mean features, of which the last three are raw colour."""
-        m, k = index.shape
-        there, flat = index >= 0, index.clamp_min(0).flatten()
-        offset = (position[:, None] - self.positions[flat].view(m, k, 3)) / self.radius
-        weight = torch.where(there, 1 / (offset.square().sum(dim=2) + 1e-6).sqrt(), 0.0)
-        weight = weight / weight.sum(dim=1, keepdim=True)
-        offset = torch.where(there[:, :, None], offset, 0.0).view(m * k, 3)
+        # Only neighbours that are there pass through the network: two fifths of the places are empty.
+        sample, place = (index >= 0).nonzero(as_tuple=True)
+        point, m = index[sample, place], len(index)
+        offset = (position.index_select(0, sample) - self.positions.index_select(0, point)) / self.radius
+        weight = 1 / (offset.square().sum(dim=1) + 1e-6).sqrt()
+        weight = weight / weight.new_zeros(m).index_add(0, sample, weight).index_select(0, sample)
         table = torch.cat([self.point_layer(self.features), self.raw_rgb, self.confidence_logits.sigmoid()[:, None]], dim=1)
-        hidden, raw_rgb, confidence = table.index_select(0, flat).split([self.config.width, 3, 1], dim=1)
+        hidden, raw_rgb, confidence = table.index_select(0, point).split([self.config.width, 3, 1], dim=1)
         hidden = relu(hidden + self.offset_layer(frequencies(offset / 2, self.config.octaves)))
         for layer in self.hidden:
             hidden = relu(layer(hidden), inplace=True)
-        weighted = (weight * confidence.view(m, k))[:, None]
-        density = softplus(self.density_head(hidden).view(m, k, 1) - 1)
-        density = (weighted @ density)[:, 0, 0] * (self.config.density_scale / self.radius)
-        features = (weighted @ hidden.view(m, k, self.config.width))[:, 0]
-        return density, torch.cat([features, (weight[:, None] @ raw_rgb.view(m, k, 3))[:, 0]], dim=1)
+        weighted = weight * confidence[:, 0]
+        density = softplus(self.density_head(hidden) - 1) * (self.config.density_scale / self.radius)
+        density = segment_sums(density, weighted, sample, m)[:, 0]
+        features, own = segment_sums(hidden, weighted, sample, m), segment_sums(raw_rgb, weight, sample, m)
+        return density, torch.cat([features, own], dim=1)
 
     def _radiance(self, handed: Float[Tensor, "m f"], direction: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
         features, own = handed.split([self.config.width, 3], dim=1)

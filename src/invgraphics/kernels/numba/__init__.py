@@ -22,6 +22,7 @@ from invgraphics.kernels.numba.ngp.render import ngp_render as ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace as sdf_trace
 from invgraphics.kernels.numba.rays.composite import composite as composite
 from invgraphics.kernels.numba.rays.march import ray_march as ray_march
+from invgraphics.kernels.numba.segments import segment_sums as segment_sums
 from invgraphics.kernels.numba.splat.binning import splat_bin as splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project as splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median as splat_median

@@ -30,6 +30,7 @@ from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace
 from invgraphics.kernels.numba.rays.composite import composite
 from invgraphics.kernels.numba.rays.march import ray_march
+from invgraphics.kernels.numba.segments import segment_sums
 from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
 from invgraphics.kernels.numba.splat.rasterise import splat_median, splat_rasterise
@@ -76,6 +77,8 @@ def samples() -> None:
     image = torch.zeros(8, 8, 3).requires_grad_()
     ssim(image, torch.zeros_like(image)).backward()
     near_points(torch.zeros(1, 3), torch.zeros(1, 3), 1, 1.0)
+    rows, weights = torch.ones(1, 2).requires_grad_(), torch.ones(1).requires_grad_()
+    segment_sums(rows, weights, torch.zeros(1, dtype=torch.int64), 1).sum().backward()
     unit = torch.full((2, 3), 0.4).requires_grad_()
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)

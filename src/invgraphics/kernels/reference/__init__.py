@@ -16,6 +16,7 @@ from invgraphics.kernels.reference.mesh import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.reference.near import near_points as near_points
 from invgraphics.kernels.reference.ngp import ngp_march as ngp_march
 from invgraphics.kernels.reference.ngp import ngp_render as ngp_render
+from invgraphics.kernels.reference.segments import segment_sums as segment_sums
 from invgraphics.kernels.reference.splat_discs import splat_project_discs as splat_project_discs
 from invgraphics.kernels.reference.splat_project import splat_project as splat_project
 from invgraphics.kernels.reference.splat_raster import splat_bin as splat_bin

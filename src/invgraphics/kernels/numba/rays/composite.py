@@ -13,13 +13,13 @@ from invgraphics.kernels.numba.runtime import (
     array,
     index,
     inlined,
-    job_start,
     once_differentiable,
     parallel,
     power_minus_one,
     prange,
     threads,
 )
+from invgraphics.kernels.numba.segments import first_of_segment
 from invgraphics.kernels.reference.composite import OPAQUE
 
 _OPAQUE, _LOG2E = np.float32(OPAQUE), np.float32(1 / np.log(2.0))
@@ -37,22 +37,13 @@ def interval_alpha(optical_depth):
     return np.float64(transmitted), np.float32(1.0) - transmitted
 
 
-@inlined
-def _first_sample(ray, jobs, job):
-    """First sample of a job: an even split, moved on to the beginning of a ray."""
-    first = job_start(len(ray), jobs, job)
-    while 0 < first < len(ray) and ray[first] == ray[first - 1]:
-        first += 1
-    return first
-
-
 @parallel
 def accumulate(optical_depth, channels, ray, jobs, weights, after, sums, alpha):
     """Weights, transmittance behind each sample, and weighted sums per ray (``sums`` and ``alpha`` hold zeros before)."""
     width = channels.shape[1]
     for job in prange(jobs):
         transmittance, current = 1.0, np.int64(-1)
-        for number in range(_first_sample(ray, jobs, job), _first_sample(ray, jobs, job + 1)):
+        for number in range(first_of_segment(ray, jobs, job), first_of_segment(ray, jobs, job + 1)):
             i = index(number)
             if ray[i] != current:
                 transmittance, current = 1.0, ray[i]
@@ -71,7 +62,7 @@ def accumulate_backward(channels, ray, weights, after, jobs, grad_weights, grad_
     """Gradients of optical depths and channels, back to front."""
     width = channels.shape[1]
     for job in prange(jobs):
-        first, end = _first_sample(ray, jobs, job), _first_sample(ray, jobs, job + 1)
+        first, end = first_of_segment(ray, jobs, job), first_of_segment(ray, jobs, job + 1)
         behind, current = 0.0, np.int64(-1)
         for step in range(end - first):
             i = index(end - 1 - step)
