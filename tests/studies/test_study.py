@@ -185,7 +185,7 @@ def test_the_studies_that_come_along_are_whole_and_short(path: Path, tmp_path: P
     """Every level fits its methods; an hour on two cores, with a third of the fit's time for start and evaluation.
 
     Twenty steps are taken for a second. Some take hours: the gauntlet, whose own test says what it covers, integral-or-splat,
-    whose question is about up to 100,000 Gaussians, its replication at a 160th, whose steps are short, families, which has seven
+    whose question is about up to 100,000 Gaussians, its replication at a 160th, whose steps are short, families, with seven
     methods on seven scenes, and gaussian-ablation, whose steps are short.
     """
     hours = {"gauntlet": 10, "integral-or-splat": 15, "integral-or-splat-64px": 5, "families": 2, "gaussian-ablation": 2}
