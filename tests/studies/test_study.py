@@ -188,7 +188,7 @@ def test_the_studies_that_come_along_are_whole_and_short(path: Path, tmp_path: P
     whose question is about up to 100,000 Gaussians, its replication at a 160th, whose steps are short, families, with seven
     methods on seven scenes, and gaussian-ablation, whose steps are short.
     """
-    hours = {"gauntlet": 10, "integral-or-splat": 15, "integral-or-splat-64px": 5, "families": 2, "gaussian-ablation": 2}
+    hours = {"gauntlet": 10, "integral-or-splat": 15, "integral-or-splat-64px": 3, "families": 2, "gaussian-ablation": 2}
     study = read_study(path)
     plan = make_plan(study, AblateRequest(study=str(path), out=str(tmp_path)))
     assert len({planned.fit.out for planned in plan}) == len(plan)
