@@ -73,6 +73,13 @@ def frequencies(x: Float[Tensor, "m 3"], octaves: int, include_input: bool = Tru
     Returns:
         The input first (if included), then all sines, then all cosines, each octave by octave and x, y, z within it.
     """
-    scales = torch.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype)
-    phases = (x[:, None, :] * scales[:, None]).reshape(len(x), 3 * octaves)
-    return torch.cat([*([x] if include_input else []), phases.sin(), phases.cos()], dim=1)
+    scaled = phases(x, octaves)
+    return torch.cat([*([x] if include_input else []), scaled.sin(), scaled.cos()], dim=1)
+
+
+def phases(x: Float[Tensor, "m b"], octaves: int) -> Float[Tensor, "m f"]:
+    """``2^k π x`` for k = 0 .. octaves - 1, octave by octave and coordinate by coordinate within it."""
+    if octaves == 0:
+        return x[:, :0]
+    # One product per octave: to broadcast over rows as short as these takes three times as long.
+    return torch.cat([x * (torch.pi * 2.0**octave) for octave in range(octaves)], dim=1)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from invgraphics.fields.encodings.frequency import phases
 from invgraphics.fields.encodings.window import Windowed
 
 Basis = Literal["axes", "icosahedron"]
@@ -92,12 +93,11 @@ def expected_frequencies(
     Returns:
         All sines, then all cosines, each octave by octave and coordinate by coordinate within it.
     """
-    scales = torch.pi * 2.0 ** torch.arange(octaves, device=mean.device, dtype=mean.dtype)
-    phases = (mean[:, None, :] * scales[:, None]).flatten(1)
+    scaled = phases(mean, octaves)
     if variance is None:
-        return torch.cat([phases.sin(), phases.cos()], dim=1)
-    damping = torch.exp((-0.5 * variance)[:, None, :] * scales.square()[:, None]).flatten(1)
-    return torch.cat([damping * phases.sin(), damping * phases.cos()], dim=1)
+        return torch.cat([scaled.sin(), scaled.cos()], dim=1)
+    damping = torch.exp(torch.cat([variance * (-0.5 * (torch.pi * 2.0**octave) ** 2) for octave in range(octaves)], dim=1))
+    return torch.cat([damping * scaled.sin(), damping * scaled.cos()], dim=1)
 
 
 def icosahedral_basis() -> Float[Tensor, "21 3"]:

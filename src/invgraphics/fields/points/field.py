@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -208,15 +209,15 @@ class PointField(Field):
         offset = (position.index_select(0, sample) - self.positions.index_select(0, point)) / self.radius
         weight = 1 / (offset.square().sum(dim=1) + 1e-6).sqrt()
         weight = weight / weight.new_zeros(m).index_add(0, sample, weight).index_select(0, sample)
-        table = torch.cat([self.point_layer(self.features), self.raw_rgb, self.confidence_logits.sigmoid()[:, None]], dim=1)
-        hidden, raw_rgb, confidence = table.index_select(0, point).split([self.config.width, 3, 1], dim=1)
-        hidden = relu(hidden + self.offset_layer(frequencies(offset / 2, self.config.octaves)))
+        hidden = self.point_layer(self.features).index_select(0, point)
+        encoded = frequencies(offset / 2, self.config.octaves)
+        hidden = relu(torch.addmm(hidden, encoded, self.offset_layer.weight.t()), inplace=True)
         for layer in self.hidden:
             hidden = relu(layer(hidden), inplace=True)
-        weighted = weight * confidence[:, 0]
+        weighted = weight * self.confidence_logits.sigmoid().index_select(0, point)
         density = softplus(self.density_head(hidden) - 1) * (self.config.density_scale / self.radius)
         density = segment_sums(density, weighted, sample, m)[:, 0]
-        features, own = segment_sums(hidden, weighted, sample, m), segment_sums(raw_rgb, weight, sample, m)
+        features, own = segment_sums(hidden, weighted, sample, m), segment_sums(self.raw_rgb.index_select(0, point), weight, sample, m)
         return density, torch.cat([features, own], dim=1)
 
     def _radiance(self, handed: Float[Tensor, "m f"], direction: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
@@ -239,16 +240,21 @@ class PointField(Field):
         """Cells within the radius of a point; ``None`` in contracted space, where a radius has no one size."""
         if bounds.space == "contracted":
             return None
-        occupied = torch.zeros(resolution, resolution, resolution, dtype=torch.bool, device=self.positions.device)
         margin = self.radius / (2 * bounds.half)
         unit = bounds.to_unit(self.positions)
-        lo, hi = ((unit + side * margin).mul(resolution).floor().long() for side in (-1, 1))
-        span = [torch.arange(count + 1, device=lo.device) for count in (hi - lo).amax(dim=0).tolist()]
-        for step in torch.cartesian_prod(*span):
-            cell = (lo + step).minimum(hi)
-            x, y, z = cell[((cell >= 0) & (cell < resolution)).all(dim=1)].unbind(dim=1)
-            occupied[x, y, z] = True
-        return occupied
+        first, end = (
+            ((unit + side * margin).mul(resolution).floor().long() + past).clamp(0, resolution)
+            for side, past in ((-1, 0), (1, 1))
+        )
+        # Boxes that cover a cell: running sums, along each axis, of +1 where a box begins and -1 where it has ended.
+        covered = torch.zeros((resolution + 1,) * 3, dtype=torch.int32, device=self.positions.device)
+        for ends in itertools.product((False, True), repeat=3):
+            corner = torch.where(torch.tensor(ends, device=first.device), end, first)
+            change = covered.new_tensor((-1) ** sum(ends))
+            covered.index_put_(tuple(corner.unbind(dim=1)), change, accumulate=True)
+        for axis in range(3):
+            covered = covered.cumsum(dim=axis, dtype=torch.int32)
+        return covered[:resolution, :resolution, :resolution] > 0
 
     def primitives(self, want: Quantity, ctx: Context) -> Any:
         """The points, with their colours, features and confidences."""
