@@ -140,11 +140,12 @@ def test_a_run_measures_both_implementations_and_their_limit() -> None:
 
 @pytest.mark.usefixtures("tiny")
 def test_surfaces_and_neighbours_are_measured_by_both_implementations(monkeypatch) -> None:
+    monkeypatch.setattr(surface_cases, "QUICK_DISTANCES", (16,))
     monkeypatch.setattr(surface_cases, "QUICK_TRACE_RAYS", (16,))
     monkeypatch.setattr(surface_cases, "QUICK_MESH_SIZES", ((12, 24),))
     monkeypatch.setattr(surface_cases, "QUICK_NEAR_POINTS", ((60, 40),))
     results = bench(BenchRequest(("trace", "mesh", "near"), quick=True))
-    for operation in ("sdf_trace", "mesh_rasterise", "mesh_interpolate", "near_points"):
+    for operation in ("sdf_values", "sdf_trace", "mesh_rasterise", "mesh_interpolate", "near_points"):
         for name in ("reference", "numba"):
             found = results.find(operation, name, FORWARD)
             assert found is not None and found.timing.median > 0 and found.amount > 0, (operation, name)

@@ -30,6 +30,8 @@ DISTANCE = NeuralFieldConfig(
 )
 """The hash grid's distance of `sphere-tracing/hash`, laptop, as the sphere that a fit starts from."""
 LIMITS = TracingLimits(steps=128, relaxation=1.2, refinements=8, least=1e-3, tolerance=1e-6, depth=0.03)
+DISTANCES, QUICK_DISTANCES = (1 << 14, 1 << 17), (1 << 14,)
+"""Positions at which a distance is evaluated."""
 
 RADIUS = 0.7
 MESH_SIZES, QUICK_MESH_SIZES = ((32, 200), (96, 400), (192, 400), (192, 800)), ((32, 200), (96, 400))
@@ -45,9 +47,13 @@ MOST_POINTS_FOR_REFERENCE = 1 << 14
 
 
 def sdf_trace(quick: bool) -> Iterator[Case]:
-    """Fused sphere tracing of a hash grid's distance over rays."""
+    """A hash grid's distance in one pass: at positions in the order of rays, and by sphere tracing."""
+    levels = DISTANCE.encoding.levels
+    for positions in QUICK_DISTANCES if quick else DISTANCES:
+        sizes = {"levels": levels, "positions": positions}
+        yield Case("sdf_values", sizes, lambda positions=positions: _distances(positions))
     for rays in QUICK_TRACE_RAYS if quick else TRACE_RAYS:
-        yield Case("sdf_trace", {"levels": DISTANCE.encoding.levels, "rays": rays}, lambda rays=rays: _trace(rays))
+        yield Case("sdf_trace", {"levels": levels, "rays": rays}, lambda rays=rays: _trace(rays))
 
 
 def meshes(quick: bool) -> Iterator[Case]:
@@ -75,6 +81,13 @@ def sphere_distance() -> FusedSDF:
         parts = NeuralField(DISTANCE, bounds()).fused_sdf(bounds())
     assert parts is not None
     return parts
+
+
+def _distances(count: int) -> dict[str, KernelPass]:
+    field, region, places = sphere_distance(), bounds(), bounds().from_unit(ray_ordered(count))
+    evaluate = lambda: kernels.sdf_values(places, region, field)  # noqa: E731
+    products = sum(weight.numel() for weight, _ in field.net)
+    return {FORWARD: KernelPass(evaluate, 2.0 * products * count, limits.sgemm(), "flop")}
 
 
 def _trace(count: int) -> dict[str, KernelPass]:

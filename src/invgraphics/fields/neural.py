@@ -142,6 +142,10 @@ class NeuralField(Field):
         Features are what geometry hands on to colour; samples that bring them along are not looked at again where only their
         radiance is wanted and colour sees no normal.
         """
+        if want == Quantity.SDF and not torch.is_grad_enabled():
+            sdf = self._fused_distance(samples.position)
+            if sdf is not None:
+                return FieldValues(sdf=sdf)
         appearance = self._appearance(samples) if Quantity.RADIANCE in want else None
         sees_normal = Quantity.RADIANCE in want and "normal" in self.config.colour_inputs
         known = samples.features if self._needs_geometry_for_colour else samples.position[:, :0]
@@ -190,6 +194,14 @@ class NeuralField(Field):
         if not self._covers(bounds) or self.config.geometry != "sdf":
             return None
         return sdf_parts(self.config, self.encoding, self.geometry_net, self.bounds.half / self._half, self._half)
+
+    def _fused_distance(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"] | None:
+        """Signed distances by one fused kernel, outside the graph, where it supports the field; else ``None``."""
+        if self._space != "box" or not kernels.compiled("sdf_values", position):
+            return None
+        bounds = self.bounds
+        parts = self.fused_sdf(bounds)
+        return None if parts is None else kernels.sdf_values(position, bounds, parts)
 
     def _covers(self, bounds: Bounds) -> bool:
         return bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)

@@ -27,6 +27,7 @@ from invgraphics.kernels.dispatch import warm_up as warm_up
 from invgraphics.kernels.meshes import mesh_interpolate as mesh_interpolate
 from invgraphics.kernels.meshes import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.tracing import sdf_trace as sdf_trace
+from invgraphics.kernels.tracing import sdf_values as sdf_values
 
 
 def hash_encode(

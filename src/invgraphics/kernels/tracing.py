@@ -1,6 +1,9 @@
-"""Sphere tracing of a fused signed distance, dispatched as the operations in `invgraphics.kernels`."""
+"""A fused signed distance at points and along rays, dispatched as the operations in `invgraphics.kernels`."""
 
 from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.ngp import FusedSDF
@@ -22,3 +25,17 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
         First hits and closest approaches. Not differentiable.
     """
     return choose("sdf_trace", rays.origins)(rays, bounds, field, limits)
+
+
+def sdf_values(position: Float[Tensor, "n 3"], bounds: Bounds, field: FusedSDF) -> Float[Tensor, " n"]:
+    """Signed distances at positions by a network over a hash grid or octaves: encode and evaluate in one pass.
+
+    Args:
+        position: where, local frame; outside the box, a grid's features are those of its boundary.
+        bounds: a box, whose unit cube the field is over.
+        field: parameters of the signed distance.
+
+    Returns:
+        Distances in local units, negative inside. Not differentiable.
+    """
+    return choose("sdf_values", position)(position, bounds, field)

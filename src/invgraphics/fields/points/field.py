@@ -217,7 +217,10 @@ class PointField(Field):
         weighted = weight * self.confidence_logits.sigmoid().index_select(0, point)
         density = softplus(self.density_head(hidden) - 1) * (self.config.density_scale / self.radius)
         density = segment_sums(density, weighted, sample, m)[:, 0]
-        features, own = segment_sums(hidden, weighted, sample, m), segment_sums(self.raw_rgb.index_select(0, point), weight, sample, m)
+        features, own = (
+            segment_sums(hidden, weighted, sample, m),
+            segment_sums(self.raw_rgb.index_select(0, point), weight, sample, m),
+        )
         return density, torch.cat([features, own], dim=1)
 
     def _radiance(self, handed: Float[Tensor, "m f"], direction: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:

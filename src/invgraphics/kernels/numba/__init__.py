@@ -17,6 +17,7 @@ from invgraphics.kernels.numba.lattice.encode import lattice_encode as lattice_e
 from invgraphics.kernels.numba.mesh.interpolate import mesh_interpolate as mesh_interpolate
 from invgraphics.kernels.numba.mesh.rasterise import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.numba.near import near_points as near_points
+from invgraphics.kernels.numba.ngp.distance import sdf_values as sdf_values
 from invgraphics.kernels.numba.ngp.march import ngp_march as ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render as ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace as sdf_trace

@@ -25,6 +25,7 @@ from invgraphics.kernels.numba.lattice.encode import lattice_encode
 from invgraphics.kernels.numba.mesh.interpolate import mesh_interpolate
 from invgraphics.kernels.numba.mesh.rasterise import mesh_rasterise
 from invgraphics.kernels.numba.near import near_points
+from invgraphics.kernels.numba.ngp.distance import sdf_values
 from invgraphics.kernels.numba.ngp.march import ngp_march
 from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace
@@ -102,6 +103,7 @@ def samples() -> None:
     ngp_render(rays, everywhere, bounds, MarchSteps(0.1), field)
     net = (torch.zeros(8, 7), torch.zeros(8)), (torch.zeros(1, 8), torch.zeros(1))
     distance = FusedSDF(torch.zeros(levels.entries, 2), levels, 0, net, 100.0, torch.ones(3), 1.0)
+    sdf_values(unit.detach(), bounds, distance)
     sdf_trace(rays, bounds, distance, TracingLimits(2, 1.0, 1, 1e-3, 1e-3, 1e-2))
     planes = CombinedLattices(tuple(Lattice(torch.zeros(2, 2, 4), axes) for axes in ("xy", "xz", "yz")), "sum")
     dense = FusedLattice(planes, (), DensityHead("exp"), None, (), ColourHead("none"))

@@ -24,3 +24,4 @@ from invgraphics.kernels.reference.splat_raster import splat_median as splat_med
 from invgraphics.kernels.reference.splat_raster import splat_rasterise as splat_rasterise
 from invgraphics.kernels.reference.ssim import ssim as ssim
 from invgraphics.kernels.reference.tracing import sdf_trace as sdf_trace
+from invgraphics.kernels.reference.tracing import sdf_values as sdf_values

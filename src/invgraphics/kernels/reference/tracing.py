@@ -151,13 +151,18 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
     """See `invgraphics.kernels.sdf_trace`."""
 
     def distance(index: Int[Tensor, " k"], t: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-        unit = bounds.to_unit(torch.addcmul(rays.origins[index], t[:, None], rays.directions[index]))
-        x = torch.cat([(2 * unit - 1) * field.coordinate_scale, _encode(unit, field)], dim=1)
-        for weight, bias in field.net[:-1]:
-            x = softplus(linear(x, weight, bias), beta=field.sharpness)
-        return field.scale * linear(x, *field.net[-1])[:, 0]
+        return sdf_values(torch.addcmul(rays.origins[index], t[:, None], rays.directions[index]), bounds, field)
 
     return sphere_trace(distance, rays, limits)
+
+
+def sdf_values(position: Float[Tensor, "k 3"], bounds: Bounds, field: FusedSDF) -> Float[Tensor, " k"]:
+    """See `invgraphics.kernels.sdf_values`."""
+    unit = bounds.to_unit(position)
+    x = torch.cat([(2 * unit - 1) * field.coordinate_scale, _encode(unit, field)], dim=1)
+    for weight, bias in field.net[:-1]:
+        x = softplus(linear(x, weight, bias), beta=field.sharpness)
+    return field.scale * linear(x, *field.net[-1])[:, 0]
 
 
 def _encode(unit: Float[Tensor, "k 3"], field: FusedSDF) -> Float[Tensor, "k f"]:

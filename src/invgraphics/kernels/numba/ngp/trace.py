@@ -14,9 +14,9 @@ from invgraphics.core.ngp import FusedSDF
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.hash.cells import BLOCK
-from invgraphics.kernels.numba.hash.encode import levels_of
-from invgraphics.kernels.numba.ngp.dense import POINTS, dense
-from invgraphics.kernels.numba.ngp.network import encode, pack_network, softplus
+from invgraphics.kernels.numba.ngp.dense import POINTS
+from invgraphics.kernels.numba.ngp.distance import coordinates, distances, pack_sdf
+from invgraphics.kernels.numba.ngp.network import encode
 from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, prange, threads
 from invgraphics.kernels.reference.tracing import GOLDEN, ROUNDING, result
 from invgraphics.kernels.types import Tracing, TracingLimits
@@ -24,13 +24,10 @@ from invgraphics.kernels.types import Tracing, TracingLimits
 _T, _F, _LOW, _LOW_T, _LOW_A, _LOW_B, _HIT_A, _HIT_FA, _HIT_B, _HIT_FB, _NEXT = range(11)
 _ROWS = 11
 _MARCH, _HIT, _CLOSEST, _DONE = range(4)
-_NO_LEVELS = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint64)
 _RUN = 32
 """Consecutive rays that are given to one job before the next job has its turn."""
 
-_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_INFINITE, _PI = np.float32(np.inf), np.float32(np.pi)
-_THREE = index(3) * POINTS
+_ZERO, _HALF, _INFINITE = np.float32(0), np.float32(0.5), np.float32(np.inf)
 _GOLDEN, _ROUNDING = np.float32(GOLDEN), np.float32(ROUNDING)
 
 
@@ -142,38 +139,6 @@ def _advance(state, p, value, phase, counts, far, limits):
 
 
 @inlined
-def _distances(net, x, ping, pong, sharpness):
-    """Outputs of a softplus network for `POINTS` inputs; layers write to ``ping`` and ``pong`` in turn."""
-    layers, sizes = net
-    at, last, source, target = index(0), len(sizes) - 1, x, ping
-    for number in range(len(sizes)):
-        size = index(sizes[number, 0]), index(sizes[number, 1])
-        dense(layers, at, source, target, size, False)
-        if number < last:
-            for k in range(index(size[1] * POINTS)):
-                target[k] = softplus(sharpness * target[k]) / sharpness
-        at += (size[0] + index(1)) * size[1]
-        source, target = target, pong if number % 2 == 0 else ping
-    return source
-
-
-@inlined
-def _coordinates(points, x, first, settings, octaves):
-    """Write scaled coordinates at ``first``; unless ``octaves`` is negative, behind them x, its sines and its cosines."""
-    for axis in range(3):
-        for p in range(POINTS):
-            u, at = _TWO * points[axis, p] - _ONE, first + index(axis) * POINTS + index(p)
-            x[at] = u * settings[2 + axis]
-            if octaves >= 0:
-                x[at + _THREE] = u
-                sine, cosine = np.sin(_PI * u), np.cos(_PI * u)
-                for octave in range(octaves):
-                    row = at + _THREE * index(2 + octave)
-                    x[row], x[row + _THREE * index(octaves)] = sine, cosine
-                    sine, cosine = _TWO * sine * cosine, cosine * cosine - sine * sine
-
-
-@inlined
 def _next_ray(cursor, job, jobs, near, far):
     """Index of the job's next ray with an interval, -1 at the end; and the cursor behind it. Jobs take runs of rays in turn."""
     while True:
@@ -196,7 +161,7 @@ def trace(rays, box, table, levels, octaves, net, widest, settings, limits, jobs
         table: features, flat.
         levels: see `levels_of`.
         octaves: number of octaves behind the coordinates, -1 for none.
-        net: layers and sizes as `pack_network` returns them; its inputs are the grid's features, then what `_coordinates` says.
+        net: layers and sizes as `pack_network` returns them; its inputs are the grid's features, then what `coordinates` says.
         widest: largest number of inputs or outputs of any layer.
         settings: sharpness, scale of the distance, scales of the coordinates.
         limits: as `TracingLimits`.
@@ -231,8 +196,8 @@ def trace(rays, box, table, levels, octaves, net, widest, settings, limits, jobs
             if busy == 0:
                 break
             encode(table, levels, points, entries, weights, x)
-            _coordinates(points, x, first, settings, octaves)
-            raw = _distances(net, x, ping, pong, settings[0])
+            coordinates(points, x, first, settings, octaves)
+            raw = distances(net, x, ping, pong, settings[0])
             for p in range(POINTS):
                 r = lane_ray[p]
                 if r >= 0:
@@ -248,21 +213,13 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
     """See `invgraphics.kernels.sdf_trace`; other than two features per entry are left to the reference."""
     if field.table.shape[1] != 2:
         return reference.sdf_trace(rays, bounds, field, limits)
-    (weight, bias), *others = field.net
-    levels, octaves = _NO_LEVELS, field.octaves
-    if field.grid is not None:
-        levels, octaves = levels_of(field.grid), -1
-        weight = torch.cat([weight[:, 3:], weight[:, :3]], dim=1)
-    net = pack_network(((weight, bias), *others))
     batch = tuple(array(part) for part in (rays.origins, rays.directions, rays.near, rays.far))
     box = array(bounds.lo), array(1 / (bounds.hi - bounds.lo))
-    settings = np.array([field.sharpness, field.scale, *field.coordinate_scale.tolist()], np.float32)
     lengths = (np.float32(value) for value in (limits.least, limits.tolerance, limits.depth))
     stops = limits.steps, np.float32(limits.relaxation), limits.refinements, *lengths
     results = torch.full((_ROWS, len(rays)), torch.inf)
     results[_LOW_T] = rays.near
     steps, ended = torch.zeros(len(rays), dtype=torch.long), rays.far <= rays.near
     outputs = results.numpy(), steps.numpy(), ended.numpy()
-    model = array(field.table).reshape(-1), levels, octaves, net, int(net[1].max())
-    trace(batch, box, *model, settings, stops, threads(), *outputs)
+    trace(batch, box, *pack_sdf(field), stops, threads(), *outputs)
     return result(results, steps, ended, rays, limits)
