@@ -160,6 +160,15 @@ def test_no_sideways_scrolling(opened: Any, either: Path, width: int) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
+def test_a_long_name_of_a_variant_does_not_widen_a_phone_s_page(opened: Any) -> None:
+    page = opened(viewport={"width": 390, "height": 800})
+    page.evaluate("document.querySelectorAll('details').forEach(details => (details.open = true))")
+    name = "gaussian-volume/exact, count 625, max_init 625, opacity extinction, no self attenuation"
+    page.evaluate("name => document.querySelectorAll('select.left option').forEach(option => (option.text = name))", name)
+    assert page.locator("select.left").count() > 0
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
 def test_dark_mode_changes_page_and_plots(opened: Any) -> None:
     grounds, plots = [], []
     for scheme in ("light", "dark"):

@@ -243,6 +243,18 @@ def test_starts_that_differ_in_their_number_of_points_are_one_fact(pristine_comp
     assert start_fact([start(*each) for each in enumerate(runs)]) == "from SfM on these, and random ones inside the silhouettes"
 
 
+def test_a_recipe_that_does_not_start_from_the_scene_s_points_says_so(comparison_folder: Path) -> None:
+    runs = read_comparison(comparison_folder).runs
+    runs = [replace(run, provenance=replace(run.provenance, notes={"points": "from SfM"})) for run in runs]
+    assert start_fact(runs) == "from SfM"
+    nerf = [run for run in runs if run.scores.method == "volumetric/nerf"]
+    for run in nerf:
+        (run.folder / "recipe.toml").write_text('[field]\ninit = "random"\n')
+    assert 0 < len(nerf) < len(runs)
+    assert start_fact(runs) == "from SfM; random points (volumetric/nerf)"
+    assert start_fact(nerf) == "random points"
+
+
 def test_protocol_settings_are_shown_in_words(pristine_comparison: Path) -> None:
     comparison = read_comparison(pristine_comparison)
 

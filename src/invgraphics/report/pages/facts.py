@@ -10,7 +10,7 @@ from typing import Any
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.wording import budget_words, listing
-from invgraphics.runs.folder import PUBLISHED
+from invgraphics.runs.folder import PUBLISHED, RECIPE
 from invgraphics.runs.run import Run
 from invgraphics.runs.schema import plain
 from invgraphics.text import duration
@@ -27,6 +27,13 @@ SETTING_WORDS = {
     ("masks", "unknown"): "not supported",
 }
 """(Setting, value) of a protocol -> words."""
+START_WORDS = {
+    "stereo": "points that stereo finds in the training photographs, the scene's or random ones where these are few",
+    "random": "random points",
+    "depth": "true depth maps of the training views",
+    "field": "another run's field",
+}
+"""``field.init`` of a recipe that does not start from the scene's points -> words."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +105,23 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
 
 
 def start_fact(runs: Sequence[Run]) -> str:
-    """What the fits' fields may start from, by scene where scenes differ; empty where no run says."""
-    pairs = [(_start(run), run.scores.scene) for run in runs]
-    return "" if all(not start for start, _ in pairs) else _grouped([(start or "none", scene) for start, scene in pairs])
+    """What the fits' fields may start from: by scene where scenes differ, by method where a recipe has a start of its own.
+
+    Empty where no run says.
+    """
+    own = [(START_WORDS.get(_init(run), ""), run) for run in runs]
+    scenes = [(_start(run), run.scores.scene) for words, run in own if not words]
+    starts = [_grouped([(start or "none", scene) for start, scene in scenes])] if any(start for start, _ in scenes) else []
+    for words in dict.fromkeys(words for words, _ in own if words):
+        methods = list(dict.fromkeys(run.scores.method for each, run in own if each == words))
+        starts.append(words if all(each == words for each, _ in own) else f"{words} ({listing(methods)})")
+    return "; ".join(starts)
+
+
+def _init(run: Run) -> str:
+    """The recipe's choice of first points; empty where it has none or is not there."""
+    field = run.files.read_recipe().get("field") if (run.folder / RECIPE).is_file() else None
+    return str(field.get("init", "")) if isinstance(field, Mapping) else ""
 
 
 def _start(run: Run) -> str:
