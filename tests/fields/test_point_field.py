@@ -91,6 +91,22 @@ def test_support_holds_every_sample_with_a_density(scene) -> None:
     assert torch.equal(sampler.occupied, support)
 
 
+@pytest.mark.parametrize("resolution", [5, 12])
+def test_support_is_the_cells_that_a_box_around_a_point_meets(scene, resolution: int) -> None:
+    torch.manual_seed(1)
+    # Some overlap, some stick out of the bounds, some are wholly outside.
+    position = scene.bounds.from_unit(2 * torch.rand(12, 3) - 0.5)
+    field = SMALL.from_points(Points(position, torch.full((12, 3), 0.5)), scene)
+    field.radius.fill_(0.15)
+    reach = field.radius / (2 * scene.bounds.half)
+    unit, first = scene.bounds.to_unit(position)[:, None], torch.arange(resolution)[:, None]
+    meets = ((unit + reach) * resolution >= first) & ((unit - reach) * resolution < first + 1)
+    x, y, z = meets.unbind(dim=2)
+    boxes = x[:, :, None, None] & y[:, None, :, None] & z[:, None, None, :]
+    assert 0 < int(boxes.flatten(1).any(dim=1).sum()) < 12
+    assert torch.equal(field.support(scene.bounds, resolution), boxes.any(dim=0))
+
+
 @pytest.mark.parametrize("init", ["scene", "random", "depth"])
 def test_starts(scene, init: str) -> None:
     torch.manual_seed(0)

@@ -29,7 +29,7 @@ _CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
     "march": sample_cases.ray_march,
     "composite": sample_cases.composite,
     "picture": sample_cases.ngp_render,
-    "trace": surface_cases.sdf_trace,
+    "trace": surface_cases.signed_distances,
     "mesh": surface_cases.meshes,
     "near": surface_cases.near_points,
     "ssim": splat_cases.ssim,

@@ -46,7 +46,7 @@ NEIGHBOURS, NEAR_RADIUS = 8, 0.05
 MOST_POINTS_FOR_REFERENCE = 1 << 14
 
 
-def sdf_trace(quick: bool) -> Iterator[Case]:
+def signed_distances(quick: bool) -> Iterator[Case]:
     """A hash grid's distance in one pass: at positions in the order of rays, and by sphere tracing."""
     levels = DISTANCE.encoding.levels
     for positions in QUICK_DISTANCES if quick else DISTANCES:
