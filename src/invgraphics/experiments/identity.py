@@ -79,8 +79,9 @@ def check_replaceable(job: Job) -> None:
         "number of test views": (found.options.test_views, request.test_views),
         "samples per pixel": (found.options.spp, request.spp),
         "training data": (found.data, job.data.changes()),
-        "recipe": (found.recipe_sha256[:12], job.method.digest[:12]),
     }
+    if found.recipe_sha256 not in job.recipes:
+        settings["recipe"] = (found.recipe_sha256[:12], job.method.digest[:12])
     for name, (theirs, ours) in settings.items():
         if theirs != ours:
             sentence = f"{folder.root} holds another run: its {name} is {theirs}, not {ours}."

@@ -16,7 +16,7 @@ from invgraphics.metrics.protocols import Protocol, protocol_named
 from invgraphics.recipes.recipe import Method, assign, load_method
 from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.degrade import TrainingData
-from invgraphics.scenes.open import SceneOptions
+from invgraphics.scenes.open import SceneOptions, longest_edge
 from invgraphics.training.budget import Budget, Cadence
 
 
@@ -70,6 +70,11 @@ class Job:
             protocol=protocol,
             variants=tuple(map(variant_named, request.render_with)),
         )
+
+    @property
+    def recipes(self) -> tuple[str, ...]:
+        """SHA-256 of every recipe that makes the same fit, this one's first (see `Method.digests`)."""
+        return self.method.digests(longest_edge(self.request.scene, self.options.size))
 
     @property
     def folder(self) -> RunFolder:

@@ -14,7 +14,7 @@ from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.presets import select_preset
-from invgraphics.recipes.renamed import with_current_names, with_first_names
+from invgraphics.recipes.renamed import ADDED_KEYS, with_current_names, with_first_names
 from invgraphics.tables import LIMITS, parse_toml, read_text
 from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 PRESET = "preset="
 """How the change in a method's name begins that chooses a preset."""
+
+_WITHOUT_SMALL_PICTURES = {key: ADDED_KEYS["batches"][key] for key in ("start_size", "start_until")}
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,19 @@ class Method:
     def digest(self) -> str:
         """SHA-256 of the resolved table, invariant under renamed keys."""
         return sha256_of(with_first_names(self.table))
+
+    def digests(self, longest_edge: int | None) -> tuple[str, ...]:
+        """SHA-256 of every table that makes the same fit to photographs of a size, this one's first.
+
+        There are two where photographs are too small for ``batches.start_size`` to do anything: with it and without.
+
+        Args:
+            longest_edge: of the photographs in pixels; ``None`` where it is not known.
+        """
+        if longest_edge is None or self.recipe.batches.halvings(longest_edge):
+            return (self.digest,)
+        plain = self.table | {"batches": {**self.table["batches"], **_WITHOUT_SMALL_PICTURES}}
+        return self.digest, sha256_of(with_first_names(plain))
 
 
 def methods() -> dict[str, str]:

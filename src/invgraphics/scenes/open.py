@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -145,6 +145,23 @@ def _path(spec: str) -> Path:
 def is_rendered(spec: str) -> bool:
     """Whether a scene is rendered here (built in, or a ``scene.toml``), so that its samples per pixel can be chosen."""
     return _description(spec) is not None
+
+
+def longest_edge(spec: str, size: int | Sequence[int] | None) -> int | None:
+    """Longest edge in pixels of a scene's pictures; ``None`` where only the scene itself tells.
+
+    Args:
+        spec: the scene's name or path.
+        size: as asked for, if it was.
+    """
+    from invgraphics.scenes.mitsuba.spec import description_path, read
+
+    if size is None:
+        try:
+            size = read(description_path(spec)).size
+        except InputError:
+            return None
+    return size if isinstance(size, int) else max(size)
 
 
 def selection_notes(scene: Scene) -> str:

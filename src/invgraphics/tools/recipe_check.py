@@ -10,16 +10,12 @@ from pathlib import Path
 
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import DATA
-from invgraphics.recipes.recipe import Method, load_method
-from invgraphics.recipes.renamed import ADDED_KEYS
+from invgraphics.recipes.recipe import load_method
 from invgraphics.report.wording import listing
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
-from invgraphics.scenes.mitsuba.spec import description_path, read
+from invgraphics.scenes.open import longest_edge
 from invgraphics.training.budget import Budget
-
-WITHOUT_EFFECT = {key: ADDED_KEYS["batches"][key] for key in ("start_size", "start_until")}
-"""Keys of ``batches`` without effect on pictures near or below ``start_size``, with the values of recipes that lack them."""
 
 
 @dataclass(frozen=True)
@@ -78,33 +74,12 @@ def check_recipes(folder: Path) -> RecipeCheck:
 
 
 def _todays_digests(record: Provenance, overrides: Sequence[str]) -> tuple[str, ...]:
-    """SHA-256 of each recipe that the same request may make today; the reason where it makes none.
-
-    There are two where pictures were too small for ``batches.start_size`` to do anything: with it and without.
-    """
-
-    def made(*more: str) -> Method:
-        return load_method(record.method, record.preset or None, [*overrides, *more], Budget.parse(record.budget))
-
+    """SHA-256 of each recipe that the same request may make today; the reason where it makes none."""
     try:
-        method = made()
-        edge = _longest_edge(record)
-        if edge is None or method.recipe.batches.halvings(edge):
-            return (method.digest,)
-        return method.digest, made(*(f"batches.{key}={value}" for key, value in WITHOUT_EFFECT.items())).digest
+        method = load_method(record.method, record.preset or None, overrides, Budget.parse(record.budget))
     except InputError as error:
         return (error.sentence.rstrip("."),)
-
-
-def _longest_edge(record: Provenance) -> int | None:
-    """Longest edge of a run's photographs in pixels: as asked for, or a built-in scene's own; ``None`` of other scenes."""
-    size = record.options.size
-    if size is None:
-        try:
-            size = read(description_path(record.scene)).size
-        except InputError:
-            return None
-    return size if isinstance(size, int) else max(size)
+    return method.digests(longest_edge(record.scene, record.options.size))
 
 
 def _overrides(command: str) -> list[str]:
