@@ -53,6 +53,13 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_run, "bench", made_up_run)
 
 
+def test_the_help_names_every_part(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main.run(["bench", "--help"])
+    listed = re.search(r"Parts to measure: ([^.]*)\.", capsys.readouterr().out.replace("│", " "))
+    assert listed is not None and tuple(re.findall(r"\w+", listed.group(1))) == PARTS
+
+
 def test_parts() -> None:
     assert Bench().parts() == PARTS
     assert Bench(quick=True).parts() == QUICK

@@ -31,8 +31,10 @@ class Bench:
 
     quick: bool = False
     """Only small sizes and those that promises are made for (under two minutes)."""
-    only: Annotated[str | None, arg(metavar="A,B,C", help_behavior_hint="(default: everything)")] = None
-    """Parts to measure: splats, hash, lattice, march, composite, picture, ssim, iterations, threads, memory, peers."""
+    only: Annotated[
+        str | None,
+        arg(metavar="A,B,C", help=f"Parts to measure: {', '.join(PARTS)}.", help_behavior_hint="(default: everything)"),
+    ] = None
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: all in alternation)")] = None
     """Measure one implementation only: numba, or reference (plain torch)."""
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("reports/bench")
