@@ -80,7 +80,7 @@ def check_replaceable(job: Job) -> None:
         "samples per pixel": (found.options.spp, request.spp),
         "training data": (found.data, job.data.changes()),
     }
-    if found.recipe_sha256 not in job.recipes:
+    if found.recipe_sha256 not in job.recipe_digests:
         settings["recipe"] = (found.recipe_sha256[:12], job.method.digest[:12])
     for name, (theirs, ours) in settings.items():
         if theirs != ours:

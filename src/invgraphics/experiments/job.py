@@ -72,9 +72,9 @@ class Job:
         )
 
     @property
-    def recipes(self) -> tuple[str, ...]:
-        """SHA-256 of every recipe that makes the same fit, this one's first (see `Method.digests`)."""
-        return self.method.digests(longest_edge(self.request.scene, self.options.size))
+    def recipe_digests(self) -> tuple[str, ...]:
+        """SHA-256 of every recipe that makes the same fit, this one's first (see `Method.equivalent_digests`)."""
+        return self.method.equivalent_digests(longest_edge(self.request.scene, self.options.size))
 
     @property
     def folder(self) -> RunFolder:

@@ -70,7 +70,7 @@ def is_kept(job: Job) -> bool:
     """
     if not job.folder.finished or not renderings_complete(job):
         return False
-    return job.folder.read(Provenance).recipe_sha256 in job.recipes
+    return job.folder.read(Provenance).recipe_sha256 in job.recipe_digests
 
 
 def render_missing(job: Job, scene: Scene) -> None:

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 PRESET = "preset="
 """How the change in a method's name begins that chooses a preset."""
 
-_WITHOUT_SMALL_PICTURES = {key: ADDED_KEYS["batches"][key] for key in ("start_size", "start_until")}
+_NO_START_SIZE = {key: ADDED_KEYS["batches"][key] for key in ("start_size", "start_until")}
+"""Values of ``batches`` with which a fit begins with all pixels."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Method:
         """SHA-256 of the resolved table, invariant under renamed keys."""
         return sha256_of(with_first_names(self.table))
 
-    def digests(self, longest_edge: int | None) -> tuple[str, ...]:
+    def equivalent_digests(self, longest_edge: int | None) -> tuple[str, ...]:
         """SHA-256 of every table that makes the same fit to photographs of a size, this one's first.
 
         There are two where photographs are too small for ``batches.start_size`` to do anything: with it and without.
@@ -69,7 +70,7 @@ class Method:
         """
         if longest_edge is None or self.recipe.batches.halvings(longest_edge):
             return (self.digest,)
-        plain = self.table | {"batches": {**self.table["batches"], **_WITHOUT_SMALL_PICTURES}}
+        plain = self.table | {"batches": {**self.table["batches"], **_NO_START_SIZE}}
         return self.digest, sha256_of(with_first_names(plain))
 
 

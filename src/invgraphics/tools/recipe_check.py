@@ -79,7 +79,7 @@ def _todays_digests(record: Provenance, overrides: Sequence[str]) -> tuple[str, 
         method = load_method(record.method, record.preset or None, overrides, Budget.parse(record.budget))
     except InputError as error:
         return (error.sentence.rstrip("."),)
-    return method.digests(longest_edge(record.scene, record.options.size))
+    return method.equivalent_digests(longest_edge(record.scene, record.options.size))
 
 
 def _overrides(command: str) -> list[str]:
