@@ -55,6 +55,7 @@ def test_a_report_is_current_until_its_recipe_changes(tmp_path: Path, capsys: py
     [
         ("anything", {"size": 128}, True),
         ("anything", {"size": [160, 200]}, True),
+        ("anything", {"size": [160, 400]}, False),
         ("anything", {"size": 400}, False),
         ("anything", {}, False),
         ("bricks", {}, True),  # 128 px
