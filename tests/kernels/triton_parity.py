@@ -1,10 +1,15 @@
 """Parity of the Triton kernels with the reference; `test_cuda_interpreted` runs this in a process of its own."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
+from invgraphics.core.camera import Camera
+from invgraphics.core.field import Gaussians
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import cuda, reference
+from invgraphics.kernels.types import Footprints
 
 
 def differentiate(function, inputs: list[Tensor], dtype: torch.dtype) -> list[Tensor]:
@@ -73,8 +78,50 @@ def edges() -> None:
     assert abs(thin / 9.995e-4 - 1) < 1e-4, "thin media lose their digits"
 
 
+def cloud(count: int, opaque: float) -> tuple[Footprints, Tensor]:
+    """A cloud on a screen of 41 by 27 pixels, some of it culled, and its colours; ``opaque`` shifts the opacities' logits."""
+    pose = torch.eye(4)
+    pose[2, 3] = -3.0
+    camera = Camera(pose, torch.tensor([40.0, 44.0]), torch.tensor([22.0, 12.0]), 41, 27)
+    gaussians = Gaussians(
+        torch.randn(count, 3) * 0.7, torch.randn(count, 4), torch.exp(torch.randn(count, 3) * 0.4 - 1.7),
+        torch.sigmoid(torch.randn(count) + opaque), torch.randn(count, 4, 3) * 0.3,
+    )  # fmt: skip
+    return reference.splat_project(gaussians, camera)
+
+
+def draw(rasterise, footprints: Footprints, tile: int | None = None):
+    """``rasterise`` of means, conics, opacities, features and absolute gradients, whatever their number type."""
+
+    def function(means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, absgrad: Tensor | None = None):
+        rest = {name: getattr(footprints, name).to(means2d) for name in ("depths", "depth_planes", "radii")}
+        return rasterise(Footprints(means2d, conics, opacities, absgrad=absgrad, **rest), features, 41, 27, tile)
+
+    return function
+
+
+def splatting() -> None:
+    # Opaque clouds end many pixels early and clamp alpha; that of 80 splats has tiles of more than one chunk.
+    for opaque, channels, tile in ((0.0, 3, None), (6.0, 3, 8), (1.0, 1, 16), (1.0, 7, 32)):
+        footprints, _ = cloud(80, opaque)
+        assert 0 < int((footprints.radii > 0).sum()) < 80
+        inputs = [footprints.means2d, footprints.conics, footprints.opacities, torch.randn(80, channels)]
+        fast, plain = draw(cuda.splat_rasterise, footprints, tile), draw(reference.splat_rasterise, footprints, tile)
+        assert_equal(fast, plain, inputs)
+        if channels == 3:
+            assert_equal(fast, plain, [*inputs, torch.zeros(80, 2)])
+    for other in (replace(footprints, absgrad=torch.zeros(80, 2)), replace(footprints, homography=torch.eye(3).repeat(80, 1, 1))):
+        ours, theirs = (kernels.splat_rasterise(other, torch.ones(80, 4), 41, 27) for kernels in (cuda, reference))
+        assert torch.equal(ours[0], theirs[0])
+    nothing = Footprints(*(value[:0] for value in vars(footprints).values() if value is not None))
+    image, alpha = cuda.splat_rasterise(nothing, torch.zeros(0, 3), 41, 27)
+    assert (image.shape, alpha.shape) == ((27, 41, 3), (27, 41))
+    assert not image.any()
+    assert not alpha.any()
+
+
 if __name__ == "__main__":
-    torch.manual_seed(0)
-    for check, name in ((hash_encoding, "hash"), (compositing, "composite"), (edges, "edges")):
+    for check, name in ((hash_encoding, "hash"), (compositing, "composite"), (edges, "edges"), (splatting, "splats")):
+        torch.manual_seed(0)  # under which no response lies so near a threshold that its two sides are one in float32
         check()
         print(name)

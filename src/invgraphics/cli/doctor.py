@@ -109,12 +109,12 @@ def _cuda() -> Iterator[Finding]:
 
 
 def _cuda_kernels() -> Iterator[Finding]:
-    for package, purpose in (("triton", "hash encoding and compositing"), ("gsplat", "splatting")):
-        if importlib.util.find_spec(package) is None:
-            remedy = f"`pip install 'invgraphics[cuda]'`; until then {purpose} runs as plain torch on the GPU"
-            yield Finding(package, "not installed", remedy)
-        else:
-            yield Finding(package, f"{version(package)}, for {purpose} on the GPU")
+    purpose = "splatting, hash encoding and compositing"
+    if importlib.util.find_spec("triton") is None:
+        remedy = f"`pip install 'invgraphics[cuda]'`; until then {purpose} run as plain torch on the GPU"
+        yield Finding("Triton", "not installed", remedy)
+    else:
+        yield Finding("Triton", f"{version('triton')}, for {purpose} on the GPU")
 
 
 def _lpips() -> Finding:

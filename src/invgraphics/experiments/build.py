@@ -100,10 +100,10 @@ def _view_share(recipe: Recipe, renderer: Renderer, scene: Scene) -> float:
     return min(recipe.batches.views, views) / views if isinstance(renderer, RayRenderer) else 1 / views
 
 
-def use_kernels(name: str | None) -> None:
-    """Select the kernel backend by name, and compile its kernels before any timing starts."""
+def use_kernels(name: str | None, device: torch.device) -> None:
+    """Select the kernel backend by name, and compile its kernels for a device before any timing starts."""
     kernels.use(name)
-    kernels.warm_up()
+    kernels.warm_up(device)
 
 
 def use_deterministic_algorithms(device: torch.device) -> None:

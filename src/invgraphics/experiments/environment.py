@@ -18,7 +18,7 @@ from invgraphics import kernels
 from invgraphics.runs.environment import Environment
 
 PACKAGES = ("numpy", "numba", "mitsuba", "pycolmap", "scikit-image")
-CUDA_PACKAGES = ("triton", "gsplat")
+CUDA_PACKAGES = ("triton",)
 """Packages that decide numbers, besides torch; of the latter some may be missing."""
 
 

@@ -93,7 +93,7 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
         if same and folder.finished:
             render_missing(job, scene)
             return
-        use_kernels(request.kernels)
+        use_kernels(request.kernels, job.device)
         began_at = load_average()
         with PeakMemory(job.device) as memory:
             fit = prepare(job, shown)

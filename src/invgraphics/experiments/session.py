@@ -182,7 +182,7 @@ class MemoryRun(FittedRun):
         self._history: list[Moment] = []
         self._scores: ScoreTable | None = None
         use_deterministic_algorithms(job.device)
-        use_kernels(job.request.kernels)
+        use_kernels(job.request.kernels, job.device)
         with PeakMemory(job.device) as memory:
             self.fit = prepare(job, degrade(scene, job.data, job.request.seed))
             warm_up(self.fit, job.method, memory)

@@ -104,7 +104,10 @@ def in_use(device: torch.device | None = None) -> str:
     return name if DEVICES.get(name) == kind and not unavailable_reason(name) else "reference"
 
 
-def warm_up() -> float:
-    """Compile the kernels ahead of time, so that no fit's clock includes it; returns seconds."""
-    module = _module("numba") if in_use() == "numba" else None
+def warm_up(device: torch.device | None = None) -> float:
+    """Compile the kernels of a device (``None``: the CPU) ahead of time, so that no fit's clock includes it; returns seconds.
+
+    Kernels of a GPU compile at their first call, which a fit's discarded warm-up step makes.
+    """
+    module = _module("numba") if in_use(device) == "numba" else None
     return module.warm_up() if isinstance(module, ModuleType) and hasattr(module, "warm_up") else 0.0

@@ -157,6 +157,8 @@ class Frames:
         elif model in _PINHOLES:
             return None
         elif model in ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV"):
+            if not any((k1, k2, p1, p2, k3, k4)):  # known without pycolmap, whose import takes as long as many a scene
+                return None
             extended = bool(k3 or k4)
             more = (k3, k4, 0.0, 0.0) if extended else ()
             lens = Lens("FULL_OPENCV" if extended else "OPENCV", (*pinhole, k1, k2, p1, p2, *more), *size)

@@ -93,7 +93,7 @@ def try_method(job: Job, scene: Scene) -> Cost:
         InputError: field, renderer or scene do not go together.
     """
     seed, device = job.request.seed, job.device
-    use_kernels(job.request.kernels)
+    use_kernels(job.request.kernels, device)
     pixels = sum(view.camera.width * view.camera.height for view in scene.test)
     shown = degrade(scene, job.data, seed)
     try:

@@ -116,7 +116,7 @@ def convert_run(request: ConvertRequest) -> Converted:
     folder = job.folder
     _check_empty(folder)
     use_deterministic_algorithms(job.device)
-    use_kernels(request.kernels)
+    use_kernels(request.kernels, job.device)
     shown = degrade(fitted.scene, job.data, fitted.folder.read(Provenance).seed)
     plan = build_plan(job.method, shown, job.budget, request.seed, job.device)
     torch.manual_seed(request.seed)

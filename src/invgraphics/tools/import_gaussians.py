@@ -78,7 +78,7 @@ def import_run(request: ImportRequest) -> Path:
     gaussians = transform_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()
     use_deterministic_algorithms(job.device)
-    use_kernels(job.request.kernels)
+    use_kernels(job.request.kernels, job.device)
     origin = _origin(request, name, splats, axes)
     if splats.antialiased and not getattr(job.method.recipe.renderer, "antialiased", False):
         print(

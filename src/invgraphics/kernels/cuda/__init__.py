@@ -1,13 +1,9 @@
-"""Float32 kernels for NVIDIA GPUs: Triton for packed samples, gsplat (where it is installed) for splats.
+"""Float32 kernels for NVIDIA GPUs, in Triton, which is part of every CUDA build of torch for Linux: nothing else to install.
 
-Other operations fall back to the reference, which runs on any device. Gradients of hash tables are accumulated atomically, in
-no fixed order: repeated runs agree to rounding, not bitwise.
+Other operations fall back to the reference, which runs on any device. Gradients of hash tables and of splats are accumulated
+atomically, in no fixed order: repeated runs agree to rounding, not bitwise.
 """
-
-from importlib.util import find_spec
 
 from invgraphics.kernels.cuda.composite import composite as composite
 from invgraphics.kernels.cuda.hash import hash_encode as hash_encode
-
-if find_spec("gsplat") is not None:
-    from invgraphics.kernels.cuda.splats import splat_rasterise as splat_rasterise
+from invgraphics.kernels.cuda.raster import splat_rasterise as splat_rasterise

@@ -95,7 +95,7 @@ def position_gradient(
     point = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
     in_range, column = point < points, tl.arange(0, WIDTH)
     valid = in_range[:, None] & (column < FEATURES)[None, :]
-    along_x, along_y, along_z = (tl.zeros((SIZE,), tl.float32) for _ in tl.static_range(3))
+    along_x, along_y, along_z = tl.zeros((SIZE,), tl.float32), tl.zeros((SIZE,), tl.float32), tl.zeros((SIZE,), tl.float32)
     for level in range(count):
         edge, offset, mask = tl.load(levels + level), tl.load(levels + count + level), tl.load(levels + 2 * count + level)
         x, fx, in_x = _axis(unit, point, 0, in_range, edge)

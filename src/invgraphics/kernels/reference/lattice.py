@@ -61,7 +61,7 @@ def locate(unit: Float[Tensor, "m d"], cells: Int[Tensor, " d"]) -> Cell:
 def interpolate(unit: Float[Tensor, "m 3"], lattice: Lattice) -> Float[Tensor, "m c"]:
     """Linear, bilinear or trilinear interpolation of one lattice's features."""
     size = torch.tensor(lattice.resolution, device=unit.device)
-    cell = locate(unit[:, list(lattice.columns)], size - 1)
+    cell = locate(torch.stack([unit[:, column] for column in lattice.columns], dim=1), size - 1)
     index = cell.vertices[..., 0]
     for axis in range(1, len(size)):
         index = index * size[axis] + cell.vertices[..., axis]
