@@ -110,7 +110,8 @@ def splatting() -> None:
         assert_equal(fast, plain, inputs)
         if channels == 3:
             assert_equal(fast, plain, [*inputs, torch.zeros(80, 2)])
-    for other in (replace(footprints, absgrad=torch.zeros(80, 2)), replace(footprints, homography=torch.eye(3).repeat(80, 1, 1))):
+    left = [{"absgrad": torch.zeros(80, 2)}, {"homography": torch.eye(3).repeat(80, 1, 1)}]
+    for other in (replace(footprints, **extra) for extra in left):
         ours, theirs = (kernels.splat_rasterise(other, torch.ones(80, 4), 41, 27) for kernels in (cuda, reference))
         assert torch.equal(ours[0], theirs[0])
     nothing = Footprints(*(value[:0] for value in vars(footprints).values() if value is not None))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args, runtime_checkable
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from typing_extensions import Protocol, runtime_checkable
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.errors import InputError, did_you_mean

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from dataclasses import field as default
-from typing import Annotated, Any, Protocol, Self, get_type_hints, runtime_checkable
+from typing import Annotated, Any, Self, get_type_hints
+
+from typing_extensions import Protocol, runtime_checkable
 
 from invgraphics.config import OMIT_EMPTY, Slot
 from invgraphics.training.batches import BatchConfig

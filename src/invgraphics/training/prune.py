@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, cast, runtime_checkable
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
-from typing_extensions import override
+from typing_extensions import Protocol, override, runtime_checkable
 
 from invgraphics.core import RayRenderer, Trace
 from invgraphics.core.lattice import LatticeEncoding, LatticeField
@@ -22,10 +22,7 @@ from invgraphics.training.penalties import LATTICES
 
 @runtime_checkable
 class Prunable(Protocol):
-    """Protocol of sparse grids: their links, and how vertices are emptied."""
-
-    links: Tensor
-    rows: Tensor
+    """Protocol of sparse grids: how vertices are emptied. Their parameter is called ``rows``."""
 
     def keep(self, kept: Bool[Tensor, "x y z"]) -> Int[Tensor, " k"]:
         """Empty all vertices but those ``kept``; returns the old rows of those left."""
@@ -129,6 +126,7 @@ def dilated(mask: Bool[Tensor, "x y z"], by: int) -> Bool[Tensor, "x y z"]:
 def prune(state: FitState, grid: Prunable, kept: Bool[Tensor, "x y z"]) -> None:
     """Empty the vertices of a grid that are not ``kept``; the optimiser's moments of the others stay."""
     names = {id(parameter): f"field.{name}" for name, parameter in state.field.named_parameters()}
-    name = names[id(grid.rows)]
+    module = cast(nn.Module, grid)
+    name = names[id(module.get_parameter("rows"))]
     rows = grid.keep(kept)
-    state.optimiser.reindex_rows(name, cast(nn.Parameter, grid.rows), rows, 0)
+    state.optimiser.reindex_rows(name, module.get_parameter("rows"), rows, 0)

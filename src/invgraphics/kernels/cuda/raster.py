@@ -2,7 +2,7 @@
 
 A program owns a tile of pixels and walks through its splats, front to back forward and back to front backward, where each
 pixel's transmittance is recovered by division (Kerbl et al. 2023, section 6). One warp per program: the sums over a tile's
-pixels, of which the backward pass has eight per splat, then need no shared memory.
+pixels, of which the backward pass has nine per splat, then need no shared memory.
 """
 
 # pyright: reportMissingImports=false
@@ -23,8 +23,8 @@ from invgraphics.kernels.cuda.runtime import on_device_of, once_differentiable
 _ALPHA_MIN, _ALPHA_MAX = tl.constexpr(types.ALPHA_MIN), tl.constexpr(types.ALPHA_MAX)
 _TRANSMITTANCE_MIN = tl.constexpr(types.TRANSMITTANCE_MIN)
 
-TILE = 16
-"""Edge of a tile in pixels where nobody chooses one; a power of two."""
+TILE = 8
+"""Edge of a tile in pixels where nobody chooses one. With 16 a step takes twice as long (H200, 800 pixels, 300,000 splats)."""
 CHANNELS = 3
 """Features that one pass composites; more of them take more passes."""
 WARPS = 1
@@ -115,8 +115,8 @@ def rasterise_backward(
         if tl.max(blends.to(tl.int32), axis=0) > 0:
             blended = tl.where(blends, tl.minimum(response, _ALPHA_MAX), 0.0)
             transmittance = transmittance / (1 - blended)
-            red, green, blue = tl.load(features + 3 * splat), tl.load(features + 3 * splat + 1), tl.load(features + 3 * splat + 2)
-            value = red * grad_red + green * grad_green + blue * grad_blue + grad_opaque
+            value = grad_opaque + tl.load(features + 3 * splat) * grad_red
+            value += tl.load(features + 3 * splat + 1) * grad_green + tl.load(features + 3 * splat + 2) * grad_blue
             grad_blended = transmittance * value - behind / (1 - blended)
             weight = blended * transmittance
             behind += weight * value
