@@ -28,8 +28,8 @@ def derivatives(kernels, unit: Tensor, lattices: list[Lattice], combine: Combina
     unit = unit.to(dtype).clone().requires_grad_()
     features = [x.features.detach().to(dtype).clone().requires_grad_() for x in lattices]
     out = kernels.lattice_encode(unit, [replace(x, features=f) for x, f in zip(lattices, features, strict=True)], combine)
-    generator = torch.Generator().manual_seed(2)
-    weights = torch.randn(out.shape, generator=generator).to(dtype).requires_grad_()
+    generator = torch.Generator("cpu").manual_seed(2)
+    weights = torch.randn(out.shape, generator=generator, device="cpu").to(out).requires_grad_()
     leaves = [unit, *features]
     first = torch.autograd.grad((out * weights).sum(), leaves, create_graph=True)
     squared = torch.stack([(x**2).sum() for x in first]).sum()

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from triton_parity import CHECKS, check
 
 from invgraphics import kernels
 from invgraphics.bench.workload import activated, camera, gaussian_field
@@ -20,6 +21,13 @@ def compare(function, plain, inputs, tolerance: float) -> None:
         results.append([*(output.detach().cpu() for output in outputs), *(leaf.grad.cpu() for leaf in leaves)])
     for ours, theirs in zip(*results, strict=True):
         assert (ours - theirs).abs().max() <= tolerance * theirs.abs().max()
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_parity(name: str) -> None:
+    """What `test_cuda_interpreted` checks without a GPU."""
+    with torch.device("cuda"):
+        check(name)
 
 
 def test_hash_encoding() -> None:

@@ -20,4 +20,4 @@ def test_interpreted_kernels_equal_the_reference() -> None:
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
     done = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, timeout=200, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.split() == ["hash", "composite", "edges", "splats"]
+    assert done.stdout.split() == ["hash", "composite", "edges", "march", "lattices", "splats", "projection"]

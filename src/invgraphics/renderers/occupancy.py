@@ -55,7 +55,8 @@ class OccupancyConfig:
         cells: cells that a refresh looks at after warm-up, half of them drawn from the occupied ones.
         stop: when to leave out samples behind opaque surfaces, at the price of a density look-up.
         transmittance: a ray stops when less than this is left of its light.
-        chunk: samples per ray before the transmittance is tested first; each later chunk is half as long again.
+        chunk: samples per ray before the transmittance is tested first; each later chunk is half as long again. On a GPU it is
+            tested once, for all samples.
     """
 
     resolution: int = 128
@@ -183,7 +184,8 @@ class Occupancy(Sampler):
             # Features are of use to the renderer only where it needs no gradients through them.
             want |= field.provides & Quantity.FEATURES
         query = partial(field.query_no_grad, want=want)
-        return visible_samples(rays, self._march(rays, ctx), query, self.config.transmittance, self.config.chunk), ()
+        chunk = self.config.chunk if rays.origins.device.type == "cpu" else None
+        return visible_samples(rays, self._march(rays, ctx), query, self.config.transmittance, chunk), ()
 
     @torch.no_grad()
     def _march_fused(self, rays: Rays, field: Field, ctx: Context) -> March | None:

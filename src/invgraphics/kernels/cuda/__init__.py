@@ -6,4 +6,7 @@ atomically, in no fixed order: repeated runs agree to rounding, not bitwise.
 
 from invgraphics.kernels.cuda.composite import composite as composite
 from invgraphics.kernels.cuda.hash import hash_encode as hash_encode
+from invgraphics.kernels.cuda.lattice import lattice_encode as lattice_encode
+from invgraphics.kernels.cuda.march import ray_march as ray_march
+from invgraphics.kernels.cuda.project import splat_project as splat_project
 from invgraphics.kernels.cuda.raster import splat_rasterise as splat_rasterise

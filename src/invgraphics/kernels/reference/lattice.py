@@ -81,12 +81,16 @@ def lattice_encode(
     unit: Float[Tensor, "m 3"], lattices: Sequence[Lattice], combine: Combination = "concat"
 ) -> Float[Tensor, "m width"]:
     """See `invgraphics.kernels.lattice_encode`."""
-    values = [interpolate(unit, lattice) for lattice in lattices]
+    return combine_features([interpolate(unit, lattice) for lattice in lattices], combine)
+
+
+def combine_features(values: Sequence[Float[Tensor, "m c"]], combine: Combination) -> Float[Tensor, "m width"]:
+    """Combine the features of several lattices (see `core.lattice.Combination`)."""
     match combine:
         case "concat":
-            return torch.cat(values, dim=1)
+            return torch.cat(list(values), dim=1)
         case "sum":
-            return torch.stack(values).sum(0)
+            return torch.stack(list(values)).sum(0)
         case "vm":
             return torch.cat([plane * line for plane, line in zip(values[::2], values[1::2], strict=True)], dim=1)
         case "cp":

@@ -74,8 +74,9 @@ def _edges(
         return torch.minimum(start[:, None] + count * steps.step, far[:, None])
     edges = [t]
     for _ in range(BLOCK):
-        t = t + step_lengths(rays, t, bounds, steps)
-        edges.append(torch.minimum(t, far))
+        # Without the limit, steps that grow with the distance would overflow behind it.
+        t = torch.minimum(t + step_lengths(rays, t, bounds, steps), far)
+        edges.append(t)
     return torch.stack(edges, dim=1)
 
 

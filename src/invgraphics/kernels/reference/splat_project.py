@@ -130,3 +130,17 @@ def depth_planes_of(mean: Float[Tensor, "n 3"], a: Float[Tensor, "n 3 3"], dilat
     slope_x = (along_x * yy - along_y * xy) / det
     slope_y = (along_y * xx - along_x * xy) / det
     return torch.stack([mean.norm(dim=1), slope_x, slope_y], dim=1)
+
+
+def depth_plane_gradients(
+    gaussians: Gaussians, camera: Camera, dilation: float, grad_planes: Float[Tensor, "n 3"], radii: Float[Tensor, " n"]
+) -> tuple[Tensor | None, ...]:
+    """Gradients through the depth planes, which only depth losses have: of means, quaternions, scales, sh and pose."""
+    with torch.enable_grad():
+        leaves = [x.detach().requires_grad_() for x in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.sh)]
+        means, quaternions, scales, sh = leaves
+        pose = camera.cam_to_world.detach().requires_grad_()
+        again = Gaussians(means, quaternions, scales, gaussians.opacities.detach(), sh)
+        footprints, _ = splat_project(again, camera.moved(pose), dilation)
+        visible = torch.where(radii[:, None] > 0, grad_planes, 0.0)
+        return torch.autograd.grad(footprints.depth_planes, [*leaves, pose], visible, allow_unused=True)

@@ -16,6 +16,7 @@ from invgraphics.kernels import reference
 from invgraphics.kernels.numba.runtime import array, once_differentiable, threads
 from invgraphics.kernels.numba.splat.ewa import CENTRE, FOCAL, POSITION, SIZE, VIEW, project
 from invgraphics.kernels.numba.splat.ewa_backward import project_backward
+from invgraphics.kernels.reference.splat_project import depth_plane_gradients
 from invgraphics.kernels.types import Footprints
 
 
@@ -64,7 +65,7 @@ class _Project(torch.autograd.Function):
         grad_pose = _pose_gradient(pose_sums, pose) if ctx.needs_input_grad[4] else None
         if grad_planes is not None:
             gaussians = Gaussians(means, quaternions, scales, opacities, sh)
-            extras = _depth_plane_backward(gaussians, ctx.camera, ctx.dilation, grad_planes, radii)
+            extras = depth_plane_gradients(gaussians, ctx.camera, ctx.dilation, grad_planes, radii)
             for result, extra in zip((*results, grad_pose), extras, strict=True):
                 if result is not None and extra is not None:
                     result.add_(extra)
@@ -87,20 +88,6 @@ def _pose_gradient(jobs: np.ndarray, pose: Tensor) -> Tensor:
     gradient = np.zeros((4, 4))
     gradient[:3, :3], gradient[:3, 3] = total[:9].reshape(3, 3), total[9:]
     return torch.from_numpy(gradient).to(pose)
-
-
-def _depth_plane_backward(
-    gaussians: Gaussians, camera: Camera, dilation: float, grad_planes: Tensor, radii: Tensor
-) -> tuple[Tensor | None, ...]:
-    """Gradients through the depth planes, which only depth losses have, by the reference."""
-    with torch.enable_grad():
-        leaves = [x.detach().requires_grad_() for x in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.sh)]
-        means, quaternions, scales, sh = leaves
-        pose = camera.cam_to_world.detach().requires_grad_()
-        again = Gaussians(means, quaternions, scales, gaussians.opacities.detach(), sh)
-        footprints, _ = reference.splat_project(again, camera.moved(pose), dilation)
-        visible = torch.where(radii[:, None] > 0, grad_planes, 0.0)
-        return torch.autograd.grad(footprints.depth_planes, [*leaves, pose], visible, allow_unused=True)
 
 
 def splat_project(
