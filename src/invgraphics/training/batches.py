@@ -187,9 +187,10 @@ class Batches:
             self._order = torch.randperm(len(self._scene.train), generator=self._generator)
         index, self._order = int(self._order[0]), self._order[1:]
         view = self._scaled(index, progress)
-        batch = _whole(view, background, index)
+        # Moved as bytes, a quarter of the floats that they become.
+        batch = _whole(_pictures_to(view, self._device), background.to(self._device), index)
         camera = view.camera if self._refined is None else self._refined.camera(index).resized(*size_of(view))
-        return camera.to(self._device), batch.to(self._device)
+        return camera.to(self._device), batch
 
     def _scaled(self, index: int, progress: float) -> View:
         """A training view at the image scale of a point of the fit, area-averaged; the last scale's are kept as bytes."""
@@ -242,6 +243,12 @@ class _Pool:
 def size_of(view: View) -> tuple[int, int]:
     """Width and height in pixels."""
     return view.camera.width, view.camera.height
+
+
+def _pictures_to(view: View, device: torch.device) -> View:
+    """The view with picture, alpha and mask on a device."""
+    alpha, mask = (None if tensor is None else tensor.to(device) for tensor in (view.alpha, view.mask))
+    return replace(view, image=view.image.to(device), alpha=alpha, mask=mask)
 
 
 def _whole(view: View, background: Tensor, index: int) -> Batch:

@@ -73,7 +73,7 @@ class TotalVariationPenalty:
             return total
         half = lattice_field(field, self.name).bounds.half
         for lattice in lattices_of(field, self.role, self.name):
-            edges = half[list(lattice.columns)] / half.prod().pow(1 / 3)
+            edges = torch.stack([half[column] for column in lattice.columns]) / half.prod().pow(1 / 3)
             total = total + total_variation(lattice, edges, self._vertices(lattice, ctx), self.norm)
         return self.weight * total
 
