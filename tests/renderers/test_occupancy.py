@@ -208,6 +208,19 @@ def test_steps_grow_with_a_cone(make_scene: Callable[..., Scene]) -> None:
     assert float(far) > 2
 
 
+def test_rays_with_more_samples_than_one_march_takes(make_scene: Callable[..., Scene]) -> None:
+    """Some rays go on after others have ended: each is still tiled without a gap."""
+    scene = make_scene()
+    sampler = replace(SMALL, steps_per_diagonal=2000, stop="never").build(scene)
+    rays = scene.bounds.clip(scene.train[0].camera.rays())
+    samples, _ = sampler.sample(rays, NOTHING, context(scene, training=False))
+    counts = torch.bincount(samples.ray, minlength=len(rays))
+    assert 0 < int((counts > 1024).sum()) < int((counts > 0).sum())
+    lengths = torch.zeros(len(rays)).index_add(0, samples.ray, samples.delta)
+    torch.testing.assert_close(lengths, rays.far - rays.near, rtol=1e-4, atol=1e-4)
+    assert bool((samples.t0[1:] >= samples.t0[:-1])[samples.ray[1:] == samples.ray[:-1]].all())
+
+
 def test_endless_space_takes_as_many_steps_as_its_contraction_is_long(make_scene: Callable[..., Scene]) -> None:
     """Each but the last, which is cut, is the same part of the way through the contracted ball, to first order."""
     scene = make_scene("contracted")

@@ -230,11 +230,12 @@ class Occupancy(Sampler):
         march = kernels.ray_march(rays, self.occupied, ctx.bounds, steps, self._start(rays, steps, ctx))
         parts = [march]
         going = torch.nonzero(march.resume < rays.far)[:, 0]
+        start = march.resume[going]
         while len(going):
-            march = kernels.ray_march(rays[going], self.occupied, ctx.bounds, steps, march.resume)
+            march = kernels.ray_march(rays[going], self.occupied, ctx.bounds, steps, start)
             parts.append(replace(march, ray=going[march.ray]))
             unfinished = march.resume < rays.far[going]
-            going, march = going[unfinished], replace(march, resume=march.resume[unfinished])
+            going, start = going[unfinished], march.resume[unfinished]
         return parts[0] if len(parts) == 1 else joined(parts)
 
     @torch.no_grad()
