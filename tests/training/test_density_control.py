@@ -258,3 +258,32 @@ def test_statistics_of_earlier_checkpoints_are_read() -> None:
     old.load_state_dict({next((first for first, now in names.items() if now == name), name): v for name, v in written.items()})
     for name, value in old.state_dict().items():
         assert torch.equal(value, written[name]), name
+
+
+def test_resets_that_come_too_soon_are_left_out() -> None:
+    """Due at a tenth, a fifth and three tenths, at least 300 steps apart: only the second one happens, resumed or not."""
+    hook, lowered = DensityControlConfig(every=10_000, resets=(0.1, 0.2, 0.3), reset_spacing=300).build(), []
+    state = _state(3)
+    for step, progress in ((200, 0.1), (399, 0.2), (600, 0.3), (601, 0.31)):
+        with torch.no_grad():
+            state.field.opacity_logits.fill_(0.0)
+        state.step, state.ctx = step, replace(state.ctx, progress=progress)
+        hook.after_step(state)
+        lowered.append(float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02)
+        resumed = DensityControlConfig(every=10_000, resets=(0.1, 0.2, 0.3), reset_spacing=300).build()
+        resumed.load_state_dict(hook.state_dict())
+        hook = resumed
+    assert lowered == [False, True, False, False]
+
+
+def test_large_gaussians_stay_until_a_reset_has_happened() -> None:
+    """One that is due but left out says nothing about how long the Gaussians have had to shrink."""
+    state = _state(3)
+    with torch.no_grad():
+        state.field.log_scales[2] = math.log(0.9 * state.scene.extent)
+    for spacing, count in ((10**6, 3), (0, 2)):
+        hook = DensityControlConfig(every=10, threshold=1e9, resets=(0.0,), reset_spacing=spacing, prune_opacity=1e-9).build()
+        for _ in range(2):
+            _gradients(state, hook, [0.0] * 3)
+            hook.after_step(state)
+        assert state.field.primitive_count() == count

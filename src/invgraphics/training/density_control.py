@@ -33,6 +33,8 @@ class DensityControlConfig:
         prune_extent: share of the scene's extent above which a Gaussian is pruned, after the first reset.
         prune_pixels: radius in pixels above which a Gaussian is pruned, after the first reset; 0 never.
         resets: progress values at which opacities are reset to at most twice ``prune_opacity``.
+        reset_spacing: least number of steps before the first reset and between two; one that is due sooner is left out. Within
+            fewer steps Gaussians neither shrink below ``prune_pixels`` nor become opaque again, and most are pruned.
         white_reset: whether they are also reset at ``start`` where the scene's background is white, before splats of the
             background's colour settle in front of it.
         max_primitives: cap on the number of Gaussians; those with the largest gradients grow first.
@@ -54,6 +56,7 @@ class DensityControlConfig:
     prune_extent: float = 0.1
     prune_pixels: float = 0.0
     resets: tuple[float, ...] = ()
+    reset_spacing: int = 0
     white_reset: bool = False
     max_primitives: int = 1_000_000
     cap_ramp: float = 0.0
@@ -64,6 +67,8 @@ class DensityControlConfig:
     def __post_init__(self) -> None:
         if self.every < 1 or self.max_primitives < 1:
             raise ValueError("'every' and 'max_primitives' must be at least 1.")
+        if self.reset_spacing < 0:
+            raise ValueError(f"'reset_spacing' must not be negative, not {self.reset_spacing}.")
 
     def capped(self, most: int) -> DensityControlConfig:
         """The same, growing to at most ``most`` Gaussians."""
@@ -91,7 +96,7 @@ class GrowthRound:
     pruned: Bool[Tensor, " n"]
 
 
-_FIRST_NAMES = {"gradient_sum": "pull", "views": "seen", "max_radius": "radius", "first_count": "first"}
+_FIRST_NAMES = {"gradient_sum": "pull", "views": "seen", "max_radius": "radius", "first_count": "first", "resets_due": "resets_done"}
 """Tensors of a checkpoint -> what they were called in those of earlier versions."""
 
 
@@ -114,7 +119,8 @@ class DensityControl(Hook):
         self._gradient_sum = torch.zeros(0)
         self._views = torch.zeros(0)
         self._max_radius = torch.zeros(0)
-        self._resets_done = 0
+        self._resets_due = 0
+        self._last_reset = 0
         self._started = -1.0
         self._first_count = 0
         self.last_round: GrowthRound | None = None
@@ -144,9 +150,11 @@ class DensityControl(Hook):
         due = (state.step + 1) % config.every == 0 and len(self._gradient_sum) == len(field.means)
         if due and self._started >= 0 and progress < config.stop:
             self._grow_and_prune(state)
-        if self._resets_done < len(config.resets) and progress >= config.resets[self._resets_done]:
-            self._resets_done += 1
-            self._reset_opacities(state)
+        if self._resets_due < len(config.resets) and progress >= config.resets[self._resets_due]:
+            self._resets_due += 1
+            if state.step + 1 - self._last_reset >= config.reset_spacing:
+                self._last_reset = state.step + 1
+                self._reset_opacities(state)
         if starts and config.white_reset and bool((state.scene.background >= 1).all()):
             self._reset_opacities(state)
 
@@ -201,7 +209,7 @@ class DensityControl(Hook):
         """Gaussians that are transparent or, after the first reset, too large in the scene or on a screen."""
         config = self._config
         prune = torch.sigmoid(field.opacity_logits) < config.prune_opacity
-        if self._resets_done:
+        if self._last_reset:
             prune |= largest > config.prune_extent * extent
             if config.prune_pixels:
                 prune |= self._max_radius > config.prune_pixels
@@ -237,7 +245,8 @@ class DensityControl(Hook):
             "gradient_sum": self._gradient_sum,
             "views": self._views,
             "max_radius": self._max_radius,
-            "resets_done": torch.tensor(self._resets_done),
+            "resets_due": torch.tensor(self._resets_due),
+            "last_reset": torch.tensor(self._last_reset),
             "started": torch.tensor(self._started),
             "first_count": torch.tensor(self._first_count),
         }
@@ -246,5 +255,6 @@ class DensityControl(Hook):
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         state = {name: state[first] for name, first in _FIRST_NAMES.items() if first in state} | state
         self._gradient_sum, self._views, self._max_radius = state["gradient_sum"], state["views"], state["max_radius"]
-        self._resets_done, self._started = int(state["resets_done"]), float(state["started"])
+        self._resets_due, self._started = int(state["resets_due"]), float(state["started"])
+        self._last_reset = int(state.get("last_reset", state["resets_due"]))
         self._first_count = int(state["first_count"])

@@ -100,8 +100,8 @@ def total_variation(
         norm: as of the penalty.
     """
     size = torch.tensor(lattice.resolution, device=vertices.device)
-    place = torch.stack(torch.unravel_index(vertices, lattice.resolution), dim=1)
     strides = size.flip(0).cumprod(0).flip(0) // size
+    place = vertices[:, None] // strides % size
     neighbours = vertices[:, None] + torch.where(place + 1 < size, strides, 0)
     wanted = torch.cat([vertices[:, None], neighbours], dim=1).flatten()
     values = _values(lattice, wanted).unflatten(0, (len(vertices), -1))
