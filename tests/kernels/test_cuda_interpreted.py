@@ -1,6 +1,6 @@
-"""Triton's kernels against the plain reference, gradients included, on the CPU through Triton's interpreter.
+"""Triton's kernels without a GPU: interpreted against the plain reference, gradients included, and compiled.
 
-The interpreter is chosen when Triton is imported, and it is chosen for the whole process: hence a process of its own.
+The interpreter is chosen when Triton is imported, and it is chosen for the whole process: hence processes of their own.
 """
 
 import os
@@ -11,13 +11,28 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
+pytestmark = pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed (`make test-triton` installs it)")
 
-SCRIPT = Path(__file__).with_name("triton_parity.py")
+KERNELS = (
+    "accumulate accumulate_backward encode encode_backward march position_gradient project project_backward rasterise "
+    "rasterise_backward"
+)
+
+
+def words_of(script: str, **environment: str) -> list[str]:
+    """Run a script of this folder; returns the words it prints."""
+    path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, Path(__file__).with_name(script)]
+    variables = {**os.environ, "PYTHONPATH": path, **environment}
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=280, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout.split()
 
 
 def test_interpreted_kernels_equal_the_reference() -> None:
-    environment = {**os.environ, "TRITON_INTERPRET": "1"}
-    done = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, timeout=200, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.split() == ["hash", "composite", "edges", "march", "lattices", "splats", "projection"]
+    checks = ["hash", "composite", "edges", "march", "lattices", "splats", "projection"]
+    assert words_of("triton_parity.py", TRITON_INTERPRET="1") == checks
+
+
+def test_every_kernel_compiles_for_a_gpu(tmp_path: Path) -> None:
+    assert words_of("triton_compilation.py", TRITON_CACHE_DIR=str(tmp_path)) == KERNELS.split()

@@ -96,7 +96,13 @@ class GrowthRound:
     pruned: Bool[Tensor, " n"]
 
 
-_FIRST_NAMES = {"gradient_sum": "pull", "views": "seen", "max_radius": "radius", "first_count": "first", "resets_due": "resets_done"}
+_FIRST_NAMES = {
+    "gradient_sum": "pull",
+    "views": "seen",
+    "max_radius": "radius",
+    "first_count": "first",
+    "resets_due": "resets_done",
+}
 """Tensors of a checkpoint -> what they were called in those of earlier versions."""
 
 
