@@ -1,6 +1,6 @@
-"""Compiles every launch of the Triton kernels for a GPU, without one; `test_cuda_interpreted` runs this in a process of its own.
+"""Compiles every launch of Triton's kernels for a GPU, without one; `test_cuda_interpreted` runs this in its own process.
 
-The interpreter accepts Python that Triton's compiler does not. What the launches would write is never written, so that no number
+The interpreter accepts Python that the compiler does not. What the launches would write is never written, so that no number
 here means anything.
 """
 
