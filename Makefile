@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 METHODS := volumetric/nerf,volumetric/hash,splatting/gaussians
 
-.PHONY: env compare picture matrix prior bench notebooks test test-notebooks fuzz sabotage slow check clean
+.PHONY: env compare picture matrix prior bench notebooks test test-triton test-notebooks fuzz sabotage slow check clean
 
 env: .venv/.ready  ## create .venv and install invgraphics with all it needs
 
@@ -38,6 +38,10 @@ notebooks: env  ## run the notebooks and write them as pages: reports/notebooks
 test: env  ## compile the kernels, once for all processes (2 minutes), and run the test suite (about 10 on 2 cores)
 	$(BIN)/invgraphics doctor --warm-up
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+test-triton: env  ## install triton (0.6 GB) and test the GPU's kernels without one: interpreted against the reference, and compiled
+	$(BIN)/python -m pip install --quiet "triton>=3.8; sys_platform == 'linux'"
+	$(BIN)/python -m pytest tests/kernels/test_cuda_interpreted.py
 
 test-notebooks: env  ## every notebook at a small size, and the numbers it prints
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"
