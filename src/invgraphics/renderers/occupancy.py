@@ -35,9 +35,8 @@ class OccupancyConfig:
         steps_per_diagonal: steps that a march across the bounds' diagonal takes.
         evaluation_steps: the same outside training; ``None`` takes as many. In training the steps are shifted at random, so
             that a field fitted with long ones is sharper when it is seen with short ones.
-        early_steps: the same at the start of training; the number moves to ``steps_per_diagonal`` over the first quarter of the
-            fit. While there is fog, few long steps tell as much as many short ones, and more rays can be afforded. ``None``:
-            no change.
+        early_steps: the same at the start of training; moves to ``steps_per_diagonal`` over the fit's first quarter. In fog few
+            long steps tell as much as many short ones, and more rays can be afforded. ``None``: no change.
         late_steps: the same at the end of training; the number moves there over the second half of the fit. Shorter steps
             show thin things, once they are all that is left to be learned. ``None``: no change.
         cone: growth of the step with distance; ``None`` means 0 in a box and steps of equal contracted length in a contracted
@@ -55,8 +54,7 @@ class OccupancyConfig:
         cells: cells that a refresh looks at after warm-up, half of them drawn from the occupied ones.
         stop: when to leave out samples behind opaque surfaces, at the price of a density look-up.
         transmittance: a ray stops when less than this is left of its light.
-        chunk: samples per ray before the transmittance is tested first; each later chunk is half as long again. On a GPU it is
-            tested once, for all samples.
+        chunk: samples per ray before the transmittance is tested first; each later chunk is half as long again. A GPU has one.
     """
 
     resolution: int = 128
@@ -228,14 +226,13 @@ class Occupancy(Sampler):
         """March all rays to their ends; returns the intervals in occupied cells."""
         steps = self.steps(ctx)
         march = kernels.ray_march(rays, self.occupied, ctx.bounds, steps, self._start(rays, steps, ctx))
-        parts = [march]
-        going = torch.nonzero(march.resume < rays.far)[:, 0]
+        parts, going = [march], torch.nonzero(march.resume < rays.far)[:, 0]
         start = march.resume[going]
         while len(going):
-            march = kernels.ray_march(rays[going], self.occupied, ctx.bounds, steps, start)
-            parts.append(replace(march, ray=going[march.ray]))
-            unfinished = march.resume < rays.far[going]
-            going, start = going[unfinished], march.resume[unfinished]
+            part = kernels.ray_march(rays[going], self.occupied, ctx.bounds, steps, start)
+            parts.append(replace(part, ray=going[part.ray]))
+            unfinished = part.resume < rays.far[going]
+            going, start = going[unfinished], part.resume[unfinished]
         return parts[0] if len(parts) == 1 else joined(parts)
 
     @torch.no_grad()
