@@ -9,13 +9,20 @@ from invgraphics.experiments.recorder import Monitor
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 
-METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
+SPARSE = ["field.encoding.resolution=8", "field.appearance.resolution=8", "hooks=[]"]
+METHODS = {
+    "volumetric/nerf": [],
+    "volumetric/hash": [],
+    "volumetric/tensorf-vm": [],
+    "volumetric/plenoxels": SPARSE,
+    "splatting/gaussians": [],
+}
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_fit_and_evaluate_elsewhere(name: str, scene, small) -> None:
     with other_device() as device:
-        fit = Fit(build_plan(small(name), scene, Budget(steps=12), 0, device))
+        fit = Fit(build_plan(small(name, *METHODS[name]), scene, Budget(steps=12), 0, device))
         fit.warmup_step()
         fit.run(lambda loss: False)
         assert fit.steps == 12
