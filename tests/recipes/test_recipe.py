@@ -119,6 +119,7 @@ def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
         del table["batches"][key]
     for key in ("dropout", "dropout_views"):
         del table["field"][key]
+    del hook["reset_spacing"]
     assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
     again = resolve(method.name, "long", table)
     assert again.recipe == method.recipe and again.table == method.table
