@@ -10,7 +10,7 @@ from invgraphics.kernels import reference
 
 if not torch.cuda.is_available():
     pytest.skip("torch finds no CUDA device", allow_module_level=True)
-from triton_parity import CHECKS, check  # noqa: E402  # which needs Triton
+from triton_parity import CHECKS, check  # which needs Triton
 
 
 def compare(function, plain, inputs, tolerance: float) -> None:
