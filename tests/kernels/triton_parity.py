@@ -81,6 +81,13 @@ def edges() -> None:
     assert features.shape == (0, 4)
     assert table.grad is not None
     assert not table.grad.any()
+    slopes = []
+    for kernels, dtype in ((cuda, torch.float32), (reference, torch.float64)):
+        places = torch.linspace(0.1, 0.9, 12).reshape(3, 4).T.to(dtype).requires_grad_()  # column by column in memory
+        entries = table.detach().to(dtype).requires_grad_()
+        (slope,) = torch.autograd.grad(kernels.hash_encode(places, entries, grid)[0].square().sum(), places, create_graph=True)
+        slopes.append(torch.autograd.grad(slope.square().sum(), entries)[0])
+    assert (slopes[0] - slopes[1]).abs().max() <= 1e-5 * slopes[1].abs().max()
     points = rand(5, 3)
     ours, theirs = (kernels.hash_encode(points, table, grid, True) for kernels in (cuda, reference))
     assert torch.equal(ours[0], theirs[0])
@@ -109,7 +116,7 @@ def lattices() -> None:
         inputs = [unit, *(x.features for x in several)]
         assert_equal(lambda *x: encode(cuda.lattice_encode, *x), lambda *x: encode(reference.lattice_encode, *x), inputs)
         ours, theirs = (
-            derivatives(kernels, unit, several, combine, dtype)
+            derivatives(kernels, unit.T.contiguous().T, several, combine, dtype)  # positions column by column in memory
             for kernels, dtype in ((cuda, torch.float32), (reference, torch.float64))
         )
         assert len(ours) == len(theirs) > 2 + len(several)

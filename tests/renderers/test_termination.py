@@ -32,8 +32,8 @@ def marched(counts: list[int]) -> tuple[Rays, March]:
     return rays, March(ray, t0, t0 + 1, rays.far)
 
 
-@pytest.mark.parametrize("chunk", [1, 2, 5, 100])
-def test_keeps_what_light_reaches(chunk: int) -> None:
+@pytest.mark.parametrize("chunk", [1, 2, 5, 100, None])
+def test_keeps_what_light_reaches(chunk: int | None) -> None:
     """Density 1 everywhere: light e^-k reaches interval k, so that 5 intervals see more than e^-4.5."""
     rays, march = marched([0, 3, 40, 1, 17])
     samples = visible_samples(rays, march, dense(lambda s: torch.ones(len(s))), 0.0111, chunk)

@@ -109,7 +109,7 @@ def _cuda() -> Iterator[Finding]:
 
 
 def _cuda_kernels() -> Iterator[Finding]:
-    purpose = "splatting, hash encoding and compositing"
+    purpose = "splatting, hash encoding, lattices, ray marching and compositing"
     if importlib.util.find_spec("triton") is None:
         remedy = f"`pip install 'invgraphics[cuda]'`; until then {purpose} run as plain torch on the GPU"
         yield Finding("Triton", "not installed", remedy)

@@ -53,7 +53,7 @@ def lattice_encode(
 ) -> Float[Tensor, "m width"]:
     """Linear, bilinear and trilinear interpolation of features on lines, planes and voxel grids, combined per point.
 
-    Compiled for float32 on the CPU; elsewhere, CUDA included, the reference runs.
+    Compiled for float32 on the CPU and on NVIDIA GPUs; elsewhere the reference runs.
 
     Args:
         unit: positions in [0, 1]; those outside are clamped, NaN counts as 0.

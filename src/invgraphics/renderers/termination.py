@@ -51,7 +51,8 @@ def _intervals_before_depth(
     found, order = [], []
     depth = rays.near.new_zeros(len(rays))
     going, done = torch.nonzero(counts)[:, 0], 0
-    chunk = int(counts[going].max()) if chunk is None and len(going) else chunk or 1
+    if chunk is None:
+        chunk = int(counts.max()) if len(going) else 1
     while len(going):
         left = counts[going] - done
         # One row per ray that goes on, one column per interval of this chunk; the last rows' ends stay empty.

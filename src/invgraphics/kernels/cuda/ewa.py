@@ -30,6 +30,14 @@ def vector_at(base, i, mask, other):
 
 
 @triton.jit
+def store_vector(base, i, valid, visible, a, b, c):
+    """Store three numbers of each primitive, zeros where it is culled."""
+    tl.store(base + 3 * i, tl.where(visible, a, 0.0), mask=valid)
+    tl.store(base + 3 * i + 1, tl.where(visible, b, 0.0), mask=valid)
+    tl.store(base + 3 * i + 2, tl.where(visible, c, 0.0), mask=valid)
+
+
+@triton.jit
 def rotation_of(view):
     """The camera's rotation to the world, row by row."""
     return (
@@ -47,7 +55,7 @@ def clamped_slope(view, axis: tl.constexpr, size, slope):
 
 
 @triton.jit
-def placed(i, valid, means, view):
+def camera_point(i, valid, means, view):
     """Offset from the camera in world axes, and the mean in camera axes."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_of(view)
     ox, oy, oz = vector_at(means, i, valid, 0.0)
@@ -57,7 +65,7 @@ def placed(i, valid, means, view):
 
 
 @triton.jit
-def turned(i, valid, quaternions):
+def rotation_matrix(i, valid, quaternions):
     """Unit quaternion, the norm it was divided by, and its rotation matrix."""
     w, x = tl.load(quaternions + 4 * i, mask=valid, other=1.0), tl.load(quaternions + 4 * i + 1, mask=valid, other=0.0)
     y, z = tl.load(quaternions + 4 * i + 2, mask=valid, other=0.0), tl.load(quaternions + 4 * i + 3, mask=valid, other=0.0)
@@ -98,10 +106,10 @@ def project(
     """Footprints and colours of a block of primitives; culled ones get radius 0 and finite values."""
     i = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
     valid = i < n
-    ox, oy, oz, mx, my, depth = placed(i, valid, means, view)
+    ox, oy, oz, mx, my, depth = camera_point(i, valid, means, view)
     in_front = depth > _NEAR
     mz = tl.where(in_front, depth, 1.0)
-    _, _, _, _, _, m00, m01, m02, m10, m11, m12, m20, m21, m22 = turned(i, valid, quaternions)
+    _, _, _, _, _, m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotation_matrix(i, valid, quaternions)
     a00, a01, a02, a10, a11, a12, a20, a21, a22 = axes_of(view, m00, m01, m02, m10, m11, m12, m20, m21, m22)
     s0, s1, s2 = vector_at(scales, i, valid, 1.0)
     b00, b01, b02, b10, b11, b12 = a00 * s0, a01 * s1, a02 * s2, a10 * s0, a11 * s1, a12 * s2
@@ -142,11 +150,8 @@ def project(
     bare = tl.maximum(area + blur * (xx + yy) + blur * blur, TINY)
     along_x, along_y = d0 * x0 + d1 * x1 + d2 * x2, d0 * y0 + d1 * y1 + d2 * y2
     slope_x, slope_y = (along_x * (yy + blur) - along_y * xy) / bare, (along_y * (xx + blur) - along_x * xy) / bare
-    tl.store(planes + 3 * i, tl.where(visible, distance, 0.0), mask=valid)
-    tl.store(planes + 3 * i + 1, tl.where(visible, slope_x, 0.0), mask=valid)
-    tl.store(planes + 3 * i + 2, tl.where(visible, slope_y, 0.0), mask=valid)
+    store_vector(planes, i, valid, visible, distance, slope_x, slope_y)
     away = tl.maximum(tl.sqrt(ox * ox + oy * oy + oz * oz), 1e-12)
     red, green, blue = colour_of(ox / away, oy / away, oz / away, sh, i, visible, DEGREE)
-    tl.store(rgb + 3 * i, tl.where(visible, tl.maximum(red + 0.5, 0.0), 0.0), mask=valid)
-    tl.store(rgb + 3 * i + 1, tl.where(visible, tl.maximum(green + 0.5, 0.0), 0.0), mask=valid)
-    tl.store(rgb + 3 * i + 2, tl.where(visible, tl.maximum(blue + 0.5, 0.0), 0.0), mask=valid)
+    red, green, blue = tl.maximum(red + 0.5, 0.0), tl.maximum(green + 0.5, 0.0), tl.maximum(blue + 0.5, 0.0)
+    store_vector(rgb, i, valid, visible, red, green, blue)

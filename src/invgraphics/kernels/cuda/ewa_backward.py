@@ -12,10 +12,11 @@ from invgraphics.kernels.cuda.ewa import (
     TINY,
     area_of,
     axes_of,
+    camera_point,
     clamped_slope,
-    placed,
+    rotation_matrix,
     rotation_of,
-    turned,
+    store_vector,
     vector_at,
 )
 from invgraphics.kernels.cuda.harmonics import harmonics_backward
@@ -25,14 +26,6 @@ from invgraphics.kernels.cuda.harmonics import harmonics_backward
 def _unclamped(colour, gradient):
     """Gradient through max(0, colour): where it is cut off, only what would raise it (see `core.harmonics.colour`)."""
     return tl.where((colour > 0) | (gradient < 0), gradient, 0.0)
-
-
-@triton.jit
-def _put(base, i, valid, visible, a, b, c):
-    """Store three numbers of each primitive, zeros where it is culled."""
-    tl.store(base + 3 * i, tl.where(visible, a, 0.0), mask=valid)
-    tl.store(base + 3 * i + 1, tl.where(visible, b, 0.0), mask=valid)
-    tl.store(base + 3 * i + 2, tl.where(visible, c, 0.0), mask=valid)
 
 
 @triton.jit
@@ -116,9 +109,9 @@ def _pose_backward(
     tl.store(pose + 6, _total(visible, oz * grad_x + m20 * a00 + m21 * a01 + m22 * a02))
     tl.store(pose + 7, _total(visible, oz * grad_y + m20 * a10 + m21 * a11 + m22 * a12))
     tl.store(pose + 8, _total(visible, oz * grad_z + m20 * a20 + m21 * a21 + m22 * a22))
-    tl.store(pose + 9, -tl.sum(world_x, axis=0))
-    tl.store(pose + 10, -tl.sum(world_y, axis=0))
-    tl.store(pose + 11, -tl.sum(world_z, axis=0))
+    tl.store(pose + 9, -_total(visible, world_x))
+    tl.store(pose + 10, -_total(visible, world_y))
+    tl.store(pose + 11, -_total(visible, world_z))
 
 
 @triton.jit
@@ -132,9 +125,9 @@ def project_backward(
     i = tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
     valid = i < n
     visible = valid & (tl.load(radii + i, mask=valid, other=0.0) > 0)
-    ox, oy, oz, mx, my, mz = placed(i, visible, means, view)
+    ox, oy, oz, mx, my, mz = camera_point(i, visible, means, view)
     mz = tl.where(visible, mz, 1.0)
-    w, x, y, z, norm, m00, m01, m02, m10, m11, m12, m20, m21, m22 = turned(i, valid, quaternions)
+    w, x, y, z, norm, m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotation_matrix(i, valid, quaternions)
     a00, a01, a02, a10, a11, a12, a20, a21, a22 = axes_of(view, m00, m01, m02, m10, m11, m12, m20, m21, m22)
     s0, s1, s2 = vector_at(scales, i, valid, 1.0)
     b00, b01, b02, b10, b11, b12 = a00 * s0, a01 * s1, a02 * s2, a10 * s0, a11 * s1, a12 * s2
@@ -163,7 +156,7 @@ def project_backward(
     b00, b01, b02, b10, b11, b12 = fx * gx0, fx * gx1, fx * gx2, fy * gy0, fy * gy1, fy * gy2
     b20, b21, b22 = -sx * b00 - sy * b10, -sx * b01 - sy * b11, -sx * b02 - sy * b12
     along_0, along_1 = b00 * a00 + b10 * a10 + b20 * a20, b01 * a01 + b11 * a11 + b21 * a21
-    _put(grad_scales, i, valid, visible, along_0, along_1, b02 * a02 + b12 * a12 + b22 * a22)
+    store_vector(grad_scales, i, valid, visible, along_0, along_1, b02 * a02 + b12 * a12 + b22 * a22)
     a00, a01, a02, a10, a11, a12 = b00 * s0, b01 * s1, b02 * s2, b10 * s0, b11 * s1, b12 * s2
     a20, a21, a22 = b20 * s0, b21 * s1, b22 * s2
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_of(view)
@@ -173,9 +166,7 @@ def project_backward(
     world_x = r00 * grad_x + r01 * grad_y + r02 * grad_z + tx
     world_y = r10 * grad_x + r11 * grad_y + r12 * grad_z + ty
     world_z = r20 * grad_x + r21 * grad_y + r22 * grad_z + tz
-    _put(grad_means, i, valid, visible, world_x, world_y, world_z)
-    world_x, world_y = tl.where(visible, world_x, 0.0), tl.where(visible, world_y, 0.0)
-    world_z = tl.where(visible, world_z, 0.0)
+    store_vector(grad_means, i, valid, visible, world_x, world_y, world_z)
     pose = grad_pose + tl.program_id(0) * 12
     _pose_backward(
         pose, visible, ox, oy, oz, grad_x, grad_y, grad_z, world_x, world_y, world_z,

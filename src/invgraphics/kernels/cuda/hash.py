@@ -128,7 +128,6 @@ class _Encode(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
-        unit, table = unit.contiguous(), table.contiguous()
         features, levels = table.shape[1], _levels(grid, table.device)
         out = table.new_empty(len(unit), grid.levels * features)
         if len(unit):
@@ -195,4 +194,5 @@ def hash_encode(
     """See `invgraphics.kernels.hash_encode`; the Jacobian is left to the reference."""
     if jacobian:
         return reference.hash_encode(unit, table, grid, jacobian)
-    return _Encode.apply(unit, table, grid), None
+    # Contiguous before autograd sees them, lest what is differentiated again be copies outside the graph.
+    return _Encode.apply(unit.contiguous(), table.contiguous(), grid), None

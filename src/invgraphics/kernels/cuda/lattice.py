@@ -119,7 +119,6 @@ class _Interpolate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, features: Tensor, lattice: Lattice) -> Tensor:
-        unit, features = unit.contiguous(), features.contiguous()
         rows, axes, channels = features.reshape(-1, lattice.channels), len(lattice.axes), lattice.channels
         numbers = [*lattice.columns, *[0] * (3 - axes), *lattice.resolution, *[1] * (3 - axes)]
         shape = torch.tensor(numbers, dtype=torch.int32).to(unit.device, non_blocking=True)
@@ -147,16 +146,8 @@ class _Interpolate(torch.autograd.Function):
         if len(unit):
             results = gradient, grad_unit, grad_features
             with on_device_of(unit):
-                encode_backward[(blocks(len(unit), BLOCK),)](
-                    unit,
-                    features,
-                    links,
-                    shape,
-                    shape[3:],
-                    *results,
-                    *ctx.sizes,
-                    **flags,
-                )
+                inputs = unit, features, links, shape, shape[3:]
+                encode_backward[(blocks(len(unit), BLOCK),)](*inputs, *results, *ctx.sizes, **flags)
         return grad_unit if ctx.needs_input_grad[0] else None, grad_features, None
 
 
@@ -165,5 +156,7 @@ def lattice_encode(
 ) -> Float[Tensor, "m width"]:
     """See `invgraphics.kernels.lattice_encode`; the derivative of its gradient is the reference's."""
     bare = (replace(lattice, features=lattice.features.detach()) for lattice in lattices)
-    values = [_Interpolate.apply(unit, lattice.features, shape) for lattice, shape in zip(lattices, bare, strict=True)]
+    # Contiguous before autograd sees them, lest what is differentiated again be copies outside the graph.
+    unit, features = unit.contiguous(), [lattice.features.contiguous() for lattice in lattices]
+    values = [_Interpolate.apply(unit, rows, lattice) for rows, lattice in zip(features, bare, strict=True)]
     return combine_features(values, combine)
