@@ -83,8 +83,8 @@ def edges() -> None:
     assert not table.grad.any()
     slopes = []
     for kernels, dtype in ((cuda, torch.float32), (reference, torch.float64)):
-        places = torch.linspace(0.1, 0.9, 12).reshape(3, 4).T.to(dtype).requires_grad_()  # column by column in memory
-        entries = table.detach().to(dtype).requires_grad_()
+        places = torch.linspace(0.1, 0.9, 12).reshape(3, 4).T.to(dtype).requires_grad_()
+        entries = table.detach().to(dtype).T.contiguous().T.requires_grad_()  # both column by column in memory
         (slope,) = torch.autograd.grad(kernels.hash_encode(places, entries, grid)[0].square().sum(), places, create_graph=True)
         slopes.append(torch.autograd.grad(slope.square().sum(), entries)[0])
     assert (slopes[0] - slopes[1]).abs().max() <= 1e-5 * slopes[1].abs().max()
