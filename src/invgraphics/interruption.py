@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import NoReturn
 
 INTERRUPTED = 130
@@ -55,14 +55,23 @@ def end_on_sigterm() -> None:
 
     Python handles signals between two instructions of the main thread, which may be inside a compiler, a kernel or a library
     for longer; and an exception may be caught on its way. The operating system's handler itself writes to a pipe, which a
-    thread reads. Where Python swallows the exception, in destructors and callbacks of weak references, the signal comes again.
+    thread reads. Where Python swallows the exception, in destructors and callbacks of weak references, the signal comes again;
+    where nothing catches it, before a command begins or after it, the process ends with the same sentence and status.
     """
-    signal.signal(signal.SIGTERM, terminate)
+    sys.excepthook = _end_uncaught
     sys.unraisablehook = _raise_again
     receiver, sender = os.pipe()
     os.set_blocking(sender, False)
     signal.set_wakeup_fd(sender, warn_on_full_buffer=False)
     threading.Thread(target=_end_later, args=(receiver,), daemon=True).start()
+    signal.signal(signal.SIGTERM, terminate)  # last, so that all of the above is there when it raises
+
+
+def _end_uncaught(kind: type[BaseException], error: BaseException, where: TracebackType | None) -> None:
+    """End the process if nothing caught `Terminated`, for which Python's status would be 1; show other exceptions as usual."""
+    if issubclass(kind, Terminated):
+        _end_now("Terminated.")
+    sys.__excepthook__(kind, error, where)
 
 
 def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:

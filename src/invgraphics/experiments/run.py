@@ -34,7 +34,7 @@ from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, initialise_field, memory_forecast
 from invgraphics.files import file_fault
-from invgraphics.interruption import INTERRUPTED, end_on_sigterm, end_with_parent
+from invgraphics.interruption import INTERRUPTED, Terminated, end_on_sigterm, end_with_parent
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
 from invgraphics.recipes.recipe import Method
@@ -233,6 +233,8 @@ def work(job: Path) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:  # a cell that fails is a result: its sentence goes into the report
+        if Terminated.raised:  # a library made its own exception of it
+            return INTERRUPTED
         fault = file_fault(error) or error
         with suppress(InputError, OSError):  # the disk that is full may be this one, and the folder that may not be written
             write_json(job.with_suffix(".error.json"), {"kind": type(fault).__name__, "error": str(fault)})
