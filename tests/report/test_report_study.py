@@ -272,6 +272,18 @@ def test_variants_are_named_by_their_difference_from_the_base(tmp_path: Path) ->
     assert "clone, no isotropic, sh_degree 2" in dict(study_facts(study)).values()
 
 
+def test_facts_name_the_budgets_and_sizes_of_all_cells(tmp_path: Path) -> None:
+    """A list of cells has settings of its own; the study's are those of cells that name none."""
+    folder = bare_study(tmp_path, {}, lambda _: [30.0, 31.0], scenes=["balls", "cubes", "cones"])
+    table = json.loads((folder / "study.json").read_text()) | {"budget": "60s", "size": 128}
+    own = {"balls": ("60s", 128), "cubes": ("5min", 128), "cones": ("1000steps", [800, 400])}
+    table["cells"] = [cell | dict(zip(("budget", "size"), own[cell["scene"]], strict=True)) for cell in table["cells"]]
+    (folder / "study.json").write_text(json.dumps(table))
+    facts = dict(study_facts(read_study(folder)))
+    assert facts["budget per fit"] == "60 s, 5 min and 1,000 steps"
+    assert facts["picture size"] == "128 and 800 × 400"
+
+
 def test_levels_have_the_words_that_the_study_gives_them(tmp_path: Path) -> None:
     factors = {"hooks.1.stop": [0.6, 0.0], "batches.rays": [1, 2, 3], "field.sh_degree": [2, 0]}
     words = {"hooks.1.stop 0": "no growth", "hooks.1.stop 0.6": "growth", "batches.rays 2": "some", "batches.rays 3": "many"}

@@ -159,9 +159,9 @@ def listing(items: Iterable[str]) -> str:
 
 
 def budget_words(budget: str) -> str:
-    """Format a budget: ``60s`` -> ``60 s``; ``5000steps`` -> ``5,000 steps``."""
-    for unit, words in (("steps", " steps"), ("s", " s")):
+    """Format a budget: ``60s`` -> ``60 s``; ``5min`` -> ``5 min``; ``5000steps`` -> ``5,000 steps``."""
+    for unit in ("steps", "min", "h", "s"):
         amount = budget.removesuffix(unit)
         if amount != budget and amount.replace(".", "", 1).isdigit():
-            return f"{float(amount):,g}{words}" if unit == "s" else f"{int(float(amount)):,}{words}"
+            return f"{int(float(amount)):,} {unit}" if unit == "steps" else f"{float(amount):,g} {unit}"
     return budget

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 from invgraphics.files import write_text
 from invgraphics.report.data.assets import Folder
@@ -135,12 +135,18 @@ def study_facts(study: Study) -> facts.Facts:
         "base, from which variants are named by what differs": base_words(study.factors),
         "seeds": ", ".join(map(str, study.seeds)),
         "cells": _counted(study),
-        "budget per fit": budget_words(study.budget),
+        "budget per fit": _of_the_cells(study, "budget", study.budget),
         **facts.preset_facts([replace(cell.run, method=cell.method) for cell in study.cells if cell.run], study.preset),
-        "picture size": study.size,
+        "picture size": _of_the_cells(study, "size", study.size),
         "points to start from": facts.start_fact([cell.run for cell in study.cells if cell.run]),
     }
     return tuple((name, value) for name, value in entries.items() if value)
+
+
+def _of_the_cells(study: Study, setting: Literal["budget", "size"], stated: str) -> str:
+    """All values in words that cells have of a setting; empty where none is ``stated``, since it is a factor then."""
+    own = [value for value in dict.fromkeys(getattr(cell, setting) for cell in study.cells) if value]
+    return listing(budget_words(value) for value in own or [stated]) if stated else ""
 
 
 def _counted(study: Study) -> str:
