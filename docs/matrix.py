@@ -29,7 +29,8 @@ def draw(folder: Path, out: Path, view: int = 0) -> None:
     alone = [place for place in cells if renderers[place[0]] == 1]
     used = dict.fromkeys(renderer for field, renderer in cells if field in rows)
     columns = sorted(used, key=lambda name: (name != "volume rendering", name))
-    each = math.ceil(len(alone) / max(1, math.ceil(len(alone) / len(columns))))  # of rows of about the same length
+    lines = max(1, math.ceil(len(alone) / len(columns)))
+    each = max(1, math.ceil(len(alone) / lines))  # rows of about the same length
     strips = [alone[i : i + each] for i in range(0, len(alone), each)]
     table = [[cells.get((row, column), []) for column in columns] for row in rows]
     # A row is as high as its picture, the names under it and, below the table, those above it.
