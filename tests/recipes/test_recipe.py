@@ -119,7 +119,7 @@ def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
         del table["batches"][key]
     for key in ("dropout", "dropout_views"):
         del table["field"][key]
-    del hook["reset_spacing"]
+    del hook["reset_spacing"], table["optimiser"]["muon"]
     assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
     again = resolve(method.name, "long", table)
     assert again.recipe == method.recipe and again.table == method.table
@@ -144,11 +144,13 @@ def test_keys_that_came_later_leave_the_digest_alone(preset: str) -> None:
         del table["renderer"][key]
     for key in LATER_IN_BATCHES:
         del table["batches"][key]
+    del table["optimiser"]["muon"]
     assert resolve(method.name, preset, table).digest == method.digest
     text = json.dumps(table, sort_keys=True)
     assert method.digest == hashlib.sha256(text.encode()).hexdigest()
     assert load_method(method.name, preset, ["field.density_scale=2.0"]).digest != method.digest
     assert load_method(method.name, preset, ["renderer.colour_threshold=0.1"]).digest != method.digest
+    assert load_method(method.name, preset, ["optimiser.muon=1.0"]).digest != method.digest
     for key in LATER_IN_BATCHES:
         assert load_method(method.name, preset, [f"batches.{key}={0.3 if key != 'start_size' else 7}"]).digest != method.digest
 

@@ -23,18 +23,17 @@ ROW_RATES = "row_rates"
 """Name there of a parameter's factors of the learning rate, one per row."""
 
 
-class Adam(ABC):
-    """Groups of parameters with a learning rate each, and per parameter its moments and count of steps.
+class GroupedOptimiser(ABC):
+    """Groups of parameters with a learning rate each, and a state per parameter.
 
     Attributes:
         param_groups: dictionaries with ``params``, ``lr`` and whatever else the caller put there.
-        state: by parameter, empty before its first step; then ``step`` and `MOMENTS`, as in torch's Adam.
+        state: by parameter, empty before its first step.
     """
 
-    def __init__(self, groups: Iterable[dict[str, Any]], betas: tuple[float, float], eps: float) -> None:
+    def __init__(self, groups: Iterable[dict[str, Any]]) -> None:
         self.param_groups: list[dict[str, Any]] = [{"lr": 0.0, **group} for group in groups]
         self.state: defaultdict[nn.Parameter, dict[str, Tensor]] = defaultdict(dict)
-        self._betas, self._eps = betas, eps
 
     def zero_grad(self) -> None:
         """Drop all gradients."""
@@ -46,20 +45,34 @@ class Adam(ABC):
     def step(self) -> None:
         """Update every parameter that has a gradient."""
         for group in self.param_groups:
-            parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
-            for parameter in parameters:
-                state = self.state[parameter]
-                if "step" not in state:
-                    state["step"] = torch.zeros((), device=parameter.device if self._steps_beside_parameters else None)
-                    state |= {name: torch.zeros_like(parameter, memory_format=torch.preserve_format) for name in MOMENTS}
-            if parameters:
+            if parameters := [parameter for parameter in group["params"] if parameter.grad is not None]:
                 self._update(parameters, group["lr"])
+
+    @abstractmethod
+    def _update(self, parameters: list[nn.Parameter], lr: float) -> None:
+        """Step the parameters of one group; all have gradients."""
+
+
+class Adam(GroupedOptimiser):
+    """Adam's moments and counts of steps: a parameter's state is ``step`` and `MOMENTS`, as in torch's Adam."""
+
+    def __init__(self, groups: Iterable[dict[str, Any]], betas: tuple[float, float], eps: float) -> None:
+        super().__init__(groups)
+        self._betas, self._eps = betas, eps
 
     _steps_beside_parameters: bool
     """Whether counts of steps are on their parameters' device, and not on the CPU."""
 
-    @abstractmethod
     def _update(self, parameters: list[nn.Parameter], lr: float) -> None:
+        for parameter in parameters:
+            state = self.state[parameter]
+            if "step" not in state:
+                state["step"] = torch.zeros((), device=parameter.device if self._steps_beside_parameters else None)
+                state |= {name: torch.zeros_like(parameter, memory_format=torch.preserve_format) for name in MOMENTS}
+        self._adam_step(parameters, lr)
+
+    @abstractmethod
+    def _adam_step(self, parameters: list[nn.Parameter], lr: float) -> None:
         """Step the parameters of one group; all have gradients and state."""
 
 
@@ -69,7 +82,7 @@ class DenseAdam(Adam):
 
     _steps_beside_parameters = True
 
-    def _update(self, parameters: list[nn.Parameter], lr: float) -> None:
+    def _adam_step(self, parameters: list[nn.Parameter], lr: float) -> None:
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         first, second, steps = ([self.state[parameter][key] for parameter in parameters] for key in (*MOMENTS, "step"))
         beta1, beta2 = self._betas
@@ -100,7 +113,7 @@ class MaskedAdam(Adam):
 
     _steps_beside_parameters = False
 
-    def _update(self, parameters: list[nn.Parameter], lr: float) -> None:
+    def _adam_step(self, parameters: list[nn.Parameter], lr: float) -> None:
         for parameter in parameters:
             state = self.state[parameter]
             state["step"] += 1

@@ -1,4 +1,4 @@
-"""Adam with named parameter groups whose learning rates follow the fit's progress."""
+"""Adam, and Muon where asked for, with named parameter groups whose learning rates follow the fit's progress."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from invgraphics.errors import InputError
-from invgraphics.training.adam import MOMENTS, ROW_RATES, Adam, DenseAdam, MaskedAdam
+from invgraphics.training.adam import MOMENTS, ROW_RATES, DenseAdam, GroupedOptimiser, MaskedAdam
+from invgraphics.training.muon import MOMENTUM, Muon, is_hidden_matrix
 
+_MOMENTS = {*MOMENTS, MOMENTUM}
 RESTARTED = "restarted"
 """Name in an optimiser's state of the progress at which rates were restarted last."""
 LATEST_RESTART = 0.999
@@ -59,23 +61,29 @@ class GroupConfig:
 
 @dataclass(frozen=True)
 class OptimiserConfig:
-    """Adam (Kingma and Ba 2015).
+    """Adam (Kingma and Ba 2015), and Muon (Jordan et al. 2024) for matrices of hidden layers where ``muon`` is above 0.
 
     Attributes:
         groups: named parameter groups; every trainable parameter must match one.
         beta1: decay of the first moment.
         beta2: decay of the second moment.
         eps: added to the root of the second moment.
+        muon: learning rate of matrices with at least 16 rows and columns, over their group's; 0 leaves them to Adam.
     """
 
     groups: dict[str, GroupConfig] = field(default_factory=dict)
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
+    muon: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.muon < 0:
+            raise ValueError(f"'muon' must be at least 0, not {self.muon}.")
 
 
 class Optimiser:
-    """Adam over the parameters of a field, a renderer and poses; follows changes of a parameter's shape."""
+    """Steps of the parameters of a field, a renderer and poses; follows changes of a parameter's shape."""
 
     def __init__(self, config: OptimiserConfig, parameters: dict[str, nn.Parameter], extent: float) -> None:
         self._config = config
@@ -96,11 +104,17 @@ class Optimiser:
         dense, masked = (
             [group for group in groups if config.groups[str(group["name"])].skip_zero == skip] for skip in (False, True)
         )
-        self._adams: list[Adam] = []
+        hidden = []
+        if config.muon > 0:
+            hidden = [{**group, "params": [one for one in group["params"] if is_hidden_matrix(one)]} for group in dense]
+            dense = [{**group, "params": [one for one in group["params"] if not is_hidden_matrix(one)]} for group in dense]
+        self._optimisers: list[GroupedOptimiser] = []
         if dense:
-            self._adams.append(DenseAdam(dense, betas, config.eps))
+            self._optimisers.append(DenseAdam(dense, betas, config.eps))
         if masked:
-            self._adams.append(MaskedAdam(masked, betas, config.eps))
+            self._optimisers.append(MaskedAdam(masked, betas, config.eps))
+        if hidden:
+            self._optimisers.append(Muon(hidden))
         self._since = 0.0
         self.set_progress(0.0)
 
@@ -111,12 +125,14 @@ class Optimiser:
         return max(fits, key=lambda key: len(self._config.groups[key].match))
 
     def _groups(self) -> list[dict[str, Any]]:
-        return [group for adam in self._adams for group in adam.param_groups]
+        return [group for one in self._optimisers for group in one.param_groups]
 
-    def _adam_of(self, name: str) -> Adam:
+    def _optimiser_of(self, name: str) -> GroupedOptimiser:
         """The optimiser that holds a parameter."""
-        key = self._group_of(name)
-        return next(adam for adam in self._adams if any(group["name"] == key for group in adam.param_groups))
+        parameter = self._names[name]
+        return next(
+            one for one in self._optimisers for group in one.param_groups if any(parameter is p for p in group["params"])
+        )
 
     def set_progress(self, progress: float) -> None:
         """Set every group's learning rate for this point of the fit, of whose rest after `restart` a schedule makes all."""
@@ -124,6 +140,10 @@ class Optimiser:
         for group in self._groups():
             config = self._config.groups[group["name"]]
             group["lr"] = config.rate(progress) * (self._extent if config.per_extent else 1.0)
+        for one in self._optimisers:
+            if isinstance(one, Muon):
+                for group in one.param_groups:
+                    group["lr"] *= self._config.muon
 
     def restart(self, progress: float) -> None:
         """Begin all learning rates' schedules anew at this point of the fit, from which they take as long as is left."""
@@ -132,7 +152,7 @@ class Optimiser:
 
     def rates(self) -> dict[str, float]:
         """Current learning rate of each group."""
-        return {group["name"]: group["lr"] for group in self._groups()}
+        return {group["name"]: group["lr"] for one in reversed(self._optimisers) for group in one.param_groups}
 
     def rate_of(self, name: str) -> float:
         """Current learning rate of one parameter."""
@@ -140,17 +160,17 @@ class Optimiser:
 
     def zero_grad(self) -> None:
         """Drop all gradients."""
-        for adam in self._adams:
-            adam.zero_grad()
+        for one in self._optimisers:
+            one.zero_grad()
 
     def step(self) -> None:
-        """One Adam step."""
-        for adam in self._adams:
-            adam.step()
+        """One step of all parameters that have a gradient."""
+        for one in self._optimisers:
+            one.step()
 
     def row_rates(self, name: str) -> Float[Tensor, "*rows"] | None:
         """Factors of the learning rate of a parameter's rows; ``None`` for 1."""
-        return self._adam_of(name).state.get(self._names[name], {}).get(ROW_RATES)
+        return self._optimiser_of(name).state.get(self._names[name], {}).get(ROW_RATES)
 
     def set_row_rates(self, name: str, rates: Float[Tensor, "*rows"] | None) -> None:
         """Set a factor of the learning rate for every row of a parameter of shape (*rows, c), in place of earlier ones.
@@ -162,7 +182,7 @@ class Optimiser:
         Raises:
             InputError: the parameter's group does not have ``skip_zero``, or the shapes do not fit.
         """
-        adam, parameter = self._adam_of(name), self._names[name]
+        adam, parameter = self._optimiser_of(name), self._names[name]
         if rates is None:
             adam.state.get(parameter, {}).pop(ROW_RATES, None)
             return
@@ -180,10 +200,10 @@ class Optimiser:
         """
         state = self._exchange(name, parameter)
         if state:
-            for key in {*MOMENTS, ROW_RATES} & set(state):
+            for key in {*_MOMENTS, ROW_RATES} & set(state):
                 kept = state[key][rows]
                 state[key] = torch.cat([kept, kept.new_full((new, *kept.shape[1:]), float(key == ROW_RATES))])
-            self._adam_of(name).state[parameter] = state
+            self._optimiser_of(name).state[parameter] = state
 
     def replace(self, name: str, parameter: nn.Parameter, moments: Callable[[Tensor], Tensor] | None = None) -> None:
         """Replace a parameter by one of another shape.
@@ -196,12 +216,12 @@ class Optimiser:
         """
         state = self._exchange(name, parameter)
         if state and moments is not None:
-            kept = {key: moments(value) if key in MOMENTS else value for key, value in state.items() if key != ROW_RATES}
-            self._adam_of(name).state[parameter] = kept
+            kept = {key: moments(value) if key in _MOMENTS else value for key, value in state.items() if key != ROW_RATES}
+            self._optimiser_of(name).state[parameter] = kept
 
     def _exchange(self, name: str, parameter: nn.Parameter) -> dict[str, Any] | None:
         """Put a parameter in another's place; returns the other's state."""
-        old, adam = self._names[name], self._adam_of(name)
+        old, adam = self._names[name], self._optimiser_of(name)
         for group in adam.param_groups:
             group["params"] = [parameter if other is old else other for other in group["params"]]
         self._names[name] = parameter
@@ -209,13 +229,13 @@ class Optimiser:
 
     def drop_moments(self) -> None:
         """Forget all parameters' moments, step counts and rates per row, as a new optimiser has none."""
-        for adam in self._adams:
-            adam.state.clear()
+        for one in self._optimisers:
+            one.state.clear()
 
     def reset_moments(self, name: str, rows: Int[Tensor, " k"] | None = None) -> None:
         """Zero the moments of a parameter (after an opacity reset), or of some of its rows."""
-        for key, value in self._adam_of(name).state.get(self._names[name], {}).items():
-            if key in MOMENTS:
+        for key, value in self._optimiser_of(name).state.get(self._names[name], {}).items():
+            if key in _MOMENTS:
                 value[slice(None) if rows is None else rows] = 0.0
 
     def state(self) -> dict[str, Tensor]:
@@ -224,7 +244,7 @@ class Optimiser:
         return restarted | {
             f"{name}/{key}": value
             for name, parameter in self._names.items()
-            for key, value in self._adam_of(name).state.get(parameter, {}).items()
+            for key, value in self._optimiser_of(name).state.get(parameter, {}).items()
         }
 
     def load(self, state: dict[str, Tensor]) -> None:
@@ -234,4 +254,4 @@ class Optimiser:
                 self._since = float(value)
                 continue
             name, _, key = path.rpartition("/")
-            self._adam_of(name).state[self._names[name]][key] = value.clone()
+            self._optimiser_of(name).state[self._names[name]][key] = value.clone()

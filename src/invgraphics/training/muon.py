@@ -1,0 +1,56 @@
+"""Muon (Jordan et al. 2024, kellerjordan.github.io/posts/muon): orthogonalised steps of hidden layers' matrices.
+
+A gradient's momentum G = U S V' is replaced by U V', so that directions with small gradients are learnt as fast as the others.
+Not ``torch.optim.Muon``, for the reason in `adam`; and in float32, where that computes in bfloat16.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from invgraphics.training.adam import GroupedOptimiser
+
+MOMENTUM = "momentum_buffer"
+"""Name of the momentum in a parameter's state, torch's own."""
+DECAY = 0.95
+LEAST_SIZE = 16
+"""Rows and columns from which on a matrix is one of a hidden layer: first and last layers keep Adam, as its author advises."""
+RMS = 0.2
+"""Root mean square of a step over the learning rate, which is about Adam's (Liu et al. 2025, arXiv 2502.16982)."""
+QUINTIC, ITERATIONS = (3.4445, -4.7750, 2.0315), 5
+"""Coefficients of the odd polynomial that brings singular values from (0, 1] to about 1, between 0.7 and 1.2."""
+
+
+def is_hidden_matrix(parameter: Tensor) -> bool:
+    """Whether a parameter takes Muon's steps: a matrix with at least `LEAST_SIZE` rows and columns."""
+    return parameter.ndim == 2 and min(parameter.shape) >= LEAST_SIZE
+
+
+def orthogonalised(matrix: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
+    """``U V'`` of a matrix ``U S V'``, approximately, by Newton-Schulz iterations."""
+    a, b, c = QUINTIC
+    x = matrix.mT if matrix.shape[0] > matrix.shape[1] else matrix
+    x = x / x.norm().clamp_min(1e-7)
+    for _ in range(ITERATIONS):
+        gram = x @ x.mT
+        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+    return x.mT if matrix.shape[0] > matrix.shape[1] else x
+
+
+@final
+class Muon(GroupedOptimiser):
+    """Muon with Nesterov's momentum; a parameter's state is its `MOMENTUM`."""
+
+    def _update(self, parameters: list[nn.Parameter], lr: float) -> None:
+        for parameter in parameters:
+            gradient, state = parameter.grad, self.state[parameter]
+            assert gradient is not None
+            momentum = state.setdefault(MOMENTUM, torch.zeros_like(parameter, memory_format=torch.preserve_format))
+            momentum.lerp_(gradient, 1 - DECAY)
+            step = orthogonalised(gradient.lerp(momentum, DECAY))
+            parameter.add_(step, alpha=-lr * RMS * math.sqrt(max(parameter.shape)))

@@ -1,0 +1,117 @@
+"""Muon: orthogonalisation against singular vectors, steps against torch's class, and its place beside Adam."""
+
+import pytest
+import torch
+
+from invgraphics.training.adam import DenseAdam
+from invgraphics.training.muon import MOMENTUM, Muon, orthogonalised
+from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
+
+SHAPES = {
+    "field.hidden": (32, 24),
+    "field.bias": (32,),
+    "field.output": (3, 32),
+    "field.table": (4096, 2),
+    "renderer.hidden": (16, 64),
+}
+GROUPS = {"field": GroupConfig("field", 1e-2, final=1e-3), "renderer": GroupConfig("renderer", 2e-2)}
+
+
+def made(muon: float) -> tuple[dict[str, torch.nn.Parameter], Optimiser]:
+    generator = torch.Generator().manual_seed(0)
+    parameters = {name: torch.nn.Parameter(torch.randn(shape, generator=generator)) for name, shape in SHAPES.items()}
+    return parameters, Optimiser(OptimiserConfig(GROUPS, muon=muon), parameters, 1.0)
+
+
+def step(parameters: dict[str, torch.nn.Parameter], optimiser: Optimiser, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in parameters.values():
+        parameter.grad = torch.randn(parameter.shape, generator=generator)
+    optimiser.step()
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (64, 16), (16, 64)])
+def test_orthogonalised_keeps_singular_vectors_and_brings_values_to_about_one(shape: tuple[int, int]) -> None:
+    matrix = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+    u, _, vt = torch.linalg.svd(matrix, full_matrices=False)
+    inner = u.mT @ orthogonalised(matrix) @ vt.mT
+    values = inner.diagonal()
+    assert float(values.min()) > 0.6 and float(values.max()) < 1.3
+    assert float((inner - values.diag()).abs().max()) < 1e-4
+
+
+def test_steps_are_those_of_torchs_own_class() -> None:
+    """Up to bfloat16, in which torch's iterates; their scale is a whole-matrix factor, which it rounds too."""
+    generator = torch.Generator().manual_seed(2)
+    ours, theirs = (torch.nn.Parameter(torch.zeros(48, 24)) for _ in range(2))
+    muon = Muon([{"params": [ours], "lr": 0.05}])
+    judge = torch.optim.Muon([theirs], lr=0.05, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+    for _ in range(4):
+        ours.grad = torch.randn(48, 24, generator=generator)
+        theirs.grad = ours.grad.clone()
+        muon.step()
+        judge.step()
+    assert float((ours - theirs).detach().norm() / theirs.detach().norm()) < 0.02
+    assert torch.allclose(muon.state[ours][MOMENTUM], judge.state[theirs]["momentum_buffer"])
+
+
+def test_hidden_matrices_take_muons_steps_and_all_else_adams() -> None:
+    (with_muon, optimiser), (alone, adam) = made(3.0), made(0.0)
+    for seed in range(3):
+        step(with_muon, optimiser, seed)
+        step(alone, adam, seed)
+    same = {name for name in SHAPES if torch.equal(with_muon[name], alone[name])}
+    assert same == {"field.bias", "field.output", "field.table"}
+    assert {key.rpartition("/")[2] for key in optimiser.state() if key.startswith("field.hidden/")} == {MOMENTUM}
+
+
+def test_a_steps_size_is_adams_times_the_factor() -> None:
+    """The first step of Adam has entries of +-lr; Muon's have a root mean square of a fifth of its rate (arXiv 2502.16982)."""
+    parameters, optimiser = made(3.0)
+    before = parameters["renderer.hidden"].detach().clone()
+    step(parameters, optimiser, 0)
+    size = (parameters["renderer.hidden"].detach() - before).square().mean().sqrt()
+    assert float(size) == pytest.approx(0.2 * 3 * 2e-2, rel=0.15)
+
+
+def test_rates_follow_progress_and_are_said_without_the_factor() -> None:
+    _, optimiser = made(3.0)
+    optimiser.set_progress(1.0)
+    assert optimiser.rates() == pytest.approx({"field": 1e-3, "renderer": 2e-2})
+    muon = next(one for one in optimiser._optimisers if isinstance(one, Muon))
+    assert {group["name"]: group["lr"] for group in muon.param_groups} == pytest.approx({"field": 3e-3, "renderer": 6e-2})
+
+
+def test_resumption_is_bitwise() -> None:
+    (straight, one), (first, two) = made(2.0), made(2.0)
+    for seed in range(4):
+        step(straight, one, seed)
+    for seed in range(2):
+        step(first, two, seed)
+    second, three = made(2.0)
+    for name, parameter in second.items():
+        parameter.data = first[name].detach().clone()
+    three.load(two.state())
+    for seed in (2, 3):
+        step(second, three, seed)
+    assert all(torch.equal(second[name], straight[name]) for name in SHAPES)
+
+
+def test_a_matrix_of_another_shape_begins_with_the_momentum_it_is_given() -> None:
+    parameters, optimiser = made(2.0)
+    step(parameters, optimiser, 0)
+    new = torch.nn.Parameter(torch.zeros(20, 24))
+    optimiser.replace("field.hidden", new, lambda moment: moment[:20])
+    assert optimiser.state()[f"field.hidden/{MOMENTUM}"].shape == (20, 24)
+    optimiser.replace("field.hidden", torch.nn.Parameter(torch.zeros(18, 24)))
+    assert f"field.hidden/{MOMENTUM}" not in optimiser.state()
+
+
+def test_a_negative_factor_is_refused() -> None:
+    with pytest.raises(ValueError, match="'muon' must be at least 0"):
+        OptimiserConfig(GROUPS, muon=-1.0)
+
+
+def test_without_muon_all_parameters_are_adams() -> None:
+    _, optimiser = made(0.0)
+    assert [type(one) for one in optimiser._optimisers] == [DenseAdam]
