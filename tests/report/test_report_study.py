@@ -275,7 +275,7 @@ def test_variants_are_named_by_their_difference_from_the_base(tmp_path: Path) ->
 def test_facts_name_the_budgets_and_sizes_of_all_cells(tmp_path: Path) -> None:
     """A list of cells has settings of its own; the study's are those of cells that name none."""
     folder = bare_study(tmp_path, {}, lambda _: [30.0, 31.0], scenes=["balls", "cubes", "cones"])
-    table = json.loads((folder / "study.json").read_text()) | {"budget": "60s", "size": 128}
+    table = json.loads((folder / "study.json").read_text()) | {"budget": "60s", "size": None}
     own = {"balls": ("60s", 128), "cubes": ("5min", 128), "cones": ("1000steps", [800, 400])}
     table["cells"] = [cell | dict(zip(("budget", "size"), own[cell["scene"]], strict=True)) for cell in table["cells"]]
     (folder / "study.json").write_text(json.dumps(table))

@@ -94,4 +94,5 @@ def summary(checks: Sequence[RecipeCheck]) -> str:
     stale = [check.folder.name for check in checks if not check.current]
     if not stale:
         return f"All {len(checks)} reports are current."
-    return f"{len(stale)} of {len(checks)} reports are not current: {listing(stale)}."
+    verb = "is" if len(stale) == 1 else "are"
+    return f"{len(stale)} of {len(checks)} reports {verb} not current: {listing(stale)}."

@@ -144,9 +144,11 @@ def study_facts(study: Study) -> facts.Facts:
 
 
 def _of_the_cells(study: Study, setting: Literal["budget", "size"], stated: str) -> str:
-    """All values in words that cells have of a setting; empty where none is ``stated``, since it is a factor then."""
-    own = [value for value in dict.fromkeys(getattr(cell, setting) for cell in study.cells) if value]
-    return listing(budget_words(value) for value in own or [stated]) if stated else ""
+    """All values in words that cells have of a setting; empty where it is a crossed factor, among which its levels stand."""
+    if study.design != "list" and any(factor.path == setting for factor in study.factors):
+        return ""
+    own = dict.fromkeys(getattr(cell, setting) for cell in study.cells)
+    return listing(budget_words(value) for value in own if value) or budget_words(stated)
 
 
 def _counted(study: Study) -> str:
