@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from invgraphics.errors import InputError
-from invgraphics.training.adam import DenseAdam
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
+from invgraphics.training.optimisers.adam import DenseAdam
 
 CONFIG = OptimiserConfig({"grid": GroupConfig("field.grid", 0.1, skip_zero=True), "net": GroupConfig("field.net", 0.1)})
 

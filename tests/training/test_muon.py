@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from invgraphics.training.adam import DenseAdam
-from invgraphics.training.muon import MOMENTUM, Muon, orthogonalised
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
+from invgraphics.training.optimisers.adam import DenseAdam
+from invgraphics.training.optimisers.muon import MOMENTUM, Muon, orthogonalised
 
 SHAPES = {
     "field.hidden": (32, 24),

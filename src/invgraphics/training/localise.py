@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from invgraphics.core import Batch, Camera, Context, Model, RayRenderer, Scene, View
 from invgraphics.scenes.scales import resized_view
-from invgraphics.training.adam import DenseAdam
+from invgraphics.training.optimisers.adam import DenseAdam
 from invgraphics.training.poses import motion_about, pivot_depth
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from invgraphics.errors import InputError
-from invgraphics.training.adam import MOMENTS, ROW_RATES, DenseAdam, GroupedOptimiser, MaskedAdam
-from invgraphics.training.muon import MOMENTUM, Muon, is_hidden_matrix
+from invgraphics.training.optimisers.adam import MOMENTS, ROW_RATES, DenseAdam, GroupedOptimiser, MaskedAdam
+from invgraphics.training.optimisers.muon import MOMENTUM, Muon, is_hidden_matrix
 
 _MOMENTS = {*MOMENTS, MOMENTUM}
 RESTARTED = "restarted"

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from invgraphics.training.adam import GroupedOptimiser
+from invgraphics.training.optimisers.adam import GroupedOptimiser
 
 MOMENTUM = "momentum_buffer"
 """Name of the momentum in a parameter's state, torch's own."""

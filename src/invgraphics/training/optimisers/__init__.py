@@ -1,0 +1,1 @@
+"""Optimisers of groups of parameters: Adam, its masked form, and Muon."""
