@@ -75,11 +75,18 @@ def test_a_steps_size_is_adams_times_the_factor() -> None:
 
 
 def test_rates_follow_progress_and_are_said_without_the_factor() -> None:
-    _, optimiser = made(3.0)
+    parameters, optimiser = made(3.0)
     optimiser.set_progress(1.0)
     assert optimiser.rates() == pytest.approx({"field": 1e-3, "renderer": 2e-2})
-    muon = next(one for one in optimiser._optimisers if isinstance(one, Muon))
-    assert {group["name"]: group["lr"] for group in muon.param_groups} == pytest.approx({"field": 3e-3, "renderer": 6e-2})
+    for name, rate in (("field.hidden", 3e-3), ("renderer.hidden", 6e-2)):
+        alone = torch.nn.Parameter(parameters[name].detach().clone())
+        judge = Muon([{"params": [alone], "lr": rate}])
+        parameters[name].grad = torch.ones_like(alone).cumsum(0)
+        alone.grad = parameters[name].grad.clone()
+        judge.step()
+        optimiser.step()
+        assert torch.allclose(parameters[name], alone, rtol=1e-6, atol=1e-9)
+        optimiser.zero_grad()
 
 
 def test_resumption_is_bitwise() -> None:

@@ -16,6 +16,7 @@ from invgraphics.training.optimisers.adam import MOMENTS, ROW_RATES, DenseAdam, 
 from invgraphics.training.optimisers.muon import MOMENTUM, Muon, is_hidden_matrix
 
 _MOMENTS = {*MOMENTS, MOMENTUM}
+"""Names of what any of the optimisers remembers of a parameter's gradients, entry by entry."""
 RESTARTED = "restarted"
 """Name in an optimiser's state of the progress at which rates were restarted last."""
 LATEST_RESTART = 0.999
@@ -114,7 +115,7 @@ class Optimiser:
         if masked:
             self._optimisers.append(MaskedAdam(masked, betas, config.eps))
         if hidden:
-            self._optimisers.append(Muon(hidden))
+            self._optimisers.append(Muon(hidden, config.muon))
         self._since = 0.0
         self.set_progress(0.0)
 
@@ -140,10 +141,6 @@ class Optimiser:
         for group in self._groups():
             config = self._config.groups[group["name"]]
             group["lr"] = config.rate(progress) * (self._extent if config.per_extent else 1.0)
-        for one in self._optimisers:
-            if isinstance(one, Muon):
-                for group in one.param_groups:
-                    group["lr"] *= self._config.muon
 
     def restart(self, progress: float) -> None:
         """Begin all learning rates' schedules anew at this point of the fit, from which they take as long as is left."""
@@ -152,7 +149,7 @@ class Optimiser:
 
     def rates(self) -> dict[str, float]:
         """Current learning rate of each group."""
-        return {group["name"]: group["lr"] for one in reversed(self._optimisers) for group in one.param_groups}
+        return {group["name"]: group["lr"] for group in self._groups()}
 
     def rate_of(self, name: str) -> float:
         """Current learning rate of one parameter."""

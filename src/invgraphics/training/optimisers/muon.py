@@ -7,7 +7,8 @@ Not ``torch.optim.Muon``, for the reason in `adam`; and in float32, where that c
 from __future__ import annotations
 
 import math
-from typing import final
+from collections.abc import Iterable
+from typing import Any, final
 
 import torch
 from jaxtyping import Float
@@ -46,11 +47,17 @@ def orthogonalised(matrix: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
 class Muon(GroupedOptimiser):
     """Muon with Nesterov's momentum; a parameter's state is its `MOMENTUM`."""
 
+    def __init__(self, groups: Iterable[dict[str, Any]], factor: float = 1.0) -> None:
+        """Begin without momentum; ``factor`` multiplies all groups' rates."""
+        super().__init__(groups)
+        self._factor = factor
+
     def _update(self, parameters: list[nn.Parameter], lr: float) -> None:
         for parameter in parameters:
             gradient, state = parameter.grad, self.state[parameter]
             assert gradient is not None
-            momentum = state.setdefault(MOMENTUM, torch.zeros_like(parameter, memory_format=torch.preserve_format))
-            momentum.lerp_(gradient, 1 - DECAY)
+            if MOMENTUM not in state:
+                state[MOMENTUM] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+            momentum = state[MOMENTUM].lerp_(gradient, 1 - DECAY)
             step = orthogonalised(gradient.lerp(momentum, DECAY))
-            parameter.add_(step, alpha=-lr * RMS * math.sqrt(max(parameter.shape)))
+            parameter.add_(step, alpha=-lr * self._factor * RMS * math.sqrt(max(parameter.shape)))
