@@ -241,11 +241,20 @@ SPHERES = [
 
 
 @pytest.mark.parametrize(("encoding", "layers", "skip"), SPHERES)
-@pytest.mark.parametrize("space", ["box", "contracted"])
-def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, layers, skip, space):
-    """On every encoding, in a cube and in a flatter box: distances, and gradients of length 1 along the radius."""
+@pytest.mark.parametrize(("space", "interior"), [("box", False), ("box", True), ("contracted", False)])
+def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, layers, skip, space, interior):
+    """On every encoding, in a cube and in a flatter box: distances, and gradients of length 1 along the radius.
+
+    The sphere is a solid one before the cameras, and a hollow one of twice its radius around cameras in the box.
+    """
+    sign, radius = (-1, 1.0) if interior else (1, 0.5)
     for flat in (1.0, 0.6):
         scene = make_scene(space)
+        if space == "box" and not interior:
+            away = torch.eye(4)
+            away[0, 3] = 4.0
+            camera = replace(scene.train[0].camera, cam_to_world=away)
+            scene = scene.with_views(train=(replace(scene.train[0], camera=camera),))
         half = scene.bounds.half * torch.tensor([1.0, 1.0, flat])
         bounds = Bounds(scene.bounds.centre - half, scene.bounds.centre + half, space)
         scene = replace(scene, bounds=bounds)
@@ -255,10 +264,10 @@ def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, layers, skip
         values = field.query_no_grad(Samples.at(bounds.centre + offset), S | G)
         assert values.sdf is not None
         assert values.gradient is not None
-        error = (values.sdf - (offset.norm(dim=1) - 0.5 * half[2]))[inside]
+        error = (sign * values.sdf - (offset.norm(dim=1) - radius * half[2]))[inside]
         assert float(error.abs().mean()) < 0.05 * float(half.mean())
         away = inside & (offset.norm(dim=1) > 0.2 * half.mean())
-        cosine = (values.gradient * torch.nn.functional.normalize(offset, dim=1)).sum(dim=1)[away]
+        cosine = sign * (values.gradient * torch.nn.functional.normalize(offset, dim=1)).sum(dim=1)[away]
         assert float((cosine - 1).abs().mean()) < 0.1
         assert float((values.gradient.norm(dim=1)[away] - 1).abs().mean()) < 0.1
 

@@ -161,6 +161,12 @@ class Scene:
         return any(view.alpha is not None for view in self.train)
 
     @property
+    def is_interior(self) -> bool:
+        """Whether it is seen from within: every training camera is in a box, which a contracted space is not."""
+        positions = [view.camera.position for view in self.train]
+        return self.bounds.space == "box" and bool(positions) and bool(self.bounds.contains(torch.stack(positions)).all())
+
+    @property
     def is_class(self) -> bool:
         """Whether it shows a class of objects: its training views name their subjects."""
         return any(view.subject is not None for view in self.train)

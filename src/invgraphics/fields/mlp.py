@@ -59,8 +59,8 @@ class Mlp(nn.Module):
         return h
 
     @torch.no_grad()
-    def initialise_as_sphere(self, radius: float) -> None:
-        """Make the first output about ``|x| - radius``, where x are the first three inputs, in [-1, 1].
+    def initialise_as_sphere(self, radius: float, *, inside_out: bool = False) -> None:
+        """Make the first output about ``|x| - radius``, where x are the first three inputs, in [-1, 1]; ``inside_out`` negates it.
 
         Atzmon and Lipman 2020 (SAL), theorem 1: wide layers with weights N(0, 2 / width) keep the norm, and the output layer
         averages. Inputs beyond the first three, and those that come in by the skip, start with weight zero, as in IDR.
@@ -82,6 +82,9 @@ class Mlp(nn.Module):
         self.output.weight[0] = 0
         self.output.weight[0, :width] = average + torch.linalg.solve(normal, h.T @ error)
         self.output.bias[0] = -radius
+        if inside_out:
+            self.output.weight[0].neg_()
+            self.output.bias[0].neg_()
 
 
 class _TruncatedExp(torch.autograd.Function):

@@ -40,6 +40,8 @@ from invgraphics.fields.settings import NeuralSettings
 
 INITIAL_RADIUS = 0.5
 """Radius of the sphere that a signed distance function starts as, in the box's smallest half-extent (NeuS)."""
+INTERIOR_RADIUS = 1.0
+"""The same where cameras are within the box: a hollow sphere around them (MonoSDF), as a solid one would blind them."""
 
 _POINTWISE = {
     "density": Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL | Quantity.FEATURES,
@@ -55,7 +57,7 @@ class NeuralFieldConfig(NeuralSettings):
 
     def build(self, scene: Scene) -> NeuralField:
         """Build the field for ``scene``'s bounds and colour space, its weights drawn from torch's global generator."""
-        return NeuralField(self, scene.bounds, scene.colour)
+        return NeuralField(self, scene.bounds, scene.colour, interior=scene.is_interior)
 
 
 class NeuralField(Field):
@@ -65,6 +67,7 @@ class NeuralField(Field):
         config: sizes and kinds.
         bounds: the region; density is zero outside it.
         colour: radiance is in [0, 1] for ``srgb``, in [0, inf) for ``linear``.
+        interior: a signed distance starts as a hollow sphere instead of a solid one.
 
     Attributes:
         encoding: of positions, for geometry.
@@ -79,7 +82,14 @@ class NeuralField(Field):
     geometry_net: Mlp
     colour_net: Mlp
 
-    def __init__(self, config: NeuralFieldConfig, bounds: Bounds, colour: Literal["srgb", "linear"] = "srgb") -> None:
+    def __init__(
+        self,
+        config: NeuralFieldConfig,
+        bounds: Bounds,
+        colour: Literal["srgb", "linear"] = "srgb",
+        *,
+        interior: bool = False,
+    ) -> None:
         super().__init__()
         self.config = config
         self.colour: Literal["srgb", "linear"] = colour
@@ -109,7 +119,8 @@ class NeuralField(Field):
         self._needs_geometry_for_colour = handed > 0 or self.appearance is None
         self._features_handed_on = handed
         if config.geometry == "sdf":
-            self.geometry_net.initialise_as_sphere(INITIAL_RADIUS * float(bounds.half.min()) / self._half)
+            radius = (INTERIOR_RADIUS if interior else INITIAL_RADIUS) * float(bounds.half.min()) / self._half
+            self.geometry_net.initialise_as_sphere(radius, inside_out=interior)
 
     @property
     def bounds(self) -> Bounds:
