@@ -60,7 +60,7 @@ class Mlp(nn.Module):
 
     @torch.no_grad()
     def initialise_as_sphere(self, radius: float, *, inside_out: bool = False) -> None:
-        """Make the first output about ``|x| - radius``, where x are the first three inputs, in [-1, 1]; ``inside_out`` negates it.
+        """Make the first output about ``|x| - radius`` of the first three inputs x in [-1, 1]; ``inside_out`` negates it.
 
         Atzmon and Lipman 2020 (SAL), theorem 1: wide layers with weights N(0, 2 / width) keep the norm, and the output layer
         averages. Inputs beyond the first three, and those that come in by the skip, start with weight zero, as in IDR.
