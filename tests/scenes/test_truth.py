@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from invgraphics.core import Bounds
 from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.mitsuba import folder as folders
@@ -22,14 +23,15 @@ W, H = 12, 8
 RIG = {"kind": "sphere", "radius": 2.0}
 
 
-def _write(folder: Path, *, opaque: bool = False, surface: bool = True) -> Path:
+def _write(folder: Path, *, opaque: bool = False, surface: bool = True, radius: float = 2.0, points: int = 5) -> Path:
+    rig = {**RIG, "radius": radius}
     background = None if opaque else (1.0, 0.5, 0.25)
-    spec = SceneSpec("toy", "bricks", "A toy.", "Nothing.", (-1, -1, -1), (1, 1, 2), RIG, background=background)
+    spec = SceneSpec("toy", "bricks", "A toy.", "Nothing.", (-1, -1, -1), (1, 1, 2), rig, background=background)
     job = Job(spec, (W, H), Counts(3, 1, 4), SamplesPerPixel(4, 2, 8), 0, "scalar_rgb")
     rng = np.random.default_rng(0)
     views = {}
     for split, count in (("train", 3), ("val", 1), ("test", 4)):
-        views[split] = cameras(make_rig(RIG), split, count, (W, H), 0)
+        views[split] = cameras(make_rig(rig), split, count, (W, H), 0)
         for index in range(count):
             alpha = np.ones((H, W, 1)) if opaque else rng.random((H, W, 1)).round()
             linear = np.concatenate([rng.random((H, W, 3)) * alpha, alpha], axis=2).astype(np.float32)
@@ -42,7 +44,7 @@ def _write(folder: Path, *, opaque: bool = False, surface: bool = True) -> Path:
     if surface:
         cube = box((0, 0, 0), (1, 1, 1))
         ply.write(folder / "mesh.ply", cube.vertices, cube.faces)
-        np.savez(folder / "points.npz", position=np.zeros((5, 3), np.float32), rgb=np.ones((5, 3), np.float32))
+        np.savez(folder / "points.npz", position=np.zeros((points, 3), np.float32), rgb=np.ones((points, 3), np.float32))
     folders.write_truth(folder, job, views, [40.0, 41.0, 42.0, 43.0])
     return folder
 
@@ -70,6 +72,18 @@ def test_loads_what_was_written(tmp_path):
     assert view.depth[view.alpha == 255].unique().tolist() == [3.5]
     assert view.normal is not None
     assert view.normal.shape == (H, W, 3)
+
+
+def test_only_cameras_in_the_box_get_a_near_plane_before_the_nearest_points(tmp_path):
+    """Cameras half a unit from all points have it at 0.35, also where one of them is loaded; those outside keep the default."""
+    within, outside = _write(tmp_path / "within", radius=0.5, points=20), _write(tmp_path / "outside", points=20)
+    for views in (None, 1):
+        scene = Truth().load(within, SceneOptions(train_views=views))
+        assert scene.is_interior
+        assert scene.bounds.near == pytest.approx(0.7 * 0.5, rel=1e-5)
+    scene = Truth().load(outside, SceneOptions())
+    assert not scene.is_interior
+    assert scene.bounds.near == Bounds.near
 
 
 def test_opaque_scenes_have_no_alpha(tmp_path):

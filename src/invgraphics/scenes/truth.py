@@ -21,6 +21,7 @@ from invgraphics.scenes.pictures.images import Photo
 from invgraphics.scenes.pictures.resize import RESIZE
 from invgraphics.scenes.pictures.views import load_view
 from invgraphics.scenes.poses import pose
+from invgraphics.scenes.region import near_plane
 
 LINEAR_RESIZE = "area average of linear light"
 """The filter from a larger rendering to the folder's pictures, see `invgraphics.scenes.mitsuba.average`."""
@@ -64,8 +65,13 @@ class Truth:
             for split, count in wanted.items()
         }
         # Points are made from the depth of all training views: of fewer, they know too much.
-        points = _points(path / "points.npz") if len(views["train"]) == len(truth["cameras"]["train"]) else None
+        known = _points(path / "points.npz")
+        points = known if len(views["train"]) == len(truth["cameras"]["train"]) else None
         bounds = Bounds(torch.tensor(truth["bounds"]["lo"]), torch.tensor(truth["bounds"]["hi"]))
+        # Of all cameras, however many are loaded: a near plane belongs to a data set, as its lenses do.
+        poses = torch.stack([pose(camera["cam_to_world"], f"{path}") for camera in truth["cameras"]["train"]]).float()
+        if known is not None and bool(bounds.contains(poses[:, :3, 3]).all()):
+            bounds = replace(bounds, near=near_plane(poses, known.position) or bounds.near)
         return Scene(
             name=truth["name"],
             train=views["train"],
