@@ -126,9 +126,9 @@ def test_a_process_that_fits_imports_no_compiler():
     """As torch's optimisers do, and its switch to deterministic algorithms."""
     code = (
         "import sys, torch\n"
-        "from invgraphics.experiments.build import use_deterministic_algorithms\n"
+        "from invgraphics.experiments.build import configure_torch\n"
         "from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig\n"
-        "use_deterministic_algorithms(torch.device('cpu'))\n"
+        "configure_torch(torch.device('cpu'))\n"
         "assert torch.are_deterministic_algorithms_enabled()\n"
         "parameters = {name: torch.nn.Parameter(torch.ones(2, 3)) for name in ('field.a', 'field.b')}\n"
         "groups = {name[-1]: GroupConfig(name, 0.1, skip_zero=name == 'field.b') for name in parameters}\n"

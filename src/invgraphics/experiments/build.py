@@ -106,10 +106,15 @@ def use_kernels(name: str | None, device: torch.device) -> None:
     kernels.warm_up(device)
 
 
-def use_deterministic_algorithms(device: torch.device) -> None:
-    """Use torch's deterministic algorithms on a CPU, where the same seed and thread count then give the same bits.
+def configure_torch(device: torch.device) -> None:
+    """Set this process's modes for a fit: deterministic algorithms on a CPU, and denormal numbers flushed to zero.
 
-    By the debug mode: ``torch.use_deterministic_algorithms`` imports torch's compiler, two seconds of every process that fits.
+    Deterministic algorithms give the same bits for the same seed and thread count; by the debug mode, as
+    ``torch.use_deterministic_algorithms`` imports torch's compiler, two seconds of every process that fits.
+
+    Arithmetic with denormals (below 1e-38) takes a CPU up to a hundred times as long; NeuS's vanishing weights are such numbers.
+    Threads of torch's and Numba's pools follow if they start later: all of them, unless torch has computed here before.
     """
     torch.set_deterministic_debug_mode("warn" if device.type == "cpu" else "default")
     torch.utils.deterministic.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]  # a debugging aid, slow
+    torch.set_flush_denormal(True)

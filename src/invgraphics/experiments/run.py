@@ -17,8 +17,8 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import (
     build_plan,
+    configure_torch,
     open_with_progress,
-    use_deterministic_algorithms,
     use_kernels,
 )
 from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average, processor_share
@@ -78,7 +78,7 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
     if request.existing == "resume":
         _check_existing(job)  # before the folder is made
     folder.create()
-    use_deterministic_algorithms(job.device)
+    configure_torch(job.device)
     with folder.held(wait=request.existing == "reuse"):  # by a child of a killed comparison or study, which is about to end
         _check_existing(job)
         scene = scene or open_with_progress(request.scene, job.options)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import final
 
 from invgraphics.core import Model, Scene
-from invgraphics.experiments.build import use_deterministic_algorithms, use_kernels
+from invgraphics.experiments.build import configure_torch, use_kernels
 from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.display import curve_svg, table_html
 from invgraphics.experiments.evaluate import score_model
@@ -181,7 +181,7 @@ class MemoryRun(FittedRun):
         self._job, self._on_step = job, on_step
         self._history: list[Moment] = []
         self._scores: ScoreTable | None = None
-        use_deterministic_algorithms(job.device)
+        configure_torch(job.device)
         use_kernels(job.request.kernels, job.device)
         with PeakMemory(job.device) as memory:
             self.fit = prepare(job, degrade(scene, job.data, job.request.seed))

@@ -10,7 +10,7 @@ import torch
 
 from invgraphics.core import Model
 from invgraphics.errors import InputError, did_you_mean
-from invgraphics.experiments.build import build_plan, use_deterministic_algorithms, use_kernels
+from invgraphics.experiments.build import build_plan, configure_torch, use_kernels
 from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate, score_model
@@ -115,7 +115,7 @@ def convert_run(request: ConvertRequest) -> Converted:
     job = _job(request, fitted)
     folder = job.folder
     _check_empty(folder)
-    use_deterministic_algorithms(job.device)
+    configure_torch(job.device)
     use_kernels(request.kernels, job.device)
     shown = degrade(fitted.scene, job.data, fitted.folder.read(Provenance).seed)
     plan = build_plan(job.method, shown, job.budget, request.seed, job.device)

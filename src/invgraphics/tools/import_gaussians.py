@@ -10,7 +10,7 @@ from pathlib import Path
 
 from invgraphics.core import Gaussians, Scene, harmonics
 from invgraphics.errors import InputError
-from invgraphics.experiments.build import build_model, open_with_progress, use_deterministic_algorithms, use_kernels
+from invgraphics.experiments.build import build_model, configure_torch, open_with_progress, use_kernels
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate
 from invgraphics.experiments.job import Job
@@ -77,7 +77,7 @@ def import_run(request: ImportRequest) -> Path:
     scene = open_with_progress(job.request.scene, job.options)
     gaussians = transform_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()
-    use_deterministic_algorithms(job.device)
+    configure_torch(job.device)
     use_kernels(job.request.kernels, job.device)
     origin = _origin(request, name, splats, axes)
     if splats.antialiased and not getattr(job.method.recipe.renderer, "antialiased", False):
