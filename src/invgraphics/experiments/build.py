@@ -112,7 +112,7 @@ def configure_torch(device: torch.device) -> None:
     Deterministic algorithms give the same bits for the same seed and thread count; by the debug mode, as
     ``torch.use_deterministic_algorithms`` imports torch's compiler, two seconds of every process that fits.
 
-    Arithmetic with denormals (below 1e-38) takes a CPU up to a hundred times as long; NeuS's vanishing weights are such numbers.
+    Arithmetic with denormals (below 1e-38) takes a CPU up to a hundred times as long; weights of NeuS vanish into them.
     Threads of torch's and Numba's pools follow if they start later: all of them, unless torch has computed here before.
     """
     torch.set_deterministic_debug_mode("warn" if device.type == "cpu" else "default")
