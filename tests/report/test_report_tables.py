@@ -255,6 +255,26 @@ def test_a_recipe_that_does_not_start_from_the_scene_s_points_says_so(comparison
     assert start_fact(nerf) == "random points"
 
 
+def test_methods_without_points_do_not_say_what_others_start_from(comparison_folder: Path) -> None:
+    def noted(run: Run) -> Run:
+        words = "exact ones" if run.scores.method == "volumetric/nerf" else "from SfM"
+        return replace(run, provenance=replace(run.provenance, notes={"points": words}))
+
+    runs = [noted(run) for run in read_comparison(comparison_folder).runs]
+    assert start_fact(runs).count("(") == 2
+    nerf = [run for run in runs if run.scores.method == "volumetric/nerf"]
+    for run in runs:
+        field = (
+            '[field]\ntype = "neural"\n[renderer]\nsampler = { coarse = 32 }\n' if run in nerf else '[field]\ninit = "scene"\n'
+        )
+        (run.folder / "recipe.toml").write_text(field)
+    assert start_fact(runs) == "from SfM"
+    assert start_fact(nerf) == "exact ones"
+    for run in nerf:  # an occupancy grid that points seed
+        (run.folder / "recipe.toml").write_text('[field]\ntype = "neural"\n[renderer]\nsampler = { points_until = 0.1 }\n')
+    assert start_fact(runs).count("(") == 2
+
+
 def test_protocol_settings_are_shown_in_words(pristine_comparison: Path) -> None:
     comparison = read_comparison(pristine_comparison)
 

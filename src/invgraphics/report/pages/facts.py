@@ -107,10 +107,11 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
 def start_fact(runs: Sequence[Run]) -> str:
     """What the fits' fields may start from: by scene where scenes differ, by method where a recipe has a start of its own.
 
-    Empty where no run says.
+    Of methods that start from no points, the scene's points are told only where there are no others. Empty where no run says.
     """
     own = [(START_WORDS.get(_init(run), ""), run) for run in runs]
-    scenes = [(_start(run), run.scores.scene) for words, run in own if not words]
+    others = [run for words, run in own if not words]
+    scenes = [(_start(run), run.scores.scene) for run in [run for run in others if _uses_points(run)] or others]
     starts = [_grouped([(start or "none", scene) for start, scene in scenes])] if any(start for start, _ in scenes) else []
     for words in dict.fromkeys(words for words, _ in own if words):
         methods = list(dict.fromkeys(run.scores.method for each, run in own if each == words))
@@ -118,10 +119,22 @@ def start_fact(runs: Sequence[Run]) -> str:
     return "; ".join(starts)
 
 
+def _recipe(run: Run) -> Mapping[str, Any]:
+    """A run's recipe; empty where it is not there."""
+    return run.files.read_recipe() if (run.folder / RECIPE).is_file() else {}
+
+
 def _init(run: Run) -> str:
-    """The recipe's choice of first points; empty where it has none or is not there."""
-    field = run.files.read_recipe().get("field") if (run.folder / RECIPE).is_file() else None
+    """The recipe's choice of first points; empty where it has none."""
+    field = _recipe(run).get("field")
     return str(field.get("init", "")) if isinstance(field, Mapping) else ""
+
+
+def _uses_points(run: Run) -> bool:
+    """Whether primitives or an occupancy grid start from the scene's points; assumed where there is no recipe."""
+    recipe = _recipe(run)
+    sampler = recipe.get("renderer", {}).get("sampler", {})
+    return not recipe or _init(run) == "scene" or sampler.get("points_until", 0) > 0
 
 
 def _start(run: Run) -> str:
