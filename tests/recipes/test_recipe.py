@@ -133,7 +133,8 @@ def test_keys_that_came_later_leave_the_digest_alone(preset: str) -> None:
     """While they have the values that change nothing; neural fields and the volumetric renderer had these keys first."""
     fields = "type encoding geometry layers width skip geometry_features colour_layers colour_width direction direction_degree"
     known = {*fields.split(), "density_activation", "density_bias", "density_per"}
-    method = load_method("volumetric/nerf", preset, ["batches.foreground_least=0", "batches.foreground_until=1"])
+    unset = ["batches.foreground_least=0", "batches.foreground_until=1", "optimiser.muon=0"]
+    method = load_method("volumetric/nerf", preset, unset)
     table = copy.deepcopy(method.table)
     parts = [table["field"], *([table["renderer"]["sampler"]["proposal"]] if preset == "paper" else [])]
     for part in parts:

@@ -10,7 +10,7 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.testing import toy_scene
 
-STEPS = {"volumetric/nerf": 150, "volumetric/hash": 150, "splatting/gaussians": 60}
+STEPS = {"volumetric/nerf": 300, "volumetric/hash": 150, "splatting/gaussians": 60}
 
 
 @pytest.fixture(scope="session")

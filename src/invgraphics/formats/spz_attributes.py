@@ -60,7 +60,7 @@ def pack(gaussians: Gaussians, fraction: int) -> dict[str, Bytes]:
     """Attributes of version 4, rounded to the nearest; what lies out of a byte's range goes to its end."""
     fixed = (gaussians.means.double() * 2.0**fraction).round().int().numpy().astype("<i4")
     colours = (gaussians.sh[:, 0] * COLOUR_RANGE + 0.5) * 255
-    log_scales = gaussians.scales.clamp_min(1e-38).log()
+    log_scales = gaussians.scales.clamp_min(1e-37).log()
     return {
         "positions": fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),
         "alphas": _to_bytes(gaussians.opacities * 255)[:, None],

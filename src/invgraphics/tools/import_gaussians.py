@@ -132,7 +132,7 @@ def fill(field: GaussianField, gaussians: Gaussians) -> None:
     tensors = {
         "means": gaussians.means,
         "quaternions": gaussians.quaternions,
-        "log_scales": gaussians.scales.clamp_min(1e-38).log(),
+        "log_scales": gaussians.scales.clamp_min(1e-37).log(),
         "opacity_logits": gaussians.opacities.logit(OPACITY_EPS),
         "sh_dc": gaussians.sh[:, :1],
         "sh_rest": gaussians.sh[:, 1:],
