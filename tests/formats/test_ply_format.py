@@ -73,10 +73,16 @@ def test_files_of_an_independent_writer(tmp_path: Path, kind: str, order: str) -
     assert torch.allclose(gaussians.sh[:, 4, 1], torch.from_numpy(table["f_rest_18"].astype(np.float32)))
 
 
-def test_extreme_opacities_and_scales_stay_finite(tmp_path: Path) -> None:
+@pytest.mark.parametrize("flushed", [False, True])
+def test_extreme_opacities_and_scales_stay_finite(tmp_path: Path, flushed: bool) -> None:
+    """Also in a process that has fitted, which flushes denormals to zero."""
     gaussians = cloud(3, 0)
     gaussians = replace(gaussians, opacities=torch.tensor([0.0, 1.0, 0.5]), scales=torch.zeros(3, 3))
-    write_gaussians(tmp_path / "a.ply", "ply", Splats(gaussians))
+    torch.set_flush_denormal(flushed)
+    try:
+        write_gaussians(tmp_path / "a.ply", "ply", Splats(gaussians))
+    finally:
+        torch.set_flush_denormal(False)
     vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
     assert np.isfinite(vertex["opacity"]).all() and np.isfinite(vertex["scale_0"]).all()
     back = read_gaussians(tmp_path / "a.ply")[1].gaussians

@@ -264,10 +264,8 @@ def test_methods_without_points_do_not_say_what_others_start_from(comparison_fol
     assert start_fact(runs).count("(") == 2
     nerf = [run for run in runs if run.scores.method == "volumetric/nerf"]
     for run in runs:
-        field = (
-            '[field]\ntype = "neural"\n[renderer]\nsampler = { coarse = 32 }\n' if run in nerf else '[field]\ninit = "scene"\n'
-        )
-        (run.folder / "recipe.toml").write_text(field)
+        field, sampler = ('type = "neural"', "coarse = 32") if run in nerf else ('init = "scene"', "")
+        (run.folder / "recipe.toml").write_text(f"[field]\n{field}\n[renderer]\nsampler = {{ {sampler} }}\n")
     assert start_fact(runs) == "from SfM"
     assert start_fact(nerf) == "exact ones"
     for run in nerf:  # an occupancy grid that points seed

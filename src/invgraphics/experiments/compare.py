@@ -21,8 +21,7 @@ from invgraphics.experiments.renderings import check_variants, is_kept
 from invgraphics.experiments.request import DATA, CompareRequest, FitRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
-from invgraphics.recipes.recipe import Method
-from invgraphics.recipes.suitable import default_methods
+from invgraphics.recipes.suitable import default_methods, starts_from_points
 from invgraphics.recipes.table import cell_of
 from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, SceneFacts
 from invgraphics.runs.folder import RunFolder, output_folder
@@ -171,14 +170,8 @@ def _start_for_all(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -
     Points of a rendered scene are exact: no method could find them, and most have no use for them.
     """
     chosen = any(item.partition("=")[0] == START for item in request.data_overrides)
-    used = any(_starts_from_points(job.method) for job in jobs)
+    used = any(starts_from_points(job.method.table) for job in jobs)
     return f"{START}=sfm" if used and not chosen and scene.notes.get("points") == EXACT_POINTS else ""
-
-
-def _starts_from_points(method: Method) -> bool:
-    """Whether a method's primitives, or its occupancy grid, start from the scene's points."""
-    sampler = getattr(method.recipe.renderer, "sampler", None)
-    return getattr(method.recipe.field, "init", "") == "scene" or getattr(sampler, "points_until", 0) > 0
 
 
 def _suitable(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> tuple[list[Job], list[Refusal]]:

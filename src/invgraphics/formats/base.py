@@ -18,6 +18,8 @@ from invgraphics.files import replacing
 
 HEAD_BYTES = 1 << 16
 """How much of a file `Format.matches` gets to see."""
+SMALLEST_SCALE = 1e-37
+"""Least scale whose logarithm is written: above float32's denormals, which a process that has fitted flushes to zero."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from invgraphics.core import Gaussians, harmonics
 from invgraphics.errors import InputError
-from invgraphics.formats.base import Splats
+from invgraphics.formats.base import SMALLEST_SCALE, Splats
 from invgraphics.formats.ply_elements import columns, missing, read_elements, write_element
 
 POSITION, NORMAL, DC, OPACITY = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("opacity",)
@@ -68,7 +68,7 @@ class Ply:
         n, rest = len(gaussians), gaussians.sh[:, 1:].permute(0, 2, 1).reshape(len(gaussians), -1)
         names = (*POSITION, *NORMAL, *DC, *(f"f_rest_{i}" for i in range(rest.shape[1])), *OPACITY, *SCALE, *ROTATION)
         values = [gaussians.means, torch.zeros(n, 3), gaussians.sh[:, 0], rest]
-        values += [gaussians.opacities.logit(OPACITY_EPS)[:, None], gaussians.scales.clamp_min(1e-37).log()]
+        values += [gaussians.opacities.logit(OPACITY_EPS)[:, None], gaussians.scales.clamp_min(SMALLEST_SCALE).log()]
         values += [torch.nn.functional.normalize(gaussians.quaternions, dim=1)]
         table = torch.cat([value.detach().float().cpu() for value in values], dim=1).numpy().astype("<f4")
         record = np.dtype([(name, "<f4") for name in names])

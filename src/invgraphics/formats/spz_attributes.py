@@ -15,7 +15,7 @@ from torch import Tensor
 
 from invgraphics.core import Gaussians, harmonics
 from invgraphics.errors import InputError
-from invgraphics.formats.base import complete_quaternions
+from invgraphics.formats.base import SMALLEST_SCALE, complete_quaternions
 
 Bytes = UInt8[np.ndarray, "n b"]
 
@@ -60,7 +60,7 @@ def pack(gaussians: Gaussians, fraction: int) -> dict[str, Bytes]:
     """Attributes of version 4, rounded to the nearest; what lies out of a byte's range goes to its end."""
     fixed = (gaussians.means.double() * 2.0**fraction).round().int().numpy().astype("<i4")
     colours = (gaussians.sh[:, 0] * COLOUR_RANGE + 0.5) * 255
-    log_scales = gaussians.scales.clamp_min(1e-37).log()
+    log_scales = gaussians.scales.clamp_min(SMALLEST_SCALE).log()
     return {
         "positions": fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),
         "alphas": _to_bytes(gaussians.opacities * 255)[:, None],

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from invgraphics.core import Scene
 from invgraphics.recipes.recipe import Method, split_name
 
@@ -17,6 +20,12 @@ were 1.3 dB behind the occupancy grid, with the 43 of fox 1.1 dB ahead; Gaussian
 def is_open_space(scene: Scene) -> bool:
     """Whether a scene is opaque photographs of a space without end."""
     return scene.bounds.space == "contracted" and not scene.has_alpha
+
+
+def starts_from_points(table: Mapping[str, Any]) -> bool:
+    """Whether a recipe's primitives, or its occupancy grid, start from the scene's points."""
+    sampler = table.get("renderer", {}).get("sampler", {})
+    return table.get("field", {}).get("init") == "scene" or sampler.get("points_until", 0) > 0
 
 
 def default_methods(scene: Scene) -> tuple[tuple[str, ...], str]:

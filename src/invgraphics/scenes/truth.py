@@ -67,23 +67,31 @@ class Truth:
         # Points are made from the depth of all training views: of fewer, they know too much.
         known = _points(path / "points.npz")
         points = known if len(views["train"]) == len(truth["cameras"]["train"]) else None
-        bounds = Bounds(torch.tensor(truth["bounds"]["lo"]), torch.tensor(truth["bounds"]["hi"]))
-        # Of all cameras, however many are loaded: a near plane belongs to a data set, as its lenses do.
-        poses = torch.stack([pose(camera["cam_to_world"], f"{path}") for camera in truth["cameras"]["train"]]).float()
-        if known is not None and bool(bounds.contains(poses[:, :3, 3]).all()):
-            bounds = replace(bounds, near=near_plane(poses, known.position) or bounds.near)
         return Scene(
             name=truth["name"],
             train=views["train"],
             val=views["val"],
             test=views["test"],
             background=torch.tensor(truth["background"] or [0.0, 0.0, 0.0]),
-            bounds=bounds,
+            bounds=_bounds(path, truth, known),
             points=points,
             mesh=_mesh(path / "mesh.ply"),
             noise_ceiling=truth["noise_ceiling"],
             notes=_notes(truth, views["train"][0]) | ({"points": POINTS} if points is not None else {}),
         )
+
+
+def _bounds(path: Path, truth: Mapping[str, Any], points: Points | None) -> Bounds:
+    """The described box; if all training cameras are in it, with a near plane before the nearest points.
+
+    Of all cameras, however many are loaded: a near plane belongs to a data set, as its lenses do.
+    """
+    bounds = Bounds(torch.tensor(truth["bounds"]["lo"]), torch.tensor(truth["bounds"]["hi"]))
+    if points is None:
+        return bounds
+    poses = torch.stack([pose(camera["cam_to_world"], f"{path}") for camera in truth["cameras"]["train"]]).float()
+    near = near_plane(poses, points.position) if bool(bounds.contains(poses[:, :3, 3]).all()) else None
+    return bounds if near is None else replace(bounds, near=near)
 
 
 def _class_scene(path: Path, truth: Mapping[str, Any], options: SceneOptions) -> Scene:

@@ -18,7 +18,7 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import describe
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
 from invgraphics.fields.similarity import transform_gaussians
-from invgraphics.formats.base import Splats, read_gaussians
+from invgraphics.formats.base import SMALLEST_SCALE, Splats, read_gaussians
 from invgraphics.formats.ply import OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
@@ -132,7 +132,7 @@ def fill(field: GaussianField, gaussians: Gaussians) -> None:
     tensors = {
         "means": gaussians.means,
         "quaternions": gaussians.quaternions,
-        "log_scales": gaussians.scales.clamp_min(1e-37).log(),
+        "log_scales": gaussians.scales.clamp_min(SMALLEST_SCALE).log(),
         "opacity_logits": gaussians.opacities.logit(OPACITY_EPS),
         "sh_dc": gaussians.sh[:, :1],
         "sh_rest": gaussians.sh[:, 1:],

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from invgraphics.recipes.suitable import starts_from_points
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.wording import budget_words, listing
@@ -109,9 +110,11 @@ def start_fact(runs: Sequence[Run]) -> str:
 
     Of methods that start from no points, the scene's points are told only where there are no others. Empty where no run says.
     """
-    own = [(START_WORDS.get(_init(run), ""), run) for run in runs]
-    others = [run for words, run in own if not words]
-    scenes = [(_start(run), run.scores.scene) for run in [run for run in others if _uses_points(run)] or others]
+    recipes = [_recipe(run) for run in runs]
+    own = [(START_WORDS.get(_init(recipe), ""), run) for recipe, run in zip(recipes, runs, strict=True)]
+    others = [(recipe, run) for recipe, (words, run) in zip(recipes, own, strict=True) if not words]
+    users = [(recipe, run) for recipe, run in others if not recipe or starts_from_points(recipe)]
+    scenes = [(_start(run), run.scores.scene) for _, run in users or others]
     starts = [_grouped([(start or "none", scene) for start, scene in scenes])] if any(start for start, _ in scenes) else []
     for words in dict.fromkeys(words for words, _ in own if words):
         methods = list(dict.fromkeys(run.scores.method for each, run in own if each == words))
@@ -124,17 +127,10 @@ def _recipe(run: Run) -> Mapping[str, Any]:
     return run.files.read_recipe() if (run.folder / RECIPE).is_file() else {}
 
 
-def _init(run: Run) -> str:
+def _init(recipe: Mapping[str, Any]) -> str:
     """The recipe's choice of first points; empty where it has none."""
-    field = _recipe(run).get("field")
+    field = recipe.get("field")
     return str(field.get("init", "")) if isinstance(field, Mapping) else ""
-
-
-def _uses_points(run: Run) -> bool:
-    """Whether primitives or an occupancy grid start from the scene's points; assumed where there is no recipe."""
-    recipe = _recipe(run)
-    sampler = recipe.get("renderer", {}).get("sampler", {})
-    return not recipe or _init(run) == "scene" or sampler.get("points_until", 0) > 0
 
 
 def _start(run: Run) -> str:
