@@ -1,16 +1,26 @@
-"""Modes of a process that fits."""
+"""Modes of a process that fits, or shows what was fitted."""
 
 import subprocess
 import sys
 
 import pytest
 
+CONFIGURED = 'configure_torch(torch.device("cpu"))'
+OPENED = """
+try:
+    open_fitted(Path("no-run"))
+except InputError:
+    pass
+"""
 CODE = """
+from pathlib import Path
 import numba, numpy as np, torch
+from invgraphics.errors import InputError
 from invgraphics.experiments.build import configure_torch
+from invgraphics.experiments.fitted import open_fitted
 
 torch.set_num_threads(2)
-configure_torch(torch.device("cpu"))
+SETTING
 
 @numba.njit(parallel=True)
 def scale(values, by, out):
@@ -24,9 +34,11 @@ print(int((torch.from_numpy(small) * 1e-20).count_nonzero()), int(np.count_nonze
 """
 
 
-@pytest.mark.parametrize(("configured", "expected"), [(True, "0 0"), (False, "1000000 1000000")])
-def test_denormal_products_are_zero_on_all_threads_of_a_fit(configured, expected):
+@pytest.mark.parametrize(
+    ("setting", "expected"), [(CONFIGURED, "0 0"), (OPENED, "0 0"), ("", "1000000 1000000")], ids=["fits", "opens", "neither"]
+)
+def test_denormal_products_are_zero_on_all_threads_of_a_process_that_fits_or_opens_a_run(setting, expected):
     """Of torch's pool and of Numba's; without the setting 1e-40 is a number."""
-    code = CODE if configured else CODE.replace('configure_torch(torch.device("cpu"))', "")
+    code = CODE.replace("SETTING", setting)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == expected

@@ -66,6 +66,7 @@ def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
     Raises:
         InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe.
     """
+    torch.set_flush_denormal(True)  # as in fits (`build.configure_torch`), before the scene is opened and threads start
     folder = RunFolder(run)
     provenance = folder.read(Provenance)
     chosen = provenance.options
