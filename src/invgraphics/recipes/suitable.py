@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from invgraphics.core import Scene
 from invgraphics.recipes.recipe import Method, split_name
+
+if TYPE_CHECKING:  # a report, which imports no torch, reads this module too
+    from invgraphics.core import Scene
 
 CLOSED = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians")
 """One method of each large family, for scenes in a box and for objects that are cut out."""
