@@ -30,14 +30,19 @@ def test_runs_from_before_have_no_share() -> None:
         "fit_seconds": 1.5,
         "fit_cpu_seconds": None,
         "fit_processor_share": None,
+        "fit_standstill_seconds": None,
         "steps": 7,
         "peak_memory_bytes": None,
     }
 
 
 def test_what_is_disturbed() -> None:
-    assert disturbance(None) == disturbance(1.0) == disturbance(LEAST_SHARE) == ""
-    assert disturbance(0.614) == "had 61 % of the processor time that it was ready to use; other programs had the rest"
+    assert disturbance({}) == disturbance({"fit_processor_share": LEAST_SHARE, "fit_standstill_seconds": 0.0}) == ""
+    busy = "had 61 % of the processor time that it was ready to use; other programs had the rest"
+    still = "stood still for 3 min 12 s, which are not counted: it was stopped, or the machine suspended"
+    assert disturbance({"fit_processor_share": 0.614}) == busy
+    assert disturbance({"fit_processor_share": 0.9, "fit_standstill_seconds": 192.0}) == still
+    assert disturbance({"fit_processor_share": 0.614, "fit_standstill_seconds": 192.0}) == f"{busy}, and {still}"
 
 
 def test_load_average_is_that_of_the_machine() -> None:

@@ -1,6 +1,7 @@
 """Clocks: processor time, time spent waiting for a core, and threads that do not spin."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -43,6 +44,41 @@ def test_only_busy_threads_count(tmp_path: Path, monkeypatch) -> None:
 def test_kernels_without_such_times(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(clock, "TASKS", tmp_path / "absent")
     assert SchedulerTimes().seconds() is None
+    assert SchedulerTimes().standstill(100.0, 1.0) == 0
+
+
+def test_a_standstill_is_neither_running_nor_waiting(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(clock, "TASKS", tmp_path)
+    _thread(tmp_path, "1", 5_000_000_000, 1_000_000_000)
+    times = SchedulerTimes()
+    assert times.standstill(8.0, 6.5) == 0  # too short to tell
+    _thread(tmp_path, "1", 8_000_000_000, 1_500_000_000)
+    assert times.standstill(10.0, 3.0) == pytest.approx(6.5)
+    _thread(tmp_path, "1", 11_000_000_000, 8_000_000_000)  # waited for all but half a second of it
+    assert times.standstill(10.0, 3.0) == 0
+    assert times.standstill(10.0, 3.0) == pytest.approx(7.0)  # the waiting was in the step before
+
+
+STOPPED = """
+import time
+from invgraphics.training.clock import SchedulerTimes
+times, began, cpu_began = SchedulerTimes(), time.perf_counter(), time.process_time()
+print("began", flush=True)
+while time.process_time() - cpu_began < 1:
+    pass
+print(times.standstill(time.perf_counter() - began, time.process_time() - cpu_began))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the kernel keeps no times of threads")
+def test_a_stopped_process_stands_still() -> None:
+    """As by Ctrl-Z; a suspended machine looks the same from within."""
+    process = subprocess.Popen([sys.executable, "-c", STOPPED], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "began\n"
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(3)
+    process.send_signal(signal.SIGCONT)
+    assert float(process.communicate()[0]) == pytest.approx(3.0, abs=0.5)
 
 
 @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the kernel keeps no times of threads")

@@ -14,6 +14,7 @@ from invgraphics.errors import NumericalError
 from invgraphics.experiments.recorder import Monitor
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.training.clock import SchedulerTimes
 
 METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
 STEPS = {"volumetric/nerf": 200, "volumetric/hash": 220, "splatting/gaussians": 120}
@@ -160,6 +161,19 @@ def test_processor_time_is_counted_beside_the_clock(scene, make_fit) -> None:
     assert (resumed.clocks()["seconds"], resumed.clocks()["cpu_seconds"]) == (clocks["seconds"], clocks["cpu_seconds"])
     if clocks["ran_seconds"] is not None:
         assert resumed.clocks()["ran_seconds"] >= clocks["ran_seconds"] > 0
+
+
+def test_a_standstill_is_not_optimisation(scene, make_fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SchedulerTimes, "standstill", lambda self, seconds, cpu_seconds: 0.75 * seconds)
+    fit = make_fit("volumetric/nerf", scene, 3)
+    began = time.perf_counter()
+    fit.run(lambda loss: False)
+    passed = time.perf_counter() - began
+    assert fit.standstill_seconds == pytest.approx(3 * fit.seconds)
+    assert 0 < fit.seconds + fit.standstill_seconds <= passed
+    resumed = make_fit("volumetric/nerf", scene, 9)
+    resumed.resume_clocks(fit.clocks())
+    assert resumed.standstill_seconds == fit.standstill_seconds > 0
 
 
 def test_every_fit_sees_to_waiting_threads(scene, make_fit, monkeypatch) -> None:

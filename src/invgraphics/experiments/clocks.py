@@ -1,4 +1,4 @@
-"""Time costs of a fit, and detection of timings disturbed by other processes."""
+"""Time costs of a fit, and detection of timings disturbed by other processes or by a standstill."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 
 from invgraphics.runs.fit import FitRecord
+from invgraphics.text import duration
 
 LEAST_SHARE = 0.85
 """A fit that ran for less of the time in which it was ready to run was disturbed: its times are not ranked."""
@@ -27,6 +28,7 @@ def fit_record(steps: int, clocks: Mapping[str, float | None]) -> FitRecord:
         cpu_seconds=clocks["cpu_seconds"],
         ran_seconds=clocks["ran_seconds"],
         waited_seconds=clocks["waited_seconds"],
+        standstill_seconds=clocks["standstill_seconds"],
     )
 
 
@@ -36,6 +38,7 @@ def fit_costs(fit: FitRecord) -> dict[str, float | None]:
         "fit_seconds": fit.seconds,
         "fit_cpu_seconds": fit.cpu_seconds,
         "fit_processor_share": processor_share(fit),
+        "fit_standstill_seconds": fit.standstill_seconds,
         "steps": fit.steps,
         "peak_memory_bytes": fit.peak_memory_bytes,
     }
@@ -53,12 +56,16 @@ def processor_share(fit: FitRecord) -> float | None:
     return None if not load else min(1.0, float(fit.cores or 1) / load)
 
 
-def disturbance(share: float | None) -> str:
+def disturbance(costs: Mapping[str, float | None]) -> str:
     """Describe how a fit's timings were disturbed, as a sentence without its subject; empty where they were not.
 
     Args:
-        share: as `processor_share` has it.
+        costs: as `fit_costs` has them.
     """
-    if share is None or share >= LEAST_SHARE:
-        return ""
-    return f"had {100 * share:.0f} % of the processor time that it was ready to use; other programs had the rest"
+    share, still = costs.get("fit_processor_share"), costs.get("fit_standstill_seconds")
+    found = []
+    if share is not None and share < LEAST_SHARE:
+        found.append(f"had {100 * share:.0f} % of the processor time that it was ready to use; other programs had the rest")
+    if still:
+        found.append(f"stood still for {duration(still)}, which are not counted: it was stopped, or the machine suspended")
+    return ", and ".join(found)

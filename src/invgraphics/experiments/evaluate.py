@@ -96,7 +96,7 @@ def evaluate(
         preset_choice=method.preset_choice,
         seed=folder.read(Provenance).seed,
         cost=costs | found.cost,
-        disturbed=disturbance(costs.get("fit_processor_share")),
+        disturbed=disturbance(costs),
         test_poses="" if poses is None else protocol_note(method),
         test_exposure=exposure_note(method),
     )

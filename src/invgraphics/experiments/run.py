@@ -21,7 +21,7 @@ from invgraphics.experiments.build import (
     open_with_progress,
     use_kernels,
 )
-from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average, processor_share
+from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
@@ -169,7 +169,7 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
     """Write the system load to the run's provenance, and warn where other processes disturbed the timings."""
     folder.write(replace(folder.read(Provenance), threads=torch.get_num_threads(), load_average=spent.load_average))
-    if disturbed := disturbance(processor_share(spent)):
+    if disturbed := disturbance(fit_costs(spent)):
         warn(f"The fit {disturbed}. Its times are not to be compared.")
 
 

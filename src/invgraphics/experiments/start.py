@@ -30,8 +30,8 @@ CHECKPOINT_COPIES = 3
 MARGIN = 1.25
 """Memory that is freed and asked for again in other sizes leaves gaps."""
 GROWTH_MARGIN = 1.5
-"""As `MARGIN`, of primitives that are still to be made, whose arrays are asked for in each size once. Grown by MCMC from 5,000 to
-150,000, Gaussians took 400 MB; as many from the first step on took 230."""
+"""As `MARGIN`, of primitives that are still to be made, whose arrays are asked for in each size once. Grown by MCMC from 5,000
+to 150,000, Gaussians took 400 MB; as many from the first step on took 230."""
 BASE_BYTES = 65 * 10**6
 """Of work arrays of threads and libraries, whatever the method. With 50 MB, NeRF at 128 px exceeded the forecast by 4 MB."""
 

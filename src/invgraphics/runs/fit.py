@@ -19,6 +19,7 @@ class FitRecord(Record):
         cpu_seconds: of all threads together.
         ran_seconds: that busy threads had a core; ``None`` where the system does not say.
         waited_seconds: that busy threads waited for a core.
+        standstill_seconds: in which the process was stopped or its machine suspended; not among ``seconds``.
         peak_memory_bytes: most memory above what the process held before the fit; known at its end.
         cores: that the process may use; known at the end.
         load_average: known at the end.
@@ -31,6 +32,7 @@ class FitRecord(Record):
     cpu_seconds: float | None = None
     ran_seconds: float | None = None
     waited_seconds: float | None = None
+    standstill_seconds: float | None = None
     peak_memory_bytes: int | None = None
     cores: int | None = None
     load_average: LoadAverage | None = None

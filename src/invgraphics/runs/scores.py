@@ -15,6 +15,7 @@ COST_UNITS = {
     "fit_seconds": "s",
     "fit_cpu_seconds": "s",
     "fit_processor_share": "",
+    "fit_standstill_seconds": "s",
     "steps": "",
     "peak_memory_bytes": "bytes",
     "render_seconds_per_view": "s",

@@ -147,9 +147,15 @@ class Fit:
         self.steps += 1
         if plan.device.type == "cuda":
             torch.cuda.synchronize(plan.device)
-        self.seconds += time.perf_counter() - began
-        self.cpu_seconds += time.process_time() - cpu_began
+        self._count(time.perf_counter() - began, time.process_time() - cpu_began)
         return value
+
+    def _count(self, seconds: float, cpu_seconds: float) -> None:
+        """Add a step's times to the clocks."""
+        still = self._scheduler.standstill(seconds, cpu_seconds) if self.plan.device.type == "cpu" else 0.0
+        self.standstill_seconds += still
+        self.seconds += seconds - still
+        self.cpu_seconds += cpu_seconds
 
     def _set_coarse_to_fine(self, progress: float) -> None:
         for encoding in self._coarse_to_fine:
@@ -190,15 +196,22 @@ class Fit:
         self.resume_clocks(clocks)
 
     def clocks(self) -> dict[str, float | None]:
-        """Seconds of the steps (of all threads together: ``cpu_seconds``), and seconds in which busy threads ran, and waited
-        for a core, since the fit began; ``None`` where the system does not say."""
+        """Seconds of the steps (of all threads together: ``cpu_seconds``), those left out because the process stood still, and
+        those in which busy threads ran, and waited for a core, since the fit began; ``None`` where the system does not say."""
         here = self._scheduler.seconds()
         ran, waited = (None, None) if here is None else (self._earlier[0] + here[0], self._earlier[1] + here[1])
-        return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "ran_seconds": ran, "waited_seconds": waited}
+        return {
+            "seconds": self.seconds,
+            "cpu_seconds": self.cpu_seconds,
+            "ran_seconds": ran,
+            "waited_seconds": waited,
+            "standstill_seconds": self.standstill_seconds,
+        }
 
     def resume_clocks(self, record: Mapping[str, Any]) -> None:
         """Continue from a record of `clocks`, but for ``seconds``, which `load` takes."""
         self.cpu_seconds = float(record.get("cpu_seconds") or 0.0)
+        self.standstill_seconds = float(record.get("standstill_seconds") or 0.0)
         self._earlier = float(record.get("ran_seconds") or 0.0), float(record.get("waited_seconds") or 0.0)
         self._scheduler = SchedulerTimes()
 
