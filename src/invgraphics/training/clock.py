@@ -15,7 +15,7 @@ BUSY = 0.1
 """A thread is busy if it ran for at least this share of the busiest one's time; others only wake to poll."""
 
 STANDSTILL = 2.0
-"""Seconds of a step in which no thread ran or waited that are taken for a standstill; page faults and timers cost far less."""
+"""Seconds of a step in which no thread ran or waited that are taken for a standstill; timers and single page faults cost far less."""
 
 
 class SchedulerTimes:
@@ -44,7 +44,8 @@ class SchedulerTimes:
         """Seconds, of ``seconds`` by the wall clock since a step of CPU work began, in which the process stood still.
 
         It was stopped then (Ctrl-Z), or its machine suspended or paused: no thread ran, or waited for a core that another
-        program had. At least `STANDSTILL`; else, or where the system does not say, 0.
+        program had. A step that waits for a disk, on which memory was swapped, cannot be told from that. At least `STANDSTILL`;
+        else, or where the system does not say, 0.
 
         Args:
             seconds: of the step.

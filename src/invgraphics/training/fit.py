@@ -147,11 +147,11 @@ class Fit:
         self.steps += 1
         if plan.device.type == "cuda":
             torch.cuda.synchronize(plan.device)
-        self._count(time.perf_counter() - began, time.process_time() - cpu_began)
+        self._advance_clocks(time.perf_counter() - began, time.process_time() - cpu_began)
         return value
 
-    def _count(self, seconds: float, cpu_seconds: float) -> None:
-        """Add a step's times to the clocks."""
+    def _advance_clocks(self, seconds: float, cpu_seconds: float) -> None:
+        """Add a step's wall and CPU time to the clocks, without a standstill."""
         still = self._scheduler.standstill(seconds, cpu_seconds) if self.plan.device.type == "cpu" else 0.0
         self.standstill_seconds += still
         self.seconds += seconds - still
