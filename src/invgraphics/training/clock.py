@@ -15,7 +15,7 @@ BUSY = 0.1
 """A thread is busy if it ran for at least this share of the busiest one's time; others only wake to poll."""
 
 STANDSTILL = 2.0
-"""Seconds of a step in which no thread ran or waited that are taken for a standstill; timers and single page faults cost far less."""
+"""Seconds of a step in which no thread ran or waited that are taken for a standstill; timers and page faults cost far less."""
 
 
 class SchedulerTimes:
