@@ -166,9 +166,10 @@ def test_a_fit_of_gaussians_recovers_them_and_resumes_to_the_same_bits(exposed_s
 
 
 def test_methods_say_under_which_exposure_held_out_views_are_shown() -> None:
-    assert exposure_note(load_method("volumetric/hash")) == ""
-    assert exposure_note(load_method("volumetric/hash", overrides=["training.exposure.optimise=false"])) == ""
-    note = exposure_note(load_method("volumetric/hash", overrides=["training.exposure.model=affine"]))
+    scene = toy_scene()
+    assert exposure_note(load_method("volumetric/hash"), scene) == ""
+    assert exposure_note(load_method("volumetric/hash", overrides=["training.exposure.optimise=false"]), scene) == ""
+    note = exposure_note(load_method("volumetric/hash", overrides=["training.exposure.model=affine"]), scene)
     assert note.startswith("mean of the training views")
     with pytest.raises(InputError, match="learning rates must be positive"):
         load_method("volumetric/hash", overrides=["training.exposure.lr=0"])

@@ -50,7 +50,8 @@ class Shared:
     """Largest number of Gaussians; short for --set max_primitives=N."""
     optimise: Annotated[str, arg(metavar="poses,exposure")] = ""
     """Fit the training cameras' poses too, or an exposure of each training photograph, or both; short for
-    --set training.poses.optimise=true and --set training.exposure.optimise=true."""
+    --set training.poses.optimise=true and --set training.exposure.optimise=true. Exposures are fitted unasked where those of a
+    COLMAP reconstruction's photographs differ."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
     """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None

@@ -131,6 +131,8 @@ class Scene:
         scan: measured points of the surface, in the data set's world, if any.
         colour: the space of the pixels, in which everything is fitted and composited.
         world_from_local: similarity from the local frame (all cameras, depths, points here) to the data set's world.
+        exposure_spread: standard deviation, over the training photographs, of the logarithm of their exposure (display values),
+            estimated from pixels that show the same points; ``None`` where nothing tells.
         noise_ceiling: PSNR in dB between two independent half-sample renders of the truth; ``None`` for photographs.
         notes: how the pixels came about (resize filter, undistortion, files skipped), recorded in each run.
     """
@@ -147,6 +149,7 @@ class Scene:
     scan: Scan | None = None
     colour: Literal["srgb", "linear"] = "srgb"
     world_from_local: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
+    exposure_spread: float | None = None
     noise_ceiling: float | None = None
     notes: dict[str, str] = field(default_factory=dict)
 

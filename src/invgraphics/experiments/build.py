@@ -72,7 +72,7 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
     recipe = method.recipe
     model = build_model(method, scene, seed, device)
     poses = make_poses(recipe.training, scene)
-    exposures = make_exposures(None if recipe.training is None else recipe.training.exposure, len(scene.train))
+    exposures = make_exposures(None if recipe.training is None else recipe.training.exposure, scene)
     optimiser = recipe.optimiser
     if poses is not None:
         optimiser = poses.config.optimiser(optimiser, _view_share(recipe, model.renderer, scene))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -209,7 +209,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
     methods = [job.method for job in jobs]
     notes = {
         "test_poses": {protocol_note(method) for method in methods} - {""},
-        "test_exposure": {f"{method.name}: {note}" for method in methods if (note := exposure_note(method))},
+        "test_exposure": _of_methods({method.name: exposure_note(method, scene) for method in methods}),
     }
     baselines = baseline_scores(scene, protocol)
     return ComparisonRecord(
@@ -247,6 +247,12 @@ def _scene_facts(scene: Scene) -> SceneFacts:
         space=scene.bounds.space,
         notes=scene.notes,
     )
+
+
+def _of_methods(notes: Mapping[str, str]) -> set[str]:
+    """Notes with the method that each is about; the note alone where all methods have the same."""
+    common = _common(list(notes.values()))
+    return {common} - {""} if common else {f"{method}: {note}" for method, note in notes.items() if note}
 
 
 def _common(texts: Sequence[str]) -> str:

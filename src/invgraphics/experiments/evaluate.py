@@ -22,7 +22,7 @@ from invgraphics.experiments.below_baseline import below_baseline, coverage_and_
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.identity import check_truth
-from invgraphics.experiments.posed import PosedEvaluation, exposure_note, protocol_note, scene_in_fit_frame
+from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
 from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.experiments.scaled import scaled_scores
 from invgraphics.experiments.subjects import UnseenInstances
@@ -87,18 +87,19 @@ def evaluate(
         poses,
         keep=lambda index, picture: _save_view(folder, index, picture, scene),
     )
-    quality, skipped = scaled_scores(model, scene, protocol, folder.read(Provenance).data, refined=poses is not None)
+    provenance = folder.read(Provenance)
+    quality, skipped = scaled_scores(model, scene, protocol, provenance.data, refined=poses is not None)
     result = replace(
         found,
         quality=found.quality | quality,
         skipped=found.skipped | skipped,
         preset=method.preset,
         preset_choice=method.preset_choice,
-        seed=folder.read(Provenance).seed,
+        seed=provenance.seed,
         cost=costs | found.cost,
         disturbed=disturbance(costs),
         test_poses="" if poses is None else protocol_note(method),
-        test_exposure=exposure_note(method),
+        test_exposure=provenance.test_exposure,
     )
     folder.write(result)
     return result

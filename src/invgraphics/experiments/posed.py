@@ -19,6 +19,7 @@ from invgraphics.recipes.recipe import Method
 from invgraphics.runs.scores import Score
 from invgraphics.training.localise import PoseDescent, refine_pose
 from invgraphics.training.poses import Poses, PosesConfig
+from invgraphics.training.views.exposure import exposure_config
 
 
 def protocol_note(method: Method) -> str:
@@ -30,11 +31,11 @@ def protocol_note(method: Method) -> str:
     return f"aligned by the similarity between refined and true training poses{refined}"
 
 
-def exposure_note(method: Method) -> str:
+def exposure_note(method: Method, scene: Scene) -> str:
     """Describe the exposure under which test views are shown; empty where no exposures are fitted."""
     training = method.recipe.training
-    exposure = None if training is None else training.exposure
-    return exposure.note if exposure is not None and exposure.optimise else ""
+    config = exposure_config(None if training is None else training.exposure, scene)
+    return "" if config is None else config.note
 
 
 def refined_poses(method: Method) -> PosesConfig | None:

@@ -163,7 +163,16 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     scene = fit.plan.scene
     advice = suggestion(job.method, scene)
     notes = selection_notes(scene) + space_note(scene) + (f"\n  try also: {advice}" if advice else "")
+    notes += _exposures_note(job.method, scene)
     return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{notes}"
+
+
+def _exposures_note(method: Method, scene: Scene) -> str:
+    """Announce, on a line, exposures that are fitted because the photographs differ in them; empty where they are not."""
+    asked = method.recipe.training is not None and method.recipe.training.exposure is not None
+    if asked or not exposure_note(method, scene):
+        return ""
+    return f"\n  exposures: {scene.notes['exposures']}; fitted too, unless --set training.exposure.optimise=false"
 
 
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
@@ -218,7 +227,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance
         options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
         device=str(job.device),
         test_poses=protocol_note(method),
-        test_exposure=exposure_note(method),
+        test_exposure=exposure_note(method, shown),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,9 @@ from invgraphics.core import Camera, Points, Scene
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
-from invgraphics.scenes.colmap_workspace import find_model, model_folders
+from invgraphics.scenes.colmap_workspace import Model, find_model, model_folders
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, existing_photos, scene_name
+from invgraphics.scenes.photos.exposures import exposure_spread
 from invgraphics.scenes.photos.notes import pose_notes
 from invgraphics.scenes.pictures.images import Photo
 from invgraphics.scenes.pictures.lens import Lens
@@ -50,7 +53,24 @@ class Colmap:
         } | pose_notes(path)
         notes |= {"model": model.note} if model.note else {}
         frame = photo_frame(photos, _points(model.reconstruction))
-        return compose(scene_name(path), every_eighth(photos), frame, options, notes)
+        return _with_exposures(compose(scene_name(path), every_eighth(photos), frame, options, notes), model)
+
+
+def _with_exposures(scene: Scene, model: Model) -> Scene:
+    """Add the spread of the training photographs' exposures to a scene, and to its notes."""
+    if scene.points is None:
+        return scene
+    rows = {number: row for row, number in enumerate(model.reconstruction.points3D)}
+    observed = {
+        image.name: [rows[point.point3D_id] for point in image.points2D if point.has_point3D()] for image in model.registered
+    }
+    shown = [torch.tensor(sorted(set(observed[view.name])), dtype=torch.int64) for view in scene.train]
+    spread = exposure_spread(scene.train, scene.points.position, shown)
+    if spread is None:
+        return scene
+    differ = f"of the training photographs differ by {math.expm1(spread):.0%}"
+    words = f"{differ} (standard deviation), by what they show of the same points"
+    return replace(scene, exposure_spread=spread, notes=scene.notes | {"exposures": words})
 
 
 def _photo(image: Any, folder: Path) -> Photo:
