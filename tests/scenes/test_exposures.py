@@ -68,6 +68,24 @@ def test_factors_are_told_from_other_parts_of_the_scene() -> None:
     assert exposure_spread(views, points, shared) == pytest.approx(float(np.log(factors).std()), rel=0.05)
 
 
+def test_what_is_masked_or_transparent_does_not_count() -> None:
+    factors = [0.7, 0.8, 0.9, 1.0, 1.0, 1.2, 1.4, 1.6]
+    views, points, observed = photographs(factors)
+    left = torch.arange(SIZE)[None, :].expand(SIZE, -1) < SIZE // 2
+    spoilt = [replace(view, image=torch.where(left[..., None], torch.full_like(view.image, 0.5), view.image)) for view in views]
+    known = pytest.approx(float(np.log(factors).std()), rel=0.05)
+    assert exposure_spread(spoilt, points, observed) != known
+    assert exposure_spread([replace(view, mask=~left) for view in spoilt], points, observed) == known
+    assert exposure_spread([replace(view, alpha=(~left).float()) for view in spoilt], points, observed) == known
+
+
+def test_a_photograph_without_points_has_no_say() -> None:
+    factors = [0.7, 0.8, 0.9, 1.0, 1.2, 1.4]
+    views, points, observed = photographs(factors)
+    observed[-1] = observed[-1][:0]
+    assert exposure_spread(views, points, observed) == pytest.approx(float(np.log(factors[:-1]).std()), rel=0.05)
+
+
 def test_nothing_is_estimated_from_two_photographs_or_points_seen_once() -> None:
     views, points, observed = photographs([0.8, 1.2])
     assert exposure_spread(views, points, observed) is None

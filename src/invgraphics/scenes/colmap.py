@@ -61,11 +61,12 @@ def _with_exposures(scene: Scene, model: Model) -> Scene:
     if scene.points is None:
         return scene
     rows = {number: row for row, number in enumerate(model.reconstruction.points3D)}
-    observed = {
-        image.name: [rows[point.point3D_id] for point in image.points2D if point.has_point3D()] for image in model.registered
-    }
-    shown = [torch.tensor(sorted(set(observed[view.name])), dtype=torch.int64) for view in scene.train]
-    spread = exposure_spread(scene.train, scene.points.position, shown)
+    images = {image.name: image for image in model.registered}
+    observed = []
+    for view in scene.train:
+        seen = {rows[point.point3D_id] for point in images[view.name].points2D if point.point3D_id in rows}
+        observed.append(torch.tensor(sorted(seen), dtype=torch.int64))
+    spread = exposure_spread(scene.train, scene.points.position, observed)
     if spread is None:
         return scene
     differ = f"of the training photographs differ by {math.expm1(spread):.0%}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ EDGE = 400
 """Longest edge in pixels of the pictures that are compared: points are placed to a pixel of larger ones, not better."""
 DARKEST, BRIGHTEST = 0.03, 0.97
 """Display values between which a pixel follows the exposure: others are noise, or cut off."""
+ALL = 0.999
+"""Share of a pixel that must be opaque and not masked."""
 FEWEST_VIEWS = 3
 """Fewest views of a point, so that one of them cannot speak for it."""
 FEWEST_PIXELS = 20
@@ -28,7 +31,7 @@ Observations = Sequence[Int[Tensor, " k"]]
 
 
 def exposure_spread(views: Sequence[View], points: Float[Tensor, "n 3"], observed: Observations) -> float | None:
-    """Standard deviation over photographs of the logarithm of their exposure; ``None`` where too little is seen twice.
+    """Standard deviation of the logarithm of photographs' exposure, estimated; ``None`` where they share too few points.
 
     A pixel's logarithm, mean of the display channels, is modelled as brightness of its point plus exposure of its photograph,
     both fitted by iteratively reweighted least squares. Without exposures surfaces that shine leave a spread as well.
@@ -38,6 +41,8 @@ def exposure_spread(views: Sequence[View], points: Float[Tensor, "n 3"], observe
         points: surface points.
         observed: of each view, the rows of ``points`` that it shows.
     """
+    from scipy.sparse import coo_matrix
+
     parts = [_pixels(view, points[rows], rows) for view, rows in zip(views, observed, strict=True)]
     view_of = np.concatenate([np.full(len(rows), index) for index, (rows, _) in enumerate(parts)])
     point_of = np.concatenate([rows for rows, _ in parts])
@@ -47,27 +52,29 @@ def exposure_spread(views: Sequence[View], points: Float[Tensor, "n 3"], observe
     counted = np.bincount(view_of, minlength=len(views)) >= FEWEST_PIXELS
     if counted.sum() < FEWEST_VIEWS:
         return None
+    shape = (len(views), len(points))
     exposure, weight = np.zeros(len(views)), np.ones(len(value))
     for _ in range(REWEIGHTINGS):
-        exposure, brightness = _fitted(view_of, point_of, value, weight)
+        weights, values = (coo_matrix((each, (view_of, point_of)), shape).tocsr() for each in (weight, weight * value))
+        exposure, brightness = _fitted(weights, values)
         weight = 1 / (1 + np.square((value - brightness[point_of] - exposure[view_of]) / SCALE))
     return float(exposure[counted].std())
 
 
-def _fitted(view_of: np.ndarray, point_of: np.ndarray, value: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exposure of each view and brightness of each point, by weighted least squares; the brightness is eliminated."""
-    from scipy.sparse import coo_matrix
+def _fitted(weights: Any, values: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Exposure of each view and brightness of each point, by weighted least squares; the brightness is eliminated.
 
-    shape = (int(view_of.max()) + 1, int(point_of.max()) + 1)
-    weights = coo_matrix((weight, (view_of, point_of)), shape).tocsr()
-    sums = coo_matrix((weight * value, (view_of, point_of)), shape).tocsr()
-    total = np.asarray(weights.sum(axis=0)).ravel()
-    inverse = np.divide(1, total, where=total > 0, out=np.zeros_like(total))
+    Args:
+        weights: of each pixel, a sparse matrix of views by points.
+        values: times its weight, likewise.
+    """
+    of_views, of_points = (np.asarray(weights.sum(axis=axis)).ravel() for axis in (1, 0))
+    sum_of_views, sum_of_points = (np.asarray(values.sum(axis=axis)).ravel() for axis in (1, 0))
+    inverse = np.divide(1, of_points, where=of_points > 0, out=np.zeros_like(of_points))
     shared = weights.multiply(inverse).tocsr()
-    normal = np.diag(np.asarray(weights.sum(axis=1)).ravel()) - (shared @ weights.T).toarray()
-    right = np.asarray(sums.sum(axis=1)).ravel() - shared @ np.asarray(sums.sum(axis=0)).ravel()
-    exposure = np.linalg.lstsq(normal, right, rcond=1e-9)[0]  # the smallest: one common factor is not determined
-    return exposure, inverse * (np.asarray(sums.sum(axis=0)).ravel() - weights.T @ exposure)
+    normal = np.diag(of_views) - (shared @ weights.T).toarray()
+    exposure = np.linalg.lstsq(normal, sum_of_views - shared @ sum_of_points, rcond=1e-9)[0]  # least norm: one factor is free
+    return exposure, inverse * (sum_of_points - weights.T @ exposure)
 
 
 def _pixels(view: View, points: Float[Tensor, "k 3"], rows: Int[Tensor, " k"]) -> tuple[np.ndarray, np.ndarray]:
@@ -75,10 +82,13 @@ def _pixels(view: View, points: Float[Tensor, "k 3"], rows: Int[Tensor, " k"]) -
     height, width = view.image.shape[:2]
     shrink = min(1.0, EDGE / max(height, width))
     size = (max(1, round(height * shrink)), max(1, round(width * shrink)))
-    picture = torch.nn.functional.adaptive_avg_pool2d(view.over(torch.ones(3)).permute(2, 0, 1), size)
+    counts = view.opacity() if view.mask is None else view.opacity() * view.mask
+    channels = view.colour().permute(2, 0, 1)
+    picture, whole = (torch.nn.functional.adaptive_avg_pool2d(values, size) for values in (channels, counts[None]))
     place, depth = view.camera.project(points.to(view.camera.cam_to_world))
     x, y = (place / torch.tensor([width / size[1], height / size[0]])).floor().nan_to_num(-1).unbind(1)
     inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < size[1]) & (y < size[0])
-    colour = picture[:, y[inside].long(), x[inside].long()]
-    usable = (colour.amin(dim=0) > DARKEST) & (colour.amax(dim=0) < BRIGHTEST)
+    pixel = y[inside].long(), x[inside].long()
+    colour = picture[:, *pixel]
+    usable = (colour.amin(dim=0) > DARKEST) & (colour.amax(dim=0) < BRIGHTEST) & (whole[0, *pixel] > ALL)
     return rows[inside][usable].numpy(), colour[:, usable].log().mean(dim=0).double().numpy()
