@@ -96,3 +96,11 @@ def test_the_forecast_covers_a_growth_that_was_measured(toy_folder: Path) -> Non
     forecast = memory_forecast(build_plan(method, scene, budget, 0, device), method, 24_000_000)
     assert forecast.primitives == 150_000
     assert 555e6 < forecast.bytes < 1.25 * 555e6
+
+
+def test_the_forecast_covers_gaps_that_were_measured(toy_folder: Path) -> None:
+    """NeRF on `room` at 128 px and two threads held 49 MB after its first step and monitor pass, and 144 MB at most."""
+    scene, device = open_scene(str(toy_folder), SceneOptions()), torch.device("cpu")
+    method, budget = load_method("volumetric/nerf", "laptop"), Budget(seconds=60.0)
+    forecast = memory_forecast(build_plan(method, scene, budget, 0, device), method, 49_000_000)
+    assert 144e6 < forecast.bytes < 1.25 * 144e6

@@ -47,7 +47,7 @@ def exposure_spread(views: Sequence[View], points: Float[Tensor, "n 3"], observe
     view_of = np.concatenate([np.full(len(rows), index) for index, (rows, _) in enumerate(parts)])
     point_of = np.concatenate([rows for rows, _ in parts])
     value = np.concatenate([value for _, value in parts])
-    often = np.bincount(point_of, minlength=len(points))[point_of] >= FEWEST_VIEWS if len(value) else value > 0
+    often = np.bincount(point_of, minlength=len(points))[point_of] >= FEWEST_VIEWS
     view_of, point_of, value = view_of[often], point_of[often], value[often]
     counted = np.bincount(view_of, minlength=len(views)) >= FEWEST_PIXELS
     if counted.sum() < FEWEST_VIEWS:
