@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from invgraphics.experiments.run import fit_run
 from invgraphics.recipes.recipe import load_method
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
+from invgraphics.scenes.degrade import TrainingData, degrade
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.scenes.photos.exposures import exposure_spread
 from invgraphics.training.budget import Budget
@@ -130,6 +132,15 @@ def test_exposures_are_fitted_where_tracks_show_that_photographs_differ(tmp_path
     off, on = (f"training.exposure.optimise={value}" for value in ("false", "true"))
     assert [fitted(changes, scene) for changes in ([], [on], [off])] == [(True, True), (True, True), (False, False)]
     assert [fitted(changes, same) for changes in ([], [on], [off])] == [(False, False), (True, True), (False, False)]
+
+
+@pytest.mark.parametrize("changes", [{"train_views": 4}, {"size": 32}, {"photo_noise": 0.1}, {"exposure": 0.5}])
+def test_changed_photographs_do_not_keep_the_spread_of_the_others(tmp_path: Path, changes: dict[str, Any]) -> None:
+    scene = open_scene(str(workspace(tmp_path / "differ", [0.7, 0.8, 0.9, 1.0, 1.0, 1.2, 1.4, 1.6, 1.1, 0.8])), SceneOptions())
+    found = degrade(scene, TrainingData(init="random", **changes), 0)
+    assert found.exposure_spread is None and "exposures" not in found.notes
+    kept = degrade(scene, TrainingData(init="random"), 0)
+    assert kept.exposure_spread == scene.exposure_spread and "exposures" in kept.notes
 
 
 def test_a_run_says_that_it_fits_exposures_and_how_not_to(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -144,6 +144,8 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
     train = [_degraded(_named(views[index], scale), index, scene, data, seed) for scale, views in shown for index in chosen]
     done = [f"{name} = {value}" for name, value in changes.items() if name != "test_scales"]
     notes = scene.notes | ({"training_data": ", ".join(done)} if done else {})
+    if data.changes_photographs and notes.pop("exposures", None):
+        scene = replace(scene, exposure_spread=None)  # estimated from all photographs as they were
     if data.background != KEEP:
         colour = torch.tensor(COLOURS[data.background] if isinstance(data.background, str) else data.background)
         train = [replace(view, image=like(view.over(colour), view), alpha=None) for view in train]
