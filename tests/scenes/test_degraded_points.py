@@ -72,13 +72,30 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_sfm_points_lie_on_the_plane(plane: Scene, capfd: pytest.CaptureFixture[str]) -> None:
-    points = sfm.triangulate(plane)
+    points = sfm.triangulate(plane).points
     assert capfd.readouterr() == ("", "")  # COLMAP accounts for every photograph and pair
     assert len(points) > 50
     assert float(points.position[:, 2].abs().median()) < 0.02 and float(points.position[:, 2].abs().max()) < 0.2
     place = ((points.position[:, :2].numpy() + 1) * 128).clip(0, 255).astype(int)
     expected = textured_plane()[place[:, 1], place[:, 0]]
     assert float(np.abs(points.rgb.numpy() - expected).mean()) < 0.1
+
+
+@pytest.mark.parametrize("blank", [0, 3])
+def test_tracks_name_the_photographs_that_show_a_point(plane: Scene, blank: int) -> None:
+    """A blank photograph shows none; all others some, within their pictures; two or more show each point."""
+    train = tuple(replace(v, image=torch.full_like(v.image, 99)) if i == blank else v for i, v in enumerate(plane.train))
+    found = sfm.triangulate(plane.with_views(train=train))
+    assert [len(rows) > 50 for rows in found.observed] == [index != blank for index in range(CAMERAS)]
+    for view, rows in zip(train, found.observed, strict=True):
+        place, depth = view.camera.project(found.points.position[rows].double())
+        assert bool(((place >= 0) & (place < SIZE)).all()) and bool((depth > 0).all())
+        assert torch.equal(rows, rows.unique())
+    counts = torch.cat(found.observed).bincount(minlength=len(found.points))
+    assert int(counts.min()) >= 2
+    made = degrade(plane.with_views(train=train), TrainingData(init="sfm"), 0)
+    for view, rows in zip(made.train, found.observed, strict=True):
+        assert view.landmarks is not None and torch.equal(view.landmarks, found.points.position[rows])
 
 
 def tensors(value: object, path: str = "") -> dict[str, torch.Tensor]:
@@ -93,6 +110,13 @@ def tensors(value: object, path: str = "") -> dict[str, torch.Tensor]:
     return {}
 
 
+def with_landmarks(scene: Scene) -> Scene:
+    """The scene, with some of its points as landmarks of every view."""
+    assert scene.points is not None
+    landmarks = scene.points.position[:40]
+    return scene.with_views(train=tuple(replace(view, landmarks=landmarks) for view in scene.train))
+
+
 @pytest.mark.parametrize("init", ["scene", "sfm", "random"])
 def test_nothing_in_a_degraded_scene_depends_on_withheld_photographs(plane: Scene, init: str) -> None:
     """Two scenes that differ in the photographs that are left out, and in the points made from all of them."""
@@ -103,7 +127,7 @@ def test_nothing_in_a_degraded_scene_depends_on_withheld_photographs(plane: Scen
         for view in plane.train
     )
     other = replace(plane, train=hidden, points=Points(torch.rand(300, 3), torch.rand(300, 3)))
-    first, second = (tensors(degrade(scene, data, 0)) for scene in (plane, other))
+    first, second = (tensors(degrade(with_landmarks(scene), data, 0)) for scene in (plane, other))
     assert first.keys() == second.keys()
     assert [path for path in first if not torch.equal(first[path], second[path])] == []
     assert (".points.position" in first) == (init != "random")
@@ -113,7 +137,7 @@ def test_the_start_is_declared(plane: Scene) -> None:
     assert degrade(plane, TrainingData(), 0) is plane
     assert degrade(plane, TrainingData(init="random"), 0).points is None
     made = degrade(plane, TrainingData(init="sfm"), 0)
-    found = sfm.triangulated(plane)
+    found = sfm.triangulated(plane).points
     assert made.points is not None and torch.equal(made.points.position[: len(found)], found.position)
     rest = made.points.position[len(found) :]
     assert len(rest) == ENOUGH_POINTS and bool(((rest >= plane.bounds.lo) & (rest <= plane.bounds.hi)).all())
@@ -146,4 +170,6 @@ def test_points_are_cached_by_what_they_are_made_of(plane: Scene, monkeypatch: p
     first = sfm.triangulated(plane)
     monkeypatch.setattr(sfm, "triangulate", lambda scene: pytest.fail("computed again"))
     again = sfm.triangulated(replace(plane, points=None))
-    assert torch.equal(first.position, again.position) and torch.equal(first.rgb, again.rgb)
+    assert torch.equal(first.points.position, again.points.position) and torch.equal(first.points.rgb, again.points.rgb)
+    assert len(first.observed) == len(again.observed) == CAMERAS
+    assert all(torch.equal(*rows) for rows in zip(first.observed, again.observed, strict=True))

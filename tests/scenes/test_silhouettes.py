@@ -7,6 +7,7 @@ import torch
 
 from invgraphics.core import Points, Scene
 from invgraphics.scenes.degrade import FEWEST_POINTS, TrainingData, degrade
+from invgraphics.scenes.photos.triangulate import Triangulated
 from invgraphics.scenes.silhouettes import inside_silhouettes, points_inside
 from invgraphics.testing import TwoBalls, toy_scene
 
@@ -63,7 +64,8 @@ def test_a_view_says_nothing_of_what_is_behind_its_camera(scene: Scene) -> None:
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_they_join_few_points_unless_poses_are_disturbed(scene: Scene, monkeypatch: pytest.MonkeyPatch, noise: float) -> None:
     few = Points(torch.zeros(FEWEST_POINTS, 3), torch.zeros(FEWEST_POINTS, 3))
-    monkeypatch.setattr("invgraphics.scenes.photos.triangulate.triangulated", lambda scene: few)
+    nowhere = Triangulated.of(few, torch.zeros(2, 0, dtype=torch.int64), len(scene.train))
+    monkeypatch.setattr("invgraphics.scenes.photos.triangulate.triangulated", lambda scene: nowhere)
     found = degrade(scene, TrainingData(init="sfm", pose_noise=noise), 0)
     assert found.points is not None
     share = float(inside_silhouettes(found.points.position[FEWEST_POINTS:], scene.train).float().mean())

@@ -39,6 +39,8 @@ class View:
         mask: True where the pixel counts; ``None`` means everywhere.
         ground_truth_pose: the camera's pose before it was degraded on purpose; ``None`` where it was not. For scores only.
         subject: which instance of a class of objects it shows; ``None`` in scenes of one subject.
+        landmarks: surface points that it shows, local frame: those of structure from motion whose tracks name it; ``None``
+            where nothing is known.
     """
 
     camera: Camera
@@ -50,6 +52,7 @@ class View:
     mask: Tensor | None = None
     ground_truth_pose: Float[Tensor, "4 4"] | None = None
     subject: int | None = None
+    landmarks: Float[Tensor, "k 3"] | None = None
 
     @property
     def true_pose(self) -> Float[Tensor, "4 4"]:

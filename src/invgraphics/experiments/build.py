@@ -16,8 +16,9 @@ from invgraphics.recipes.schema import Recipe
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Plan
-from invgraphics.training.poses import coarse_to_fine_encodings, make_poses
+from invgraphics.training.poses import TrainingConfig, coarse_to_fine_encodings, make_poses
 from invgraphics.training.views.exposure import make_exposures
+from invgraphics.training.views.sparse_depth import make_sparse_depth
 
 
 def device_of(name: str | None) -> torch.device:
@@ -72,7 +73,10 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
     recipe = method.recipe
     model = build_model(method, scene, seed, device)
     poses = make_poses(recipe.training, scene)
-    exposures = make_exposures(None if recipe.training is None else recipe.training.exposure, scene)
+    training = TrainingConfig() if recipe.training is None else recipe.training
+    exposures = make_exposures(training.exposure, scene)
+    # Points were triangulated at the given poses.
+    depth = make_sparse_depth(training.sparse_depth, scene, model.renderer) if poses is None else None
     optimiser = recipe.optimiser
     if poses is not None:
         optimiser = poses.config.optimiser(optimiser, _view_share(recipe, model.renderer, scene))
@@ -82,7 +86,7 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
         model=model,
         scene=scene,
         losses=recipe.losses,
-        penalties=recipe.penalties,
+        penalties=recipe.penalties if depth is None else (*recipe.penalties, depth.to(device)),
         hooks=[hook.build() for hook in recipe.hooks],
         optimiser=optimiser,
         batches=recipe.batches if poses is None else poses.config.batches(recipe.batches),

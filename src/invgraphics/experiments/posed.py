@@ -17,9 +17,11 @@ from invgraphics.metrics.keys import POSE_ROTATION, POSE_TRANSLATION
 from invgraphics.metrics.poses import PoseErrors, Similarity, pose_errors
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.scores import Score
+from invgraphics.training.fit import Plan
 from invgraphics.training.localise import PoseDescent, refine_pose
 from invgraphics.training.poses import Poses, PosesConfig
 from invgraphics.training.views.exposure import exposure_config
+from invgraphics.training.views.sparse_depth import SparseDepth
 
 
 def protocol_note(method: Method) -> str:
@@ -36,6 +38,11 @@ def exposure_note(method: Method, scene: Scene) -> str:
     training = method.recipe.training
     config = exposure_config(None if training is None else training.exposure, scene)
     return "" if config is None else config.note
+
+
+def sparse_depth_note(plan: Plan) -> str:
+    """Describe the points of structure from motion that supervise a fit's depth; empty where none do."""
+    return next((penalty.note for penalty in plan.penalties if isinstance(penalty, SparseDepth)), "")
 
 
 def refined_poses(method: Method) -> PosesConfig | None:
@@ -73,7 +80,7 @@ def scene_in_fit_frame(poses: Poses, scene: Scene) -> Scene:
         turn = turn / torch.linalg.det(turn) ** (1 / 3)
         depth = None if view.depth is None else view.depth / errors.scale
         normal = None if view.normal is None else view.normal @ turn.T
-        return replace(view, camera=camera, depth=depth, normal=normal)
+        return replace(view, camera=camera, depth=depth, normal=normal, landmarks=None)
 
     refined = zip(scene.train, poses().cpu(), strict=True)
     back = torch.linalg.inv(similarity.matrix)

@@ -27,7 +27,7 @@ from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_tr
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, check_replaceable, identify
 from invgraphics.experiments.job import Job
-from invgraphics.experiments.posed import exposure_note, protocol_note
+from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder
 from invgraphics.experiments.renderings import check_variants, render_missing
@@ -47,7 +47,7 @@ from invgraphics.runs.schema import write_json
 from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import selection_notes, space_note
 from invgraphics.tables import read_json
-from invgraphics.training.fit import Fit
+from invgraphics.training.fit import Fit, Plan
 
 
 def fit_run(request: FitRequest) -> Path:
@@ -106,7 +106,8 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
                 folder.clear()
             folder.write(describe(job, (scene, shown), identity))
             forecast = warm_up(fit, method, memory)
-            folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
+            known = {"memory_forecast_bytes": forecast.bytes, "sparse_depth": sparse_depth_note(fit.plan)}
+            folder.write(replace(folder.read(Provenance), **known))
             if "inconsistent_poses" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
             with memory.excluding():  # pictures that are rendered to forecast the evaluation's time are no part of the fit
@@ -163,7 +164,7 @@ def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
     scene = fit.plan.scene
     advice = suggestion(job.method, scene)
     notes = selection_notes(scene) + space_note(scene) + (f"\n  try also: {advice}" if advice else "")
-    notes += _exposures_note(job.method, scene)
+    notes += _exposures_note(job.method, scene) + _depth_note(job.method, fit.plan)
     return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{notes}"
 
 
@@ -173,6 +174,13 @@ def _exposures_note(method: Method, scene: Scene) -> str:
     if asked or not exposure_note(method, scene):
         return ""
     return f"\n  exposures: {scene.notes['exposures']}; fitted too, unless --set training.exposure.optimise=false"
+
+
+def _depth_note(method: Method, plan: Plan) -> str:
+    """Announce, on a line, depths that are supervised because the photographs came with points; empty where they are not."""
+    asked = method.recipe.training is not None and method.recipe.training.sparse_depth is not None
+    what = sparse_depth_note(plan)
+    return "" if asked or not what else f"\n  depth: {what}, unless --set training.sparse_depth.weight=0"
 
 
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:

@@ -113,6 +113,7 @@ class Provenance(Record):
         device: that computed.
         test_poses: how test poses are found; empty where they are taken as given.
         test_exposure: under which exposure test views are shown; empty where exposures are not fitted.
+        sparse_depth: points of structure from motion at which the fit's depth was supervised; empty where it was not.
         memory_forecast_bytes: memory that the fit was expected to hold at most; written after its first step.
         threads: of the process; written after the fit.
         load_average: of the machine; written after the fit.
@@ -150,6 +151,7 @@ class Provenance(Record):
     device: str
     test_poses: str = ""
     test_exposure: str = ""
+    sparse_depth: str = ""
     memory_forecast_bytes: int | None = None
     threads: int | None = None
     load_average: LoadAverage | None = None

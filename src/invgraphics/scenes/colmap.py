@@ -53,11 +53,11 @@ class Colmap:
         } | pose_notes(path)
         notes |= {"model": model.note} if model.note else {}
         frame = photo_frame(photos, _points(model.reconstruction))
-        return _with_exposures(compose(scene_name(path), every_eighth(photos), frame, options, notes), model)
+        return _with_tracks(compose(scene_name(path), every_eighth(photos), frame, options, notes), model)
 
 
-def _with_exposures(scene: Scene, model: Model) -> Scene:
-    """Add the spread of the training photographs' exposures to a scene, and to its notes."""
+def _with_tracks(scene: Scene, model: Model) -> Scene:
+    """Add to a scene and its notes what tracks tell of training photographs: landmarks, and the spread of exposures."""
     if scene.points is None:
         return scene
     rows = {number: row for row, number in enumerate(model.reconstruction.points3D)}
@@ -66,7 +66,12 @@ def _with_exposures(scene: Scene, model: Model) -> Scene:
     for view in scene.train:
         seen = {rows[point.point3D_id] for point in images[view.name].points2D if point.point3D_id in rows}
         observed.append(torch.tensor(sorted(seen), dtype=torch.int64))
-    spread = exposure_spread(scene.train, scene.points.position, observed)
+    position = scene.points.position
+    train = tuple(replace(view, landmarks=position[rows]) for view, rows in zip(scene.train, observed, strict=True))
+    seen = sum(len(rows) for rows in observed)
+    notes = {"landmarks": f"{seen:,} views of points of structure from motion by the training photographs"}
+    scene = replace(scene, train=train, notes=scene.notes | notes)
+    spread = exposure_spread(scene.train, position, observed)
     if spread is None:
         return scene
     differ = f"of the training photographs differ by {math.expm1(spread):.0%}"

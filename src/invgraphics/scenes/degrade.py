@@ -146,6 +146,9 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
     notes = scene.notes | ({"training_data": ", ".join(done)} if done else {})
     if data.changes_photographs and notes.pop("exposures", None):
         scene = replace(scene, exposure_spread=None)  # estimated from all photographs as they were
+    if data.changes_photographs or data.pose_noise or data.init != "scene":
+        notes.pop("landmarks", None)  # of other photographs or poses, or not to be known
+        train = [replace(view, landmarks=None) for view in train]
     if data.background != KEEP:
         colour = torch.tensor(COLOURS[data.background] if isinstance(data.background, str) else data.background)
         train = [replace(view, image=like(view.over(colour), view), alpha=None) for view in train]
@@ -161,7 +164,11 @@ def _with_points(scene: Scene, data: TrainingData, seed: int) -> Scene:
         return scene
     from invgraphics.scenes.photos.triangulate import triangulated
 
-    points = triangulated(scene)
+    found = triangulated(scene)
+    points = found.points
+    if not data.pose_noise:
+        known = zip(scene.train, found.observed, strict=True)
+        scene = scene.with_views(train=tuple(replace(view, landmarks=points.position[rows]) for view, rows in known))
     what = f"{len(points):,} from SfM on the training photographs as they are here"
     # Silhouettes at disturbed poses have little in common.
     views = [] if data.pose_noise else [view for view in scene.train if view.alpha is not None]

@@ -20,6 +20,7 @@ from invgraphics.fields.encodings.window import Windowed
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
 from invgraphics.training.views.exposure import ExposureConfig
+from invgraphics.training.views.sparse_depth import SparseDepthConfig
 
 
 @dataclass(frozen=True)
@@ -105,15 +106,18 @@ class PosesConfig:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Options for optimising camera poses and exposures along with the scene.
+    """Options of a fit beside field, renderer and losses: what is optimised with the scene, and what is known of its depth.
 
     Attributes:
         poses: the training cameras' poses; ``None`` takes them as they are given.
-        exposure: an exposure of each training view; ``None`` takes all photographs as equally exposed.
+        exposure: an exposure of each training view; ``None`` fits them where photographs are found to differ.
+        sparse_depth: supervision by points of structure from motion; ``None`` takes it where photographs of an open space came
+            with some.
     """
 
     poses: PosesConfig | None = None
     exposure: ExposureConfig | None = None
+    sparse_depth: SparseDepthConfig | None = None
 
 
 class Poses(nn.Module):

@@ -210,6 +210,7 @@ def _run_facts(run: Run) -> dict[str, str]:
         "budget": known.budget,
         "test poses": known.test_poses,
         "test exposure": known.test_exposure,
+        "sparse depth": known.sparse_depth,
         "load average": _text(plain(known.load_average)),
     }
     for key, value in run.environment.facts().items():

@@ -9,12 +9,15 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from PIL import Image
+from torch import Tensor
 
 from invgraphics.arrays import read_arrays
 from invgraphics.core import Points, Scene, View
@@ -27,12 +30,36 @@ NEIGHBOURS = 20
 """A photograph is matched with as many of its nearest, by position and direction of the camera."""
 LONGEST_TRACK_ERROR = 2.0
 """Largest reprojection error of a point, px."""
-SCHEMA = 1
-"""Rises where the same photographs give other points."""
+SCHEMA = 2
+"""Rises where the same photographs give other points, or more is known of them."""
 DATABASE, PHOTOS, PAIRS = "features.db", "photos", "pairs.txt"
 
 
-def triangulated(scene: Scene) -> Points:
+@dataclass(frozen=True, eq=False)
+class Triangulated:
+    """SfM points of a scene's training photographs.
+
+    Attributes:
+        points: in the local frame, with display sRGB colours; empty where nothing is matched.
+        observed: of each training view, ascending rows of the points that it shows: those whose tracks name it.
+    """
+
+    points: Points
+    observed: tuple[Int[Tensor, " k"], ...]
+
+    @staticmethod
+    def of(points: Points, tracks: Int[Tensor, "2 m"], views: int) -> Triangulated:
+        """From pairs of a view and a point, in any order, of so many views."""
+        return Triangulated(points, tuple(tracks[1, tracks[0] == view].sort().values for view in range(views)))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """As arrays, for the cache."""
+        tracks = [torch.stack([torch.full_like(rows, view), rows]) for view, rows in enumerate(self.observed)]
+        joined = torch.cat(tracks, dim=1) if tracks else torch.zeros(2, 0, dtype=torch.int64)
+        return {"position": self.points.position.numpy(), "rgb": self.points.rgb.numpy(), "tracks": joined.numpy()}
+
+
+def triangulated(scene: Scene) -> Triangulated:
     """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else."""
     sha = hashlib.sha256(f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour}".encode())
     for view in scene.train:
@@ -44,15 +71,16 @@ def triangulated(scene: Scene) -> Points:
         path = folder / f"{sha.hexdigest()[:32]}.npz"
         if path.is_file():
             arrays = read_arrays(path)
-            return Points(torch.from_numpy(arrays["position"]), torch.from_numpy(arrays["rgb"]))
+            position, rgb, tracks = (torch.from_numpy(arrays[name]) for name in ("position", "rgb", "tracks"))
+            return Triangulated.of(Points(position, rgb), tracks, len(scene.train))
     except (InputError, OSError, KeyError):  # no cache, or what is in it is damaged
         return triangulate(scene)
-    points = triangulate(scene)
-    write_arrays(path, {"position": points.position.numpy(), "rgb": points.rgb.numpy()})
-    return points
+    found = triangulate(scene)
+    write_arrays(path, found.arrays())
+    return found
 
 
-def triangulate(scene: Scene, seed: int = 0) -> Points:
+def triangulate(scene: Scene, seed: int = 0) -> Triangulated:
     """Triangulate SfM points from the training photographs at their known poses (Schönberger & Frahm 2016, §4.3).
 
     Args:
@@ -60,11 +88,11 @@ def triangulate(scene: Scene, seed: int = 0) -> Points:
         seed: of RANSAC.
 
     Returns:
-        Points in the local frame with display sRGB colours, the mean over the photographs that see them; empty where nothing
-        is matched.
+        Points, their colours the mean over the photographs that see them, and which these are.
     """
     if len(scene.train) < 2:
-        return Points(torch.zeros(0, 3), torch.zeros(0, 3))
+        none = torch.zeros(2, 0, dtype=torch.int64)
+        return Triangulated.of(Points(torch.zeros(0, 3), torch.zeros(0, 3)), none, len(scene.train))
     from invgraphics.scenes.colmap_library import pycolmap
 
     with tempfile.TemporaryDirectory() as name:
@@ -90,7 +118,10 @@ def triangulate(scene: Scene, seed: int = 0) -> Points:
     points = [point for point in points if point.error <= LONGEST_TRACK_ERROR]
     position = np.array([point.xyz for point in points]).reshape(-1, 3)
     rgb = np.array([point.color for point in points]).reshape(-1, 3) / 255
-    return Points(torch.from_numpy(position).float(), torch.from_numpy(rgb).float())
+    # Photographs are numbered from 1 in their order; one may show a point twice.
+    seen = sorted({(part.image_id - 1, row) for row, point in enumerate(points) for part in point.track.elements})
+    tracks = torch.tensor(seen, dtype=torch.int64).reshape(-1, 2).T
+    return Triangulated.of(Points(torch.from_numpy(position).float(), torch.from_numpy(rgb).float()), tracks, len(scene.train))
 
 
 def _bytes(view: View, scene: Scene) -> torch.Tensor:

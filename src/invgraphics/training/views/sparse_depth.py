@@ -1,0 +1,112 @@
+"""Sparse depth supervision: rays through points of structure from motion end there (Deng et al. 2022, DS-NeRF).
+
+Few photographs can be explained by a fog before each camera that no other photograph shows. Tracks of structure from motion say
+which photographs show a point: the ray from such a camera passes what is before the point, and ends there. Fields that start
+from these points have that built in; ray-marched ones learn it by a penalty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from invgraphics.core import Context, Field, RayRenderer, Rays, Renderer, Scene, View
+from invgraphics.core.camera import rays_through
+from invgraphics.renderers.hybrid import Hybrid
+from invgraphics.renderers.volumetric import Volumetric
+
+SPAN = 0.5
+"""Share of a point's distance from which on the error of a ray's end is no longer counted as larger: some points are wrong."""
+
+
+@dataclass(frozen=True)
+class SparseDepthConfig:
+    """Supervision of depth at points of structure from motion.
+
+    Attributes:
+        weight: factor of the penalty; 0 leaves it away. On five captures 0.1 gained 2.8 dB in the mean (volumetric/hash, 480 px,
+            1,700 steps, one seed), at worst -0.1; 1.0 gained as much on three, and 0.4 to 0.7 less on two.
+        rays: rays through points in each step, beside those of the batch.
+    """
+
+    weight: float = 0.1
+    rays: int = 128
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or self.rays < 1:
+            raise ValueError("'weight' must not be negative, and 'rays' at least 1.")
+
+
+@dataclass(frozen=True, eq=False)
+class SparseDepth:
+    """Penalty on the relative distance between known points and the ends of rays through them, in the mean.
+
+    A ray ends in a sample with the probability of its weight. The error of an end is |t - d| / (`SPAN` d), at most 1, for a
+    point at distance d; not to end at all counts 1 too.
+
+    Attributes:
+        config: settings.
+        rays: from training cameras through points that their photographs show, clipped to the bounds.
+        distance: of the point on each ray, local units.
+    """
+
+    config: SparseDepthConfig
+    rays: Rays
+    distance: Float[Tensor, " n"]
+
+    @property
+    def note(self) -> str:
+        """What is supervised, in words."""
+        views = len(self.rays.view.unique())
+        return f"{len(self.rays):,} rays of {views} training photographs end at points of structure from motion"
+
+    def to(self, device: torch.device) -> SparseDepth:
+        """Move all tensors."""
+        return replace(self, rays=self.rays.to(device), distance=self.distance.to(device))
+
+    def __call__(self, field: Field, renderer: Renderer, ctx: Context) -> Float[Tensor, ""]:
+        """The weighted mean over random rays."""
+        assert isinstance(renderer, RayRenderer)
+        chosen = torch.randint(len(self.rays), (self.config.rays,), generator=ctx.generator).to(self.distance.device)
+        distance = self.distance[chosen]
+        _, trace = renderer.render_rays(field, self.rays[chosen], ctx)
+        assert trace.samples is not None
+        assert trace.weights is not None
+        at = distance[trace.samples.ray]
+        error = ((trace.samples.mid - at).abs() / (SPAN * at)).clamp_max(1)
+        return self.config.weight * (1 + (trace.weights * (error - 1)).sum() / len(chosen))
+
+
+def make_sparse_depth(chosen: SparseDepthConfig | None, scene: Scene, renderer: Renderer) -> SparseDepth | None:
+    """Make the penalty of a fit; ``None`` for none.
+
+    Args:
+        chosen: of the recipe. Without any, depths are used where photographs of open space came with points that they show.
+        scene: to fit.
+        renderer: of the fit. Only volume rendering by samples along rays, of densities or distances, has use for depths.
+    """
+    config = SparseDepthConfig() if chosen is None else chosen
+    if config.weight == 0 or not isinstance(renderer, Volumetric | Hybrid):
+        return None
+    if chosen is None and scene.bounds.space != "contracted":
+        return None
+    found = [_through_landmarks(view, index) for index, view in enumerate(scene.train)]
+    rays, distance = scene.bounds.clip(Rays.cat([ray for ray, _ in found])), torch.cat([depth for _, depth in found])
+    inside = (distance > rays.near) & (distance < rays.far)
+    return SparseDepth(config, rays[inside], distance[inside]) if bool(inside.any()) else None
+
+
+def _through_landmarks(view: View, index: int) -> tuple[Rays, Float[Tensor, " n"]]:
+    """Rays through a photograph's landmarks, and their distances; landmarks at pixels that do not count are left out."""
+    points = view.camera.position.new_zeros(0, 3) if view.landmarks is None else view.landmarks.to(view.camera.position)
+    pixels, depth = view.camera.project(points)
+    x, y = pixels.nan_to_num(-1).floor().long().unbind(1)
+    seen = (depth > 0) & (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)
+    if view.mask is not None:
+        seen &= view.mask[y.clamp(0, view.camera.height - 1), x.clamp(0, view.camera.width - 1)].bool()
+    of_view = torch.full((int(seen.sum()),), index)
+    rays = rays_through([view.camera], torch.zeros_like(of_view), pixels[seen], of_view)
+    return rays, (points[seen] - view.camera.position).norm(dim=1)
