@@ -25,6 +25,11 @@ def test_photographs_of_a_place_get_the_methods_for_open_spaces() -> None:
     boxed = replace(opaque, bounds=toy_scene(views=2, size=8).bounds)
     assert default_methods(boxed)[0] == CLOSED
     assert {*OPEN, *CLOSED} <= set(methods())
+    for name in ("volumetric/hash", OPEN[0], "volumetric/nerf"):
+        assert suggestion(load_method(name), opaque).startswith("--set data.init=sfm")
+    assert scene.points is not None
+    landmarks = scene.points.position[:3]
+    opaque = replace(opaque, train=tuple(replace(view, landmarks=landmarks) for view in opaque.train))
     for name in ("volumetric/hash", OPEN[0]):  # two photographs are few, but for scenes whose points are not known
         assert suggestion(load_method(name), opaque).startswith("splatting/gaussians, which starts from the 400 known points")
     assert suggestion(load_method(OPEN[1]), opaque) == ""

@@ -111,7 +111,7 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
             if "inconsistent_poses" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
             with memory.excluding():  # pictures that are rendered to forecast the evaluation's time are no part of the fit
-                prediction = _prediction(job, fit, forecast)
+                prediction = _prediction(job, scene, fit, forecast)
             for sentence in (*announcements([method.choice]), prediction):
                 print(sentence, file=sys.stderr)
             Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots, on_step).run()
@@ -156,14 +156,14 @@ def warm_up(fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
     return memory_forecast(fit.plan, method, memory.peak_bytes)
 
 
-def _prediction(job: Job, fit: Fit, memory: MemoryForecast) -> str:
-    """Forecast the fit's budget, memory and evaluation time in one sentence, before the fit starts."""
+def _prediction(job: Job, loaded: Scene, fit: Fit, memory: MemoryForecast) -> str:
+    """Forecast the fit's budget, memory and evaluation time in one sentence, before the fit starts; notes follow, on lines."""
     views = len(fit.plan.scene.test)
     seconds = expected_seconds(fit.plan.model, fit.plan.scene)
     evaluation = f"{views} test views in at most about {seconds:.0f} s"
     scene = fit.plan.scene
     advice = suggestion(job.method, scene)
-    notes = selection_notes(scene) + space_note(scene) + (f"\n  try also: {advice}" if advice else "")
+    notes = selection_notes(scene) + space_note(loaded) + (f"\n  try also: {advice}" if advice else "")
     notes += _exposures_note(job.method, scene) + _depth_note(job.method, fit.plan)
     return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{notes}"
 

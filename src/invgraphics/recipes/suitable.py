@@ -48,12 +48,14 @@ def default_methods(scene: Scene) -> tuple[tuple[str, ...], str]:
 def suggestion(method: Method, scene: Scene) -> str:
     """Suggest, in a sentence, what suits an open space better than a ray-marched method; empty where there is no such thing.
 
-    That is one with proposals, and Gaussians where photographs are few and points are known.
+    That is points to end its rays, where none are known; else Gaussians where photographs are few, and a method with proposals.
     """
     sampler = method.table["renderer"].get("sampler")
     name = split_name(method.name)[0]
     if not is_open_space(scene) or sampler is None or not name.startswith("volumetric/"):
         return ""
+    if not any(view.landmarks is not None for view in scene.train):
+        return f"--set data.init=sfm finds points in the photographs, where rays then end: without any, {name} may leave fog."
     if len(scene.train) < FEW and scene.points is not None:
         start = f"starts from the {len(scene.points):,} known points"
         return f"{OPEN[1]}, which {start}: from {len(scene.train)} photographs of an open space {name} may leave fog."
