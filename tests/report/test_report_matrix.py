@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from made_up_runs import made_up_run
@@ -171,6 +172,35 @@ def test_methods_are_compared_from_a_start_that_all_could_have(
     request, jobs, _, _ = comparing._resolve(request)
     assert {job.data.init for job in jobs} == {Job.of(fit).data.init for fit in request.fits()} == {start}
     assert ("--set data.init=" in request.shell()) == (start == "sfm" or bool(overrides))
+
+
+@pytest.mark.parametrize(
+    ("known", "alpha", "space", "overrides", "start"),
+    [
+        (False, False, "contracted", (), "sfm"),
+        (False, False, "contracted", ("data.init=random",), "random"),
+        (True, False, "contracted", (), "scene"),
+        (False, True, "contracted", (), "scene"),
+        (False, False, "box", (), "scene"),
+    ],
+)
+def test_photographs_of_an_open_space_without_points_are_searched_for_some(
+    known: bool,
+    alpha: bool,
+    space: Literal["box", "contracted"],
+    overrides: tuple[str, ...],
+    start: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = toy_scene(views=2, size=8, space=space)
+    train = tuple(view if alpha else replace(view, alpha=None) for view in scene.train)
+    scene = replace(scene, train=train, points=scene.points if known else None)
+    monkeypatch.setattr(comparing, "open_with_progress", lambda *_: scene)
+    monkeypatch.setattr(comparing, "degrade", lambda scene, *_: scene)
+    request = CompareRequest(scene="toy", methods=("volumetric/hash",), out=str(tmp_path), overrides=overrides)
+    request, jobs, _, _ = comparing._resolve(request)
+    assert {job.data.init for job in jobs} == {Job.of(fit).data.init for fit in request.fits()} == {start}
 
 
 def test_cells_are_those_of_the_table_of_recipes() -> None:

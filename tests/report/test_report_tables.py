@@ -255,6 +255,16 @@ def test_a_recipe_that_does_not_start_from_the_scene_s_points_says_so(comparison
     assert start_fact(nerf) == "random points"
 
 
+def test_methods_whose_rays_end_at_the_points_are_named(comparison_folder: Path) -> None:
+    def told(run: Run) -> Run:
+        depth = "9 rays end at points" if run.scores.method == "volumetric/nerf" else ""
+        return replace(run, provenance=replace(run.provenance, notes={"points": "from SfM"}, sparse_depth=depth))
+
+    runs = [told(run) for run in read_comparison(comparison_folder).runs]
+    assert start_fact(runs) == "from SfM; rays of volumetric/nerf end there"
+    assert start_fact([run for run in runs if not run.provenance.sparse_depth]) == "from SfM"
+
+
 def test_methods_without_points_do_not_say_what_others_start_from(comparison_folder: Path) -> None:
     def noted(run: Run) -> Run:
         words = "exact ones" if run.scores.method == "volumetric/nerf" else "from SfM"

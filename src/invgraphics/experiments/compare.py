@@ -21,7 +21,7 @@ from invgraphics.experiments.renderings import check_variants, is_kept
 from invgraphics.experiments.request import DATA, CompareRequest, FitRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
-from invgraphics.recipes.suitable import default_methods, starts_from_points
+from invgraphics.recipes.suitable import default_methods, is_open_space, starts_from_points
 from invgraphics.recipes.table import cell_of
 from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, SceneFacts
 from invgraphics.runs.folder import RunFolder, output_folder
@@ -110,7 +110,7 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     jobs, refused = _jobs(request)
     full = opened or open_with_progress(request.scene, jobs[0].options)
     if start := _start_for_all(request, jobs, full):
-        print(f"Methods start from points found in the training photographs ({start}); --set overrides.", file=sys.stderr)
+        print(f"Methods have points that are found in the training photographs ({start}); --set overrides.", file=sys.stderr)
         request = replace(request, overrides=(*request.overrides, start))
         jobs = [Job.of(replace(job.request, overrides=request.overrides), job.method) for job in jobs]
     methods = {job.request.method: job.method for job in jobs}
@@ -165,13 +165,15 @@ def _jobs(request: CompareRequest) -> tuple[list[Job], list[Refusal]]:
 
 
 def _start_for_all(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> str:
-    """Override that lets fields start from what photographs tell; empty where the request, or the scene, says what from.
+    """Override that gives methods the points which photographs tell; empty where the request, or the scene, says what from.
 
-    Points of a rendered scene are exact: no method could find them, and most have no use for them.
+    Points of a rendered scene are exact: no method could find them, and most have no use for them. In an open space all have
+    (see `invgraphics.training.views.sparse_depth`), and some data sets come without any.
     """
-    chosen = any(item.partition("=")[0] == START for item in request.data_overrides)
-    used = any(starts_from_points(job.method.table) for job in jobs)
-    return f"{START}=sfm" if used and not chosen and scene.notes.get("points") == EXACT_POINTS else ""
+    if any(item.partition("=")[0] == START for item in request.data_overrides):
+        return ""
+    exact = scene.notes.get("points") == EXACT_POINTS and any(starts_from_points(job.method.table) for job in jobs)
+    return f"{START}=sfm" if exact or (is_open_space(scene) and scene.points is None) else ""
 
 
 def _suitable(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> tuple[list[Job], list[Refusal]]:

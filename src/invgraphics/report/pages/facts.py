@@ -106,7 +106,7 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
 
 
 def start_fact(runs: Sequence[Run]) -> str:
-    """What the fits' fields may start from: by scene where scenes differ, by method where a recipe has a start of its own.
+    """What the fits' fields may start from, by scene or by method where these differ, and whose rays end at these points.
 
     Of methods that start from no points, the scene's points are told only where there are no others. Empty where no run says.
     """
@@ -119,6 +119,8 @@ def start_fact(runs: Sequence[Run]) -> str:
     for words in dict.fromkeys(words for words, _ in own if words):
         methods = list(dict.fromkeys(run.scores.method for each, run in own if each == words))
         starts.append(words if all(each == words for each, _ in own) else f"{words} ({listing(methods)})")
+    if supervised := list(dict.fromkeys(run.scores.method for run in runs if run.provenance.sparse_depth)):
+        starts.append(f"rays of {listing(supervised)} end there")
     return "; ".join(starts)
 
 
