@@ -8,7 +8,6 @@ import pytest
 import torch
 from tracked_plane import SIZE, photographs, workspace
 
-from invgraphics.config import fill
 from invgraphics.core import Bounds, Camera, Context, FieldValues, RayRenderer, Rays, Rendering, Samples, Scene, Trace, View
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_plan
@@ -63,15 +62,17 @@ def scene_of(views: list[View]) -> Scene:
     return Scene("plane", tuple(views), (), torch.zeros(3), Bounds(-torch.full((3,), 4.0), torch.full((3,), 4.0)))
 
 
-def made(scene: Scene, **settings: Any) -> SparseDepth | None:
-    return make_sparse_depth(fill(SparseDepthConfig, settings), scene, VolumetricConfig().build(scene))
+def made(scene: Scene) -> SparseDepth:
+    found = make_sparse_depth(SparseDepthConfig(), scene, VolumetricConfig().build(scene))
+    assert found is not None
+    return found
 
 
 def test_rays_go_from_their_cameras_through_the_landmarks() -> None:
     views, points, observed = photographs([1.0] * 4)
     shown = [replace(view, landmarks=points[rows]) for view, rows in zip(views, observed, strict=True)]
     found = made(scene_of(shown))
-    assert found is not None and len(found.rays) == sum(map(len, observed))
+    assert len(found.rays) == sum(map(len, observed))
     ends = found.rays.origins + found.distance[:, None] * found.rays.directions
     for index, (view, rows) in enumerate(zip(views, observed, strict=True)):
         own = found.rays.view == index
@@ -87,14 +88,17 @@ def test_landmarks_that_no_counted_pixel_shows_are_left_out() -> None:
     points = torch.tensor([[0.1, 0.0, 2.0], [-0.1, 0.0, 2.0], [0.1, 0.0, -2.0], [5.0, 0.0, 2.0], [0.1, 0.0, 9.0]])
     view = replace(view, camera=camera, landmarks=points)
     found = made(scene_of([view]))
-    assert found is not None and found.distance.tolist() == pytest.approx([2.0025, 2.0025], abs=1e-4)
+    assert found.distance.tolist() == pytest.approx([2.0025, 2.0025], abs=1e-4)
     mask = torch.arange(SIZE)[None, :].expand(SIZE, -1) >= SIZE // 2
     found = made(scene_of([replace(view, mask=mask)]))
-    assert found is not None and bool((found.rays.directions[:, 0] > 0).all())
-    assert made(scene_of([replace(view, mask=torch.zeros_like(mask))])) is None
-    assert made(scene_of([replace(view, landmarks=None)])) is None
-    assert made(scene_of([replace(view, landmarks=points[:0])])) is None
-    assert made(scene_of([view]), weight=0.0) is None
+    assert bool((found.rays.directions[:, 0] > 0).all())
+    for without in (
+        replace(view, mask=torch.zeros_like(mask)),
+        replace(view, landmarks=None),
+        replace(view, landmarks=points[:0]),
+    ):
+        with pytest.raises(InputError, match="show no known points"):
+            made(scene_of([without]))
 
 
 def test_a_colmap_reconstruction_tells_which_photographs_show_its_points(tmp_path: Path) -> None:
@@ -137,6 +141,15 @@ def test_volume_rendering_of_photographs_with_tracks_is_supervised(tmp_path: Pat
     assert not supervised("volumetric/hash", boxed) and supervised("volumetric/hash", boxed, "training.sparse_depth.rays=7")
     assert not supervised("volumetric/hash", scene, "training.poses.optimise=true")
     assert not supervised("volumetric/hash", replace(scene, train=tuple(replace(v, landmarks=None) for v in scene.train)))
+    unseen = replace(scene, train=tuple(replace(view, landmarks=None) for view in scene.train))
+    for method, where, more, reason in [
+        ("volumetric/hash", unseen, (), "show no known points"),
+        ("splatting/gaussians", scene, (), "only volume rendering"),
+        ("volumetric/hash", scene, ("training.poses.optimise=true",), "poses are optimised"),
+    ]:
+        with pytest.raises(InputError, match=f"training.sparse_depth cannot be used: .*{reason}"):
+            supervised(method, where, "training.sparse_depth.rays=7", *more)
+        assert not supervised(method, where, "training.sparse_depth.weight=0", *more)
     with pytest.raises(InputError, match="rays"):
         load_method("volumetric/hash", overrides=["training.sparse_depth.rays=0"])
 

@@ -75,8 +75,7 @@ def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: 
     poses = make_poses(recipe.training, scene)
     training = TrainingConfig() if recipe.training is None else recipe.training
     exposures = make_exposures(training.exposure, scene)
-    # Points were triangulated at the given poses.
-    depth = make_sparse_depth(training.sparse_depth, scene, model.renderer) if poses is None else None
+    depth = make_sparse_depth(training.sparse_depth, scene, model.renderer, fixed_poses=poses is None)
     optimiser = recipe.optimiser
     if poses is not None:
         optimiser = poses.config.optimiser(optimiser, _view_share(recipe, model.renderer, scene))

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from invgraphics.core import Context, Field, RayRenderer, Rays, Renderer, Scene, View
 from invgraphics.core.camera import rays_through
+from invgraphics.errors import InputError
 from invgraphics.renderers.hybrid import Hybrid
 from invgraphics.renderers.volumetric import Volumetric
 
@@ -81,23 +82,36 @@ class SparseDepth:
         return self.config.weight * (1 + (trace.weights * (error - 1)).sum() / len(chosen))
 
 
-def make_sparse_depth(chosen: SparseDepthConfig | None, scene: Scene, renderer: Renderer) -> SparseDepth | None:
+def make_sparse_depth(
+    chosen: SparseDepthConfig | None, scene: Scene, renderer: Renderer, *, fixed_poses: bool = True
+) -> SparseDepth | None:
     """Make the penalty of a fit; ``None`` for none.
 
     Args:
         chosen: of the recipe. Without any, depths are used where photographs of open space came with points that they show.
         scene: to fit.
         renderer: of the fit. Only volume rendering by samples along rays, of densities or distances, has use for depths.
+        fixed_poses: whether cameras stay where they are; points were triangulated there.
+
+    Raises:
+        InputError: depths are asked for, and cannot be used.
     """
     config = SparseDepthConfig() if chosen is None else chosen
-    if config.weight == 0 or not isinstance(renderer, Volumetric | Hybrid):
-        return None
-    if chosen is None and scene.bounds.space != "contracted":
+    if config.weight == 0 or (chosen is None and scene.bounds.space != "contracted"):
         return None
     found = [_through_landmarks(view, index) for index, view in enumerate(scene.train)]
     rays, distance = scene.bounds.clip(Rays.cat([ray for ray, _ in found])), torch.cat([depth for _, depth in found])
     inside = (distance > rays.near) & (distance < rays.far)
-    return SparseDepth(config, rays[inside], distance[inside]) if bool(inside.any()) else None
+    obstacle = ""
+    if not isinstance(renderer, Volumetric | Hybrid):
+        obstacle = "only volume rendering by samples along rays has use for depths"
+    elif not fixed_poses:
+        obstacle = "poses are optimised, and points were triangulated at the given ones"
+    elif not bool(inside.any()):
+        obstacle = f"the training photographs of '{scene.name}' show no known points"
+    if obstacle and chosen is not None:
+        raise InputError(f"training.sparse_depth cannot be used: {obstacle}.", "Leave it out, or find points by data.init=sfm.")
+    return None if obstacle else SparseDepth(config, rays[inside], distance[inside])
 
 
 def _through_landmarks(view: View, index: int) -> tuple[Rays, Float[Tensor, " n"]]:
