@@ -104,10 +104,9 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            folder.write(describe(job, (scene, shown), identity))
+            folder.write(describe(job, (scene, shown), identity, fit.plan))
             forecast = warm_up(fit, method, memory)
-            known = {"memory_forecast_bytes": forecast.bytes, "sparse_depth": sparse_depth_note(fit.plan)}
-            folder.write(replace(folder.read(Provenance), **known))
+            folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
             if "inconsistent_poses" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
             with memory.excluding():  # pictures that are rendered to forecast the evaluation's time are no part of the fit
@@ -197,13 +196,14 @@ def _evaluate(job: Job, scene: Scene, fit: Fit, spent: FitRecord) -> None:
         evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
 
 
-def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance:
+def describe(job: Job, scenes: tuple[Scene, Scene], identity: str, plan: Plan | None = None) -> Provenance:
     """Write the run's recipe, environment and truth; return its provenance as known before the fit.
 
     Args:
         job: of the run.
         scenes: as loaded, and as the fit sees it.
         identity: of the run.
+        plan: of the fit; ``None`` for none.
     """
     request, method, folder = job.request, job.method, job.folder
     scene, shown = scenes
@@ -236,6 +236,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str) -> Provenance
         device=str(job.device),
         test_poses=protocol_note(method),
         test_exposure=exposure_note(method, shown),
+        sparse_depth="" if plan is None else sparse_depth_note(plan),
     )
 
 
