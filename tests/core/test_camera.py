@@ -34,6 +34,22 @@ def test_rays_and_projection_undo_each_other() -> None:
     assert rays.view.tolist() == [4] * 50
 
 
+def test_the_pixel_of_a_point_is_the_one_whose_ray_meets_it() -> None:
+    """Points on the rays of all pixels, their mirror images behind the camera, and points at the picture's edges."""
+    view = camera()
+    points = view.rays().at(torch.rand(16 * 12, dtype=F64) + 0.5)
+    inside, pixel = view.pixel_of(torch.cat([points, 2 * view.position - points]))
+    assert inside.tolist() == [True] * 192 + [False] * 192
+    assert pixel.tolist() == [*range(192), *[0] * 192]
+    beside = [[e, 6.5] for e in (0.01, -0.01, 15.99, 16.01)] + [[8.5, e] for e in (0.01, -0.01, 11.99, 12.01)]
+    edges = torch.tensor(beside)
+    inside, pixel = view.pixel_of(view.rays(edges.double()).at(torch.ones(8, dtype=F64)))
+    assert inside.tolist() == [True, False] * 4
+    assert pixel.tolist() == [96, 0, 111, 0, 8, 0, 184, 0]
+    inside, pixel = view.pixel_of(view.position[None])  # projected nowhere
+    assert (inside.tolist(), pixel.tolist()) == ([False], [0])
+
+
 def test_axes_are_right_down_forward() -> None:
     view = camera()
     x, y, z = view.cam_to_world[:3, :3].unbind(dim=1)

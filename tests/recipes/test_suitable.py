@@ -27,6 +27,8 @@ def test_photographs_of_a_place_get_the_methods_for_open_spaces() -> None:
     assert {*OPEN, *CLOSED} <= set(methods())
     for name in ("volumetric/hash", OPEN[0], "volumetric/nerf"):
         assert suggestion(load_method(name), opaque).startswith("--set data.init=sfm")
+        moved = tuple(replace(view, ground_truth_pose=view.camera.cam_to_world) for view in opaque.train)
+        assert "data.init" not in suggestion(load_method(name), replace(opaque, train=moved))  # nothing is triangulated there
     assert scene.points is not None
     landmarks = scene.points.position[:3]
     opaque = replace(opaque, train=tuple(replace(view, landmarks=landmarks) for view in opaque.train))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from invgraphics.core.rays import Rays
@@ -71,6 +71,13 @@ class Camera:
         in_camera = (points - self.position) @ self.cam_to_world[:3, :3]
         z = in_camera[:, 2]
         return self.centre + self.focal * in_camera[:, :2] / z[:, None], z
+
+    def pixel_of(self, points: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, " n"], Int[Tensor, " n"]]:
+        """Find the pixel into which each point is projected: mask of points in the picture, and flat indices, 0 for others."""
+        place, z = self.project(points)
+        column, row = place.nan_to_num(-1).floor().long().unbind(dim=1)
+        inside = (z > 0) & (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
+        return inside, torch.where(inside, row * self.width + column, 0)
 
     def resized(self, width: int, height: int) -> Camera:
         """The camera of the same photograph resampled to ``width`` x ``height``."""

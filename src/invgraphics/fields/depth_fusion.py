@@ -78,10 +78,7 @@ def _projective_distances(
     points: Float[Tensor, "n 3"], camera: Camera, depth: Float[Tensor, "h w"]
 ) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
     """Projective signed distance of each point before its pixel's depth, -inf outside the picture; and that pixel's index."""
-    place, z = camera.project(points)
-    column, row = place.floor().long().unbind(dim=1)
-    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    pixel = torch.where(inside, row * camera.width + column, 0)
+    inside, pixel = camera.pixel_of(points)
     distance = depth.reshape(-1)[pixel] - (points - camera.position).norm(dim=1)
     return torch.where(inside, distance, -torch.inf), pixel
 

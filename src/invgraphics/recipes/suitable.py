@@ -16,7 +16,8 @@ OPEN = ("volumetric/hash-proposal", "splatting/gaussians")
 """Those for photographs of a place: a network of octaves alone would not be far after minutes."""
 FEW = 30
 """Fewer training photographs of a place than this leave fog to all ray-marched methods. With the 20 of colmap_statue proposals
-were 1.3 dB behind the occupancy grid, with the 43 of fox 1.1 dB ahead; Gaussians led both (160 px, 600 steps)."""
+were 1.3 dB behind the occupancy grid, with the 43 of fox 1.1 dB ahead; Gaussians led both (160 px, 600 steps, before rays
+ended at points)."""
 
 
 def is_open_space(scene: Scene) -> bool:
@@ -54,7 +55,8 @@ def suggestion(method: Method, scene: Scene) -> str:
     name = split_name(method.name)[0]
     if not is_open_space(scene) or sampler is None or not name.startswith("volumetric/"):
         return ""
-    if not any(view.landmarks is not None for view in scene.train):
+    # At disturbed poses none could be triangulated.
+    if all(view.landmarks is None and view.ground_truth_pose is None for view in scene.train):
         return f"--set data.init=sfm finds points in the photographs, where rays then end: without any, {name} may leave fog."
     if len(scene.train) < FEW and scene.points is not None:
         start = f"starts from the {len(scene.points):,} known points"

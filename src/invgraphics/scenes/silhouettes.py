@@ -46,10 +46,8 @@ def inside_silhouettes(points: Float[Tensor, "n 3"], views: Sequence[View]) -> B
         if view.alpha is None:
             continue
         index = inside.nonzero()[:, 0]
-        place, z = view.camera.project(points[index])
-        column, row = place.floor().long().unbind(dim=1)
-        seen = (z > 0) & (column >= 0) & (row >= 0) & (column < view.camera.width) & (row < view.camera.height)
-        pixel = (row * view.camera.width + column)[seen]
+        seen, pixel = view.camera.pixel_of(points[index])
+        pixel = pixel[seen]
         nearby = max_pool2d(view.opacity()[None, None], 3, stride=1, padding=1).reshape(-1)
         empty = nearby[pixel] <= LEAST_ALPHA
         if view.mask is not None:

@@ -85,10 +85,7 @@ def _pixels(view: View, points: Float[Tensor, "k 3"], rows: Int[Tensor, " k"]) -
     counts = view.opacity() if view.mask is None else view.opacity() * view.mask
     channels = view.colour().permute(2, 0, 1)
     picture, whole = (torch.nn.functional.adaptive_avg_pool2d(values, size) for values in (channels, counts[None]))
-    place, depth = view.camera.project(points.to(view.camera.cam_to_world))
-    x, y = (place / torch.tensor([width / size[1], height / size[0]])).floor().nan_to_num(-1).unbind(1)
-    inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < size[1]) & (y < size[0])
-    pixel = y[inside].long(), x[inside].long()
-    colour = picture[:, *pixel]
-    usable = (colour.amin(dim=0) > DARKEST) & (colour.amax(dim=0) < BRIGHTEST) & (whole[0, *pixel] > ALL)
+    inside, pixel = view.camera.resized(size[1], size[0]).pixel_of(points.to(view.camera.cam_to_world))
+    colour, opaque = picture.flatten(1)[:, pixel[inside]], whole.flatten()[pixel[inside]]
+    usable = (colour.amin(dim=0) > DARKEST) & (colour.amax(dim=0) < BRIGHTEST) & (opaque > ALL)
     return rows[inside][usable].numpy(), colour[:, usable].log().mean(dim=0).double().numpy()

@@ -13,14 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core import Context, Field, RayRenderer, Rays, Renderer, Scene, View
-from invgraphics.core.camera import rays_through
+from invgraphics.core import Context, Field, RayRenderer, Rays, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.renderers.hybrid import Hybrid
 from invgraphics.renderers.volumetric import Volumetric
 
 SPAN = 0.5
-"""Share of a point's distance from which on the error of a ray's end is no longer counted as larger: some points are wrong."""
+"""Share of a point's distance at which the error of a termination saturates: some points are wrong."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +43,10 @@ class SparseDepthConfig:
 
 @dataclass(frozen=True, eq=False)
 class SparseDepth:
-    """Penalty on the relative distance between known points and the ends of rays through them, in the mean.
+    """Penalty: the expected relative error of the termination distance of rays through known points, their mean.
 
-    A ray ends in a sample with the probability of its weight. The error of an end is |t - d| / (`SPAN` d), at most 1, for a
-    point at distance d; not to end at all counts 1 too.
+    A ray terminates in a sample with the probability of its weight. The error is |t - d| / (`SPAN` d), at most 1, for a point
+    at distance d; not to terminate counts 1 too. (DS-NeRF takes a KL divergence from a Gaussian around the point instead.)
 
     Attributes:
         config: settings.
@@ -99,29 +98,31 @@ def make_sparse_depth(
     config = SparseDepthConfig() if chosen is None else chosen
     if config.weight == 0 or (chosen is None and scene.bounds.space != "contracted"):
         return None
-    found = [_through_landmarks(view, index) for index, view in enumerate(scene.train)]
-    rays, distance = scene.bounds.clip(Rays.cat([ray for ray, _ in found])), torch.cat([depth for _, depth in found])
-    inside = (distance > rays.near) & (distance < rays.far)
-    obstacle = ""
     if not isinstance(renderer, Volumetric | Hybrid):
         obstacle = "only volume rendering by samples along rays has use for depths"
     elif not fixed_poses:
         obstacle = "poses are optimised, and points were triangulated at the given ones"
-    elif not bool(inside.any()):
+    else:
+        rays, distance = _through_landmarks(scene)
+        if len(rays):
+            return SparseDepth(config, rays, distance)
         obstacle = f"the training photographs of '{scene.name}' show no known points"
-    if obstacle and chosen is not None:
+    if chosen is not None:
         raise InputError(f"training.sparse_depth cannot be used: {obstacle}.", "Leave it out, or find points by data.init=sfm.")
-    return None if obstacle else SparseDepth(config, rays[inside], distance[inside])
+    return None
 
 
-def _through_landmarks(view: View, index: int) -> tuple[Rays, Float[Tensor, " n"]]:
-    """Rays through a photograph's landmarks, and their distances; landmarks at pixels that do not count are left out."""
-    points = view.camera.position.new_zeros(0, 3) if view.landmarks is None else view.landmarks.to(view.camera.position)
-    pixels, depth = view.camera.project(points)
-    x, y = pixels.nan_to_num(-1).floor().long().unbind(1)
-    seen = (depth > 0) & (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)
-    if view.mask is not None:
-        seen &= view.mask[y.clamp(0, view.camera.height - 1), x.clamp(0, view.camera.width - 1)].bool()
-    of_view = torch.full((int(seen.sum()),), index)
-    rays = rays_through([view.camera], torch.zeros_like(of_view), pixels[seen], of_view)
-    return rays, (points[seen] - view.camera.position).norm(dim=1)
+def _through_landmarks(scene: Scene) -> tuple[Rays, Float[Tensor, " n"]]:
+    """Rays from training cameras through their landmarks within the bounds and at pixels that count, and the distances."""
+    found, distances = [], []
+    for index, view in enumerate(scene.train):
+        camera = view.camera
+        points = camera.position.new_zeros(0, 3) if view.landmarks is None else view.landmarks.to(camera.position)
+        seen, pixel = camera.pixel_of(points)
+        if view.mask is not None:
+            seen &= view.mask.reshape(-1)[pixel].bool()
+        found.append(camera.rays(camera.project(points[seen])[0], index))
+        distances.append((points[seen] - camera.position).norm(dim=1))
+    rays, distance = scene.bounds.clip(Rays.cat(found)), torch.cat(distances)
+    inside = (distance > rays.near) & (distance < rays.far)
+    return rays[inside], distance[inside]
