@@ -41,21 +41,21 @@ class Fixed(RayRenderer):
 
 
 def test_the_penalty_is_that_of_a_loop_over_samples() -> None:
-    """Three rays whose points are at 1, 3 and 4: ends far off, all in one place, and none at all."""
-    distance = torch.tensor([1.0, 3.0, 4.0])
+    """Rays whose points are at 1, 2, 3 and 4: ends far off, near by, all in one place, and none at all."""
+    views, distance = [0, 0, 1, 2], torch.tensor([1.0, 2.0, 3.0, 4.0])
     expected = []
-    for weights, d in zip(Fixed.WEIGHTS.tolist(), distance.tolist(), strict=True):
+    for view, d in zip(views, distance.tolist(), strict=True):
         total, rest = 0.0, 1.0
-        for weight, t in zip(weights, (1.0, 2.0, 3.0), strict=True):
+        for weight, t in zip(Fixed.WEIGHTS[view].tolist(), (1.0, 2.0, 3.0), strict=True):
             total += weight * min(abs(t - d) / (0.5 * d), 1.0)
             rest -= weight
         expected.append(total + rest)
     ctx = Context(Bounds(-torch.ones(3), torch.ones(3)), training=True, generator=torch.Generator().manual_seed(0))
-    for index, value in enumerate(expected):
-        rays = Rays.make(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), view=index)
+    for index, (view, value) in enumerate(zip(views, expected, strict=True)):
+        rays = Rays.make(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), view=view)
         penalty = SparseDepth(SparseDepthConfig(weight=0.5, rays=4), rays, distance[index : index + 1])
         assert float(penalty(None, Fixed(), ctx)) == pytest.approx(0.5 * value, abs=1e-6)  # pyright: ignore[reportArgumentType]
-    assert expected == pytest.approx([0.2 + 0.3 + 0.4, 0.0, 1.0])
+    assert expected == pytest.approx([0.2 + 0.3 + 0.4, 0.1 + 0.3 + 0.4, 0.0, 1.0])
 
 
 def scene_of(views: list[View]) -> Scene:
@@ -116,7 +116,7 @@ def test_a_colmap_reconstruction_tells_which_photographs_show_its_points(tmp_pat
     assert scene.notes["landmarks"].startswith(f"{count:,} views of points")
 
 
-@pytest.mark.parametrize("changes", [{"pose_noise": 1.0}, {"init": "random"}])
+@pytest.mark.parametrize("changes", [{"pose_noise": 1.0}, {"pose_noise": 1.0, "init": "sfm"}, {"init": "random"}])
 def test_landmarks_are_dropped_with_the_poses_or_points_they_belong_to(tmp_path: Path, changes: dict[str, Any]) -> None:
     scene = open_scene(str(workspace(tmp_path / "plane", [1.0] * 10)), SceneOptions())
     found = degrade(scene, TrainingData(**changes), 0)
