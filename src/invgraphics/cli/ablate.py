@@ -116,7 +116,7 @@ class Ablate:
         """Print the forecast, and ask for confirmation where it is long.
 
         Raises:
-            InputError: the answer was no, or there is nobody to ask.
+            InputError: the answer was no, or no terminal could give one.
         """
         print(forecast, file=sys.stderr, flush=True)
         if self.yes or forecast.hours <= MOST_HOURS:

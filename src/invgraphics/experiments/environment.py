@@ -38,7 +38,7 @@ def commit(root: Path | None = None) -> str:
     """Git commit of the working copy that this package lies in, ``+ changes`` where tracked files differ from it; else empty.
 
     Args:
-        root: of the repository; ``None`` for the package's own. An installed package lies in nobody's repository.
+        root: of the repository; ``None`` for the package's own. An installed package lies in none.
     """
     root = root or Path(__file__).resolve().parents[3]
     if not (root / ".git").exists():

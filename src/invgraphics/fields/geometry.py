@@ -54,7 +54,7 @@ def query_geometry(
             moving = position.detach().requires_grad_()
         features = followed = encode(moving)
         if training and moving is not position:
-            # Encoded again: backward would spend more on a gradient in these positions, which nobody asks for.
+            # Encoded again: backward would spend more on a gradient in these positions, which is not needed.
             again = encode(position)
             features = again if again.requires_grad else followed
         for (part,) in chunks(features):

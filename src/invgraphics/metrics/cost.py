@@ -36,7 +36,7 @@ class PeakMemory:
         self._recorded = self._paused = False
 
     def __enter__(self) -> PeakMemory:
-        return_freed_memory()  # else what the process did before would be room that nobody sees being taken
+        return_freed_memory()  # memory freed before would hide growth within it
         self._restart()
         self._start = self._peak = self._held()
         if self._device.type != "cuda" and not self._recorded:

@@ -98,7 +98,7 @@ SCALED = "_at_1_"
 """Between a metric's name and the divisor of the test views' size, where it is of smaller pictures."""
 
 MARGINS = {"psnr": 0.2, "ssim": 0.005, "ms_ssim": 0.005, "flip": 0.005, "lpips": 0.01}
-"""Metric -> difference below which methods count as equal, where a study states no other: about what nobody sees."""
+"""Metric -> difference below which methods count as equal, where a study states no other: about what cannot be seen."""
 
 _GEOMETRY = ("depth_", "normal_", "alpha_", "pose_", "chamfer", "surface_", "f_score")
 

@@ -122,7 +122,7 @@ class RunFolder:
 
         with locks.locked(self.root, self.root / locks.INSIDE, waiting if wait else None):
             for pattern in TEMPORARY:
-                for left in self.root.glob(pattern):  # by a process that was killed; nobody else writes here now
+                for left in self.root.glob(pattern):  # by a process that was killed; the lock keeps others out
                     left.unlink(missing_ok=True)
             yield
 

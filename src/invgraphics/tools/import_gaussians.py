@@ -73,7 +73,7 @@ def import_run(request: ImportRequest) -> Path:
     job = replace(job, method=method_for(job.method, request.file, splats.gaussians))
     axes = request.frame or splats.axes
     folder = job.folder
-    _check_empty(folder)  # before the work, and again when nobody else can write there
+    _check_empty(folder)  # before the work, and again under the lock
     scene = open_with_progress(job.request.scene, job.options)
     gaussians = transform_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
     folder.create()

@@ -24,7 +24,7 @@ _ALPHA_MIN, _ALPHA_MAX = tl.constexpr(types.ALPHA_MIN), tl.constexpr(types.ALPHA
 _TRANSMITTANCE_MIN = tl.constexpr(types.TRANSMITTANCE_MIN)
 
 TILE = 8
-"""Edge of a tile in pixels where nobody chooses one. With 16 a step takes twice as long (H200, 800 pixels, 300,000 splats)."""
+"""Edge of a tile in pixels by default. With 16 a step takes twice as long (H200, 800 pixels, 300,000 splats)."""
 CHANNELS = 3
 """Features that one pass composites; more of them take more passes."""
 WARPS = 1

@@ -19,7 +19,7 @@ from invgraphics.kernels.numba.simd.partial import floats_at, unowned
 SAMPLE = 61
 """Every so many-th point tells where on a lattice the work lies: a prime, so that it keeps step with no number of samples."""
 TARGET = np.dtype([(name, np.int64) for name in ("gradient", "copy")])
-"""Per lattice: address of its features' gradient, 0 where nobody wants it; first float in a job's copy, -1 for no copy."""
+"""Per lattice: address of its features' gradient, 0 where none is wanted; first float in a job's copy, -1 for no copy."""
 PASS = np.dtype([(name, np.int64) for name in ("first", "end", "pivot", "copied")])
 """A pass over a group of lattices (see `passes_over`)."""
 _FLOAT = 4
