@@ -49,7 +49,7 @@ def main(folder: Path) -> None:
     for split in SPLITS:
         for index, camera in enumerate(views[split]):
             if os.getppid() != parent:
-                sys.exit("the process that asked for this rendering has ended")  # finished views stay in the cache
+                sys.exit("nobody waits for this rendering any more")  # what is done stays, and is gone on with
             write_progress(done, job.total, f"{split} {index:04d}")
             if not folders.view_paths(folder, split, index)[1].exists():
                 _render_view(job, scene, model, folder, (split, index, camera))
