@@ -180,10 +180,10 @@ def test_a_hook_restarts_rates_and_drops_all_moments(scene):
     for moments, left in (("keep", True), ("drop_all", False)):
         fit = fit_of(scene, "voxels", 4, at=[0.5], resolution=9, moments=moments, restart_rates=True)
         advance(fit, 2)
-        before = int(fit.state()["optimiser"]["field.geometry_net.output.weight/step"])
+        before = int(fit.state()["optimiser"]["field.geometry_net.output.bias/step"])
         fit.step()
         after = fit.state()["optimiser"]
-        assert int(after["field.geometry_net.output.weight/step"]) - before == (1 if left else -1)
+        assert int(after["field.geometry_net.output.bias/step"]) - before == (1 if left else -1)
         assert float(after["restarted"]) == 0.5
         assert fit._optimiser.rate_of("field.encoding.levels.0") == pytest.approx(0.05)
 
