@@ -192,6 +192,22 @@ def test_names_are_read() -> None:
     assert changed.folder == "gaussian-volume-exact-opacity=physical-steps=7"
 
 
+def test_a_variant_has_the_preset_of_the_fit_or_its_own() -> None:
+    """Shorter steps of a longer fit are shown as they were fitted, by whatever renderer has such a preset."""
+    laptop, long = (load_method("volumetric/hash", preset).table["renderer"] for preset in ("laptop", "long"))
+    assert laptop != long
+    assert variant_named("volumetric/hash").table == laptop
+    assert variant_named("volumetric/hash", "long").table == long
+    assert variant_named("volumetric/hash:preset=laptop", "long").table == laptop
+    assert variant_named("volumetric/hash:sampler.chunk=7:preset=long").table["sampler"]["chunk"] == 7
+    assert variant_named("gaussian-volume/exact", "no such preset").table == variant_named("gaussian-volume/exact").table
+    with pytest.raises(InputError, match="has no preset 'fine'"):
+        variant_named("volumetric/hash:preset=fine")
+    request = FitRequest(method="volumetric/hash", scene="bricks", budget="5min", out="x", render_with=("volumetric/hash",))
+    job = Job.of(request)
+    assert job.method.preset == "long" and job.variants[0].table == long
+
+
 def test_the_command_line_has_it() -> None:
     words = ["bricks", "--methods", METHOD, "--render-with", f"{RAY},{METHOD}:dilation=0"]
     assert parse(Compare, "invgraphics compare", words).request().render_with == (RAY, f"{METHOD}:dilation=0")

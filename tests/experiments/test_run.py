@@ -23,6 +23,8 @@ from invgraphics.experiments import evaluate
 from invgraphics.experiments import run as module
 from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.fitted import open_fitted
+from invgraphics.experiments.identity import TruthDigest, check_replaceable, identify
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.runs.checkpoint import load, save
@@ -140,6 +142,42 @@ def test_timing_costs_few_pictures_more_where_normals_are_scored(
 def test_same_seed_gives_the_same_bits(run: Path, toy_folder: Path, tmp_path: Path) -> None:
     again = fit_run(_request(toy_folder, tmp_path / "b"))
     assert _same_checkpoint(run, again)
+
+
+def test_another_protocol_scores_the_same_fit(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    """A finished fit is not made again, nor lost, because its pictures are to be judged otherwise."""
+    folder = shutil.copytree(run, tmp_path / "run")
+    checkpoint, scores = ((folder / name).read_bytes() for name in ("checkpoint.safetensors", "scores.json"))
+    first = json.loads((folder / "fit.json").read_text())
+    fit_run(replace(_request(toy_folder, folder), protocol="float", existing="reuse"))
+    assert (folder / "checkpoint.safetensors").read_bytes() == checkpoint
+    assert json.loads((folder / "fit.json").read_text()) == first
+    assert (folder / "scores.json").read_bytes() == scores
+    other = json.loads((folder / "scores.float.json").read_text())
+    assert other["protocol"] == "float" and other["views"] == json.loads(scores)["views"]
+
+
+@pytest.mark.parametrize(("changes", "threads", "said"), [({"device": "cuda"}, None, "device"), ({}, 3, "number of threads")])
+def test_a_fit_on_another_machine_is_not_replaced_unasked(
+    run: Path, toy_folder: Path, tmp_path: Path, changes: dict[str, str], threads: int | None, said: str
+) -> None:
+    folder = shutil.copytree(run, tmp_path / "run")
+    record = json.loads((folder / "provenance.json").read_text())
+    (folder / "provenance.json").write_text(json.dumps(record | changes))
+    job = Job.of(_request(toy_folder, folder))
+    with pytest.raises(InputError, match=f"holds another run: its {said} is"):
+        check_replaceable(job, threads)
+    check_replaceable(Job.of(_request(toy_folder, run)), torch.get_num_threads())
+
+
+def test_a_field_that_starts_from_a_changed_file_is_another_fit(toy_folder: Path, tmp_path: Path) -> None:
+    source = tmp_path / "hull.ply"
+    request = replace(_request(toy_folder, tmp_path / "run"), method="surface/mesh", overrides=(f"field.source={source}",))
+    found = []
+    for content in (b"one", b"two", b"one"):
+        source.write_bytes(content)
+        found.append(identify(Job.of(request), TruthDigest(("a", "b", "c"), "d"), 1))
+    assert found[0] == found[2] != found[1]
 
 
 def test_existing_runs_are_not_overwritten(run: Path, toy_folder: Path) -> None:

@@ -247,6 +247,18 @@ def test_nothing_is_culled_before_the_field_was_fitted_at_all(make_scene: Callab
     assert 0.3 < float(sampler.occupied.float().mean()) < 0.7
 
 
+@pytest.mark.parametrize(("grace", "warmup"), [(0, 32), (32, 32), (40, 8), (100, 32), (16, 0)])
+def test_no_cell_is_culled_that_was_never_looked_at(make_scene: Callable[..., Scene], grace: int, warmup: int) -> None:
+    """The first refresh looks at all cells however late it comes, though later ones look at few."""
+    scene, solid = make_scene(), Sphere(40.0, 0.9)
+    sampler = replace(SMALL, grace=grace, warmup=warmup, every=16, cells=16).build(scene)
+    for _ in range(grace + 17):
+        sampler.update(solid, context(scene))
+    centres = (torch.stack(torch.meshgrid(*[torch.arange(16)] * 3, indexing="ij"), dim=-1) + 0.5) / 16
+    inside = scene.bounds.from_unit(centres).norm(dim=-1) < 0.9 - 3.0 / 16  # with all of their points
+    assert bool(sampler.occupied[inside].all()) and not bool(sampler.occupied.all())
+
+
 def test_the_long_preset_gives_up_nothing_as_thick_as_the_fog_it_starts_with(make_scene: Callable[..., Scene]) -> None:
     """A cable that few rays have met is no denser than the fog was when its surroundings are long clear or opaque."""
     scene, recipe = make_scene(), load_method("volumetric/hash", "long").recipe

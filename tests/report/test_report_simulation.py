@@ -258,6 +258,41 @@ def test_questions_that_say_each_are_answered_for_each() -> None:
     assert answers == {f"{A}: field.size 16 instead of 8": True, f"{B}: field.size 16 instead of 8": False}
 
 
+@pytest.mark.parametrize("scenes", [1, 4])
+def test_a_sign_that_depends_on_another_factor_is_no_common_effect(scenes: int) -> None:
+    """Half of the fits gain 5 dB and the others lose 3: the mean of 1 dB describes none of them."""
+    rng = np.random.default_rng(16)
+    views = Factor("data.train_views", ("5", "40"), "5", {"5": "5 views", "40": "40 views"})
+    observations = []
+    for level, gain in (("5", -3.0), ("40", 5.0)):
+        noisy = lambda s, k, t, g=gain: 20 + s + g * (t == "16") + rng.normal(0, 0.05)  # noqa: E731
+        observations += observe((scenes, 3), noisy, SIZE, **{views.path: level})
+    (effect,) = effects_of([Contrast(SIZE.path, "8", "16")], PSNR, observations, factors=[SIZE, views])
+    assert effect.opposed and effect.found and effect.estimate.mean == pytest.approx(1, abs=0.1)
+    assert {name: one.sign for name, one in effect.by_setting.items()} == {"5 views": -1, "40 views": 1}
+    sentence = effect_sentence(effect)
+    assert "gains" not in sentence and "the sign depends on what else is chosen" in sentence
+    assert sentence.index("(5 views)") < sentence.index("(40 views)") < sentence.index("on average")
+    for name, one in effect.by_setting.items():  # each alone, as if the other had not been fitted
+        (alone,) = effects_of([Contrast(SIZE.path, "8", "16", {views.path: name.split()[0]})], PSNR, observations)
+        assert (one.estimate, one.across) == (alone.estimate, alone.across) and not alone.by_setting
+
+
+def test_a_setting_without_effect_does_not_oppose_one_that_has() -> None:
+    """Null settings beside a strong one: at most one study in twenty may read a sign into them."""
+
+    def once(rng: np.random.Generator) -> bool:
+        observations = []
+        for level, gain in (("5", 0.0), ("12", 0.0), ("40", 5.0)):
+            noisy = lambda s, k, t, g=gain: 20 + g * (t == "16") + rng.normal(0, 0.5)  # noqa: E731
+            observations += observe((1, 4), noisy, SIZE, **{"data.train_views": level})
+        (effect,) = effects_of([Contrast(SIZE.path, "8", "16")], PSNR, observations)
+        assert "averaged over 3 settings" in effect_sentence(effect)
+        return effect.opposed
+
+    assert rate(200, once) < 0.05
+
+
 MANY = Factor(METHOD, tuple("abcdefg"), "a")
 
 

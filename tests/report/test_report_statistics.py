@@ -202,7 +202,7 @@ def test_sentences() -> None:
     assert nothing.endswith(" would be found with 80% power after correction for 5 comparisons.")
     doubtful = effect_with(-2.1, 0.3, adjusted=0.08)
     assert not doubtful.found
-    assert "with 5 comparisons in this study that may be chance (corrected p = 0.08)" in effect_sentence(doubtful)
+    assert "with 5 such comparisons that may be chance (corrected p = 0.08)" in effect_sentence(doubtful)
     flip = quality_quantity("flip", Score(mean=0.0, higher_is_better=False))
     assert "costs 0.030 FLIP [0.020, 0.040]" in effect_sentence(effect_with(0.03, 0.01, quantity=flip))
     alone = Estimate(-1.0, -1.0, -1.0, None, "none", 1, (1, 1))

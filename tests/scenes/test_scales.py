@@ -102,6 +102,9 @@ def test_scores_at_a_scale_are_those_of_smaller_pictures(scene: Scene) -> None:
     assert quality["psnr_at_1_2"].mean == pytest.approx(float(torch.stack(errors).mean()), abs=0.1)
     assert scaled_scores(model, scene, "float", {}) == ({}, {})
     assert set(scaled_scores(model, scene, "float", {"test_scales": [2]}, refined=True)[1]) == {"psnr_at_1_2", "ssim_at_1_2"}
+    of_a_class = replace(scene, train=tuple(replace(view, subject=0) for view in scene.train))
+    quality, skipped = scaled_scores(model, of_a_class, "float", {"test_scales": [2]})
+    assert of_a_class.is_class and not quality and all("inferred" in why for why in skipped.values()) and len(skipped) == 2
 
 
 @pytest.mark.parametrize(

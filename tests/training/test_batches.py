@@ -26,6 +26,16 @@ def one_pixel(toy: Scene) -> Scene:
     return replace(toy, train=(replace(toy.train[0], alpha=alpha),))
 
 
+def test_a_mask_thinner_than_a_small_picture_s_pixels_is_drawn_from_the_large_one(toy: Scene) -> None:
+    mask = torch.zeros(12, 12, dtype=torch.bool)
+    mask[:, 5] = True
+    scene = replace(toy, train=(replace(toy.train[0], mask=mask),))
+    config = BatchConfig(rays=40, views=1, resolution=(0.25, 1.0), until=(0.5,))
+    rays, _ = Batches(config, scene, torch.Generator().manual_seed(0), CPU).rays(0.0)
+    pixels = scene.train[0].camera.project(rays.origins + rays.directions)[0]
+    torch.testing.assert_close(pixels[:, 0], torch.full((40,), 5.5), atol=1e-3, rtol=0)
+
+
 def test_rays_on_the_foreground_are_the_share_asked_for(one_pixel: Scene) -> None:
     batches = Batches(BatchConfig(rays=200, views=1, foreground=0.75), one_pixel, torch.Generator().manual_seed(0), CPU)
     _, batch = batches.rays()

@@ -79,6 +79,21 @@ def test_the_monitor_sees_every_pixel_of_small_views_once(scene, make_fit, monke
     assert Monitor(scene, torch.device("cpu")).psnr(fit) == pytest.approx(_psnr(fit), abs=1e-4)
 
 
+@pytest.mark.parametrize("most", [40, 4096])
+def test_the_monitor_looks_only_at_pixels_that_count(scene, make_fit, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    """Whatever stands where a view is masked out, the curve is the same."""
+    monkeypatch.setattr(Monitor, "PIXELS", most)
+    fit, found = make_fit("splatting/gaussians", scene, 1), []
+    for colour in (0.0, 0.9):
+        views = []
+        for view in scene.test:
+            mask = torch.arange(view.camera.width).expand(view.camera.height, -1) % 3 == 1
+            image = torch.where(mask[..., None], view.over(scene.background), colour)
+            views.append(replace(view, image=image, alpha=None, mask=mask))
+        found.append(Monitor(scene.with_views(test=tuple(views), val=()), torch.device("cpu")).psnr(fit))
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_test_pixels_never_reach_the_fit(name: str, scene, make_fit) -> None:
     noise = tuple(replace(view, image=torch.randint(0, 255, view.image.shape, dtype=torch.uint8)) for view in scene.test)

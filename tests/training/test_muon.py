@@ -3,16 +3,20 @@
 import pytest
 import torch
 
+from invgraphics.experiments.build import build_model
+from invgraphics.recipes.recipe import load_method
+from invgraphics.testing import toy_scene
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 from invgraphics.training.optimisers.adam import DenseAdam
-from invgraphics.training.optimisers.muon import MOMENTUM, Muon, orthogonalised
+from invgraphics.training.optimisers.muon import MOMENTUM, Muon, orthogonalised, takes_muon
 
 SHAPES = {
-    "field.hidden": (32, 24),
+    "field.hidden.weight": (32, 24),
     "field.bias": (32,),
-    "field.output": (3, 32),
+    "field.output.weight": (3, 32),
     "field.table": (4096, 2),
-    "renderer.hidden": (16, 64),
+    "field.features": (80, 16),
+    "renderer.hidden.weight": (16, 64),
 }
 GROUPS = {"field": GroupConfig("field", 1e-2, final=1e-3), "renderer": GroupConfig("renderer", 2e-2)}
 
@@ -55,22 +59,35 @@ def test_steps_are_those_of_torchs_own_class() -> None:
     assert torch.allclose(muon.state[ours][MOMENTUM], judge.state[theirs]["momentum_buffer"])
 
 
-def test_hidden_matrices_take_muons_steps_and_all_else_adams() -> None:
+def test_weights_take_muons_steps_and_all_else_adams() -> None:
     (with_muon, optimiser), (alone, adam) = made(3.0), made(0.0)
     for seed in range(3):
         step(with_muon, optimiser, seed)
         step(alone, adam, seed)
     same = {name for name in SHAPES if torch.equal(with_muon[name], alone[name])}
-    assert same == {"field.bias", "field.output", "field.table"}
-    assert {key.rpartition("/")[2] for key in optimiser.state() if key.startswith("field.hidden/")} == {MOMENTUM}
+    assert same == {"field.bias", "field.output.weight", "field.table", "field.features"}
+    assert {key.rpartition("/")[2] for key in optimiser.state() if key.startswith("field.hidden.weight/")} == {MOMENTUM}
+
+
+@pytest.mark.parametrize("components", [15, 16])
+def test_layers_and_factor_lines_take_muon_however_many_components(components: int) -> None:
+    changes = [f"field.{lattice}.components={components}" for lattice in ("encoding", "appearance")]
+    method = load_method("volumetric/tensorf-vm", "laptop", changes)
+    model = build_model(method, toy_scene(views=2, size=8), 0, torch.device("cpu"))
+    named = {name: parameter for part in model.parts.values() for name, parameter in part.named_parameters()}
+    chosen = {name for name, parameter in named.items() if takes_muon(name, parameter)}
+    linear = {name for name, one in model.field.named_modules() if isinstance(one, torch.nn.Linear)}
+    lines = {f"{lattice}.lines.{axis}" for lattice in ("encoding", "appearance") for axis in "xyz"}
+    assert lines < chosen and {name.removesuffix(".weight") for name in chosen - lines} <= linear
+    assert not any(takes_muon(f"field.{name}", torch.zeros(80, 16)) for name in ("table", "codes", "features", "planes.xy"))
 
 
 def test_a_steps_size_is_adams_times_the_factor() -> None:
     """The first step of Adam has entries of +-lr; Muon's have a root mean square of a fifth of its rate (arXiv 2502.16982)."""
     parameters, optimiser = made(3.0)
-    before = parameters["renderer.hidden"].detach().clone()
+    before = parameters["renderer.hidden.weight"].detach().clone()
     step(parameters, optimiser, 0)
-    size = (parameters["renderer.hidden"].detach() - before).square().mean().sqrt()
+    size = (parameters["renderer.hidden.weight"].detach() - before).square().mean().sqrt()
     assert float(size) == pytest.approx(0.2 * 3 * 2e-2, rel=0.15)
 
 
@@ -78,7 +95,7 @@ def test_rates_follow_progress_and_are_said_without_the_factor() -> None:
     parameters, optimiser = made(3.0)
     optimiser.set_progress(1.0)
     assert optimiser.rates() == pytest.approx({"field": 1e-3, "renderer": 2e-2})
-    for name, rate in (("field.hidden", 3e-3), ("renderer.hidden", 6e-2)):
+    for name, rate in (("field.hidden.weight", 3e-3), ("renderer.hidden.weight", 6e-2)):
         alone = torch.nn.Parameter(parameters[name].detach().clone())
         judge = Muon([{"params": [alone], "lr": rate}])
         parameters[name].grad = torch.ones_like(alone).cumsum(0)
@@ -108,10 +125,10 @@ def test_a_matrix_of_another_shape_begins_with_the_momentum_it_is_given() -> Non
     parameters, optimiser = made(2.0)
     step(parameters, optimiser, 0)
     new = torch.nn.Parameter(torch.zeros(20, 24))
-    optimiser.replace("field.hidden", new, lambda moment: moment[:20])
-    assert optimiser.state()[f"field.hidden/{MOMENTUM}"].shape == (20, 24)
-    optimiser.replace("field.hidden", torch.nn.Parameter(torch.zeros(18, 24)))
-    assert f"field.hidden/{MOMENTUM}" not in optimiser.state()
+    optimiser.replace("field.hidden.weight", new, lambda moment: moment[:20])
+    assert optimiser.state()[f"field.hidden.weight/{MOMENTUM}"].shape == (20, 24)
+    optimiser.replace("field.hidden.weight", torch.nn.Parameter(torch.zeros(18, 24)))
+    assert f"field.hidden.weight/{MOMENTUM}" not in optimiser.state()
 
 
 def test_a_negative_factor_is_refused() -> None:

@@ -69,8 +69,10 @@ def test_mask_loss_calls_back_what_is_nearly_gone() -> None:
     )
 
 
-def test_mask_loss_of_opaque_photographs_is_nothing() -> None:
-    assert masked(torch.tensor([-2.0, 3.0]), torch.ones(2), None) == 0
+@pytest.mark.parametrize("sharpness", [None, 50.0])
+def test_mask_loss_of_opaque_photographs_is_nothing(sharpness: float | None) -> None:
+    assert masked(torch.tensor([-2.0, 3.0]), torch.ones(2), sharpness) == 0
+    assert masked(torch.tensor([-2.0, 3.0]), torch.tensor([1.0, 0.5]), sharpness) > 0
 
 
 def test_mask_loss_pulls_on_saturated_rays_and_leaves_those_outside_the_bounds_alone() -> None:

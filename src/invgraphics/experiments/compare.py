@@ -9,10 +9,13 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, open_with_progress
 from invgraphics.experiments.environment import environment
+from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
@@ -116,7 +119,7 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     methods = {job.request.method: job.method for job in jobs}
     for fit in request.fits():
         if fit.method in methods:
-            check_replaceable(Job.of(fit, methods[fit.method]))
+            check_replaceable(Job.of(fit, methods[fit.method]), None if request.keep else torch.get_num_threads())
     scene = degrade(full, jobs[0].data, request.seeds[0])
     jobs, unsuitable = _suitable(request, jobs, scene)
     request = replace(request, methods=tuple(job.request.method for job in jobs))
@@ -141,9 +144,20 @@ def _check_folders(request: CompareRequest) -> None:
 
 
 def _missing(request: CompareRequest, jobs: Sequence[Job]) -> list[FitRequest]:
-    """Fits to start: all, since each knows by itself whether it is finished, but those that are kept whatever the code."""
+    """Fits to start: all, since each knows by itself whether it is finished, but those that are kept whatever the code.
+
+    Kept ones that the request's protocol has not scored yet are scored here, from their checkpoints.
+    """
     methods = {job.request.method: job.method for job in jobs}
-    return [fit for fit in request.fits() if not (request.keep and is_kept(Job.of(fit, methods[fit.method])))]
+    missing = []
+    for fit in request.fits():
+        job = Job.of(fit, methods[fit.method])
+        if not (request.keep and is_kept(job)):
+            missing.append(fit)
+            continue
+        for protocol in job.unscored():
+            evaluate_run(job.folder.root, protocol=protocol)
+    return missing
 
 
 def _jobs(request: CompareRequest) -> tuple[list[Job], list[Refusal]]:

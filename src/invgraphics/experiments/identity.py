@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.job import Job
+from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.open import is_rendered
@@ -35,7 +37,9 @@ class TruthDigest:
 
 
 def identify(job: Job, truth: TruthDigest, threads: int) -> str:
-    """Hash everything that determines a run's result; equal identities mean equal bits on one machine.
+    """Hash everything that determines a run's fit; equal identities mean equal bits on one machine.
+
+    The protocol is no part of it: a finished fit is scored by another one from its checkpoint.
 
     Args:
         job: of the run; its degradations of training data follow from the truth as loaded, the settings and the seed, so that
@@ -45,7 +49,7 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
     """
     method = job.method
     source = getattr(method.recipe.field, "source", "")
-    started_from = {"source": RunFolder(Path(source)).identity} if source else {}
+    started_from = {"source": _source_digest(Path(source))} if source else {}
     return sha256_of(
         started_from
         | {
@@ -54,15 +58,28 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
             "truth": truth.pixels,
             "cameras": truth.cameras,
             "data": job.data.changes(),
-            "request": _result_settings(job),
+            "request": _fit_settings(job),
             "code": code_version(),
             "threads": threads,
         }
     )
 
 
-def check_replaceable(job: Job) -> None:
+def _source_digest(source: Path) -> str:
+    """Hash what a field starts from: a run's identity with the steps it has had, or a file's bytes; empty where nothing is."""
+    if source.is_file():
+        with source.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    run = RunFolder(source)
+    return f"{run.identity}@{run.read(FitRecord).steps}" if run.has(FitRecord) else run.identity
+
+
+def check_replaceable(job: Job, threads: int | None = None) -> None:
     """Check that a job's folder holds no run on another request; only what other code or other pixels made is replaced.
+
+    Args:
+        job: of the run.
+        threads: that its fit would have; ``None`` for any. A finished fit with others is not replaced unasked.
 
     Raises:
         InputError: it does; the sentence names the first setting that differs.
@@ -79,7 +96,10 @@ def check_replaceable(job: Job) -> None:
         "number of test views": (found.options.test_views, request.test_views),
         "samples per pixel": (found.options.spp, request.spp),
         "training data": (found.data, job.data.changes()),
+        "device": (found.device, str(job.device)),
     }
+    if threads is not None and found.threads is not None:
+        settings["number of threads"] = (found.threads, threads)
     if found.recipe_sha256 not in job.recipe_digests:
         settings["recipe"] = (found.recipe_sha256[:12], job.method.digest[:12])
     for name, (theirs, ours) in settings.items():
@@ -116,11 +136,12 @@ def define(job: Job) -> str:
     request = job.request
     scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}
     scene |= {} if request.spp is None else {"spp": request.spp}  # so that studies without keep their folders' names
+    scene |= {"protocol": request.protocol}
     parts = {"method": job.method.name, "recipe": job.method.digest, "data": job.data.changes()}
-    return sha256_of(_result_settings(job) | scene | parts)
+    return sha256_of(_fit_settings(job) | scene | parts)
 
 
-def _result_settings(job: Job) -> dict[str, Any]:
-    """Collect the request's settings that determine a result; budgets are normalised, whatever their spelling."""
-    settings = {key: getattr(job.request, key) for key in ("seed", "device", "kernels", "protocol")}
+def _fit_settings(job: Job) -> dict[str, Any]:
+    """Collect the request's settings that determine a fit; budgets are normalised, whatever their spelling."""
+    settings = {key: getattr(job.request, key) for key in ("seed", "device", "kernels")}
     return settings | {"budget": str(job.budget)}

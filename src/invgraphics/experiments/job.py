@@ -59,16 +59,17 @@ class Job:
         """
         protocol = protocol_named(request.protocol)
         budget, cadence = Budget.parse(request.budget), Cadence.parse(request.checkpoint_every)
+        method = method or load_method(request.method, request.preset, request.recipe_overrides, budget)
         return Job(
             request=request,
-            method=method or load_method(request.method, request.preset, request.recipe_overrides, budget),
+            method=method,
             budget=budget,
             cadence=cadence,
             data=_training_data(request),
             device=device_of(request.device),
             options=SceneOptions(size=request.size, test_views=request.test_views, spp=request.spp),
             protocol=protocol,
-            variants=tuple(map(variant_named, request.render_with)),
+            variants=tuple(variant_named(name, method.preset) for name in request.render_with),
         )
 
     @property
@@ -85,6 +86,10 @@ class Job:
     def protocols(self) -> tuple[str, ...]:
         """Names of the protocols that score the run; the default one is last, and its scores mark the run as finished."""
         return tuple(dict.fromkeys([self.protocol.name, "default"]))
+
+    def unscored(self) -> list[str]:
+        """Protocols of which the folder holds no scores."""
+        return [protocol for protocol in self.protocols if not self.folder.scores_path(protocol).is_file()]
 
 
 def _training_data(request: FitRequest) -> TrainingData:

@@ -33,7 +33,8 @@ MARKS = (0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0
 class Monitor:
     """PSNR on a fixed set of pixels of a few views that are not trained on, all of them if there are few, for curves over time.
 
-    Uses validation views, or test views where a data set has none; what it sees never reaches the fit.
+    Pixels lie within the views' masks. Uses validation views, or test views where a data set has none; what it sees never
+    reaches the fit.
     """
 
     VIEWS, PIXELS = 4, 4096
@@ -46,11 +47,7 @@ class Monitor:
         self._bounds = scene.bounds.to(device)
         generator = torch.Generator().manual_seed(0)
         per_view = self.PIXELS // len(self._views)
-        counts = [view.image.shape[0] * view.image.shape[1] for view in self._views]
-        self._pixels = [
-            torch.arange(count) if count <= per_view else torch.randint(count, (per_view,), generator=generator)
-            for count in counts
-        ]
+        self._pixels = [_some_pixels(view, per_view, generator) for view in self._views]
 
     @torch.no_grad()
     def psnr(self, fit: Fit) -> float:
@@ -76,6 +73,14 @@ class Monitor:
             return torch.cat([renderer.render_rays(field, part, ctx)[0].over(background) for part in rays.chunks(4096)])
         picture = renderer.render_image(field, camera.to(self._device), ctx)[0].over(background)
         return picture.reshape(-1, 3)[flat.to(self._device)]
+
+
+def _some_pixels(view: View, most: int, generator: torch.Generator) -> Tensor:
+    """Flat indices of random pixels that count, all where there are no more than ``most``."""
+    valid = torch.arange(view.camera.width * view.camera.height)
+    if view.mask is not None and bool(view.mask.any()):
+        valid = valid[view.mask.reshape(-1)]
+    return valid if len(valid) <= most else valid[torch.randint(len(valid), (most,), generator=generator)]
 
 
 class Recorder:

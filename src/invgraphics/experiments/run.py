@@ -23,7 +23,7 @@ from invgraphics.experiments.build import (
 )
 from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average
 from invgraphics.experiments.environment import code_version, environment
-from invgraphics.experiments.evaluate import evaluate, expected_seconds, save_truth
+from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, check_replaceable, identify
 from invgraphics.experiments.job import Job
@@ -91,6 +91,8 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
                 f"{folder.root} holds another run: its method, scene, budget, seed or code differ.", "Choose another --out."
             )
         if same and folder.finished:
+            for protocol in job.unscored():
+                evaluate_saved(folder, scene, protocol)
             render_missing(job, scene)
             return
         use_kernels(request.kernels, job.device)

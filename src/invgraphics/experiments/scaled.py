@@ -28,9 +28,12 @@ def scaled_scores(
         ``psnr_at_1_8`` and the like, for each divisor, and what was left out and why.
     """
     rules, quality, skipped = protocol_named(protocol), {}, {}
+    reason = "the fit has refined its poses" if refined else ""
+    if scene.is_class:
+        reason = "the instances of the test views are inferred from pictures of the full size"
     for divisor in data.get("test_scales", ()):
-        if refined:
-            skipped |= {scaled_key(metric, divisor): "the fit has refined its poses" for metric in SCALED}
+        if reason:
+            skipped |= {scaled_key(metric, divisor): reason for metric in SCALED}
             continue
         smaller = scene_at(scene, divisor)
         scores = [score(model.render(view.camera, normals=False), view, smaller, rules) for view in smaller.test]

@@ -145,7 +145,9 @@ class FittedRun(ABC):
         Raises:
             InputError: that renderer needs what the field does not provide, or has learnt state without a constant substitute.
         """
-        variant = variant_named(renderer)
+        if renderer == self.method.name:
+            return self.model
+        variant = variant_named(renderer, self.method.preset)
         check_variants([variant], [self.method], self.scene)
         if variant.table == self.method.table["renderer"]:
             return self.model

@@ -8,7 +8,7 @@ from typing import Any
 
 from invgraphics.core import Field, Quantity, Renderer
 from invgraphics.fields.mesh import ExtractedMesh
-from invgraphics.recipes.recipe import Method, load_method, resolve
+from invgraphics.recipes.recipe import Method, load_method, presets, resolve, split_name
 from invgraphics.renderers.surface import Surface
 from invgraphics.text import sha256_of, slug
 
@@ -39,14 +39,19 @@ class RendererVariant:
         return re.sub(r"[^\w.=+-]+", "-", "-".join([slug(method), *settings]))
 
 
-def variant_named(name: str) -> RendererVariant:
+def variant_named(name: str, preset: str = "") -> RendererVariant:
     """Parse an entry of ``--render-with``.
 
+    Args:
+        name: of the variant; ``preset=NAME`` among its settings takes the renderer of that preset.
+        preset: of the fit that is rendered, which counts where the name says none and its recipe has one of that name.
+
     Raises:
-        InputError: unknown method or setting, or a renderer of several parts whose recipe does not say which.
+        InputError: unknown method, preset or setting, or a renderer of several parts whose recipe does not say which.
     """
-    method, *settings = re.split(_SETTING, name)
-    recipe = load_method(method, None, tuple(f"renderer.{item}" for item in settings))
+    method, named, settings = split_name(name)
+    chosen = preset if named is None and preset in presets(method) else named
+    recipe = load_method(method, chosen, tuple(f"renderer.{item}" for item in settings))
     return RendererVariant(name, recipe.table["renderer"])
 
 

@@ -40,7 +40,7 @@ class GaussianFieldConfig:
         source: folder of a run of a density field on the same scene; for ``init = "field"``.
         max_init: most points to start from; a random subset if there are more.
         backdrop: in endless space, Gaussians that start behind the subject besides those, in the colours of opaque training
-            photographs (see `backdrop_points`); for ``init`` ``scene`` and ``random``.
+            photographs (see `backdrop_points`); for ``init`` ``scene``, ``stereo`` and ``random``.
         opacity: opacity at the start.
         scale_factor: multiplies the starting scales.
         isotropic: whether all three axes of a Gaussian stay equal.

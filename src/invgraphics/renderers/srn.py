@@ -52,7 +52,8 @@ class SRNConfig:
         width: of each (SRN: 256).
         stride: length of every step of an untrained march, in mean half-extents of the box; with SRN's 0 the first
             points of all rays lie at the cameras' end of the box.
-        jitter: standard deviation of the first point's distance in training, in mean half-extents (SRN: 0.0005).
+        jitter: most that the first point is moved along its ray in training, evenly from 0, in mean half-extents (SRN moves it
+            by a normal deviate with a standard deviation of 0.0005).
     """
 
     title: ClassVar[str] = "learned aggregation"

@@ -92,8 +92,10 @@ def study_sentences(folder: Path) -> list[str]:
 
 def headline_effects(study: Study, quantity: Quantity, clean: Callable[[str], str] = str) -> list[Effect]:
     """The effects that answer a study's question: of approximations on the same fits where it names some, then of levels."""
-    crossed = cross_effects(study.observations(), study.approximations, clean)
-    return [*crossed, *effects_of(study_contrasts(study, quantity), quantity, study.observations(), study.lost())]
+    observations = study.observations()
+    crossed = cross_effects(observations, study.approximations, study.factors, clean)
+    asked = effects_of(study_contrasts(study, quantity), quantity, observations, study.lost(), study.factors)
+    return [*crossed, *asked]
 
 
 def study_contrasts(study: Study, quantity: Quantity | None) -> list[Contrast]:
@@ -118,9 +120,9 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
     observations = study.observations()
     quantities = _quantities(study, comparisons)
     asked = study_contrasts(study, quantities[0] if quantities else None)
-    contrasts = draw_contrasts(quantities, asked, observations, study.lost(), folder)
+    contrasts = draw_contrasts(quantities, asked, (observations, study.lost()), folder, study.factors)
     clean = folder.redactor.text if folder.redactor is not None else str
-    crossed = cross_effects(observations, study.approximations, clean)
+    crossed = cross_effects(observations, study.approximations, study.factors, clean)
     heat = draw_heat_maps(study.factors, quantities[0], observations, folder.figures) if quantities else []
     analyses = draw_analyses(root, study.analyses, folder.figures)
     judged = judge_predictions(study.predictions, observations, study.lost())

@@ -201,7 +201,10 @@ class Batches:
             return view
         if index not in self._small or self._small[index][0] != scale:
             width, height = (max(1, round(edge * scale)) for edge in size_of(view))
-            self._small[index] = scale, self._pool.kept(resized_view(view, width, height))
+            small = resized_view(view, width, height)
+            if small.mask is not None and not bool(small.mask.any()):
+                return view  # what is valid of it is thinner than these pixels
+            self._small[index] = scale, self._pool.kept(small)
         return self._small[index][1]
 
     def state(self) -> dict[str, Tensor]:

@@ -177,15 +177,15 @@ class MaskLoss:
 
     def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
         """The weighted mean over pixels, in nats; over the sharpness where there is one."""
+        masked = (batch.alpha < 1).any()  # stays on the device
         if trace.surface is None:
             alpha = rendering.alpha.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
-            masked = (batch.alpha < 1).any()  # stays on the device
             return self.weight * masked * torch.nn.functional.binary_cross_entropy(alpha, batch.alpha)
         logit, sharpness = trace.surface.logit, trace.surface.sharpness * float(ctx.bounds.half.mean())
         # Rays that miss the bounds are empty whatever the field is, and have a logit that is not finite.
         met = torch.nonzero(logit.isfinite())[:, 0]
         entropy = torch.nn.functional.binary_cross_entropy_with_logits(logit[met], batch.alpha[met], reduction="sum")
-        return self.weight / sharpness * entropy / max(len(logit), 1)
+        return self.weight / sharpness * masked * entropy / max(len(logit), 1)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from invgraphics.errors import InputError
 from invgraphics.training.optimisers.adam import MOMENTS, ROW_RATES, DenseAdam, GroupedOptimiser, MaskedAdam
-from invgraphics.training.optimisers.muon import MOMENTUM, Muon, is_hidden_matrix
+from invgraphics.training.optimisers.muon import MOMENTUM, Muon, takes_muon
 
 _MOMENTS = {*MOMENTS, MOMENTUM}
 """Names of what any of the optimisers remembers of a parameter's gradients, entry by entry."""
@@ -62,14 +62,14 @@ class GroupConfig:
 
 @dataclass(frozen=True)
 class OptimiserConfig:
-    """Adam (Kingma and Ba 2015), and Muon (Jordan et al. 2024) for matrices of hidden layers where ``muon`` is above 0.
+    """Adam (Kingma and Ba 2015), and Muon (Jordan et al. 2024) for the matrices of `takes_muon` where ``muon`` is above 0.
 
     Attributes:
         groups: named parameter groups; every trainable parameter must match one.
         beta1: decay of the first moment.
         beta2: decay of the second moment.
         eps: added to the root of the second moment.
-        muon: learning rate of matrices with at least 16 rows and columns, over their group's; 0 leaves them to Adam.
+        muon: learning rate of weights of layers and of factor lines, over their group's; 0 leaves them to Adam.
     """
 
     groups: dict[str, GroupConfig] = field(default_factory=dict)
@@ -107,8 +107,11 @@ class Optimiser:
         )
         hidden = []
         if config.muon > 0:
-            hidden = [{**group, "params": [one for one in group["params"] if is_hidden_matrix(one)]} for group in dense]
-            dense = [{**group, "params": [one for one in group["params"] if not is_hidden_matrix(one)]} for group in dense]
+            own = {id(parameter) for name, parameter in parameters.items() if takes_muon(name, parameter)}
+            hidden, dense = (
+                [{**group, "params": [one for one in group["params"] if (id(one) in own) == wanted]} for group in dense]
+                for wanted in (True, False)
+            )
         self._optimisers: list[GroupedOptimiser] = []
         if dense:
             self._optimisers.append(DenseAdam(dense, betas, config.eps))

@@ -41,8 +41,8 @@ class PosesConfig:
         translation_warmup: the same of translations.
         window: progress at which the finer levels of frequency and hash encodings begin to come in, and at which all are in
             (BARF: 0.1 and 0.5).
-        resolution: image scales that renderers of whole images go through instead, the last at the window's end; for recipes
-            that have no such schedule in ``batches``.
+        resolution: image scales of the photographs, the last from the window's end on, which blur what encodings without such
+            levels see; for recipes that have no such schedule in ``batches``.
         test_steps: steps that refine each test view's pose to its photograph before it is scored (BARF: 100).
     """
 

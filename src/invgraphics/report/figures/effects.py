@@ -73,9 +73,9 @@ def _draw_intervals(effects: Sequence[Effect], title: str, stem: Path, width: fl
 
 
 def _parts(effect: Effect) -> dict[str, float]:
-    """Mean of each scene, or of each method where there is one scene."""
+    """Mean of each scene, or at each combination of other factors' levels where there is one scene."""
     scenes = {name: one.estimate.mean for name, one in effect.by_scene.items()}
-    return scenes or {name: one.mean for name, one in effect.by_method.items()}
+    return scenes or {name: one.estimate.mean for name, one in effect.by_setting.items()}
 
 
 def _limits(effects: Sequence[Effect]) -> tuple[float, float]:

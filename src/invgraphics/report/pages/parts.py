@@ -170,12 +170,21 @@ def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[A
 def draw_contrasts(
     quantities: Sequence[Quantity],
     contrasts: Sequence[Contrast],
-    runs: Sequence[Observation],
-    lost: Sequence[Lost],
+    observed: tuple[Sequence[Observation], Sequence[Lost]],
     folder: Folder,
+    factors: Sequence[Factor] = (),
 ) -> Contrasts:
-    """Estimate contrasts in every metric; interval plot of the first."""
-    tables = tuple((quantity, found) for quantity in quantities if (found := effects_of(contrasts, quantity, runs, lost)))
+    """Estimate contrasts in every metric; interval plot of the first.
+
+    Args:
+        quantities: metrics and costs.
+        contrasts: what is compared.
+        observed: finished runs, and fits that failed.
+        folder: of the page.
+        factors: of the study, whose words name the levels of other factors.
+    """
+    every = ((quantity, effects_of(contrasts, quantity, *observed, factors=factors)) for quantity in quantities)
+    tables = tuple((quantity, found) for quantity, found in every if found)
     return Contrasts(tables, draw_intervals(tables[0][1], folder.figures) if tables else None)
 
 
@@ -187,7 +196,7 @@ def method_contrasts(comparison: Comparison, folder: Folder) -> Contrasts:
     runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
     lost = [Lost(comparison.scene, {METHOD: failure.method}) for failure in comparison.failures]
     pairs = contrasts_of([Factor(METHOD, methods, methods[0])])
-    return draw_contrasts(quality_columns(comparison), pairs, runs, lost, folder)
+    return draw_contrasts(quality_columns(comparison), pairs, (runs, lost), folder)
 
 
 def _thumbnails(comparison: Comparison, drawn: Drawn, folder: Folder) -> list[Thumbnail]:

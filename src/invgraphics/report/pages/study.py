@@ -175,10 +175,14 @@ def _scope(page: StudyPage) -> list[str]:
     effects = [effect for effect in [*page.crossed, *page.contrasts.first] if effect.claim.unit != "none"]
     if not effects:
         return []
+    metric = f"Differences are of {listing(dict.fromkeys(effect.quantity.label for effect in effects))}. "
     if all(effect.across is None for effect in effects):
-        return ["The unit is the seed: intervals hold for new fits on this scene, and say nothing of other scenes."]
+        return [f"{metric}The unit is the seed: intervals hold for new fits on this scene, and say nothing of other scenes."]
+    scenes = "other scenes like these (the unit is the scene)"
+    if all(effect.estimate.unit == "none" for effect in effects):
+        return [f"{metric}Intervals hold for {scenes}; how far new fits on these would spread is not known."]
     words = "Two intervals answer two questions: for new fits on these scenes, each counted equally (the unit is the seed); "
-    return [f"{words}and for other scenes like these (the unit is the scene), on which a verdict rests."]
+    return [f"{metric}{words}and for {scenes}, on which a verdict rests."]
 
 
 def _matrix(page: StudyPage, folder: Folder) -> list[MatrixRow]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import Observation
+from invgraphics.report.data.factors import Factor, Observation
 from invgraphics.report.statistics.effects import Effect, effects_of
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.summary import quality_columns
@@ -163,13 +163,17 @@ def cross_table(comparison: Comparison, approximations: Sequence[Approximation],
 
 
 def cross_effects(
-    observations: Sequence[Observation], approximations: Sequence[Approximation], clean: Callable[[str], str] = str
+    observations: Sequence[Observation],
+    approximations: Sequence[Approximation],
+    factors: Sequence[Factor] = (),
+    clean: Callable[[str], str] = str,
 ) -> list[Effect]:
     """What each approximation does to the score of the *same* fits: paired by fit, averaged over what made them.
 
     Args:
         observations: the fits of a study.
         approximations: pairs of renderers.
+        factors: of the study, whose words name what made the fits.
         clean: makes names public.
     """
     shown = []
@@ -182,7 +186,7 @@ def cross_effects(
         return []
     pairs = [(pair.name, clean(pair.exact), clean(pair.approximate)) for pair in approximations]
     contrasts = [Contrast(RENDERER, exact, other, name=f"{name} ({other} instead of {exact})") for name, exact, other in pairs]
-    return effects_of(contrasts, quality_quantity("psnr", score), shown)
+    return effects_of(contrasts, quality_quantity("psnr", score), shown, factors=factors)
 
 
 def _score(fits: Sequence[CrossRendered], name: str, quantity: Quantity) -> float | None:

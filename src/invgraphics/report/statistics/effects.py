@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
+from invgraphics.report.data.factors import Factor, Lost, Observation
+from invgraphics.report.data.variants import setting_words
 from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, holm, over_scenes, over_seeds
-from invgraphics.report.statistics.pairing import Contrast, Sample, contrast_words, sample
+from invgraphics.report.statistics.pairing import Contrast, Sample, contrast_words, sample, settings_of
 from invgraphics.report.wording import Quantity, significant_decimals
 
 ALPHA = 1 - CONFIDENCE
@@ -36,6 +37,33 @@ class SceneEffect:
 
 
 @dataclass(frozen=True)
+class SettingEffect:
+    """The same difference where every other factor, the method included, has one level.
+
+    Attributes:
+        estimate: over new fits on these scenes.
+        across: over scenes as a sample of scenes; ``None`` for one scene.
+        adjusted: p-value of `claim` after Holm's correction over the settings of one effect; ``None`` without one.
+    """
+
+    estimate: Estimate
+    across: Estimate | None
+    adjusted: float | None = None
+
+    @property
+    def claim(self) -> Estimate:
+        """The estimate that a test rests on: over scenes where there are several, else over seeds."""
+        return self.estimate if self.across is None else self.across
+
+    @property
+    def sign(self) -> int:
+        """Sign of a significant difference; 0 for none."""
+        if self.adjusted is None or self.adjusted > ALPHA:
+            return 0
+        return 1 if self.claim.mean > 0 else -1
+
+
+@dataclass(frozen=True)
 class Effect:
     """A difference, level ``after`` minus level ``before``, on the same scenes, views and other levels.
 
@@ -50,7 +78,7 @@ class Effect:
         comparisons: size of that family.
         pairs: fits compared.
         by_scene: scene -> the same for that scene alone; empty for one scene.
-        by_method: method -> the same for that method alone; empty where the method is the factor or there is only one.
+        by_setting: levels of all other factors in words -> the same at these alone; empty where there is one combination only.
         lost: diverged or failed fits of (before, after).
         silent: scenes where one side has no number at all.
         truths_differ: some pairs were scored against different pictures, because the factor changes the truth.
@@ -64,7 +92,7 @@ class Effect:
     comparisons: int
     pairs: int
     by_scene: Mapping[str, SceneEffect]
-    by_method: Mapping[str, Estimate]
+    by_setting: Mapping[str, SettingEffect]
     equivalence: float | None = None
     lost: tuple[int, int] = (0, 0)
     silent: tuple[str, ...] = ()
@@ -103,6 +131,11 @@ class Effect:
         """Whether the difference lies within the margin after Holm's correction, with no scene that contradicts it."""
         contradicted = any(one.verdict in ("higher", "lower") for one in self.by_scene.values())
         return self.equivalence is not None and self.equivalence <= ALPHA and not contradicted and self.lost == (0, 0)
+
+    @property
+    def opposed(self) -> bool:
+        """Whether the difference is significant with one sign at some levels of other factors, and with the other at others."""
+        return {1, -1} <= {one.sign for one in self.by_setting.values()}
 
     @property
     def detectable(self) -> float | None:
@@ -205,14 +238,27 @@ def effects_on(
 
 
 def effects_of(
-    contrasts: Sequence[Contrast], quantity: Quantity, observations: Sequence[Observation], lost: Iterable[Lost] = ()
+    contrasts: Sequence[Contrast],
+    quantity: Quantity,
+    observations: Sequence[Observation],
+    lost: Iterable[Lost] = (),
+    factors: Sequence[Factor] = (),
 ) -> list[Effect]:
-    """Effects of given contrasts on one quantity, corrected as one family (Holm 1979)."""
+    """Effects of given contrasts on one quantity, corrected as one family (Holm 1979).
+
+    Args:
+        contrasts: what is compared.
+        quantity: in which.
+        observations: finished runs.
+        lost: fits that failed.
+        factors: of the study, whose words name the levels of other factors.
+    """
     failed = tuple(lost)
     found = [
         effect
         for contrast in contrasts
-        if (effect := _effect(contrast, quantity, sample(contrast, quantity, observations, failed), observations)) is not None
+        if (effect := _effect(contrast, quantity, sample(contrast, quantity, observations, failed), observations, factors))
+        is not None
     ]
     adjusted = holm([effect.claim.p for effect in found])
     margin = quantity.margin
@@ -231,7 +277,9 @@ def effects_of(
     ]
 
 
-def _effect(contrast: Contrast, quantity: Quantity, values: Sample, observations: Sequence[Observation]) -> Effect | None:
+def _effect(
+    contrast: Contrast, quantity: Quantity, values: Sample, observations: Sequence[Observation], factors: Sequence[Factor]
+) -> Effect | None:
     groups = list(values.scenes.values())
     whole = over_seeds(groups)
     if whole is None:
@@ -241,25 +289,32 @@ def _effect(contrast: Contrast, quantity: Quantity, values: Sample, observations
         contrast=contrast,
         quantity=quantity,
         estimate=whole,
-        across=over_scenes(groups, least_error=whole.error) if len(groups) > 1 else None,
+        across=_across(values, whole),
         adjusted=None,
         comparisons=0,
         pairs=values.pairs,
         by_scene={scene: SceneEffect(one, None) for scene, one in alone.items() if one is not None},
-        by_method=_by_method(contrast, quantity, observations),
+        by_setting=_by_setting(contrast, quantity, observations, factors),
         lost=values.lost,
         silent=values.silent,
         truths_differ=values.truths_differ,
     )
 
 
-def _by_method(contrast: Contrast, quantity: Quantity, observations: Sequence[Observation]) -> dict[str, Estimate]:
-    methods = dict.fromkeys(one.levels.get(METHOD, "") for one in observations)
-    if contrast.independent or METHOD in contrast.where or len(methods) < 2:
-        return {}
+def _across(values: Sample, whole: Estimate) -> Estimate | None:
+    groups = list(values.scenes.values())
+    return over_scenes(groups, least_error=whole.error) if len(groups) > 1 else None
+
+
+def _by_setting(
+    contrast: Contrast, quantity: Quantity, observations: Sequence[Observation], factors: Sequence[Factor]
+) -> dict[str, SettingEffect]:
+    settings = [] if contrast.against is not None else settings_of(contrast, observations)
     found = {}
-    for method in methods:
-        own = sample(replace(contrast, where={**contrast.where, METHOD: method}), quantity, observations)
+    for levels in settings if len(settings) > 1 else []:
+        own = sample(replace(contrast, where={**contrast.where, **levels}), quantity, observations)
         if (value := over_seeds(list(own.scenes.values()))) is not None:
-            found[method] = value
-    return found if len(found) > 1 else {}
+            found[setting_words(levels, factors)] = SettingEffect(value, _across(own, value))
+    adjusted = holm([one.claim.p for one in found.values()])
+    known = {name: replace(one, adjusted=p) for (name, one), p in zip(found.items(), adjusted, strict=True)}
+    return known if len(known) > 1 else {}

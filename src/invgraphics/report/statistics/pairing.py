@@ -51,6 +51,11 @@ class Contrast:
         return ", ".join(self.where.values()) + ": " + words if self.where else words
 
     @property
+    def levels(self) -> tuple[str, str]:
+        """The levels that are compared, before and after."""
+        return self.before, self.after
+
+    @property
     def independent(self) -> bool:
         """Whether the two sides are independent groups of fits: different methods, whose seeds do not pair."""
         return METHOD in (self.factor, self.against[0] if self.against else "")
@@ -122,6 +127,20 @@ def sample(contrast: Contrast, quantity: Quantity, observations: Sequence[Observ
             differ |= len({one.run.provenance.truth_sha256 for one in compared}) > 1
     silent = tuple(scene for scene in missing if scene not in scenes)
     return Sample(scenes, (sides[contrast.before], sides[contrast.after]), silent, pairs, differ)
+
+
+def settings_of(contrast: Contrast, observations: Sequence[Observation]) -> list[dict[str, str]]:
+    """Levels of all other factors, the method included, at which both sides of a contrast have runs; shared ones are left out.
+
+    Args:
+        contrast: two levels of a factor, no interaction.
+        observations: finished runs.
+    """
+    counted = [one for one in observations if all(one.levels.get(key) == level for key, level in contrast.where.items())]
+    before, after = ({others for _, others in _table(contrast.factor, side, counted)} for side in contrast.levels)
+    found = [dict(others) for others in sorted(before & after)]
+    shared = set.intersection(*(set(levels.items()) for levels in found)) if found else set()
+    return [{key: level for key, level in levels.items() if (key, level) not in shared} for levels in found]
 
 
 def _difference(contrast: Contrast, quantity: Quantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:

@@ -13,6 +13,8 @@ from invgraphics.report.wording import Quantity, listing
 
 FEW_SCENES = 5
 """Fewer scenes than this tell little about others, and the sentence says so."""
+MOST_SETTINGS = 6
+"""Levels of other factors that a sentence lists; of more it names the two ends."""
 
 
 def effect_sentence(effect: Effect) -> str:
@@ -53,22 +55,26 @@ def _verdict(effect: Effect) -> str:
     magnitude = f"{_verb(effect.quantity, value.mean)} {effect.text(abs(value.mean))} {unit}"
     if effect.claim.unit == "none":
         return _unmeasured(effect, magnitude)
-    basis = f"{value.size}{_scene_counts(effect)}"
-    if effect.found:
-        return f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}."
+    basis = f"{value.size}{_averaged(effect)}{_scene_counts(effect)}"
     if effect.flattered:
         return f"{effect.label}: no verdict, {_signed(effect)}, {basis}."
+    if effect.opposed:
+        mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
+        return f"{effect.label}: the sign depends on what else is chosen, {basis}: {_settings(effect)}; {mean}."
+    if effect.found:
+        return f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}."
     if _contradict(effect):
         mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
         return f"{effect.label}: no common direction, {basis}; {mean}."
     if effect.scenes("higher") or effect.scenes("lower"):
-        return f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}{_reserve(effect)}."
+        p = "" if effect.adjusted is None else f" (corrected p = {effect.adjusted:.2g})"
+        return f"{effect.label}: {_signed(effect)}, {basis}; undecided for other scenes{p}."
     if effect.equivalent:
         assert effect.quantity.margin is not None
         margin = effect.text(effect.quantity.margin)
         return f"{effect.label}: no effect beyond ±{margin} {unit} (equivalence test), {_signed(effect)}, {basis}."
     if effect.uncorrected:
-        chance = f"with {effect.comparisons} comparisons in this study that may be chance"
+        chance = f"with {effect.comparisons} such comparisons that may be chance"
         words = f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}"
         return f"{words}; {chance} (corrected p = {effect.adjusted:.2g})."
     return f"{effect.label}: undecided, {_signed(effect)}, {basis}; {detectable_words(effect)}."
@@ -148,10 +154,18 @@ def _contradict(effect: Effect) -> bool:
     return bool(effect.scenes("higher")) and bool(effect.scenes("lower"))
 
 
-def _reserve(effect: Effect) -> str:
-    """Why an effect that single scenes show is no finding about scenes, where their interval does not say so already."""
-    few = effect.across is not None and effect.across.scenes < FEW_SCENES
-    return "" if few else "; the scenes differ too much to tell about others"
+def _averaged(effect: Effect) -> str:
+    """Over how many combinations of other factors' levels an effect is averaged."""
+    return f", averaged over {len(effect.by_setting)} settings of what else varies" if effect.by_setting else ""
+
+
+def _settings(effect: Effect) -> str:
+    """The difference at each combination of other factors' levels, or at the two ends of many, with its interval."""
+    rising = sorted(effect.by_setting.items(), key=lambda item: item[1].claim.mean)
+    shown = rising if len(rising) <= MOST_SETTINGS else [rising[0], rising[-1]]
+    unit = _unit(effect.quantity)
+    parts = (f"{effect.text(one.claim.mean)} {unit} {effect.bounds(one.claim)}".strip() + f" ({name})" for name, one in shown)
+    return f"{'from ' if len(shown) < len(rising) else ''}{(' to ' if len(shown) < len(rising) else ', ').join(parts)}"
 
 
 def detectable_words(effect: Effect) -> str:
