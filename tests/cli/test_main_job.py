@@ -62,7 +62,12 @@ def test_compare_then_evaluate_and_report(tmp_path, capsys) -> None:
     scored = (cell / "scores.json").stat().st_mtime_ns
     assert main.run(["compare", str(data), *words, "--keep"]) == main.DONE
     assert (cell / "scores.json").stat().st_mtime_ns == scored
-    assert "--keep" in json.loads((out / "compare.json").read_text())["command"]
+    again = json.loads((out / "compare.json").read_text())
+    assert again["command"] == table["command"] and "wall_seconds" in table and "wall_seconds" not in again
+    (cell / "scores.float.json").unlink()
+    assert main.run(["compare", str(data), *words, "--keep", "--protocol", "float"]) == main.DONE
+    assert json.loads((cell / "scores.float.json").read_text())["protocol"] == "float"
+    assert (cell / "scores.json").stat().st_mtime_ns == scored
     assert main.run(["compare", str(data), *words]) == main.DONE
     assert (cell / "scores.json").stat().st_mtime_ns > scored
     assert main.run(["evaluate", str(cell), "--protocol", "float"]) == main.DONE

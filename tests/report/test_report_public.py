@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import re
+import shlex
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -102,6 +103,9 @@ def test_public_comparison_tells_nothing_private(
     runs = sorted(comparison_folder.glob("runs/*/seed-0"))
     assert main.run(["report", *map(str, runs), "--out", str(tmp_path / "single"), "--public"]) == main.DONE
     assert leaks(tmp_path / "single") == []
+    lines = (out / "index.md").read_text().splitlines()
+    places = [words[words.index("--out") + 1] for line in lines if "invgraphics fit" in line for words in [shlex.split(line)]]
+    assert len(places) > 1 and len(set(places)) == len(places)  # else the second command would find the first one's run
     text = (out / "index.html").read_text()
     for attribute in ("src", "href", "srcset"):
         for part in text.split(f'{attribute}="')[1:]:

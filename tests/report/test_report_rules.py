@@ -178,6 +178,15 @@ def test_the_page_shows_every_standing(gauntlet: Path, capsys: pytest.CaptureFix
     assert first in capsys.readouterr().out
 
 
+def test_the_page_names_fits_that_had_less_than_their_cores(tmp_path: Path) -> None:
+    told = {"disturbed": "had 84 % of the processor time that it was ready to use"}
+    cells = [entry(HASH, "fence", 128, "60s", scores=told), entry(SPLATS, "fence", 128, "60s")]
+    page = build_study_report(write_judged(tmp_path / "gauntlet", cells)).read_text()
+    sentence = f"{HASH} fence@128 60s seed=0: {told['disturbed']}."
+    assert page.count("84 % of the processor") == 1 and f'<p class="disturbed" role="note">{sentence}</p>' in page
+    assert f"- {sentence}" in (tmp_path / "gauntlet" / "index.md").read_text()
+
+
 def test_a_public_page_holds_what_a_study_goes_on_from(gauntlet: Path, tmp_path: Path) -> None:
     """The same records in the same places, and the same page again from them alone."""
     out = tmp_path / "public"

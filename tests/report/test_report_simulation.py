@@ -271,11 +271,22 @@ def test_a_sign_that_depends_on_another_factor_is_no_common_effect(scenes: int) 
     assert effect.opposed and effect.found and effect.estimate.mean == pytest.approx(1, abs=0.1)
     assert {name: one.sign for name, one in effect.by_setting.items()} == {"5 views": -1, "40 views": 1}
     sentence = effect_sentence(effect)
-    assert "gains" not in sentence and "the sign depends on what else is chosen" in sentence
+    assert "gains" not in sentence and "the sign depends on other factors" in sentence
     assert sentence.index("(5 views)") < sentence.index("(40 views)") < sentence.index("on average")
     for name, one in effect.by_setting.items():  # each alone, as if the other had not been fitted
         (alone,) = effects_of([Contrast(SIZE.path, "8", "16", {views.path: name.split()[0]})], PSNR, observations)
         assert (one.estimate, one.across) == (alone.estimate, alone.across) and not alone.by_setting
+
+
+@pytest.mark.parametrize(("gains", "verb"), [((3.0, 3.0, 0.0), True), ((3.0, 0.0, 0.0), False)])
+def test_a_verb_needs_most_scenes(gains: tuple[float, ...], verb: bool) -> None:
+    """Scenes that are too different to tell about others: one of three decides nothing for the other two either."""
+    rng = np.random.default_rng(17)
+    effect = effect_of((3, 4), lambda s, k, level: 20 + gains[s] * (level == B) + rng.normal(0, 0.2))
+    sentence = effect_sentence(effect)
+    assert not effect.found and f"better on {sum(map(bool, gains))} of 3 scenes" in sentence
+    assert (" gains " in sentence) == verb
+    assert f"undecided for other scenes (corrected p = {effect.adjusted:.2g})" in sentence
 
 
 def test_a_setting_without_effect_does_not_oppose_one_that_has() -> None:

@@ -99,6 +99,9 @@ def test_a_study_runs_once_and_then_does_nothing(executor, request_of) -> None:
     assert not executor.made
     assert (seen[0].runs, seen[0].missing, seen[0].seconds) == (4, 0, 0)
     assert _record(request)["cells"] == record["cells"]
+    assert all(word not in record["command"] for word in ("--keep", "--cells", "--most-seconds"))
+    ablate(replace(request, keep=True, cells="* seed=0", most_seconds=60.0), _yes)
+    assert _record(request)["command"] == record["command"]  # that of the whole study
     # More seeds: only the new cells.
     ablate(replace(request, seeds=(0, 1, 2)), _yes)
     assert len(executor.made) == 2 and all("seed=2" in name for name in executor.made)

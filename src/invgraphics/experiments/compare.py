@@ -60,6 +60,7 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     request, jobs, scene, refused = _resolve(request, opened)
     folder = RunFolder(Path(request.out))
     failures: list[Failure] = []
+    earlier = any(RunFolder(Path(fit.out)).finished for fit in request.fits())
     summary = replace(_summary(request, jobs, scene), refused=tuple(refused), method_choice=choice)
     interrupted: KeyboardInterrupt | None = None
     try:
@@ -75,7 +76,7 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     failed = {(failure.method, failure.seed) for failure in failures}
     done = [fit for fit in request.fits() if (fit.method, fit.seed) not in failed and RunFolder(Path(fit.out)).finished]
     runs = tuple(Path(fit.out).relative_to(request.out).as_posix() for fit in done)
-    seconds = round(time.monotonic() - began, 1)
+    seconds = None if earlier else round(time.monotonic() - began, 1)
     folder.write(replace(summary, runs=runs, failures=tuple(failures), wall_seconds=seconds))
     if interrupted is not None:
         raise interrupted
@@ -242,7 +243,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
         preset_choice=_common([method.preset_choice for method in methods]),
         preset_chosen_on={method.name: method.chosen_on for method in methods if method.chosen_on},
         render_with=request.render_with,
-        command=request.shell(),
+        command=replace(request, keep=False).shell(),
         baselines=baselines,
         noise_ceiling=scene.noise_ceiling,
         protocol=protocol.record() | {key: "; ".join(sorted(found)) for key, found in notes.items() if found},

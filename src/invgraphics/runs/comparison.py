@@ -79,7 +79,7 @@ class ComparisonRecord(Record):
         environment: machine and versions.
         runs: folders of the finished runs, relative.
         failures: cells that gave no run.
-        wall_seconds: duration of the whole command.
+        wall_seconds: duration of the whole command; ``None`` where some of its runs were there before it.
     """
 
     FILE: ClassVar[str] = "compare.json"

@@ -135,7 +135,7 @@ def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resourc
         words=study.words,
         predictions=study.predictions,
         protocol=job.protocol.record(),
-        command=request.shell(),
+        command=replace(request, keep=False, cells=None, most_seconds=None).shell(),  # all of it, however it was made
         environment=replace(machine, threads=resources.threads, executor=request.executor, jobs=resources.jobs),
         cells=(),
     )

@@ -35,7 +35,7 @@ class Comparison:
         protocol: how scores were made: ``name``, ``summary`` and further facts.
         scene_info: what is known about the scene.
         environment: machine and versions.
-        wall_seconds: duration of the whole command.
+        wall_seconds: duration of the whole command; ``None`` where some of its runs were there before it.
         cells: method -> titles of its field and of its renderer.
         refused: methods that were left out, because they do not go with the scene.
         shown: methods that get pictures and curves; empty for all.

@@ -30,7 +30,7 @@ End = tuple[int, str, float]
 
 
 def draw_curves(comparison: Comparison, summary: Summary, folder: Path) -> Figure | None:
-    """PSNR over time, a line per method, with noise ceiling and better baseline; ``None`` where no run was monitored.
+    """PSNR over time, a line per method, with noise level and better baseline; ``None`` where no run was monitored.
 
     Of several seeds the line is the mean, and a band its t-interval over seeds; each seed's own end is marked.
     """
@@ -42,7 +42,7 @@ def draw_curves(comparison: Comparison, summary: Summary, folder: Path) -> Figur
     wide = _draw(comparison, summary, folder / "time-to-quality", WIDE)
     narrow = _draw(comparison, summary, folder / "time-to-quality-narrow", NARROW)
     ends = [f"{run.method} ends at {last:.1f} dB" for run in runs if (last := _last(run)) is not None]
-    return Figure(wide, narrow, title, f"{title}: {'; '.join(ends)}.")
+    return Figure(wide, narrow, title, f"{title}, on monitored pixels rather than the table's test views: {'; '.join(ends)}.")
 
 
 def _last(run: Run) -> float | None:
@@ -105,13 +105,13 @@ def _draw_seeds(axes: Axes, curves: Sequence[Curve], look: SeriesStyle, opacity:
 
 
 def _reference_lines(axes: Axes, comparison: Comparison, summary: Summary, values: Sequence[float]) -> None:
-    """Draw lines at noise ceiling and better baseline; far ones become a label at the edge, which keeps the curves' range."""
+    """Draw lines at noise level and better baseline; far ones become a label at the edge, which keeps the curves' range."""
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
     span = max(high - low, 1.0)
     bottom, top = low - 0.06 * span, high + 0.08 * span
     lines = []
     if comparison.noise_ceiling is not None:
-        lines.append(("truth's noise ceiling", comparison.noise_ceiling))
+        lines.append(("truth's noise level", comparison.noise_ceiling))
     cells = [(summary.cell(row, "psnr"), row.label) for row in summary.baselines]
     references = [(cell.mean, name) for cell, name in cells if cell is not None and cell.mean is not None]
     if references:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,7 +15,7 @@ from invgraphics.report.wording import budget_words, listing
 from invgraphics.runs.folder import PUBLISHED, RECIPE
 from invgraphics.runs.run import Run
 from invgraphics.runs.schema import plain
-from invgraphics.text import duration
+from invgraphics.text import duration, slug
 
 Facts = tuple[tuple[str, str], ...]
 """(name, value) in the order in which they are shown."""
@@ -101,8 +102,14 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
     choices = {run.provenance.preset_choice for run in runs}
     if choices - {""}:
         presets += f", {choices.pop()}" if len(choices) == 1 else ", chosen from each fit's budget"
-    scenes = _grouped([(_text(run.provenance.preset_chosen_on), run.method) for run in runs])
+    scenes = _chosen_on(runs)
     return {name: text for name, text in (("preset", presets), ("preset chosen on", scenes)) if text}
+
+
+def _chosen_on(runs: Sequence[Run]) -> str:
+    """Scenes on which presets were chosen, by method; those whose recipe does not say are listed where another's does."""
+    told = [(_text(run.provenance.preset_chosen_on), run.method) for run in runs]
+    return _grouped([(scenes or "not stated", method) for scenes, method in told]) if any(scenes for scenes, _ in told) else ""
 
 
 def start_fact(runs: Sequence[Run]) -> str:
@@ -157,7 +164,7 @@ def scene_facts(comparison: Comparison) -> Facts:
     for key, value in plain(replace(comparison.scene_info, notes={})).items():
         facts[{"train": "training views", "val": "validation views", "test": "test views"}.get(key, _words(key))] = _text(value)
     if comparison.noise_ceiling is not None:
-        facts["noise ceiling of the truth"] = f"{comparison.noise_ceiling:.2f} dB PSNR"
+        facts["noise level of the truth"] = f"{comparison.noise_ceiling:.2f} dB PSNR"
     notes = comparison.scene_info.notes
     facts |= {_words(key): _text(value) for key, value in notes.items() if key not in ("summary", "stresses")}
     return tuple((key, value) for key, value in facts.items() if value)
@@ -187,12 +194,23 @@ def reproduction(comparison: Comparison, folder: Folder) -> tuple[Cell, ...]:
         for run in comparison.runs_of(method):
             own = {key: value for key, value in _run_facts(run).items() if shared.get(key) != value}
             command = run.provenance.command
+            if folder.redactor is not None:
+                command = _with_out(command, f"out/{slug(method)}-seed-{run.seed}")
             files = []
             for name in PUBLISHED:
                 if run.files.path(name).is_file():
                     files.append((name, folder.publish(run.folder, name, f"runs/{series}-seed-{run.seed}/{name}")))
             cells.append(Cell(method, series, run.seed, command, tuple(own.items()), tuple(files)))
     return tuple(cells)
+
+
+def _with_out(command: str, out: str) -> str:
+    """A command that writes to ``out``: of a private path only the last part is left, which several runs may share."""
+    words = shlex.split(command)
+    if "--out" not in words[:-1]:
+        return command
+    words[words.index("--out") + 1] = out
+    return shlex.join(words)
 
 
 def plain_facts(table: Mapping[str, Any]) -> Facts:

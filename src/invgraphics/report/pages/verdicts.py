@@ -113,6 +113,12 @@ class VerdictPage:
         return sorted(pairs, key=lambda pair: pair[1].outcome == "known")
 
     @property
+    def disturbances(self) -> list[str]:
+        """A sentence per cell whose fit had less than its cores: its seconds bought fewer steps."""
+        cells = [field.judged.cell for field in self.fields]
+        return [f"{cell.label}: {cell.run.scores.disturbed}." for cell in cells if cell.run and cell.run.scores.disturbed]
+
+    @property
     def counts(self) -> list[RuleCount]:
         """Outcomes counted for each rule."""
         verdicts = [verdict for field in self.fields for verdict in field.judged.verdicts]
@@ -231,6 +237,8 @@ def _write_markdown(page: VerdictPage, folder: Folder) -> None:
                 f" Known cause: {verdict.cause}{f' (issue {verdict.issue})' if verdict.issue else ''}" if verdict.cause else ""
             )
             lines.append(f"- {field.sign} {text(f'{field.judged.cell.method} {field.name}')}: {text(verdict.sentence + cause)}")
+    if page.disturbances:
+        lines += ["", "## Disturbed clocks", "", *(f"- {text(sentence)}" for sentence in page.disturbances)]
     lines += ["", "## Cells", "", f"PSNR in dB. {', '.join(f'{sign} {words}' for words, sign in STANDINGS.values())}.", ""]
     lines += [f"| scene | | {' | '.join(map(text, page.study.methods))} |", "|---" * (2 + len(page.study.methods)) + "|"]
     for scene, rest, fields in page.rows:

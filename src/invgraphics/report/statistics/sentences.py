@@ -60,7 +60,7 @@ def _verdict(effect: Effect) -> str:
         return f"{effect.label}: no verdict, {_signed(effect)}, {basis}."
     if effect.opposed:
         mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
-        return f"{effect.label}: the sign depends on what else is chosen, {basis}: {_settings(effect)}; {mean}."
+        return f"{effect.label}: the sign depends on other factors, {basis}: {_settings(effect)}; {mean}."
     if effect.found:
         return f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}."
     if _contradict(effect):
@@ -68,7 +68,9 @@ def _verdict(effect: Effect) -> str:
         return f"{effect.label}: no common direction, {basis}; {mean}."
     if effect.scenes("higher") or effect.scenes("lower"):
         p = "" if effect.adjusted is None else f" (corrected p = {effect.adjusted:.2g})"
-        return f"{effect.label}: {_signed(effect)}, {basis}; undecided for other scenes{p}."
+        most = 2 * len(effect.scenes("higher" if value.mean > 0 else "lower")) > len(effect.by_scene)
+        words = f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}"
+        return f"{words if most else f'{effect.label}: {_signed(effect)}'}, {basis}; undecided for other scenes{p}."
     if effect.equivalent:
         assert effect.quantity.margin is not None
         margin = effect.text(effect.quantity.margin)
@@ -156,7 +158,7 @@ def _contradict(effect: Effect) -> bool:
 
 def _averaged(effect: Effect) -> str:
     """Over how many combinations of other factors' levels an effect is averaged."""
-    return f", averaged over {len(effect.by_setting)} settings of what else varies" if effect.by_setting else ""
+    return f", averaged over {len(effect.by_setting)} settings of other factors" if effect.by_setting else ""
 
 
 def _settings(effect: Effect) -> str:

@@ -56,7 +56,7 @@ def _quality(comparison: Comparison, summary: Summary) -> list[str]:
         )
     if column.key == "psnr" and comparison.noise_ceiling is not None:
         side = "below" if value < comparison.noise_ceiling else "above"
-        name = f"{side} the truth's own noise ceiling ({column.text(comparison.noise_ceiling)}{unit})"
+        name = f"{side} the truth's own noise level ({column.text(comparison.noise_ceiling)}{unit})"
         gaps.append((abs(comparison.noise_ceiling - value), name))
     worded = [f"{column.text(gap)}{unit} {where}" for gap, where in gaps]
     sentence += f": {listing(worded)}." if worded and math.isfinite(value) else "."
