@@ -23,6 +23,7 @@ from invgraphics.report.statistics.intervals import CONFIDENCE, POWER
 from invgraphics.report.statistics.predictions import PREDICTION_HEADS, JudgedPrediction, predictions_sentence
 from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences
 from invgraphics.report.statistics.values import value_of
+from invgraphics.report.statistics.verdict import unequal_start
 from invgraphics.report.wording import Quantity, budget_words, listing
 from invgraphics.text import duration
 
@@ -64,7 +65,8 @@ class StudyPage:
         effects, study = [*self.crossed, *self.contrasts.first], self.study
         judged = [predictions_sentence(self.predictions)] if self.predictions else []
         missing = unmeasured_sentences(study.interactions, effects, study.factors, study.observations())
-        return [*_progress(study), *judged, *missing, *map(effect_sentence, effects), *_scope(self)]
+        start = unequal_start([cell.run for cell in study.cells if cell.run])
+        return [*_progress(study), *judged, *missing, *map(effect_sentence, effects), *start, *_scope(self)]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD, Observation
@@ -12,6 +13,7 @@ from invgraphics.report.statistics.rules import DEAD_SHARE
 from invgraphics.report.statistics.sentences import detectable_words
 from invgraphics.report.statistics.summary import Row, Summary
 from invgraphics.report.wording import Quantity, budget_words, listing, times
+from invgraphics.runs.run import Run
 
 EXACT_POINTS = "exact surface points"
 """How the notes of a rendered scene call points that were taken from its truth."""
@@ -130,13 +132,13 @@ def _costs(summary: Summary) -> list[str]:
     return [f"{text}."] if text else []
 
 
-def _unequal_start(comparison: Comparison) -> list[str]:
-    """A warning where methods with primitives may start from points that no method could have found."""
-    told = [run for run in comparison.runs if EXACT_POINTS in str(run.provenance.notes.get("points", ""))]
-    explicit = {run.method for run in told if run.scores.cost.get("primitives")}
-    if not explicit or explicit == {run.method for run in comparison.runs}:
+def unequal_start(runs: Sequence[Run]) -> list[str]:
+    """A warning where methods with primitives may start from points that no method could have found, and others do not."""
+    told = [run for run in runs if EXACT_POINTS in str(run.provenance.notes.get("points", ""))]
+    explicit = {run.scores.method: None for run in told if run.scores.cost.get("primitives")}
+    if not explicit or set(explicit) == {run.scores.method for run in runs}:
         return []
-    names = listing(name for name in comparison.methods if name in explicit)
+    names = listing(explicit)
     return [
         f"The start is not equal: {names} may begin on exact surface points of the scene, which no method could find and "
         "others do not use; `--set data.init=sfm` or `data.init=random` makes it equal."
@@ -144,7 +146,7 @@ def _unequal_start(comparison: Comparison) -> list[str]:
 
 
 def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
-    sentences = _unequal_start(comparison)
+    sentences = unequal_start(comparison.runs)
     columns = [column for column in summary.columns if column.group != "cost"]
     reference = _best_baseline(summary, columns[0]) if columns else None
     if reference is not None:
