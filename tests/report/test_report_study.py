@@ -42,6 +42,7 @@ from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.study import build_study_report, shown_variants, study_sentences
 from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.scores import Score
+from invgraphics.scenes.truth import POINTS
 
 VIEWS, LEVELS = STUDY_FACTORS
 PSNR = quality_quantity("psnr", Score(mean=0.0, unit="dB", higher_is_better=True))
@@ -376,6 +377,17 @@ def test_study_before_its_first_run_has_a_page(small_study: Path, edit: Callable
     page = build_study_report(small_study).read_text()
     assert "4 of 4 cells have not run yet" in page
     assert "Nothing can be compared yet" in page
+
+
+def test_an_unequal_start_is_told_of_a_study_too(small_study: Path, edit: Callable[..., None]) -> None:
+    for index, run in enumerate(sorted(path.parent for path in small_study.rglob("provenance.json"))):
+        edit(run / "provenance.json", lambda t: t["notes"].update(points=POINTS))
+        changes = (
+            {"method": "splatting/gaussians", "cost": {"primitives": 10.0}} if index == 0 else {"method": "volumetric/hash"}
+        )
+        edit(run / "scores.json", lambda t, changes=changes: t.update(changes))
+    told = "The start is not equal: splatting/gaussians may begin on exact surface points"
+    assert told in build_study_report(small_study).read_text() and told in (small_study / "index.md").read_text()
 
 
 def test_many_variants_show_pictures_of_eight_from_best_to_worst(tmp_path: Path) -> None:
