@@ -74,6 +74,16 @@ def test_compare_then_evaluate_and_report(tmp_path, capsys) -> None:
     for name in ("scores.json", "scores.float.json", "provenance.json"):  # of the fit, and of the later evaluation
         assert json.loads((cell / name).read_text())["preset_choice"] == "as for every budget in steps"
 
+    # What cannot fit the scene is known before the first fit, and what the folder holds beside the report is named.
+    capsys.readouterr()
+    other = ["compare", str(data), "--methods", "volumetric/hash,surface/mesh:field.source=none", "--budget", "1steps"]
+    assert main.run([*other, "--out", str(out)]) == main.BAD_INPUT
+    assert "surface/mesh:field.source=none: none is not a run" in capsys.readouterr().err
+    assert not list(out.glob("runs/volumetric-hash*"))
+    assert main.run(["compare", str(data), "--methods", "volumetric/nerf", *words[2:]]) == main.DONE
+    assert "Not part of this report" in capsys.readouterr().err
+    assert main.run(["compare", str(data), *words]) == main.DONE
+
     assert main.run(["report", str(cell)]) == main.BAD_INPUT
     assert "--out" in capsys.readouterr().err
     assert main.run(["report", str(cell), "--out", str(tmp_path / "page")]) == main.DONE

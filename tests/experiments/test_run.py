@@ -180,11 +180,53 @@ def test_a_field_that_starts_from_a_changed_file_is_another_fit(toy_folder: Path
     assert found[0] == found[2] != found[1]
 
 
+def test_a_refused_fit_leaves_no_run_behind(toy_folder: Path, tmp_path: Path) -> None:
+    """What the first step refuses is no run that would block the folder for the corrected request; nor is a missing scene."""
+    wrong = _request(toy_folder, tmp_path / "run", overrides=(*SMALL[METHOD], "losses.0.type=eikonal"))
+    with pytest.raises(InputError, match="needs samples with gradients"):
+        fit_run(wrong)
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(InputError):
+        fit_run(_request(toy_folder / "nothing", tmp_path / "other"))
+    assert not (tmp_path / "other").exists()
+    assert fit_run(_request(toy_folder, tmp_path / "run", budget="2steps")).is_dir()
+
+
+@pytest.mark.parametrize(
+    ("method", "losses", "idle"),
+    [
+        (
+            "splatting/gaussians",
+            '[{type="photometric"}, {type="distortion"}, {type="interlevel"}]',
+            ["distortion", "interlevel"],
+        ),
+        ("volumetric/hash", '[{type="photometric"}, {type="scale"}, {type="coarse"}]', ["scale", "coarse"]),
+        ("volumetric/hash", '[{type="photometric"}, {type="distortion"}, {type="mask"}]', []),
+    ],
+)
+def test_losses_that_have_nothing_to_act_on_are_named(
+    toy_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str, losses: str, idle: list[str]
+) -> None:
+    changes = (*SMALL.get(method, ()), f"losses={losses}")
+    fit_run(_request(toy_folder, tmp_path / "run", method=method, budget="1steps", overrides=changes))
+    lines = [line for line in capsys.readouterr().err.splitlines() if "is 0 throughout" in line]
+    assert [line.split("'")[1] for line in lines] == idle
+
+
+@pytest.mark.parametrize(("losses", "said"), [('[{type="scale"}]', "nothing to fit by"), ('[{type="ssim"}]', "whole images")])
+def test_a_fit_without_an_objective_is_refused(toy_folder: Path, tmp_path: Path, losses: str, said: str) -> None:
+    request = _request(toy_folder, tmp_path / "run", method="volumetric/hash", overrides=(f"losses={losses}",))
+    with pytest.raises(InputError, match=said):
+        fit_run(request)
+
+
 def test_existing_runs_are_not_overwritten(run: Path, toy_folder: Path) -> None:
     with pytest.raises(InputError, match="already holds a run"):
         fit_run(_request(toy_folder, run))
-    with pytest.raises(InputError, match="holds another run"):
+    with pytest.raises(InputError, match="holds another run: its seed is 0, not 5"):
         fit_run(_request(toy_folder, run, seed=5, existing="resume"))
+    with pytest.raises(InputError, match="holds another run: its budget is 30steps, not 31steps"):
+        fit_run(_request(toy_folder, run, budget="31steps", existing="resume"))
     stamp = (run / "scores.json").stat().st_mtime_ns
     fit_run(_request(toy_folder, run, existing="reuse"))
     assert (run / "scores.json").stat().st_mtime_ns == stamp

@@ -1,5 +1,7 @@
 """Muon: orthogonalisation against singular vectors, steps against torch's class, and its place beside Adam."""
 
+import math
+
 import pytest
 import torch
 
@@ -131,9 +133,19 @@ def test_a_matrix_of_another_shape_begins_with_the_momentum_it_is_given() -> Non
     assert f"field.hidden.weight/{MOMENTUM}" not in optimiser.state()
 
 
-def test_a_negative_factor_is_refused() -> None:
-    with pytest.raises(ValueError, match="'muon' must be at least 0"):
-        OptimiserConfig(GROUPS, muon=-1.0)
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"muon": -1.0}, "'muon' must be at least 0"),
+        ({"beta1": 1.5}, "'beta1' and 'beta2' must be in"),
+        ({"beta2": -0.1}, "'beta1' and 'beta2' must be in"),
+        ({"eps": 0.0}, "'eps' must be above 0"),
+        ({"eps": math.nan}, "'eps' must be above 0"),
+    ],
+)
+def test_impossible_settings_are_refused(values: dict[str, float], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        OptimiserConfig(GROUPS, **values)
 
 
 def test_without_muon_all_parameters_are_adams() -> None:

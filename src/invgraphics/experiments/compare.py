@@ -20,8 +20,10 @@ from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import exposure_note, protocol_note
+from invgraphics.experiments.progress import warn
 from invgraphics.experiments.renderings import check_variants, is_kept
 from invgraphics.experiments.request import DATA, CompareRequest, FitRequest
+from invgraphics.experiments.start import check_source
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.recipes.suitable import default_methods, is_open_space, starts_from_points
@@ -60,6 +62,7 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     request, jobs, scene, refused = _resolve(request, opened)
     folder = RunFolder(Path(request.out))
     failures: list[Failure] = []
+    _name_others(request)
     earlier = any(RunFolder(Path(fit.out)).finished for fit in request.fits())
     summary = replace(_summary(request, jobs, scene), refused=tuple(refused), method_choice=choice)
     interrupted: KeyboardInterrupt | None = None
@@ -128,6 +131,14 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     return request, jobs, scene, [*refused, *unsuitable]
 
 
+def _name_others(request: CompareRequest) -> None:
+    """Warn of runs of earlier commands in the same folder, which are not part of this report."""
+    mine = {Path(fit.out) for fit in request.fits()}
+    others = sorted(path.parent for path in Path(request.out).glob("runs/*/seed-*/provenance.json"))
+    if left := [folder.relative_to(request.out).as_posix() for folder in others if folder not in mine]:
+        warn(f"Not part of this report, but of an earlier command on {request.out}: {', '.join(left)}.")
+
+
 def _check_folders(request: CompareRequest) -> None:
     """Refuse methods of other names whose runs would share a folder: a built-in method, and a file of that name.
 
@@ -192,29 +203,30 @@ def _start_for_all(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -
 
 
 def _suitable(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> tuple[list[Job], list[Refusal]]:
-    """Build every optional method's model, and separate the methods that refuse the scene.
+    """Build every method's model, and separate the optional methods that refuse the scene.
 
     Raises:
-        InputError: all of them do.
+        InputError: one that is not optional does, or all of them do.
     """
     kept, refused = [], []
     for job in jobs:
-        if job.request.method in request.optional:
-            try:
-                build_model(job.method, scene, request.seeds[0], job.device)
-            except InputError as error:
-                refused.append(_refusal(request, job.request.method, error))
-                continue
-        kept.append(job)
+        try:
+            check_source(job.method, request.scene)
+            build_model(job.method, scene, request.seeds[0], job.device)
+        except InputError as error:
+            refused.append(_refusal(request, job.request.method, error))
+        else:
+            kept.append(job)
     if not kept:
         raise InputError("None of the methods goes with the scene.", f"{refused[0].method}: {refused[0].reason}")
     return kept, refused
 
 
 def _refusal(request: CompareRequest, method: str, error: InputError) -> Refusal:
-    """Record of an optional method's refusal; raises the error of any other."""
+    """Record of an optional method's refusal; raises the error of any other, with its name."""
     if method not in request.optional:
-        raise error
+        sentence = error.sentence if method in error.sentence else f"{method}: {error.sentence}"
+        raise InputError(sentence, error.remedy) from error
     return Refusal(method=method, reason=error.sentence)
 
 

@@ -74,10 +74,20 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
         KeyboardInterrupt: the run was interrupted and holds a checkpoint.
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
-    folder, method, request = job.folder, job.method, job.request
-    if request.existing == "resume":
+    if job.request.existing == "resume":
         _check_existing(job)  # before the folder is made
-    folder.create()
+    new = not job.folder.root.exists()
+    job.folder.create()
+    try:
+        _make_run(job, scene, on_step)
+    except InputError:
+        if new:
+            job.folder.remove_empty()
+        raise
+
+
+def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | None) -> None:
+    folder, method, request = job.folder, job.method, job.request
     configure_torch(job.device)
     with folder.held(wait=request.existing == "reuse"):  # by a child of a killed comparison or study, which is about to end
         _check_existing(job)
@@ -88,7 +98,8 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
             raise InputError(
-                f"{folder.root} holds another run: its method, scene, budget, seed or code differ.", "Choose another --out."
+                f"{folder.root} holds a run of other code, threads, kernels or pictures of the same scene.",
+                "Choose another --out.",
             )
         if same and folder.finished:
             for protocol in job.unscored():
@@ -99,16 +110,18 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
         began_at = load_average()
         with PeakMemory(job.device) as memory:
             fit = prepare(job, shown)
-            if same and folder.resumable:
+            resumed = same and folder.resumable
+            if resumed:
                 earlier = folder.read(FitRecord)
                 fit.load(checkpoint.load(folder.checkpoint, job.device), earlier.seconds or 0.0)
                 fit.resume_clocks(asdict(earlier))
+            forecast = warm_up(fit, method, memory)  # which may refuse: the folder is as it was until then
+            if resumed:
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            folder.write(describe(job, (scene, shown), identity, fit.plan))
-            forecast = warm_up(fit, method, memory)
-            folder.write(replace(folder.read(Provenance), memory_forecast_bytes=forecast.bytes))
+            described = describe(job, (scene, shown), identity, fit.plan)
+            folder.write(replace(described, memory_forecast_bytes=forecast.bytes))
             if "inconsistent_poses" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
             with memory.excluding():  # pictures that are rendered to forecast the evaluation's time are no part of the fit
@@ -142,19 +155,31 @@ def _check_existing(job: Job) -> None:
         raise InputError(f"{folder.root} already holds a run.", "Add --resume to continue it, or choose another --out.")
     if request.existing == "resume" and not present:
         raise InputError(f"{folder.root} holds no run to resume.", "Leave --resume away to start one.")
-    if request.existing == "reuse":
+    if request.existing != "refuse":
         check_replaceable(job)
 
 
 def warm_up(fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
     """Run a discarded warm-up step and monitor pass, and forecast the fit's memory from their peak.
 
+    Warns of losses that have nothing to act on.
+
     Raises:
-        InputError: the primitives would need more memory than the machine has.
+        InputError: no loss has, or the primitives would need more memory than the machine has.
     """
     fit.warmup_step()
+    _check_losses(fit, method)
     Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
     return memory_forecast(fit.plan, method, memory.peak_bytes)
+
+
+def _check_losses(fit: Fit, method: Method) -> None:
+    names = [method.table["losses"][index]["type"] for index in fit.idle_losses]
+    if names and len(names) == len(fit.plan.losses) and fit.progress < 1:
+        words = f"{method.name} has nothing to fit by: its renderer gives {', '.join(names)} nothing to act on."
+        raise InputError(words, "A loss of every renderer is --set 'losses=[{type=\"photometric\"}]'.")
+    for name in names:
+        warn(f"Warning: the loss '{name}' is 0 throughout: this renderer gives it nothing to act on.")
 
 
 def _prediction(job: Job, loaded: Scene, fit: Fit, memory: MemoryForecast) -> str:

@@ -37,6 +37,22 @@ BASE_BYTES = 95 * 10**6
 takes 45 MB more than its first. With 65 MB, NeRF on room at 128 px exceeded the forecast by 5 MB on one thread, 17 on two."""
 
 
+def check_source(method: Method, scene_spec: str) -> None:
+    """Check that the run or the file that a recipe's ``field.source`` names is there, and shows the scene.
+
+    Raises:
+        InputError: it is not, or does not.
+    """
+    config = method.recipe.field
+    source = getattr(config, "source", "")
+    if not source or (isinstance(config, MeshFieldConfig) and Path(source).is_file()):
+        return
+    check_run(Path(source))
+    shown = RunFolder(Path(source)).read(Provenance).scene
+    if Path(shown).resolve() != Path(scene_spec).resolve():
+        raise InputError(f"field.source: {source} is a run on '{shown}', not on '{scene_spec}'.")
+
+
 def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:
     """Initialise the plan's field by conversion from the run that the recipe's ``field.source`` names, if any.
 
@@ -45,16 +61,12 @@ def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:
     """
     config = method.recipe.field
     source = getattr(config, "source", "")
+    check_source(method, scene_spec)
     if not source:
         return plan
     if isinstance(config, MeshFieldConfig) and Path(source).is_file():
         return _with_field(plan, config.from_mesh(mesh_from_file(Path(source), plan.scene), plan.scene))
-    check_run(Path(source))
-    folder = RunFolder(Path(source))
-    shown = folder.read(Provenance).scene
-    if Path(shown).resolve() != Path(scene_spec).resolve():
-        raise InputError(f"field.source: {source} is a run on '{shown}', not on '{scene_spec}'.")
-    source_field = load_fitted(folder, plan.scene).model.field
+    source_field = load_fitted(RunFolder(Path(source)), plan.scene).model.field
     torch.manual_seed(plan.seed)  # loading the source has drawn its own initial values
     return _with_field(plan, config.converted(source_field, plan.scene))
 

@@ -58,6 +58,10 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.max_primitives is not None and self.max_primitives < 1:
             raise ValueError(f"max_primitives must be at least 1, not {self.max_primitives}.")
+        for name, terms in (("losses", self.losses), ("penalties", self.penalties)):
+            for index, term in enumerate(terms):
+                if getattr(term, "weight", 0.0) < 0:
+                    raise ValueError(f"{name}.{index}.weight must be at least 0, not {term.weight}: a fit minimises.")
 
     def capped(self) -> Recipe:
         """Apply ``max_primitives`` to the field and the hooks that create primitives (`CapsPrimitives`)."""

@@ -68,7 +68,14 @@ class Plan:
 
 
 class Fit:
-    """A fit in progress: `step` advances it; `state` and `load` resume it after an interruption, bit-exactly on a CPU."""
+    """A fit in progress: `step` advances it; `state` and `load` resume it after an interruption, bit-exactly on a CPU.
+
+    Attributes:
+        plan: what is fitted, and how.
+        steps: number of steps taken.
+        seconds: wall time of these steps.
+        idle_losses: numbers of the losses that the first step gave nothing to act on, so that they are 0 without a gradient.
+    """
 
     def __init__(self, plan: Plan) -> None:
         for hook in plan.hooks:
@@ -80,6 +87,7 @@ class Fit:
         self.plan = plan
         self.steps = 0
         self.seconds = 0.0
+        self.idle_losses: tuple[int, ...] = ()
         self.resume_clocks({})
         self._bounds = plan.scene.bounds.to(plan.device)
         self._generator = torch.Generator().manual_seed(plan.seed)
@@ -126,10 +134,10 @@ class Fit:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
         composited = _counted(replace(rendering, rgb=rendering.over(batch.background)), batch)
-        terms = torch.stack(
-            [loss(composited, trace, batch, ctx) for loss in plan.losses]
-            + [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties]
-        )
+        losses = [loss(composited, trace, batch, ctx) for loss in plan.losses]
+        if self.steps == 0:
+            self.idle_losses = tuple(index for index, term in enumerate(losses) if not term.requires_grad)
+        terms = torch.stack(losses + [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties])
         loss = terms.sum()
         value = loss.item()
         if not torch.isfinite(loss):

@@ -13,6 +13,7 @@ from torch import Tensor
 from invgraphics import kernels
 from invgraphics.core import Batch, Bounds, Context, Rendering, Trace
 from invgraphics.core.compositing import over
+from invgraphics.errors import InputError
 from invgraphics.renderers.samplers import to_spacing
 
 Loss = Callable[[Rendering, Trace, Batch, Context], Tensor]
@@ -91,7 +92,16 @@ class SsimLoss:
     weight: float = 0.2
 
     def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
-        """The weighted loss."""
+        """The weighted loss.
+
+        Raises:
+            InputError: the batch holds single pixels.
+        """
+        if batch.target.ndim != 3:
+            raise InputError(
+                "The loss 'ssim' needs whole images, and this renderer draws single rays.",
+                "Take it out, for instance by --set 'losses=[{type=\"photometric\"}]'.",
+            )
         return self.weight * (1 - kernels.ssim(rendering.rgb, batch.target))
 
 

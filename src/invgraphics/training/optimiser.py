@@ -79,7 +79,11 @@ class OptimiserConfig:
     muon: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.muon < 0:
+        if not (0 <= self.beta1 < 1 and 0 <= self.beta2 < 1):
+            raise ValueError(f"'beta1' and 'beta2' must be in [0, 1), not {self.beta1} and {self.beta2}.")
+        if not self.eps > 0:
+            raise ValueError(f"'eps' must be above 0, not {self.eps}.")
+        if not self.muon >= 0:
             raise ValueError(f"'muon' must be at least 0, not {self.muon}.")
 
 
