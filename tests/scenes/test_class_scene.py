@@ -1,5 +1,7 @@
 """Classes of objects: instances rendered with their own cameras, unseen ones held out, and read back like any data set."""
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +71,13 @@ def test_each_instance_is_the_model_of_its_seed(scene: Scene) -> None:
         assert float((picture.depth - view.depth)[both].abs().median()) < 2e-3
         assert picture.normal is not None
         assert float((picture.normal * view.normal).sum(dim=-1)[both].median()) > 0.99
+
+
+def test_the_background_is_the_description_s(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "grey"))
+    table = json.loads((copy / "truth.json").read_text())
+    (copy / "truth.json").write_text(json.dumps(table | {"background": [0.5, 0.25, 0.0]}))
+    assert open_scene(str(copy)).background.tolist() == [0.5, 0.25, 0.0]
 
 
 def test_a_class_is_kept_and_read_like_any_data_set(scene: Scene, folder: Path, tmp_path: Path) -> None:

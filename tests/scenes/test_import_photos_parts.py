@@ -3,8 +3,10 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
 from invgraphics.scenes.photos.prepare import Preparation, natural, prepare
 from invgraphics.scenes.photos.result import max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
-from invgraphics.scenes.pictures.lens import Lens
+from invgraphics.scenes.pictures.lens import Lens, straighten
 from invgraphics.scenes.process import run_worker
 
 
@@ -146,6 +148,27 @@ def test_pairs() -> None:
     assert len(pairs(300, "exhaustive")) == 300 * 299 // 2
 
 
+def test_masks_and_calibrations_of_a_data_set_are_kept(tmp_path: Path) -> None:
+    """What the data set masks is not matched, and masked in the scene too; other focal lengths are other cameras."""
+    table: dict[str, Any] = {"w": 96, "h": 80, "camera_model": "PINHOLE", "frames": []}
+    for index in range(9):
+        save(noise(index, 96, 80), tmp_path / f"set/images/{index}.png")
+        mask = np.full((80, 96), 255, np.uint8)
+        mask[:, : 10 * (index % 2)] = 0
+        save(mask, tmp_path / f"set/masks/{index}.png")
+        focal, pose = 90.0 if index < 5 else 120.0, np.eye(4)
+        pose[0, 3] = index
+        frame = {"file_path": f"images/{index}.png", "mask_path": f"masks/{index}.png", "fl_x": focal, "fl_y": focal}
+        table["frames"].append(frame | {"cx": 50.0, "cy": 42.0, "transform_matrix": pose.tolist()})
+    (tmp_path / "set/transforms.json").write_text(json.dumps(table))
+    photos = prepared(tmp_path / "set", tmp_path).photos
+    assert sorted({photo.group: photo.focal for photo in photos}.values()) == [90.0, 120.0]
+    assert [photo.own_mask and photo.masked for photo in photos] == [bool(index % 2) for index in range(9)]
+    for index, photo in enumerate(photos):
+        left_out = np.array(Image.open(tmp_path / f"work/masks/{photo.name}.png")) == 0
+        assert left_out.sum() == 80 * 10 * (index % 2) and not left_out[:, 10 * (index % 2) :].any()
+
+
 def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None:
     """COLMAP's own synthetic scene through a bent lens: afterwards a plain pinhole explains the same observations."""
     import pycolmap
@@ -161,6 +184,9 @@ def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None
         image.name = f"{number}.png"
         save(noise(number, 160, 120), folder / image.name)
     preparation = prepared(folder, tmp_path)
+    own = replace(preparation.photos[0], own_mask=True)  # as of a data set
+    save(np.eye(120, 160, dtype=np.uint8) * 255, tmp_path / "work/own-masks/0.png.png")
+    preparation = replace(preparation, photos=(own, *preparation.photos[1:]))
     moved = write_scene(model, preparation.photos, tmp_path / "work", tmp_path / "result", quiet)
     # The corner is at radius 100/150 of the focal length: x k r³ f.
     assert moved == pytest.approx(150 * 0.1 * (100 / 150) ** 3, rel=0.5)
@@ -174,6 +200,7 @@ def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None
     assert len(errors) > 100
     assert max(errors) < 0.02
     assert Image.open(tmp_path / "result/images/0.png").size == (160, 120)
+    assert [path.name for path in (tmp_path / "result/masks").iterdir()] == ["0.png.png"]
 
 
 def test_how_much_a_lens_bends() -> None:
@@ -181,6 +208,36 @@ def test_how_much_a_lens_bends() -> None:
     assert max_distortion(Lens("SIMPLE_RADIAL", (100.0, 50.0, 50.0, 1e-4), 100, 100)) == pytest.approx(
         100 * 1e-4 * 0.5**1.5, rel=0.01
     )
+
+
+@pytest.mark.parametrize(("focal", "k"), [(550.0, -0.15), (700.0, -0.2), (700.0, -0.25), (800.0, -0.25)])
+def test_a_strong_lens_bends_though_its_corners_have_no_rays(focal: float, k: float) -> None:
+    lens = Lens("SIMPLE_RADIAL", (focal, 500.0, 375.0, k), 1000, 750)
+    moved = max_distortion(lens)
+    # On the picture's shorter axis, where the lens has an inverse: r - k r³ = 375 / f is at least that much longer.
+    assert np.isfinite(moved) and moved > focal * abs(k) * (375 / focal) ** 3
+    assert all(np.isfinite(straighten(lens).focal))
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_FISHEYE", (100.0, 100.0, 75.0)),
+        ("OPENCV_FISHEYE", (100.0, 100.0, 100.0, 75.0, 0.0, 0.0, 0.0, 0.0)),
+        ("RADIAL_FISHEYE", (100.0, 100.0, 75.0, 0.0, 0.0)),
+    ],
+)
+def test_a_fisheye_without_coefficients_is_no_pinhole(model: str, parameters: tuple[float, ...]) -> None:
+    """It draws angles: a ray 45 degrees off the axis meets the picture at f π/4, where a pinhole has f."""
+    lens = Lens(model, parameters, 200, 150)
+    assert not lens.is_pinhole()
+    assert max_distortion(lens) > 10
+    assert Lens("OPENCV", (100.0, 100.0, 100.0, 75.0, 0.0, 0.0, 0.0, 0.0), 200, 150).is_pinhole()
+    straight = straighten(lens)
+    seen = np.array([[150.0, 75.0]])  # what the straight picture shows there comes from where the angle says
+    angle = np.arctan((seen[0, 0] - straight.centre[0]) / straight.focal[0])
+    place = (straight.grid[75, 150, 0] + straight.grid[74, 150, 0]).item() / 2  # rows on both sides of the axis
+    assert (place + 1) * 100 == pytest.approx(100 + 100 * angle, abs=0.6)
 
 
 def test_settings_are_checked() -> None:

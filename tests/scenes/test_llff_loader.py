@@ -45,6 +45,13 @@ def test_dots_are_where_the_cameras_say(tmp_path: Path, eyes: list[Eye]) -> None
     assert_dots_are_found(scene)
 
 
+def test_the_file_may_be_named_instead_of_its_folder(tmp_path: Path) -> None:
+    path = write(tmp_path, forward_facing())
+    assert Llff().matches(path / "poses_bounds.npy") and Llff().matches(path) and not Llff().matches(path / "images")
+    by_file, by_folder = (Llff().load(place, SceneOptions()) for place in (path / "poses_bounds.npy", path))
+    assert by_file.name == by_folder.name and by_file.digest("train") == by_folder.digest("train")
+
+
 def test_parallel_cameras_focus_between_the_bounds(tmp_path: Path) -> None:
     """The subject is on the middle axis, at the distance that LLFF's rule gives; up is +z; near is 10% before the bound."""
     scene = Llff().load(write(tmp_path, forward_facing()), SceneOptions())

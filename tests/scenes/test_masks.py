@@ -83,6 +83,16 @@ def test_colmap_s_names_of_masks(tmp_path: Path) -> None:
     assert found == [tmp_path / "masks/a.jpg.png", tmp_path / "masks/sub/b.png", None]
 
 
+def test_masks_beside_photographs_that_lie_in_the_workspace_itself(tmp_path: Path) -> None:
+    """Names that begin with their folder, and masks that do so too or not; a neighbour's masks are not taken."""
+    names = ["images/a.jpg", "images/b.jpg", "c.jpg"]
+    for path in ("set/masks/images/a.jpg.png", "set/masks/b.png", "set/masks/c.png", "masks/c.png"):
+        save(np.zeros((2, 2), np.uint8), tmp_path / path)
+    photos = [Photo(tmp_path / "set" / name, None, name) for name in names]  # pyright: ignore[reportArgumentType]
+    found = [photo.mask for photo in with_masks_beside(photos, tmp_path / "set")]
+    assert found == [tmp_path / "set/masks" / name for name in ("images/a.jpg.png", "b.png", "c.png")]
+
+
 @pytest.mark.parametrize(
     ("mask", "sentence"),
     [

@@ -1,5 +1,6 @@
 """Our own one-file convention."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,12 @@ import pytest
 import torch
 from dots import COLOURS, POINTS, assert_dots_are_found, ring
 
+from invgraphics.core import Bounds, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
-from invgraphics.scenes.npz import Npz
+from invgraphics.scenes.npz import Npz, save_npz
 from invgraphics.scenes.open import open_scene, validate
+from invgraphics.testing import toy_scene
 
 
 def arrays(with_alpha: bool = False) -> dict[str, Any]:
@@ -98,6 +101,26 @@ def test_geometry_moves_into_the_local_frame(tmp_path: Path) -> None:
         assert float(world.norm()) < 1e-5
     assert Npz().load(path, SceneOptions(size=80)).train[0].depth is None
     assert "dropped" in Npz().load(path, SceneOptions(size=80)).notes["geometry"]
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
+def test_a_kept_scene_stays_in_its_own_units(tmp_path: Path, factor: float) -> None:
+    """Its box is not scaled to a usual size: cameras made for the scene are those of what was fitted to the copy."""
+    toy = toy_scene(views=2, size=8)
+
+    def larger(view: View) -> View:
+        pose = view.camera.cam_to_world.clone()
+        pose[:3, 3] *= factor
+        return replace(view, camera=view.camera.moved(pose), depth=None)
+
+    splits = {split: tuple(larger(view) for view in getattr(toy, split)) for split in ("train", "val", "test")}
+    bounds = Bounds(toy.bounds.lo * factor, toy.bounds.hi * factor, near=toy.bounds.near)
+    scene = replace(toy, **splits, bounds=bounds, points=None)
+    save_npz(scene, tmp_path / "kept.npz")
+    again = Npz().load(tmp_path / "kept.npz", SceneOptions(test_views=None))
+    assert torch.equal(again.world_from_local, torch.eye(4))
+    torch.testing.assert_close(again.bounds.hi, scene.bounds.hi)
+    torch.testing.assert_close(again.train[0].camera.cam_to_world, scene.train[0].camera.cam_to_world, check_dtype=False)
 
 
 @pytest.mark.parametrize(("size", "place"), [(40.0, (90.0, -200.0, 10.0)), (0.01, (0.0, 0.0, 0.0)), (1.0, (500.0, 0.0, 0.0))])

@@ -73,6 +73,7 @@ class ConvertedRun:
         hub: what the conversion went through, in words.
         native_psnr: of that run on the test views, dB; ``None`` where unknown.
         converted_psnr: of the converted model before its refit, dB.
+        data_seed: seed of what was done to the training photographs, where it is not the run's own.
     """
 
     run: str
@@ -82,6 +83,7 @@ class ConvertedRun:
     hub: str
     native_psnr: float | None = None
     converted_psnr: float | None = None
+    data_seed: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

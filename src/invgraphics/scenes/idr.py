@@ -34,7 +34,7 @@ class Idr:
     """
 
     def matches(self, path: Path) -> bool:
-        """Whether ``path`` is a folder with ``cameras*.npz`` and pictures, or such a file."""
+        """Whether ``path`` is a folder with ``cameras*.npz``."""
         return _source(path) is not None
 
     def load(self, path: Path, options: SceneOptions) -> Scene:

@@ -19,6 +19,8 @@ from invgraphics.scenes.pictures.images import Photo, image_files
 from invgraphics.scenes.poses import pose
 from invgraphics.scenes.region import contracted_frame
 
+SOURCE = "poses_bounds.npy"
+
 
 class Llff:
     """Loader of LLFF folders: one pinhole per photograph, near and far bounds, every eighth photograph scored.
@@ -29,7 +31,7 @@ class Llff:
 
     def matches(self, path: Path) -> bool:
         """Whether ``path`` is a folder with ``poses_bounds.npy``, or that file."""
-        return (path / "poses_bounds.npy").is_file()
+        return (path / SOURCE).is_file() or (path.name == SOURCE and path.is_file())
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Load poses, near and far bounds and photographs as an unbounded scene.
@@ -37,7 +39,8 @@ class Llff:
         Raises:
             InputError: a file is missing or unusable, or there are more or fewer pictures than poses.
         """
-        source = path / "poses_bounds.npy"
+        path = path.parent if path.is_file() else path
+        source = path / SOURCE
         table = _read(source)
         files = _pictures(path)
         if len(files) != len(table):

@@ -17,6 +17,7 @@ val            (n,) booleans, optional        which views are only looked at dur
 subject        (n,) integers, optional        of a class of objects: which one each view shows; scored ones are unseen
 observed       (n,) booleans, optional        of a class: views from which the unseen instances are inferred
 bounds         (2, 3), optional               lowest and highest corner of a box that holds all there is; default: unbounded
+own_units      () boolean, optional           whether the box is taken as it is, however large; default: scaled to a usual size
 ============== ============================== =====================================================================
 """
 
@@ -118,6 +119,7 @@ def _read(path: Path) -> Arrays:
         "val": [(n,)],
         "subject": [(n,)],
         "observed": [(n,)],
+        "own_units": [()],
     }
     known = (*_REQUIRED, *allowed, "points", "points_rgb")
     if unknown := [key for key in arrays if key not in known]:
@@ -150,6 +152,8 @@ def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> Frame:
         lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32)).double()
     if not bool((lo < hi).all()):
         raise InputError(f"'bounds' of {path} is {arrays['bounds'].tolist()}: the first corner must be below the second.")
+    if bool(arrays.get("own_units", False)):
+        return Frame(Bounds(lo.float(), hi.float()), points=points)
     return box_frame(lo, hi, points)
 
 
@@ -239,7 +243,10 @@ def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shap
 
 
 def save_npz(scene: Scene, path: Path) -> None:
-    """Write a scene as one ``.npz`` file that `Npz` reads as the same scene; points' colours are rounded to 8 bits.
+    """Write a scene as one ``.npz`` file that `Npz` reads as the same scene, in the same units.
+
+    Points' colours are rounded to 8 bits; names of views, spread of exposures, noise level and which photographs show which
+    points are not kept.
 
     Raises:
         InputError: it holds what the convention does not: no box, linear or unrounded colours, masks, another
@@ -260,6 +267,7 @@ def save_npz(scene: Scene, path: Path) -> None:
         "centre": np.stack([view.camera.centre.cpu().numpy() for view in views]),
         "test": split == 2,
         "bounds": torch.stack([scene.bounds.lo, scene.bounds.hi]).cpu().numpy(),
+        "own_units": np.array(True),
     }
     for key in ("alpha", "depth", "normal"):
         values = [getattr(view, key) for view in views]

@@ -102,7 +102,8 @@ def _class_scene(path: Path, truth: Mapping[str, Any], options: SceneOptions) ->
         key: scene.notes[key] for key in ("train_views", "test_views", "geometry") if key in scene.notes
     }
     notes["instances"] = f"{count['train']} to fit, {count['unseen']} unseen with {count['observed']} observed views each"
-    return replace(scene, name=truth["name"], noise_ceiling=truth["noise_ceiling"], notes=notes)
+    background = scene.background if truth["background"] is None else torch.tensor(truth["background"])
+    return replace(scene, name=truth["name"], background=background, noise_ceiling=truth["noise_ceiling"], notes=notes)
 
 
 def _view(path: Path, split: str, index: int, table: Mapping[str, Any], options: SceneOptions) -> View:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
@@ -23,7 +23,7 @@ from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
 from invgraphics.tables import read_json
 
-PHOTOS, MASKS, PREPARED = "photos", "masks", "prepared.json"
+PHOTOS, MASKS, OWN_MASKS, PREPARED = "photos", "masks", "own-masks", "prepared.json"
 
 PHONE = (".heic", ".heif", ".avif")
 """Read where Pillow has a decoder for them."""
@@ -49,7 +49,8 @@ class Prepared:
         group: photographs with the same text share a camera.
         focal: focal length from EXIF or from the data set, pixels of the working copy.
         centre: principal point, where the data set knows it.
-        masked: whether it has transparent parts, in which no features are looked for.
+        masked: whether no features are looked for in parts of it: where it is transparent, or a data set masks it.
+        own_mask: whether it has a mask of a data set, which the scene keeps.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Prepared:
     focal: float | None = None
     centre: tuple[float, float] | None = None
     masked: bool = False
+    own_mask: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,13 +85,14 @@ class Preparation:
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """One picture, not read yet: its name, group and known intrinsics (of what ``load`` returns)."""
+    """One picture, not read yet: its name, group, known intrinsics (of what ``load`` returns) and the data set's mask."""
 
     name: str
     load: Callable[[], UInt8[np.ndarray, "h w c"]]
     group: str
     focal_share: float | None = None  # focal length over the longest side
     camera: Camera | None = None
+    mask: Bool[np.ndarray, "h w"] | None = None
 
 
 def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
@@ -100,6 +103,7 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
     """
     (work / PHOTOS).mkdir(exist_ok=True)
     (work / MASKS).mkdir(exist_ok=True)
+    (work / OWN_MASKS).mkdir(exist_ok=True)
     skipped: dict[str, str] = {}
     sources = _data_set(job.path) if not image_files(job.path) and _is_data_set(job.path) else _files(job.path, skipped)
     seen: dict[str, str] = {}
@@ -213,8 +217,15 @@ def _data_set(folder: Path) -> list[_Source]:
                 alpha = [] if view.alpha is None else [(view.opacity() * 255 + 0.5).byte().numpy()[..., None]]
                 return np.concatenate([image, *alpha], axis=-1)
 
-            sources.append(_Source(label, load, "data set", camera=view.camera))
+            mask = None if view.mask is None else view.mask.numpy()
+            sources.append(_Source(label, load, _calibration(view.camera), camera=view.camera, mask=mask))
     return sorted(sources, key=lambda source: natural(source.name))
+
+
+def _calibration(camera: Camera) -> str:
+    """Name of a group of cameras of one calibration: focal lengths equal to a thousandth, principal points to a pixel."""
+    fx, fy, cx, cy = (float(value) for value in (*camera.focal, *camera.centre))
+    return f"data set f={fx:.3g},{fy:.3g} c={cx:.0f},{cy:.0f}"
 
 
 def _reduced(pixels: UInt8[np.ndarray, "h w c"], longest: int) -> UInt8[np.ndarray, "h w c"]:
@@ -236,6 +247,10 @@ def _write(work: Path, name: str, source: _Source, pixels: UInt8[np.ndarray, "h 
     masked = pixels.shape[2] == 4 and int(pixels[..., 3].min()) < _OPAQUE
     write_picture(work / PHOTOS / name, Image.fromarray(pixels), compress_level=1)
     opaque = pixels[..., 3] >= _OPAQUE if masked else np.ones((height, width), dtype=bool)
+    if source.mask is not None:
+        counts = _at_size(source.mask, width, height)
+        write_picture(work / OWN_MASKS / f"{name}.png", Image.fromarray(255 * counts.astype(np.uint8)), compress_level=1)
+        opaque, masked = opaque & counts, True
     write_picture(work / MASKS / f"{name}.png", Image.fromarray(255 * opaque.astype(np.uint8)), compress_level=1)
     focal = None if source.focal_share is None else source.focal_share * max(width, height)
     centre = None
@@ -244,7 +259,17 @@ def _write(work: Path, name: str, source: _Source, pixels: UInt8[np.ndarray, "h 
         camera = source.camera.resized(width, height)
         focal = float(camera.focal.mean())
         centre = (float(camera.centre[0]), float(camera.centre[1]))
-    return Prepared(name, source.name, width, height, group, focal, centre, masked)
+    return Prepared(name, source.name, width, height, group, focal, centre, masked, source.mask is not None)
+
+
+def _at_size(mask: Bool[np.ndarray, "h w"], width: int, height: int) -> Bool[np.ndarray, "height width"]:
+    """A mask at another size; a pixel counts where all of it did, to within a pixel of the mask."""
+    from PIL import Image
+
+    if mask.shape == (height, width):
+        return mask
+    shrunk = Image.fromarray(255 * mask.astype(np.uint8)).resize((width, height), Image.Resampling.BOX)
+    return np.asarray(shrunk) == 255
 
 
 def _reason(name: str, error: InputError) -> str:

@@ -13,14 +13,19 @@ from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import copy_file, write_picture
 from invgraphics.scenes.colmap_sizes import check_sizes
-from invgraphics.scenes.photos.prepare import PHOTOS, Prepared
+from invgraphics.scenes.photos.prepare import OWN_MASKS, PHOTOS, Prepared
 from invgraphics.scenes.pictures.images import read_pixels
 from invgraphics.scenes.pictures.lens import Lens, Straight, straighten
+from invgraphics.scenes.pictures.masks import FOLDER
 from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
 
 STRAIGHT = 0.25
 """A lens that moves no pixel farther than this many pixels is taken for a pinhole: resampling would cost more than it mends."""
+
+
+MAPS_BACK = 0.01
+"""A pixel is believed to have a ray where that ray leads back to within this many pixels of it."""
 
 
 def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path, progress: Progress) -> float:
@@ -39,6 +44,9 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
         image = by_name[photo.name]
         lens = lenses[image.camera_id] if bends[image.camera_id] > STRAIGHT else None
         _write_picture(work / PHOTOS / photo.name, result / "images" / photo.name, lens)
+        if photo.own_mask:  # of pictures that are pinholes' already
+            (result / FOLDER).mkdir(exist_ok=True)
+            copy_file(work / OWN_MASKS / f"{photo.name}.png", result / FOLDER / f"{photo.name}.png")
     for camera_id, camera in model.cameras.items():
         straight = straighten(lenses[camera_id]) if bends[camera_id] > STRAIGHT else None
         if straight is not None:
@@ -61,15 +69,22 @@ def _write_model(model: Any, folder: Path) -> None:
 
 
 def max_distortion(lens: Lens) -> float:
-    """Largest displacement in pixels by the lens distortion along the picture's border."""
+    """Largest displacement in pixels by the lens distortion, on a lattice over the picture.
+
+    Where the lens has no inverse, as in the corners of strong barrel distortion, nothing is measured: it counts as the longest
+    side of the picture if that is everywhere.
+    """
     if lens.is_pinhole():
         return 0.0
     camera = lens.colmap()
     x, y = np.linspace(0, lens.width, 33), np.linspace(0, lens.height, 33)
     border = np.array([[u, v] for u in x for v in y])
     plane = camera.cam_from_img(border)
+    back = camera.img_from_cam(np.concatenate([plane, np.ones((len(plane), 1))], axis=1))
+    known = np.abs(back - border).max(axis=1) < MAPS_BACK  # not so of NaN
     straight = plane * (camera.focal_length_x, camera.focal_length_y) + (camera.principal_point_x, camera.principal_point_y)
-    return float(np.linalg.norm(straight - border, axis=1).max())
+    moved = np.linalg.norm(straight - border, axis=1)[known]
+    return float(moved.max()) if len(moved) else float(max(lens.width, lens.height))
 
 
 def _lens(camera: Any) -> Lens:
@@ -95,7 +110,9 @@ def _move_points(image: Any, camera: Any, straight: Straight) -> None:
     if image.num_points2D() == 0:
         return
     plane = camera.cam_from_img(np.array([point.xy for point in image.points2D]))
-    for point, xy in zip(image.points2D, plane * straight.focal + straight.centre, strict=True):
+    moved = plane * straight.focal + straight.centre
+    moved[~np.isfinite(moved).all(axis=1)] = -1  # outside: the undistorted picture does not show what has no ray
+    for point, xy in zip(image.points2D, moved, strict=True):
         point.xy = xy
 
 

@@ -55,8 +55,9 @@ class Lens:
         return camera
 
     def is_pinhole(self) -> bool:
-        """Whether the lens has no distortion."""
-        return self.colmap().is_undistorted()
+        """Whether the lens has no distortion; one that projects angles (a fisheye) always has, whatever its parameters."""
+        camera = self.colmap()
+        return "FISHEYE" not in self.model and camera.is_undistorted()
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,21 +17,23 @@ FOLDER = "masks"
 
 
 def with_masks_beside(photos: Sequence[Photo], images: Path) -> list[Photo]:
-    """Give photographs the masks in `FOLDER` beside their folder, named as by COLMAP, ``NAME.jpg.png``, or ``NAME.png``.
+    """Give photographs the masks in `FOLDER` in or beside their folder, named as by COLMAP, ``NAME.jpg.png``, or ``NAME.png``.
 
     Args:
         photos: without masks.
         images: their folder, to which their names are relative.
     """
-    folder = images.parent / FOLDER
-    if not folder.is_dir():
+    folder = next((place / FOLDER for place in (images, images.parent) if (place / FOLDER).is_dir()), None)
+    if folder is None:
         return list(photos)
     return [replace(photo, mask=_named_like(photo, folder)) for photo in photos]
 
 
 def _named_like(photo: Photo, folder: Path) -> Path | None:
-    name = folder / photo.name
-    candidates = (name.with_name(name.name + ".png"), name.with_suffix(".png"), name)
+    """The mask of a photograph; where names begin with their folder (``images/0.jpg``), those of masks need not."""
+    own = Path(photo.name)
+    names = [folder / name for name in (own, *([Path(*own.parts[1:])] if len(own.parts) > 1 else []))]
+    candidates = [path for name in names for path in (name.with_name(name.name + ".png"), name.with_suffix(".png"), name)]
     return next((path for path in candidates if file_exists(path)), None)
 
 
