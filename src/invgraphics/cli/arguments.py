@@ -6,13 +6,14 @@ import contextlib
 import dataclasses
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from invgraphics.errors import InputError
+from invgraphics.experiments.request import DATA
 from invgraphics.training.budget import Budget
 
 T = TypeVar("T")
@@ -47,7 +48,7 @@ class Shared:
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
     """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
-    """Largest number of Gaussians; short for --set max_primitives=N."""
+    """Largest number of Gaussians or points, for methods that have some; short for --set max_primitives=N."""
     optimise: Annotated[str, arg(metavar="poses,exposure")] = ""
     """Fit the training cameras' poses too, or an exposure of each training photograph, or both; short for
     --set training.poses.optimise=true and --set training.exposure.optimise=true. Exposures are fitted unasked where those of a
@@ -89,6 +90,28 @@ class Shared:
             "checkpoint_every": self.checkpoint_every,
             "render_with": parse_list(self.render_with, "--render-with") if self.render_with else (),
         }
+
+    def check_primitives(self, methods: Sequence[str]) -> None:
+        """Refuse ``--max-primitives`` where no method has primitives; a method that cannot be resolved is left to the fit.
+
+        Raises:
+            InputError: it would do nothing.
+        """
+        if self.max_primitives is None or not methods:
+            return
+
+        from invgraphics.recipes.recipe import load_method
+
+        overrides = [item for item in self.settings()["overrides"] if not item.startswith(DATA)]
+        for method in methods:
+            try:
+                resolved = load_method(method, self.preset, overrides, Budget.parse(self.budget))
+            except InputError:
+                return
+            if resolved.recipe.has_primitives:
+                return
+        which = f"{methods[0]}, which has" if len(methods) == 1 else "these methods, which have"
+        refuse_idle({"--max-primitives": self.max_primitives}, f"for {which} no Gaussians or points")
 
 
 def parse(command: type[T], program: str, arguments: Sequence[str]) -> T:
@@ -139,6 +162,23 @@ def condense(box: str) -> tuple[str, str]:
     sentence = re.sub(r"invalid literal for int\(\) with base 10: ('.*')", r"\1 is not a whole number", parts[0])
     hints = [part for part in parts[1:-1] if part.startswith("Perhaps")]
     return "\n".join([sentence, *hints[:1]]), parts[-1] if len(parts) > 1 else ""
+
+
+def refuse_idle(given: Mapping[str, Any], why: str, remedy: str = "") -> None:
+    """Refuse options that would do nothing.
+
+    Args:
+        given: option -> its value; ``None`` where it was not given.
+        why: beside what they do nothing, in words that follow "does nothing".
+        remedy: what to do besides leaving them away; may be empty.
+
+    Raises:
+        InputError: one of them was given.
+    """
+    idle = [option for option, value in given.items() if value is not None]
+    if idle:
+        names = ", ".join(idle[:-1]) + " and " + idle[-1] if len(idle) > 1 else idle[0]
+        raise InputError(f"{names} {'do' if len(idle) > 1 else 'does'} nothing {why}.", f"Leave {names} away{remedy}.")
 
 
 def parse_size(text: str) -> int | tuple[int, int]:

@@ -39,6 +39,7 @@ class Fit(Shared):
         """Run the fit; prints its scores and its folder. Returns exit status 0."""
         request = self.request()
         presets(self.method)  # refuses an unknown method before torch is imported
+        self.check_primitives([self.method])
 
         from invgraphics.experiments.run import fit_run
 

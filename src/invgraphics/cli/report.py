@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from invgraphics.cli.arguments import refuse_idle
 from invgraphics.cli.output import columns_that_fit, show_table
 from invgraphics.errors import InputError
 from invgraphics.runs.comparison import ComparisonRecord
@@ -43,6 +44,7 @@ class Report:
         if not self.folders:
             raise InputError("There is nothing to report.", "Give the folder of a comparison, of a study, or of runs.")
         if self.check:
+            refuse_idle({"--out": self.out, "--public": self.public or None}, "with --check, which writes nothing")
             return check(self.folders)
         first, alone, out = self.folders[0], len(self.folders) == 1, self.out
         if alone and out is None and self.public:

@@ -59,6 +59,11 @@ class Recipe:
         if self.max_primitives is not None and self.max_primitives < 1:
             raise ValueError(f"max_primitives must be at least 1, not {self.max_primitives}.")
 
+    @property
+    def has_primitives(self) -> bool:
+        """Whether ``max_primitives`` does anything: the field or a hook makes explicit primitives."""
+        return any(isinstance(part, CapsPrimitives) for part in (self.field, *self.hooks))
+
     def capped(self) -> Recipe:
         """Apply ``max_primitives`` to the field and the hooks that create primitives (`CapsPrimitives`)."""
         most = self.max_primitives
