@@ -14,6 +14,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import DATA
+from invgraphics.tables import LIMITS
 from invgraphics.training.budget import Budget
 
 T = TypeVar("T")
@@ -23,6 +24,9 @@ SMALLEST = 8
 
 OPTIMISED = {"poses", "exposure"}
 """What ``--optimise`` can name: tables of a recipe's ``training``."""
+
+MOST_SEED = 2**63 - 1
+"""The largest seed that the generators of random numbers take."""
 
 _BOX = "│╭╮╰╯"
 _POSITIONAL = get_args(Positional[int])[1]
@@ -237,9 +241,21 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     """Parse comma-separated seeds to integers.
 
     Raises:
-        InputError: one of them is not a whole number, 0 or more.
+        InputError: one of them is not a whole number from 0 to `MOST_SEED`.
     """
     items = parse_list(text, "--seeds")
-    if not all(item.isdecimal() for item in items):
-        raise InputError(f"--seeds cannot be '{text}'.", "Expected whole numbers, 0 or more, with commas between them: 0,1,2.")
+    if not all(item.isdecimal() and len(item) <= LIMITS.digits and int(item) <= MOST_SEED for item in items):
+        expected = f"Expected whole numbers from 0 to {MOST_SEED} (2^63 - 1), with commas between them: 0,1,2."
+        raise InputError(f"--seeds cannot be '{text}'.", expected)
     return tuple(int(item) for item in items)
+
+
+def check_seed(seed: int) -> int:
+    """Validate one seed.
+
+    Raises:
+        InputError: it is not from 0 to `MOST_SEED`.
+    """
+    if not 0 <= seed <= MOST_SEED:
+        raise InputError(f"--seed cannot be {seed}.", f"Expected a whole number from 0 to {MOST_SEED} (2^63 - 1).")
+    return seed

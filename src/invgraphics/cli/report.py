@@ -28,10 +28,10 @@ FIRST_SHOWN = ("psnr", "ssim", "normal_deg", "chamfer", "fit_seconds", "render_f
 class Report:
     """Write a report from a comparison's folder, from a study's folder, or from single runs on the same ground truth."""
 
-    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN ...")]
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN ...", help_behavior_hint="(required)")]
     """The folder of one comparison or of one study, or folders of runs."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the folder itself)")] = None
-    """Where to write."""
+    """Where to write; needed for single runs, which have no folder of their own for a report."""
     public: bool = False
     """Leave out absolute paths, user names and host names; writes to FOLDER-public unless --out says otherwise."""
     check: bool = False
