@@ -42,9 +42,10 @@ class Shared:
     """Size of the method. The budget chooses: laptop under two minutes (and for steps), long up to 30, hour above, or the
     nearest smaller one that the method has; paper holds the published values."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
-    """Change one value of the recipe, for instance --set batches.rays=2048, or of the training data: data.train_views=10,
-    data.size, data.pose_noise (degrees and per cent), data.photo_noise, data.exposure (stops), data.background,
-    data.scales (divisors of the size, [1, 2, 4, 8]), data.test_scales (more scores, of smaller pictures)."""
+    """Change one value of the recipe, for instance --set batches.rays=2048 (`invgraphics list METHOD` shows all of a method's
+    keys), or of the training data: data.train_views=10, data.size, data.pose_noise (degrees and per cent), data.photo_noise,
+    data.exposure (stops), data.background, data.scales (divisors of the size, [1, 2, 4, 8]), data.test_scales (more scores, of
+    smaller pictures)."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
