@@ -70,7 +70,10 @@ def test_the_recorded_command_gives_the_same_request(tmp_path: Path) -> None:
     assert arguments.parse(Ablate, "invgraphics ablate", shlex.split(request.shell())[2:]).request() == request
     plain = arguments.parse(Ablate, "invgraphics ablate", ["families"]).request()
     assert plain.shell() == "invgraphics ablate families --out reports/families"
-    assert arguments.parse(Ablate, "invgraphics ablate", ["families", "--device", "cuda"]).request().gpus == 1
+    on_ray = ["families", "--device", "cuda", "--executor", "ray"]
+    assert arguments.parse(Ablate, "invgraphics ablate", on_ray).request().gpus == 1
+    here = arguments.parse(Ablate, "invgraphics ablate", on_ray[:3]).request()
+    assert arguments.parse(Ablate, "invgraphics ablate", shlex.split(here.shell())[2:]).request() == here
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ def test_every_command_has_help(name: str, capsys) -> None:
         ("import", "--scene SCENE [-h] [OPTIONS] FILE"),
         ("evaluate", "[-h] RUN [SCENE] [--protocol NAME]"),
         ("view", "[-h] [OPTIONS] RUN [RUN2]"),
-        ("list", "[-h] [KIND ...]"),
+        ("list", "[-h] [KIND|METHOD ...]"),
         ("report", "[-h] RUN ... [--out FOLDER] [--public] [--check]"),
     ],
 )

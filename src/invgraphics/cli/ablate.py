@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from invgraphics.cli.arguments import parse_samples, parse_seeds, parse_size, parse_views
+from invgraphics.cli.arguments import parse_samples, parse_seeds, parse_size, parse_views, refuse_idle
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.studies.reading import locate, name_of, read_study, with_request
@@ -38,9 +38,9 @@ class Ablate:
     jobs: Annotated[int, arg(metavar="N")] = 1
     """Fits that share a machine; each gets an equal part of its cores. One at a time keeps timings fair."""
     gpus: Annotated[float | None, arg(metavar="N", help_behavior_hint="(default: 1 with --device cuda)")] = None
-    """GPUs of each fit on a cluster."""
+    """GPUs of each fit; for a cluster only."""
     address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: one started for this study)")] = None
-    """The Ray cluster."""
+    """The Ray cluster; with --executor ray only."""
     yes: bool = False
     """Start a study of more than four hours without asking."""
     seeds: Annotated[str | None, arg(metavar="0,1,2", help_behavior_hint="(default: the study's)")] = None
@@ -90,7 +90,10 @@ class Ablate:
             raise InputError(f"--jobs cannot be {self.jobs}.", "Expected a number of fits, 1 or more.")
         if self.most_seconds is not None and not self.most_seconds > 0:
             raise InputError(f"--most-seconds cannot be {self.most_seconds:g}.", "Expected seconds of optimisation, above 0.")
-        gpus = float(self.device == "cuda") if self.gpus is None else self.gpus
+        local = self.executor == "local"
+        if local:
+            refuse_idle({"--gpus": self.gpus, "--address": self.address}, "on this machine", ", or add --executor ray")
+        gpus = float(self.device == "cuda" and not local) if self.gpus is None else self.gpus
         views = None if self.test_views is None else parse_views(self.test_views) or "all"
         return AblateRequest(
             study=self.study,

@@ -6,13 +6,15 @@ import contextlib
 import dataclasses
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from invgraphics.errors import InputError
+from invgraphics.experiments.request import DATA
+from invgraphics.tables import LIMITS
 from invgraphics.training.budget import Budget
 
 T = TypeVar("T")
@@ -22,6 +24,9 @@ SMALLEST = 8
 
 OPTIMISED = {"poses", "exposure"}
 """What ``--optimise`` can name: tables of a recipe's ``training``."""
+
+MOST_SEED = 2**63 - 1
+"""The largest seed that the generators of random numbers take."""
 
 _BOX = "│╭╮╰╯"
 _POSITIONAL = get_args(Positional[int])[1]
@@ -37,9 +42,10 @@ class Shared:
     """Size of the method. The budget chooses: laptop under two minutes (and for steps), long up to 30, hour above, or the
     nearest smaller one that the method has; paper holds the published values."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
-    """Change one value of the recipe, for instance --set batches.rays=2048, or of the training data: data.train_views=10,
-    data.size, data.pose_noise (degrees and per cent), data.photo_noise, data.exposure (stops), data.background,
-    data.scales (divisors of the size, [1, 2, 4, 8]), data.test_scales (more scores, of smaller pictures)."""
+    """Change one value of the recipe, for instance --set batches.rays=2048 (`invgraphics list METHOD` shows all of a method's
+    keys), or of the training data: data.train_views=10, data.size, data.pose_noise (degrees and per cent), data.photo_noise,
+    data.exposure (stops), data.background, data.scales (divisors of the size, [1, 2, 4, 8]), data.test_scales (more scores, of
+    smaller pictures)."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
@@ -47,7 +53,7 @@ class Shared:
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
     """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
-    """Largest number of Gaussians; short for --set max_primitives=N."""
+    """Largest number of Gaussians or points, for methods that have some; short for --set max_primitives=N."""
     optimise: Annotated[str, arg(metavar="poses,exposure")] = ""
     """Fit the training cameras' poses too, or an exposure of each training photograph, or both; short for
     --set training.poses.optimise=true and --set training.exposure.optimise=true. Exposures are fitted unasked where those of a
@@ -89,6 +95,28 @@ class Shared:
             "checkpoint_every": self.checkpoint_every,
             "render_with": parse_list(self.render_with, "--render-with") if self.render_with else (),
         }
+
+    def check_primitives(self, methods: Sequence[str]) -> None:
+        """Refuse ``--max-primitives`` where no method has primitives; a method that cannot be resolved is left to the fit.
+
+        Raises:
+            InputError: it would do nothing.
+        """
+        if self.max_primitives is None or not methods:
+            return
+
+        from invgraphics.recipes.recipe import load_method
+
+        overrides = [item for item in self.settings()["overrides"] if not item.startswith(DATA)]
+        for method in methods:
+            try:
+                resolved = load_method(method, self.preset, overrides, Budget.parse(self.budget))
+            except InputError:
+                return
+            if resolved.recipe.has_primitives:
+                return
+        which = f"{methods[0]}, which has" if len(methods) == 1 else "these methods, which have"
+        refuse_idle({"--max-primitives": self.max_primitives}, f"for {which} no Gaussians or points")
 
 
 def parse(command: type[T], program: str, arguments: Sequence[str]) -> T:
@@ -139,6 +167,23 @@ def condense(box: str) -> tuple[str, str]:
     sentence = re.sub(r"invalid literal for int\(\) with base 10: ('.*')", r"\1 is not a whole number", parts[0])
     hints = [part for part in parts[1:-1] if part.startswith("Perhaps")]
     return "\n".join([sentence, *hints[:1]]), parts[-1] if len(parts) > 1 else ""
+
+
+def refuse_idle(given: Mapping[str, Any], why: str, remedy: str = "") -> None:
+    """Refuse options that would do nothing.
+
+    Args:
+        given: option -> its value; ``None`` where it was not given.
+        why: beside what they do nothing, in words that follow "does nothing".
+        remedy: what to do besides leaving them away; may be empty.
+
+    Raises:
+        InputError: one of them was given.
+    """
+    idle = [option for option, value in given.items() if value is not None]
+    if idle:
+        names = ", ".join(idle[:-1]) + " and " + idle[-1] if len(idle) > 1 else idle[0]
+        raise InputError(f"{names} {'do' if len(idle) > 1 else 'does'} nothing {why}.", f"Leave {names} away{remedy}.")
 
 
 def parse_size(text: str) -> int | tuple[int, int]:
@@ -197,9 +242,21 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     """Parse comma-separated seeds to integers.
 
     Raises:
-        InputError: one of them is not a whole number, 0 or more.
+        InputError: one of them is not a whole number from 0 to `MOST_SEED`.
     """
     items = parse_list(text, "--seeds")
-    if not all(item.isdecimal() for item in items):
-        raise InputError(f"--seeds cannot be '{text}'.", "Expected whole numbers, 0 or more, with commas between them: 0,1,2.")
+    if not all(item.isdecimal() and len(item) <= LIMITS.digits and int(item) <= MOST_SEED for item in items):
+        expected = f"Expected whole numbers from 0 to {MOST_SEED} (2^63 - 1), with commas between them: 0,1,2."
+        raise InputError(f"--seeds cannot be '{text}'.", expected)
     return tuple(int(item) for item in items)
+
+
+def check_seed(seed: int) -> int:
+    """Validate one seed.
+
+    Raises:
+        InputError: it is not from 0 to `MOST_SEED`.
+    """
+    if not 0 <= seed <= MOST_SEED:
+        raise InputError(f"--seed cannot be {seed}.", f"Expected a whole number from 0 to {MOST_SEED} (2^63 - 1).")
+    return seed

@@ -41,6 +41,7 @@ class Compare(Shared):
         request = self.request()
         for method in request.methods:
             presets(method)  # refuses an unknown method before torch is imported
+        self.check_primitives(request.methods)
 
         from invgraphics.experiments.compare import compare
 

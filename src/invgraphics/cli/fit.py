@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from invgraphics.cli.arguments import Shared
+from invgraphics.cli.arguments import Shared, check_seed
 from invgraphics.cli.output import show_scores
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import FitRequest
@@ -39,6 +39,7 @@ class Fit(Shared):
         """Run the fit; prints its scores and its folder. Returns exit status 0."""
         request = self.request()
         presets(self.method)  # refuses an unknown method before torch is imported
+        self.check_primitives([self.method])
 
         from invgraphics.experiments.run import fit_run
 
@@ -54,10 +55,11 @@ class Fit(Shared):
 
     def request(self) -> FitRequest:
         """Convert the options to a validated request, without opening any data."""
-        name = f"{Path(self.scene).resolve().name}-{slug(self.method)}-seed-{self.seed}"
+        seed = check_seed(self.seed)
+        name = f"{Path(self.scene).resolve().name}-{slug(self.method)}-seed-{seed}"
         out = Path("runs") / name if self.out is None else self.out
         existing = "resume" if self.resume else "refuse"
         if self.snapshots < 0:
             raise InputError(f"--snapshots cannot be {self.snapshots}.", "Expected a number of states, 0 or more.")
         settings: dict[str, Any] = self.settings() | {"snapshots": self.snapshots}
-        return FitRequest(method=self.method, scene=self.scene, seed=self.seed, out=str(out), existing=existing, **settings)
+        return FitRequest(method=self.method, scene=self.scene, seed=seed, out=str(out), existing=existing, **settings)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from invgraphics.cli.arguments import refuse_idle
 from invgraphics.errors import InputError
 from invgraphics.runs.collection import runs_of
 
@@ -30,21 +31,21 @@ class Infer:
         None
     )
     """A photograph of one object, before the scene's background or with alpha."""
-    views: Annotated[str, arg(metavar="N,N")] = "1"
-    """Numbers of observed views from which instances are inferred."""
-    test_views: Annotated[int, arg(metavar="N")] = 4
-    """Test views of each instance that are scored."""
+    views: Annotated[str | None, arg(metavar="N,N", help_behavior_hint="(default: 1)")] = None
+    """Without a photograph: numbers of observed views from which instances are inferred."""
+    test_views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 4)")] = None
+    """Without a photograph: test views of each instance that are scored."""
     instances: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
-    """Unseen instances, the first ones."""
-    against: Annotated[str, arg(metavar="RUN,RUN", help_behavior_hint="(default: none)")] = ""
-    """Other fits to the same class to compare with, or comparisons and studies of them."""
+    """Without a photograph: unseen instances, the first ones."""
+    against: Annotated[str | None, arg(metavar="RUN,RUN", help_behavior_hint="(default: none)")] = None
+    """Without a photograph: other fits to the same class to compare with, or comparisons and studies of them."""
     no_prior: Annotated[str | None, arg(metavar="BUDGET", help_behavior_hint="(default: none)")] = None
-    """Also fit each instance without the prior, for so long (20s, 600steps)."""
+    """Without a photograph: also fit each instance without the prior, for so long (20s, 600steps)."""
     view: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the angles)")] = None
     """The photograph's camera is that of this view of the class."""
-    azimuth: Annotated[float, arg(metavar="DEGREES")] = -60.0
+    azimuth: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: -60)")] = None
     """The photograph's camera: angle around the vertical axis, from +x towards +y."""
-    elevation: Annotated[float, arg(metavar="DEGREES")] = 25.0
+    elevation: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: 25)")] = None
     """The photograph's camera: angle above the horizon."""
     steps: Annotated[int, arg(metavar="N")] = 200
     """Steps of the optimisation of the codes."""
@@ -57,32 +58,40 @@ class Infer:
 
     def run(self) -> int:
         """Infer; prints what was found and where it was written. Returns exit status 0."""
-        others = tuple(Path(one) for one in self.against.split(",") if one)
+        self._refuse_idle()
+        others = tuple(Path(one) for one in (self.against or "").split(",") if one)
         runs = [run for folder in (self.folder, *others) for run in runs_of(folder)]
         if self.photo is not None:
             if len(runs) > 1:
                 raise InputError(f"{self.folder} holds {len(runs)} runs.", f"Give one, for instance {runs[0]}.")
             return self._infer_photo(self.photo, runs[0])
-        views = self._view_counts()
+        views, tests = self._view_counts(), 4 if self.test_views is None else self.test_views
         out = self.folder.with_name(f"{self.folder.name}-inferred") if self.out is None else self.out
 
         from invgraphics.report.inference import build_inference_report, inference_sentences
         from invgraphics.tools.infer import InferRequest, infer
 
-        infer(
-            InferRequest(
-                self.folder, out, others, views, self.test_views, self.instances, self.no_prior, self.steps, self.scene
-            )
-        )
+        infer(InferRequest(self.folder, out, others, views, tests, self.instances, self.no_prior, self.steps, self.scene))
         page = build_inference_report(out)
         for sentence in inference_sentences(out):
             print(sentence)
         print(page)
         return 0
 
+    def _refuse_idle(self) -> None:
+        """Refuse options of the other use, with or without a photograph, and angles beside a named view."""
+        angles = {"--azimuth": self.azimuth, "--elevation": self.elevation}
+        if self.photo is None:
+            refuse_idle({"--view": self.view, **angles}, "without a photograph")
+            return
+        ours = {"--views": self.views, "--test-views": self.test_views, "--instances": self.instances}
+        refuse_idle({**ours, "--against": self.against, "--no-prior": self.no_prior}, "with a photograph")
+        if self.view is not None:
+            refuse_idle(angles, "with --view, whose camera is the photograph's")
+
     def _view_counts(self) -> tuple[int, ...]:
         try:
-            return tuple(int(word) for word in self.views.split(","))
+            return tuple(int(word) for word in (self.views or "1").split(","))
         except ValueError:
             raise InputError(f"--views cannot be '{self.views}'.", "Expected numbers, separated by commas: 1,2,4,8.") from None
 
@@ -91,7 +100,9 @@ class Infer:
 
         from invgraphics.tools.infer_photo import PhotoRequest, infer_photo
 
-        placed = (self.view, self.azimuth, self.elevation, self.steps, self.scene)
+        azimuth = -60.0 if self.azimuth is None else self.azimuth
+        elevation = 25.0 if self.elevation is None else self.elevation
+        placed = (self.view, azimuth, elevation, self.steps, self.scene)
         print(f"the photograph is reproduced at {infer_photo(PhotoRequest(run, photo, out, *placed)):.2f} dB")
         print(out)
         return 0

@@ -1,9 +1,9 @@
-"""``invgraphics list``: list methods, scenes and components with their origins. Imports no implementation."""
+"""``invgraphics list``: list methods, scenes and components with their origins, importing no implementation; or one method."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -12,6 +12,9 @@ from invgraphics.cli.output import show_table
 from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.tables import read_toml
+
+if TYPE_CHECKING:
+    from invgraphics.recipes.recipe import Method
 
 COMPONENTS = {
     "fields": "fields",
@@ -37,19 +40,26 @@ EVERYTHING = KINDS[1:]
 
 @dataclass(frozen=True)
 class List:
-    """List methods, scenes and the components that recipes are made of, and where each comes from."""
+    """List methods, scenes and the components that recipes are made of, and where each comes from.
 
-    kinds: Annotated[Positional[tuple[str, ...]], arg(metavar="[KIND ...]", help_behavior_hint="(default: everything)")] = ()
-    """What to list: methods, scenes, studies, fields, encodings, renderers, samplers, losses, hooks, metrics, formats,
-    model-formats, exporters, executors, protocols; or matrix, the table of fields and renderers as Markdown."""
+    Of one method: its paper, its presets, and every setting with its value and what it means.
+    """
+
+    kinds: Annotated[
+        Positional[tuple[str, ...]], arg(metavar="[KIND|METHOD ...]", help_behavior_hint="(default: all kinds but matrix)")
+    ] = ()
+    """What to list: methods, scenes, studies, fields, encodings, renderers, samplers, losses, penalties, hooks, metrics,
+    formats, model-formats, exporters, executors, protocols; matrix, the table of fields and renderers as Markdown; or a method
+    (volumetric/hash, volumetric/hash:preset=long, or the path of a recipe): its keys for --set, under its laptop preset unless
+    one is named."""
 
     def run(self) -> int:
         """Print the tables; returns exit status 0."""
-        for kind in self.kinds:
-            if kind not in KINDS:
-                raise InputError(f"There is no list of '{kind}'.{did_you_mean(kind, KINDS)}", f"Lists: {', '.join(KINDS)}.")
+        chosen = {kind: _method(kind) for kind in self.kinds if kind not in KINDS}
         for kind in self.kinds or EVERYTHING:
-            if kind == "matrix":
+            if kind in chosen:
+                _show_method(chosen[kind])
+            elif kind == "matrix":
                 _print_matrix()
             elif kind == "methods":
                 _list_methods()
@@ -64,6 +74,38 @@ class List:
             if kind == "metrics":
                 _list_surface_metrics()
         return 0
+
+
+def _method(name: str) -> Method:
+    """The method of a name that is no list's.
+
+    Raises:
+        InputError: there is none.
+    """
+    from invgraphics.recipes.aliases import suggested_method
+    from invgraphics.recipes.recipe import load_method, methods, split_name
+
+    recipe = split_name(name)[0]
+    if "/" not in recipe and not recipe.endswith(".toml") and recipe not in methods():
+        guess = did_you_mean(name, KINDS) or suggested_method(recipe, methods())
+        raise InputError(f"There is no list of '{name}'.{guess}", f"Lists: {', '.join(KINDS)}; or a method.")
+    return load_method(name)
+
+
+def _show_method(method: Method) -> None:
+    """Print a method's summary, paper and presets, and a table of its settings."""
+    from invgraphics.recipes.presets import preset_summary
+    from invgraphics.recipes.recipe import source
+    from invgraphics.recipes.settings import settings_of
+
+    presets = source(method.name).get("presets", {})
+    print(f"{method.name}: {method.recipe.summary.rstrip('.') or 'no summary'}.")
+    print(f"Paper: {method.recipe.paper or 'none named'}")
+    print(f"Presets (chosen on): {preset_summary(presets) or 'none'}")
+    rows = [(setting.key, setting.value, setting.meaning) for setting in settings_of(method.recipe)]
+    under = f"under the preset {method.preset}" if method.preset else "without a preset"
+    show_table(f"Settings {under} (--set KEY=VALUE)", ("key", "value", "meaning"), rows)
+    print("A value of - is not set; values in parentheses are those of a part that is not there until one of its keys is set.")
 
 
 def _print_matrix() -> None:

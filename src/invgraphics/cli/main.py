@@ -21,7 +21,7 @@ from invgraphics.interruption import INTERRUPTED, Terminated, end_on_sigterm
 COMMANDS = {
     "list": (
         "invgraphics.cli.list:List",
-        "list methods, scenes, fields, renderers, metrics, and where each comes from",
+        "list methods, scenes, fields, renderers, metrics, and where each comes from; or all settings of one method",
     ),
     "doctor": ("invgraphics.cli.doctor:Doctor", "check this machine: processor, kernels, CUDA, extras, and what to install"),
     "make-scene": ("invgraphics.cli.make_scene:MakeScene", "render a scene's ground truth with Mitsuba"),

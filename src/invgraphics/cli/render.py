@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from tyro.conf import Positional, arg
 
-from invgraphics.cli.arguments import parse_size
+from invgraphics.cli.arguments import parse_size, refuse_idle
 from invgraphics.errors import InputError
 from invgraphics.runs.folder import check_run
 
@@ -36,25 +36,29 @@ class Render:
     show: Literal["prediction", "depth", "normal"] = "prediction"
     """What the pictures show; depth in world units, which are printed, and in one range for all."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 90, or the duration of FILE.json)")] = None
-    """Pictures of a path."""
+    """Pictures of a path; a timelapse has one of each state."""
     fps: Annotated[int, arg(metavar="N")] = 15
     """Pictures per second."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the run's own)")] = None
     """Size of the pictures; one number is the longest side."""
-    view: Annotated[int, arg(metavar="N")] = 0
-    """Test view that a timelapse shows."""
+    view: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
+    """Test view that a timelapse shows; for --path timelapse only."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
     """Another copy of the scene, for instance where the data set has moved."""
 
     def run(self) -> int:
         """Render the film and print its path; returns exit status 0."""
         size = None if self.size is None else parse_size(self.size)
+        path = parse_path(self.path)
+        if path == "timelapse":
+            refuse_idle({"--frames": self.frames}, "with --path timelapse, which has one picture of each state")
+        else:
+            refuse_idle({"--view": self.view}, "along a path", ", or add --path timelapse")
         check_run(self.folder)
 
         from invgraphics.tools.film import FilmRequest, film
 
-        path = parse_path(self.path)
-        request = FilmRequest(self.folder, self.out, path, self.frames, self.fps, size, self.view, self.scene, self.show)
+        request = FilmRequest(self.folder, self.out, path, self.frames, self.fps, size, self.view or 0, self.scene, self.show)
         print(film(request))
         return 0
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from invgraphics.cli.arguments import refuse_idle
 from invgraphics.cli.output import columns_that_fit, show_table
 from invgraphics.errors import InputError
 from invgraphics.runs.comparison import ComparisonRecord
@@ -27,10 +28,10 @@ FIRST_SHOWN = ("psnr", "ssim", "normal_deg", "chamfer", "fit_seconds", "render_f
 class Report:
     """Write a report from a comparison's folder, from a study's folder, or from single runs on the same ground truth."""
 
-    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN ...")]
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN ...", help_behavior_hint="(required)")]
     """The folder of one comparison or of one study, or folders of runs."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the folder itself)")] = None
-    """Where to write."""
+    """Where to write; needed for single runs, which have no folder of their own for a report."""
     public: bool = False
     """Leave out absolute paths, user names and host names; writes to FOLDER-public unless --out says otherwise."""
     check: bool = False
@@ -43,6 +44,7 @@ class Report:
         if not self.folders:
             raise InputError("There is nothing to report.", "Give the folder of a comparison, of a study, or of runs.")
         if self.check:
+            refuse_idle({"--out": self.out, "--public": self.public or None}, "with --check, which writes nothing")
             return check(self.folders)
         first, alone, out = self.folders[0], len(self.folders) == 1, self.out
         if alone and out is None and self.public:

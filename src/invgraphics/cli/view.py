@@ -38,8 +38,8 @@ class View:
     """Port to listen at; 0 for any that is free."""
     max_size: Annotated[int, arg(metavar="N")] = 800
     """Most pixels along the pictures' longer side."""
-    open: bool = True
-    """Open the page in a browser, where there is a screen."""
+    no_open: Annotated[bool, arg(help_behavior_hint="(default: it is opened, where there is a screen)")] = False
+    """Do not open the page in a browser."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
     """Another copy of the scene, for instance where the data set has moved."""
 
@@ -58,7 +58,7 @@ class View:
             if not is_loopback(self.host):
                 _notify(f"Everyone who can reach port {viewer.port} of this machine can view these runs.")
             print(f"Serving {' and '.join(map(str, runs))}: {url} (Ctrl-C to stop)", flush=True)
-            if self.open and _has_screen():
+            if not self.no_open and _has_screen():
                 webbrowser.open(url)
             with contextlib.suppress(KeyboardInterrupt):
                 viewer.serve(self.live)

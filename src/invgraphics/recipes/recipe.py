@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import fnmatch
 import re
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from invgraphics import plugins
 from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
-from invgraphics.errors import InputError, did_you_mean
+from invgraphics.errors import InputError
+from invgraphics.recipes.aliases import suggested_method
 from invgraphics.recipes.presets import select_preset
 from invgraphics.recipes.renamed import ADDED_KEYS, with_current_names, with_first_names
 from invgraphics.tables import LIMITS, parse_toml, read_text
@@ -150,9 +152,25 @@ def method_from(
     table = dict(table)
     _, named, own = split_name(name)
     chosen = select_preset(name, preset if named is None else named, budget, table.pop("presets", {}))
-    table = merge(table, chosen.table)
-    assign(table, (*overrides, *own))
-    return replace(resolve(name, chosen.name, table), preset_choice=chosen.choice, chosen_on=chosen.chosen_on)
+    plain = merge(table, chosen.table)
+    changed = copy.deepcopy(plain)
+    assign(changed, (*overrides, *own))
+    try:
+        method = resolve(name, chosen.name, changed)
+    except InputError as error:
+        raise _of_its_file(error, name, plain) from error
+    return replace(method, preset_choice=chosen.choice, chosen_on=chosen.chosen_on)
+
+
+def _of_its_file(error: InputError, name: str, table: dict[str, Any]) -> InputError:
+    """The error with the file's name, where the recipe is a file whose table cannot be resolved even without overrides."""
+    file = split_name(name)[0]
+    if file.endswith(".toml"):
+        try:
+            resolve(name, "", table)
+        except InputError as fault:
+            return type(fault)(f"{file}: {fault.sentence}", fault.remedy)
+    return error
 
 
 def split_name(name: str) -> tuple[str, str | None, tuple[str, ...]]:
@@ -202,8 +220,9 @@ def source(name: str) -> dict[str, Any]:
         if name in plugins.names("recipes") and not path.is_file():
             return _foreign_source(name)
         if not path.is_file():
-            sentence = f"There is no method '{name}'.{did_you_mean(name, methods())}"
-            raise InputError(sentence, f"Known methods: {', '.join(methods())}; or the path of a .toml.")
+            known = methods()
+            sentence = f"There is no method '{name}'.{suggested_method(name, known)}"
+            raise InputError(sentence, f"Known methods: {', '.join(known)}; or the path of a .toml.")
     return _parse(read_text(path, LIMITS.toml_bytes), str(path))
 
 

@@ -63,6 +63,11 @@ class Recipe:
                 if getattr(term, "weight", 0.0) < 0:
                     raise ValueError(f"{name}.{index}.weight must be at least 0, not {term.weight}: a fit minimises.")
 
+    @property
+    def has_primitives(self) -> bool:
+        """Whether ``max_primitives`` does anything: the field or a hook makes explicit primitives."""
+        return any(isinstance(part, CapsPrimitives) for part in (self.field, *self.hooks))
+
     def capped(self) -> Recipe:
         """Apply ``max_primitives`` to the field and the hooks that create primitives (`CapsPrimitives`)."""
         most = self.max_primitives
