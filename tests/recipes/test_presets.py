@@ -155,7 +155,7 @@ def test_the_page_says_what_chose_the_preset(tmp_path: Path) -> None:
     }
     assert preset_facts([hash_, other]) == {
         "preset": "long (volumetric/hash); laptop (volumetric/nerf), chosen from the budget of 5 min",
-        "preset chosen on": "bricks, fence (volumetric/hash)",
+        "preset chosen on": "bricks, fence (volumetric/hash); not stated (volumetric/nerf)",
     }
     assert preset_facts([old]) == {"preset": "laptop"}
     assert preset_facts([], "paper") == {"preset": "paper"}

@@ -108,6 +108,22 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
             raise InputError(sentence, "Choose another --out, or delete that folder.")
 
 
+def check_existing(job: Job) -> None:
+    """Check that a job may use its folder: resume, reuse or replace the run there, or find none.
+
+    Raises:
+        InputError: it may not; the sentence says why.
+    """
+    folder, request = job.folder, job.request
+    present = folder.has(Provenance)
+    if request.existing == "refuse" and present:
+        raise InputError(f"{folder.root} already holds a run.", "Add --resume to continue it, or choose another --out.")
+    if request.existing == "resume" and not present:
+        raise InputError(f"{folder.root} holds no run to resume.", "Leave --resume away to start one.")
+    if request.existing != "refuse":
+        check_replaceable(job)
+
+
 def check_truth(folder: RunFolder, scene: Scene, spec: str | None) -> None:
     """Check that a scene has the test views that a run was fitted beside: others may be its training photographs.
 

@@ -25,14 +25,14 @@ from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, l
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
-from invgraphics.experiments.identity import TruthDigest, check_replaceable, identify
+from invgraphics.experiments.identity import TruthDigest, check_existing, identify
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder
 from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
-from invgraphics.experiments.start import MemoryForecast, initialise_field, memory_forecast
+from invgraphics.experiments.start import MemoryForecast, check_losses, initialise_field, memory_forecast, remove_empty
 from invgraphics.files import file_fault
 from invgraphics.interruption import INTERRUPTED, Terminated, end_on_sigterm, end_with_parent
 from invgraphics.metrics.cost import PeakMemory
@@ -75,14 +75,14 @@ def make_run(job: Job, scene: Scene | None = None, on_step: Callable[[Fit], None
         NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
     """
     if job.request.existing == "resume":
-        _check_existing(job)  # before the folder is made
+        check_existing(job)  # before the folder is made
     new = not job.folder.root.exists()
     job.folder.create()
     try:
         _make_run(job, scene, on_step)
     except InputError:
         if new:
-            job.folder.remove_empty()
+            remove_empty(job.folder.root)
         raise
 
 
@@ -90,7 +90,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
     folder, method, request = job.folder, job.method, job.request
     configure_torch(job.device)
     with folder.held(wait=request.existing == "reuse"):  # by a child of a killed comparison or study, which is about to end
-        _check_existing(job)
+        check_existing(job)
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
         shown = degrade(scene, job.data, request.seed)
@@ -112,9 +112,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
             fit = prepare(job, shown)
             resumed = same and folder.resumable
             if resumed:
-                earlier = folder.read(FitRecord)
-                fit.load(checkpoint.load(folder.checkpoint, job.device), earlier.seconds or 0.0)
-                fit.resume_clocks(asdict(earlier))
+                _resumed(fit, job)
             forecast = warm_up(fit, method, memory)  # which may refuse: the folder is as it was until then
             if resumed:
                 folder.cut_history(fit.steps)
@@ -138,6 +136,13 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         render_missing(job, scene)
 
 
+def _resumed(fit: Fit, job: Job) -> None:
+    """Load the folder's checkpoint into the fit, with the clocks at that moment."""
+    earlier = job.folder.read(FitRecord)
+    fit.load(checkpoint.load(job.folder.checkpoint, job.device), earlier.seconds or 0.0)
+    fit.resume_clocks(asdict(earlier))
+
+
 def prepare(job: Job, shown: Scene) -> Fit:
     """Build a job's fit, before its first step, on the degraded training data.
 
@@ -146,17 +151,6 @@ def prepare(job: Job, shown: Scene) -> Fit:
     """
     plan = build_plan(job.method, shown, job.budget, job.request.seed, job.device)
     return Fit(initialise_field(plan, job.method, job.request.scene))
-
-
-def _check_existing(job: Job) -> None:
-    folder, request = job.folder, job.request
-    present = folder.has(Provenance)
-    if request.existing == "refuse" and present:
-        raise InputError(f"{folder.root} already holds a run.", "Add --resume to continue it, or choose another --out.")
-    if request.existing == "resume" and not present:
-        raise InputError(f"{folder.root} holds no run to resume.", "Leave --resume away to start one.")
-    if request.existing != "refuse":
-        check_replaceable(job)
 
 
 def warm_up(fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
@@ -168,18 +162,9 @@ def warm_up(fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:
         InputError: no loss has, or the primitives would need more memory than the machine has.
     """
     fit.warmup_step()
-    _check_losses(fit, method)
+    check_losses(fit, method)
     Monitor(fit.plan.scene, fit.plan.device).psnr(fit)
     return memory_forecast(fit.plan, method, memory.peak_bytes)
-
-
-def _check_losses(fit: Fit, method: Method) -> None:
-    names = [method.table["losses"][index]["type"] for index in fit.idle_losses]
-    if names and len(names) == len(fit.plan.losses) and fit.progress < 1:
-        words = f"{method.name} has nothing to fit by: its renderer gives {', '.join(names)} nothing to act on."
-        raise InputError(words, "A loss of every renderer is --set 'losses=[{type=\"photometric\"}]'.")
-    for name in names:
-        warn(f"Warning: the loss '{name}' is 0 throughout: this renderer gives it nothing to act on.")
 
 
 def _prediction(job: Job, loaded: Scene, fit: Fit, memory: MemoryForecast) -> str:

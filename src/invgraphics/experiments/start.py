@@ -1,25 +1,28 @@
-"""Initialisation of explicit primitives from another run, and the forecast of a fit's peak memory."""
+"""What comes before a fit: initialisation from another run, checks of folder and losses, the forecast of its peak memory."""
 
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
+from invgraphics import locks
 from invgraphics.core import Field, RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.memory_check import COPIES, RAY_BYTES
 from invgraphics.experiments.mesh_files import mesh_from_file
+from invgraphics.experiments.progress import warn
 from invgraphics.fields.mesh import MeshFieldConfig
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.runs.provenance import Provenance
 from invgraphics.training.batches import Batches, size_of
-from invgraphics.training.fit import Plan
+from invgraphics.training.fit import Fit, Plan
 
 SCREEN_BYTES = 300
 """Of a primitive on the screen: footprint, its gradients, packed row and sums; rounded up from two threads."""
@@ -51,6 +54,28 @@ def check_source(method: Method, scene_spec: str) -> None:
     shown = RunFolder(Path(source)).read(Provenance).scene
     if Path(shown).resolve() != Path(scene_spec).resolve():
         raise InputError(f"field.source: {source} is a run on '{shown}', not on '{scene_spec}'.")
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove a folder where it holds nothing but its lock."""
+    with suppress(OSError):
+        if all(path.name == locks.INSIDE for path in folder.iterdir()):
+            (folder / locks.INSIDE).unlink(missing_ok=True)
+            folder.rmdir()
+
+
+def check_losses(fit: Fit, method: Method) -> None:
+    """Warn of losses that the first step gave nothing to act on.
+
+    Raises:
+        InputError: all losses are such.
+    """
+    names = [method.table["losses"][index]["type"] for index in fit.idle_losses]
+    if names and len(names) == len(fit.plan.losses) and fit.progress < 1:
+        words = f"{method.name} has nothing to fit by: its renderer gives {', '.join(names)} nothing to act on."
+        raise InputError(words, "A loss of every renderer is --set 'losses=[{type=\"photometric\"}]'.")
+    for name in names:
+        warn(f"Warning: the loss '{name}' is 0 throughout: this renderer gives it nothing to act on.")
 
 
 def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:

@@ -47,8 +47,7 @@ class OccupancyConfig:
         early_decay: the same at the start; its distance from 1 falls to that of ``decay`` by half of the fit. Fog must be
             forgotten quickly, but one look at a random point finds a wire only now and then. ``None``: ``decay`` throughout.
         threshold: least optical depth of a step that counts as occupied; the grid's mean, where that is smaller.
-        warmup: training steps after ``grace`` during which a refresh looks at all cells. The first refresh always does: a cell
-            that was never looked at counts as empty.
+        warmup: training steps after ``grace`` in which a refresh looks at all cells, as the first does: others count as empty.
         every: training steps between two refreshes.
         points_until: progress of a fit until which only cells within ``point_cells`` cells of one of the scene's points, where
             it has some, are sampled: a start from points for fields without primitives.
@@ -244,8 +243,7 @@ class Occupancy(Sampler):
         if step == 0:
             self._leave_out(field.support(ctx.bounds, self.config.resolution))
         if step >= self.config.grace and step % self.config.every == 0:
-            first = -(-self.config.grace // self.config.every) * self.config.every
-            everywhere = step < self.config.grace + self.config.warmup or step == first
+            everywhere = step < self.config.grace + max(self.config.warmup, self.config.every)
             cells = torch.arange(self.ema.numel(), device=self.ema.device) if everywhere else self._sampled_cells(ctx)
             self._refresh(cells, field, ctx)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -105,13 +105,6 @@ class RunFolder:
             probe.unlink()
         except OSError as error:
             raise InputError(f"The folder {self.root} cannot be written: {error.strerror}.", "Choose another --out.") from error
-
-    def remove_empty(self) -> None:
-        """Remove the folder where it holds nothing but its lock."""
-        with suppress(OSError):
-            if all(path.name == locks.INSIDE for path in self.root.iterdir()):
-                self.path(locks.INSIDE).unlink(missing_ok=True)
-                self.root.rmdir()
 
     @contextmanager
     def held(self, wait: bool = False) -> Iterator[None]:

@@ -46,7 +46,6 @@ from invgraphics.scenes.poses import poses
 from invgraphics.scenes.region import Frame, box_frame, contracted_frame, object_frame
 
 Arrays = Mapping[str, np.ndarray]
-
 _REQUIRED = ("images", "cam_to_world", "focal")
 
 
@@ -152,9 +151,8 @@ def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> Frame:
         lo, hi = torch.from_numpy(arrays["bounds"].astype(np.float32)).double()
     if not bool((lo < hi).all()):
         raise InputError(f"'bounds' of {path} is {arrays['bounds'].tolist()}: the first corner must be below the second.")
-    if bool(arrays.get("own_units", False)):
-        return Frame(Bounds(lo.float(), hi.float()), points=points)
-    return box_frame(lo, hi, points)
+    own = bool(arrays.get("own_units", False))
+    return Frame(Bounds(lo.float(), hi.float()), points=points) if own else box_frame(lo, hi, points)
 
 
 def _splits(arrays: Arrays, n: int, path: Path) -> tuple[list[int], list[int], list[int], list[int]]:
@@ -163,8 +161,7 @@ def _splits(arrays: Arrays, n: int, path: Path) -> tuple[list[int], list[int], l
     Raises:
         InputError: they overlap, or the subjects do not fit to them.
     """
-    nowhere = np.zeros(n, bool)
-    val, observed = (_booleans(arrays, key, nowhere, path) for key in ("val", "observed"))
+    val, observed = (_booleans(arrays, key, np.zeros(n, bool), path) for key in ("val", "observed"))
     test = _booleans(arrays, "test", (np.arange(n) % HOLD_OUT == 0) & ~val & ~observed, path)
     if (test & val | test & observed | val & observed).any():
         raise InputError(f"{path} has views that are more than one of 'test', 'val' and 'observed'.")
@@ -203,8 +200,7 @@ def _names(arrays: Arrays) -> list[str]:
     """A view's index; of a class, its subject and its place among that subject's views."""
     if "subject" not in arrays:
         return [str(i) for i in range(len(arrays["images"]))]
-    seen: Counter[int] = Counter()
-    names = []
+    seen, names = Counter[int](), []
     for subject in arrays["subject"].tolist():
         names.append(f"{subject:04d}-{seen[subject]:02d}")
         seen[subject] += 1
@@ -243,10 +239,9 @@ def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shap
 
 
 def save_npz(scene: Scene, path: Path) -> None:
-    """Write a scene as one ``.npz`` file that `Npz` reads as the same scene, in the same units.
+    """Write a scene as one ``.npz`` file that `Npz` reads as the same scene, in the same units; colours of points have 8 bits.
 
-    Points' colours are rounded to 8 bits; names of views, spread of exposures, noise level and which photographs show which
-    points are not kept.
+    Not kept: names of views, spread of exposures, noise level, and which photographs show which points.
 
     Raises:
         InputError: it holds what the convention does not: no box, linear or unrounded colours, masks, another

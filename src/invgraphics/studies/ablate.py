@@ -19,6 +19,7 @@ from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, identify
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.renderings import check_variants, is_kept, renderings_complete
 from invgraphics.experiments.request import AblateRequest
@@ -37,6 +38,8 @@ from invgraphics.text import duration
 
 Size = int | tuple[int, int] | None
 """Longest side in pixels, or (width, height)."""
+Trials = dict[tuple[str, str, Size], tuple[Job, Scene]]
+"""Method, preset and size -> its first cell's job and scene."""
 
 
 @dataclass
@@ -89,12 +92,12 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         record = StudyRecorder(folder, summarise_study(study, name_of(path), (request, resources), plan[0].job), plan)
         fits = {planned.id: planned for planned in plan}
         states = {name: _state(planned, request.keep, name in chosen) for name, planned in fits.items()}
-        samples, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
+        trials, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
         for name, planned in fits.items():
             if states[name].status == "missing" and _is_finished(planned, truths[_truth_key(planned)], threads):
                 states[name] = CellState("done")
         missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
-        costs = _try_methods(missing, samples)
+        costs = _try_methods(missing, trials)
         missing.sort(key=lambda planned: _execution_order(planned, study, costs))
         expected = {planned.id: costs[_cost_key(planned)].seconds(planned.job.budget) for planned in missing}
         later = sum(state.status in ("later", "skipped") for state in states.values())
@@ -142,16 +145,17 @@ def _execution_order(planned: Planned, study: Study, costs: dict[tuple[str, str,
     return study.seeds.index(planned.cell.seed), seconds, max(size) if isinstance(size, tuple) else size or 0
 
 
-def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple[str, Size], TruthDigest]]:
-    """Open every scene once per size, rendered if necessary; keeps one scene per size, and the hashes of all.
+def _open_scenes(plan: Sequence[Planned]) -> tuple[Trials, dict[tuple[str, Size], TruthDigest]]:
+    """Open every scene once per size, rendered if necessary; keeps those that costs are measured on, and the hashes of all.
 
     Raises:
         InputError: a scene cannot be used, or not with every level of the data's factors.
     """
-    samples: dict[Size, Scene] = {}
+    first = {_cost_key(planned): planned for planned in reversed(plan)}
+    trials: Trials = {}
     truths = {}
     for place in dict.fromkeys(map(_truth_key, plan)):
-        name, size = place
+        name, _ = place
         group = [planned for planned in plan if _truth_key(planned) == place]
         scene = open_with_progress(name, group[0].job.options)
         for data in dict.fromkeys(planned.job.data for planned in group):
@@ -159,8 +163,8 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[dict[Size, Scene], dict[tuple
         methods = {planned.method.digest: planned.method for planned in group}.values()
         check_variants(group[0].job.variants, methods, scene)
         truths[place] = TruthDigest.of(scene)
-        samples.setdefault(size, scene)
-    return samples, truths
+        trials |= {key: (planned.job, scene) for key, planned in first.items() if _truth_key(planned) == place}
+    return trials, truths
 
 
 def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
@@ -169,12 +173,12 @@ def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
     return same and renderings_complete(planned.job)
 
 
-def _try_methods(missing: Sequence[Planned], samples: dict[Size, Scene]) -> dict[tuple[str, str, Size], Cost]:
-    """Measure the cost of a run of each method with each preset at each size, on one scene of that size."""
+def _try_methods(missing: Sequence[Planned], trials: Trials) -> dict[tuple[str, str, Size], Cost]:
+    """Measure the cost of a run of each method with each preset at each size, by its first cell."""
     costs: dict[tuple[str, str, Size], Cost] = {}
     for planned in missing:
         if _cost_key(planned) not in costs:
-            costs[_cost_key(planned)] = try_method(planned.job, samples[planned.fit.size])
+            costs[_cost_key(planned)] = try_method(*trials[_cost_key(planned)])
     return costs
 
 

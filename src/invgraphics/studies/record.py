@@ -56,6 +56,7 @@ class StudyRecorder:
 
     def start(self, states: Mapping[str, CellState]) -> None:
         """Set the initial state of each cell, and write the record."""
+        self._ours = {name for name, state in states.items() if state.status != "later"}
         self._cells = [_started(cell, states[cell.id]) for cell in self._cells]
         self._write()
 
@@ -68,8 +69,8 @@ class StudyRecorder:
         self._write()
 
     def failed(self) -> list[CellRecord]:
-        """The cells that failed."""
-        return [cell for cell in self._cells if cell.status == "failed"]
+        """The cells of this command that failed."""
+        return [cell for cell in self._cells if cell.status == "failed" and cell.id in self._ours]
 
     def _write(self) -> None:
         self._folder.write(replace(self._summary, cells=tuple(self._cells)))

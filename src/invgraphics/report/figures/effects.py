@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 WIDE, NARROW = 860.0, 400.0
 ROW, FRAME, LINE = 50.0, 86.0, 16.0
 """Heights in CSS pixels: of a comparison, of title, axis and margins together, and of a further line of text."""
+MOST_PARTS = 12
+"""Settings of other factors whose means are numbered below a bar."""
 LETTER, WIDE_LETTERS = 7.2, 80
 """Width of a letter in CSS pixels; and letters of a line from which on numbers stand beside a label."""
 
@@ -75,7 +77,8 @@ def _draw_intervals(effects: Sequence[Effect], title: str, stem: Path, width: fl
 def _parts(effect: Effect) -> dict[str, float]:
     """Mean of each scene, or at each combination of other factors' levels where there is one scene."""
     scenes = {name: one.estimate.mean for name, one in effect.by_scene.items()}
-    return scenes or {name: one.estimate.mean for name, one in effect.by_setting.items()}
+    settings = effect.by_setting if len(effect.by_setting) <= MOST_PARTS else {}
+    return scenes or {name: one.estimate.mean for name, one in settings.items()}
 
 
 def _limits(effects: Sequence[Effect]) -> tuple[float, float]:

@@ -94,8 +94,8 @@ def _draw(points: Sequence[Point], quality: Quantity, cost: Quantity, stem: Path
 
 
 def _front(points: Sequence[Point], quality: Quantity, cost: Quantity) -> list[Point]:
-    """Pareto front by cost, over methods that lack no seed and whose clocks were not disturbed (over all if none is such)."""
-    ranked = [point for point in points if point.row.ranked_in(cost)] or list(points)
+    """Pareto front by cost, over methods that are ranked in both (over all if none is): no seed lost, no clock disturbed."""
+    ranked = [point for point in points if point.row.ranked_in(cost) and point.row.ranked_in(quality)] or list(points)
     # Costs are compared as written, to three digits: a hundredth of a second more does not change the front.
     keys = [(cost.sort_key(float(f"{point.cost:.3g}")), quality.sort_key(point.quality)) for point in ranked]
     return [ranked[i] for i in pareto_front(keys)]

@@ -100,10 +100,10 @@ def _entry(summary: Summary, row: Row, picture: Picture | None, best_of_row: boo
 
 
 def _best(comparison: Comparison, summary: Summary, placed: Sequence[Row], axis: int) -> set[str]:
-    """Methods with the best first metric of their row (axis 0) or column (1), among at least two complete ones."""
+    """Methods with the best first metric of their row (axis 0) or column (1), among at least two that are ranked in it."""
     groups: dict[str, list[Row]] = {}
     for row in placed:
-        if row.kind == "method" and row.complete and row.cells[0].mean is not None:
+        if row.kind == "method" and row.ranked_in(summary.columns[0]) and row.cells[0].mean is not None:
             groups.setdefault(comparison.cells[row.label][axis], []).append(row)
     quantity = summary.columns[0]
     return {min(rows, key=lambda row: quantity.sort_key(_mean(row))).label for rows in groups.values() if len(rows) > 1}

@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from invgraphics.report.data.factors import Factor, Lost, Observation
-from invgraphics.report.data.variants import setting_words
-from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, holm, over_scenes, over_seeds
-from invgraphics.report.statistics.pairing import Contrast, Sample, contrast_words, sample, settings_of
+from invgraphics.report.statistics.intervals import Estimate, holm, over_seeds
+from invgraphics.report.statistics.pairing import Contrast, Sample, contrast_words, sample
+from invgraphics.report.statistics.settings import ALPHA, SettingEffect, across_scenes, effects_by_setting
 from invgraphics.report.wording import Quantity, significant_decimals
-
-ALPHA = 1 - CONFIDENCE
-"""Family-wise error rate of a study."""
 
 Verdict = Literal["higher", "lower", "undecided", "untested"]
 """Of one scene: sign of a significant difference, none, or no test because there is a single fit."""
@@ -37,33 +34,6 @@ class SceneEffect:
 
 
 @dataclass(frozen=True)
-class SettingEffect:
-    """The same difference where every other factor, the method included, has one level.
-
-    Attributes:
-        estimate: over new fits on these scenes.
-        across: over scenes as a sample of scenes; ``None`` for one scene.
-        adjusted: p-value of `claim` after Holm's correction over the settings of one effect; ``None`` without one.
-    """
-
-    estimate: Estimate
-    across: Estimate | None
-    adjusted: float | None = None
-
-    @property
-    def claim(self) -> Estimate:
-        """The estimate that a test rests on: over scenes where there are several, else over seeds."""
-        return self.estimate if self.across is None else self.across
-
-    @property
-    def sign(self) -> int:
-        """Sign of a significant difference; 0 for none."""
-        if self.adjusted is None or self.adjusted > ALPHA:
-            return 0
-        return 1 if self.claim.mean > 0 else -1
-
-
-@dataclass(frozen=True)
 class Effect:
     """A difference, level ``after`` minus level ``before``, on the same scenes, views and other levels.
 
@@ -79,7 +49,7 @@ class Effect:
         pairs: fits compared.
         by_scene: scene -> the same for that scene alone; empty for one scene.
         by_setting: levels of all other factors in words -> the same at these alone; empty where there is one combination only.
-        lost: diverged or failed fits of (before, after).
+        lost: diverged or failed fits that are (subtracted, added), see `Sample`.
         silent: scenes where one side has no number at all.
         truths_differ: some pairs were scored against different pictures, because the factor changes the truth.
     """
@@ -128,8 +98,9 @@ class Effect:
 
     @property
     def equivalent(self) -> bool:
-        """Whether the difference lies within the margin after Holm's correction, with no scene that contradicts it."""
+        """Whether the difference lies within the margin after correction, with no scene or setting that contradicts it."""
         contradicted = any(one.verdict in ("higher", "lower") for one in self.by_scene.values())
+        contradicted |= any(one.sign for one in self.by_setting.values())
         return self.equivalence is not None and self.equivalence <= ALPHA and not contradicted and self.lost == (0, 0)
 
     @property
@@ -264,6 +235,7 @@ def effects_of(
     margin = quantity.margin
     same = holm([None if margin is None else effect.claim.equivalence(margin) for effect in found])
     scenes = iter(holm([one.estimate.p for effect in found for one in effect.by_scene.values()]))
+    settings = iter(holm([one.claim.p for effect in found for one in effect.by_setting.values()]))
     family = sum(p is not None for p in adjusted)
     return [
         replace(
@@ -272,6 +244,7 @@ def effects_of(
             equivalence=within,
             comparisons=family,
             by_scene={scene: replace(one, adjusted=next(scenes)) for scene, one in effect.by_scene.items()},
+            by_setting={name: replace(one, adjusted=next(settings)) for name, one in effect.by_setting.items()},
         )
         for effect, p, within in zip(found, adjusted, same, strict=True)
     ]
@@ -289,32 +262,13 @@ def _effect(
         contrast=contrast,
         quantity=quantity,
         estimate=whole,
-        across=_across(values, whole),
+        across=across_scenes(values, whole),
         adjusted=None,
         comparisons=0,
         pairs=values.pairs,
         by_scene={scene: SceneEffect(one, None) for scene, one in alone.items() if one is not None},
-        by_setting=_by_setting(contrast, quantity, observations, factors),
+        by_setting=effects_by_setting(contrast, quantity, observations, factors),
         lost=values.lost,
         silent=values.silent,
         truths_differ=values.truths_differ,
     )
-
-
-def _across(values: Sample, whole: Estimate) -> Estimate | None:
-    groups = list(values.scenes.values())
-    return over_scenes(groups, least_error=whole.error) if len(groups) > 1 else None
-
-
-def _by_setting(
-    contrast: Contrast, quantity: Quantity, observations: Sequence[Observation], factors: Sequence[Factor]
-) -> dict[str, SettingEffect]:
-    settings = [] if contrast.against is not None else settings_of(contrast, observations)
-    found = {}
-    for levels in settings if len(settings) > 1 else []:
-        own = sample(replace(contrast, where={**contrast.where, **levels}), quantity, observations)
-        if (value := over_seeds(list(own.scenes.values()))) is not None:
-            found[setting_words(levels, factors)] = SettingEffect(value, _across(own, value))
-    adjusted = holm([one.claim.p for one in found.values()])
-    known = {name: replace(one, adjusted=p) for (name, one), p in zip(found.items(), adjusted, strict=True)}
-    return known if len(known) > 1 else {}

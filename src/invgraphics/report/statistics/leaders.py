@@ -78,7 +78,9 @@ def lead_contrasts(
             first, second = (*sorted(known, key=lambda level: quantity.sort_key(means[level])), "", "")[:2]
             if second and factor.reference not in (first, second):  # with which all are compared anyway
                 words = factor.named(second, first) or contrast_words(factor.path, second, first)
-                found.append(Contrast(factor.path, second, first, where=where, name=f"best against next: {words}"))
+                found.append(
+                    Contrast(factor.path, second, first, where=where, name=f"best in {quantity.label} against next: {words}")
+                )
     return found
 
 

@@ -74,7 +74,7 @@ class Sample:
 
     Attributes:
         scenes: scene -> signed groups of values, one value per fit.
-        lost: diverged or failed fits of (before, after).
+        lost: diverged or failed fits that are (subtracted, added): of (before, after), or of an interaction's corners.
         silent: scenes where one side has no number at all.
         pairs: fits compared, on the side that has fewer.
         truths_differ: some were scored against different pictures, because the factor changes the truth.
@@ -101,19 +101,12 @@ def sample(contrast: Contrast, quantity: Quantity, observations: Sequence[Observ
         lost: fits that failed.
     """
     counted = [one for one in observations if all(one.levels.get(key) == level for key, level in contrast.where.items())]
-    known, sides, missing = [], {contrast.before: 0, contrast.after: 0}, {}
-    for one in counted:
-        level = one.levels.get(contrast.factor, "")
-        if level in sides and diverged(one.run, quantity):
-            sides[level] += 1
-            missing[one.scene] = None
-        elif level in sides and value_of(one.run, quantity) is not None:
-            known.append(one)
-    for cell in lost:
-        level = cell.levels.get(contrast.factor, "")
-        if level in sides and all(cell.levels.get(key) == value for key, value in contrast.where.items()):
-            sides[level] += 1
-            missing[cell.scene] = None
+    sided = [one for one in counted if one.levels.get(contrast.factor, "") in contrast.levels]
+    gone = [Lost(one.scene, one.levels) for one in sided if diverged(one.run, quantity)]
+    known = [one for one in sided if not diverged(one.run, quantity) and value_of(one.run, quantity) is not None]
+    gone += [cell for cell in lost if all(cell.levels.get(key) == value for key, value in contrast.where.items())]
+    gone = _compared(contrast, gone, known)
+    missing = dict.fromkeys(cell.scene for cell in gone)
     differ = False
     scenes: dict[str, list[tuple[Sign, ndarray]]] = {}
     pairs = 0
@@ -123,24 +116,64 @@ def sample(contrast: Contrast, quantity: Quantity, observations: Sequence[Observ
         if groups:
             scenes[scene] = groups
             pairs += min(len(values) for _, values in groups)
-            compared = [one for one in here if one.levels.get(contrast.factor) in sides]
-            differ |= len({one.run.provenance.truth_sha256 for one in compared}) > 1
+            differ |= len({one.run.provenance.truth_sha256 for one in here}) > 1
     silent = tuple(scene for scene in missing if scene not in scenes)
-    return Sample(scenes, (sides[contrast.before], sides[contrast.after]), silent, pairs, differ)
+    raised = sum(_raises(contrast, cell) for cell in gone)
+    return Sample(scenes, (len(gone) - raised, raised), silent, pairs, differ)
 
 
-def settings_of(contrast: Contrast, observations: Sequence[Observation]) -> list[dict[str, str]]:
-    """Levels of all other factors, the method included, at which both sides of a contrast have runs; shared ones are left out.
+def _corners(contrast: Contrast) -> list[tuple[str, ...]]:
+    """Levels of the compared factors that a contrast takes fits from: its two sides, or the four corners of an interaction."""
+    if contrast.against is None:
+        return [(level,) for level in contrast.levels]
+    return [(side, place) for side in contrast.levels for place in contrast.against[1:]]
+
+
+def _compared(contrast: Contrast, gone: Sequence[Lost], known: Sequence[Observation]) -> list[Lost]:
+    """The lost fits whose scene and other levels all sides of a contrast have, lost or not: others are not missing in it."""
+    factors = (contrast.factor, *(contrast.against or ())[:1])
+    corners = _corners(contrast)
+    places: dict[tuple[str, ...], set[tuple[Any, ...]]] = {corner: set() for corner in corners}
+
+    def place(one: Lost | Observation) -> tuple[tuple[str, ...], tuple[Any, ...]]:
+        others = tuple(sorted((key, level) for key, level in one.levels.items() if key not in factors))
+        return tuple(one.levels.get(factor, "") for factor in factors), (one.scene, others)
+
+    for one in (*known, *gone):
+        corner, stratum = place(one)
+        if corner in places:
+            places[corner].add(stratum)
+    common = set.intersection(*places.values())
+    return [cell for cell in gone if place(cell)[0] in places and place(cell)[1] in common]
+
+
+def _raises(contrast: Contrast, cell: Lost) -> bool:
+    """Whether losing a fit may raise the estimate, as the worst go first: those that are added, not those subtracted."""
+    added = cell.levels.get(contrast.factor) == contrast.after
+    if contrast.against is None:
+        return added
+    factor, _, high = contrast.against
+    return added == (cell.levels.get(factor) == high)
+
+
+def settings_of(contrast: Contrast, observations: Sequence[Observation]) -> list[tuple[dict[str, str], list[Observation]]]:
+    """Levels of all other factors, the method included, at which both sides of a contrast have runs, with these runs.
+
+    Levels that all of them share are left out.
 
     Args:
         contrast: two levels of a factor, no interaction.
         observations: finished runs.
     """
-    counted = [one for one in observations if all(one.levels.get(key) == level for key, level in contrast.where.items())]
-    before, after = ({others for _, others in _table(contrast.factor, side, counted)} for side in contrast.levels)
-    found = [dict(others) for others in sorted(before & after)]
-    shared = set.intersection(*(set(levels.items()) for levels in found)) if found else set()
-    return [{key: level for key, level in levels.items() if (key, level) not in shared} for levels in found]
+    groups: dict[tuple[tuple[str, str], ...], list[Observation]] = {}
+    for one in observations:
+        fits = all(one.levels.get(key) == level for key, level in contrast.where.items())
+        if fits and one.levels.get(contrast.factor) in contrast.levels:
+            others = tuple(sorted((key, level) for key, level in one.levels.items() if key != contrast.factor))
+            groups.setdefault(others, []).append(one)
+    both = {key: runs for key, runs in groups.items() if len({run.levels[contrast.factor] for run in runs}) == 2}
+    shared = set.intersection(*map(set, both)) if both else set()
+    return [({key: level for key, level in levels if (key, level) not in shared}, both[levels]) for levels in sorted(both)]
 
 
 def _difference(contrast: Contrast, quantity: Quantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
@@ -172,6 +205,10 @@ def _interaction(contrast: Contrast, quantity: Quantity, here: Sequence[Observat
     shared = set.intersection(*(set(table) for tables in corners for table in tables))
     if factor != METHOD or shared:  # a method may have factors that another has not
         corners = [[{key: table[key] for key in table if key in shared} for table in tables] for tables in corners]
+    together = [[table for tables in corners for table in tables]] if factor != METHOD else corners
+    corners = [
+        [_of_seeds(table, _whole_seeds(tables)) for table in own] for own, tables in zip(corners, 2 * together, strict=False)
+    ]
     sides = [_by_seed(before, after, quantity) for before, after in corners]
     if not all(sides):
         return []
@@ -179,6 +216,16 @@ def _interaction(contrast: Contrast, quantity: Quantity, here: Sequence[Observat
         return [(1.0, np.array(list(sides[0].values()))), (-1.0, np.array(list(sides[1].values())))]
     seeds = [seed for seed in sides[0] if seed in sides[1]]
     return [(1.0, np.array([sides[0][seed] - sides[1][seed] for seed in seeds]))] if seeds else []
+
+
+def _whole_seeds(tables: Sequence[Table]) -> set[int]:
+    """Seeds that have every stratum in all of some tables: means over fewer strata are of other levels."""
+    runs = [seeds.keys() for table in tables for seeds in table.values()]
+    return set.intersection(*map(set, runs)) if runs else set()
+
+
+def _of_seeds(table: Table, seeds: set[int]) -> Table:
+    return {key: {seed: run for seed, run in runs.items() if seed in seeds} for key, runs in table.items()}
 
 
 def _table(path: str, level: str, observations: Sequence[Observation], drop: str = "") -> Table:

@@ -13,8 +13,8 @@ from invgraphics.report.wording import Quantity, listing
 
 FEW_SCENES = 5
 """Fewer scenes than this tell little about others, and the sentence says so."""
-MOST_SETTINGS = 6
-"""Levels of other factors that a sentence lists; of more it names the two ends."""
+MOST_LISTED = 6
+"""Levels of other factors that a sentence lists; of more it names the two ends that are significant."""
 
 
 def effect_sentence(effect: Effect) -> str:
@@ -162,9 +162,10 @@ def _averaged(effect: Effect) -> str:
 
 
 def _settings(effect: Effect) -> str:
-    """The difference at each combination of other factors' levels, or at the two ends of many, with its interval."""
+    """The difference at each combination of other factors' levels, or at the significant ends of many, with its interval."""
     rising = sorted(effect.by_setting.items(), key=lambda item: item[1].claim.mean)
-    shown = rising if len(rising) <= MOST_SETTINGS else [rising[0], rising[-1]]
+    significant = [item for item in rising if item[1].sign]
+    shown = rising if len(rising) <= MOST_LISTED else [significant[0], significant[-1]]
     unit = _unit(effect.quantity)
     parts = (f"{effect.text(one.claim.mean)} {unit} {effect.bounds(one.claim)}".strip() + f" ({name})" for name, one in shown)
     return f"{'from ' if len(shown) < len(rising) else ''}{(' to ' if len(shown) < len(rising) else ', ').join(parts)}"
@@ -181,6 +182,10 @@ def detectable_words(effect: Effect) -> str:
 
 def _lost(effect: Effect) -> str:
     """Diverged and failed fits in words."""
+    if effect.contrast.against is not None and sum(effect.lost):
+        count = f"{sum(effect.lost)} {'fit' if sum(effect.lost) == 1 else 'fits'}"
+        words = f"Diverged or failed at one of its four corners, and not in these numbers: {count}"
+        return f"{words}; what is left flatters this sign." if effect.flattered else f"{words}."
     names = (level_words(effect.factor.rpartition(".")[2], level) for level in (effect.before, effect.after))
     names = (effect.before, effect.after) if effect.factor == METHOD else names
     parts = [f"{count} of {name}" for count, name in zip(effect.lost, names, strict=True) if count]

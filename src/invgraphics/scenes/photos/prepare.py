@@ -224,8 +224,7 @@ def _data_set(folder: Path) -> list[_Source]:
 
 def _calibration(camera: Camera) -> str:
     """Name of a group of cameras of one calibration: focal lengths equal to a thousandth, principal points to a pixel."""
-    fx, fy, cx, cy = (float(value) for value in (*camera.focal, *camera.centre))
-    return f"data set f={fx:.3g},{fy:.3g} c={cx:.0f},{cy:.0f}"
+    return "data set f={:.3g},{:.3g} c={:.0f},{:.0f}".format(*camera.focal.tolist(), *camera.centre.tolist())
 
 
 def _reduced(pixels: UInt8[np.ndarray, "h w c"], longest: int) -> UInt8[np.ndarray, "h w c"]:
@@ -264,10 +263,10 @@ def _write(work: Path, name: str, source: _Source, pixels: UInt8[np.ndarray, "h 
 
 def _at_size(mask: Bool[np.ndarray, "h w"], width: int, height: int) -> Bool[np.ndarray, "height width"]:
     """A mask at another size; a pixel counts where all of it did, to within a pixel of the mask."""
-    from PIL import Image
-
     if mask.shape == (height, width):
         return mask
+    from PIL import Image
+
     shrunk = Image.fromarray(255 * mask.astype(np.uint8)).resize((width, height), Image.Resampling.BOX)
     return np.asarray(shrunk) == 255
 

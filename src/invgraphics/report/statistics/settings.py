@@ -1,0 +1,63 @@
+"""Differences at each combination of other factors' levels: whether a mean over them describes any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from invgraphics.report.data.factors import Factor, Observation
+from invgraphics.report.data.variants import setting_words
+from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, over_scenes, over_seeds
+from invgraphics.report.statistics.pairing import Contrast, Sample, sample, settings_of
+from invgraphics.report.wording import Quantity
+
+ALPHA = 1 - CONFIDENCE
+"""Family-wise error rate of a study."""
+MOST_SETTINGS = 100
+"""Combinations of other factors' levels that an effect is looked at in one by one; of more there are too few fits in each."""
+
+
+@dataclass(frozen=True)
+class SettingEffect:
+    """The same difference where every other factor, the method included, has one level.
+
+    Attributes:
+        estimate: over new fits on these scenes.
+        across: over scenes as a sample of scenes; ``None`` for one scene.
+        adjusted: p-value of `claim` after Holm's correction over all settings and comparisons; ``None`` without one.
+    """
+
+    estimate: Estimate
+    across: Estimate | None
+    adjusted: float | None = None
+
+    @property
+    def claim(self) -> Estimate:
+        """The estimate that a test rests on: over scenes where there are several, else over seeds."""
+        return self.estimate if self.across is None else self.across
+
+    @property
+    def sign(self) -> int:
+        """Sign of a significant difference; 0 for none."""
+        if self.adjusted is None or self.adjusted > ALPHA:
+            return 0
+        return 1 if self.claim.mean > 0 else -1
+
+
+def across_scenes(values: Sample, whole: Estimate) -> Estimate | None:
+    """Estimate over scenes as a sample of scenes; ``None`` for one scene. ``whole`` is that over new fits on these."""
+    groups = list(values.scenes.values())
+    return over_scenes(groups, least_error=whole.error) if len(groups) > 1 else None
+
+
+def effects_by_setting(
+    contrast: Contrast, quantity: Quantity, observations: Sequence[Observation], factors: Sequence[Factor]
+) -> dict[str, SettingEffect]:
+    """A contrast at each combination of other factors' levels, in words, uncorrected; empty where there is one only."""
+    settings = [] if contrast.against is not None else settings_of(contrast, observations)
+    found = {}
+    for levels, runs in settings if 1 < len(settings) <= MOST_SETTINGS else []:
+        own = sample(contrast, quantity, runs)
+        if (value := over_seeds(list(own.scenes.values()))) is not None:
+            found[setting_words(levels, factors)] = SettingEffect(value, across_scenes(own, value))
+    return found if len(found) > 1 else {}
