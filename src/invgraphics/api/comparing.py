@@ -127,7 +127,7 @@ def compare(
         data: what is done to the training data: the keys that the command line takes as ``--set data.KEY=value``, such as
             ``{"train_views": 4, "init": "sfm"}`` (`invgraphics.scenes.degrade.TrainingData` explains them). On a rendered
             scene, methods that start from points are given those found in the training photographs (``sfm``) instead of
-            the exact ones, unless ``data["init"]`` says otherwise: where the hint that is printed says ``--set``, ``data`` is meant.
+            the exact ones, unless ``data["init"]`` says otherwise; the ``--set`` of a printed hint is ``data`` here.
 
     Raises:
         InputError: something cannot be used; found before the first fit.
