@@ -6,7 +6,10 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 import torch
@@ -15,10 +18,12 @@ from PIL import Image
 from invgraphics import core
 from invgraphics.core import Camera, Model
 from invgraphics.core.transforms import look_at
+from invgraphics.metrics.base import Metric, Pair
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.scenes.open import Loader
 from invgraphics.testing import TwoBalls, toy_scene
+from invgraphics.training import losses
 
 PAGE = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
 
@@ -71,6 +76,16 @@ def test_signatures_on_the_page_are_those_of_the_contract() -> None:
         hints = owner.__dict__[name].__annotations__
         written = ", ".join(f"{key}: {hint}" for key, hint in hints.items() if key != "return")
         assert f"`{name}({written}) -> {hints['return']}`" in PAGE, name
+    arguments, result = get_args(losses.Loss)
+    called = zip(("rendering", "trace", "batch", "ctx"), arguments, strict=True)
+    signature = ", ".join(f"{name}: {kind.__name__}" for name, kind in called)
+    assert f"`__call__({signature}) -> {result.__name__}`" in PAGE and f"def __call__(self, {signature})" in PAGE
+    assert "`compute(pair: Pair) -> float`" in PAGE and get_type_hints(Metric)["compute"] == Callable[[Pair], float]
+    owners = dict(zip(("rendering", "trace", "batch", "ctx"), arguments, strict=True), pair=Pair)
+    named = re.findall(r"`(rendering|trace|batch|ctx|pair)\.(\w+)`", PAGE)
+    assert {owner for owner, _ in named} == set(owners)
+    for owner, name in named:
+        assert name in {field.name for field in fields(owners[owner])} | set(vars(owners[owner])), f"{owner}.{name}"
 
 
 def test_the_parts_conform_and_take_part(environment: dict[str, str], turntable: Path, tmp_path: Path) -> None:
@@ -99,3 +114,24 @@ def test_the_parts_conform_and_take_part(environment: dict[str, str], turntable:
     assert (train, test, failures, shape) == ("14", "2", "()", "torch.Size([20, 20, 3])")
     assert float(psnr[0]) > 18 and float(psnr[1]) > 12, psnr
     assert "Dense voxel grid" in (tmp_path / "report" / "index.html").read_text()
+
+
+def test_the_loss_clears_what_the_metric_sees(environment: dict[str, str], turntable: Path) -> None:
+    code = (
+        "import torch, invgraphics as ig\n"
+        "from invgraphics.core import Batch, Bounds, Context, Rendering, Trace\n"
+        "from voxel_world import EmptyLoss\n"
+        "alpha = torch.tensor([0.5, 0.5, 0.25, 1.0])\n"
+        "batch = Batch(torch.ones(4, 3), torch.tensor([0.0, 0.5, 1.0, 1.0]), torch.ones(3))\n"
+        "bounds = Bounds(-torch.ones(3), torch.ones(3))\n"
+        "rendering = Rendering(torch.ones(4, 3), alpha, alpha)\n"
+        "for progress in (0.0, 0.5):\n"
+        "    print(float(EmptyLoss(weight=2)(rendering, Trace(), batch, Context(bounds, progress=progress))))\n"
+        f"scene = ig.load_scene({str(turntable)!r})\n"
+        "for name in ('volumetric/voxels', 'volumetric/voxels-empty'):\n"
+        "    method = ig.load_method(name, set={'field.resolution': 8, 'batches.rays': 64})\n"
+        "    print(ig.fit(method, scene, '60steps').scores['halo'])\n"
+    )
+    early, late, without, cleared = map(float, _run(environment, "-c", code).split())
+    assert (early, late) == (0.0, 2 * (0.5 + 0.25) / 4)
+    assert 0 < cleared < 0.8 * without, (without, cleared)

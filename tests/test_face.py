@@ -23,11 +23,13 @@ from training_fixtures import SMALL
 import invgraphics as ig
 from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError, NotComposableError
+from invgraphics.experiments import compare as comparing
 from invgraphics.experiments.session import ScoreTable
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.scenes.npz import Npz, save_npz
 from invgraphics.scenes.open import SceneOptions, source_of
+from invgraphics.scenes.truth import POINTS as EXACT_POINTS
 from invgraphics.testing import toy_scene
 
 SPLATS = ig.load_method("splatting/gaussians", set={"field.count": 60, "field.max_init": 60, "field.sh_degree": 0})
@@ -286,3 +288,85 @@ def test_small_methods_of_each_family_fit() -> None:
     for name, items in SMALL.items():
         method = ig.load_method(name, set={key: json.loads(value) for key, _, value in (item.partition("=") for item in items)})
         assert ig.fit(method, scene, "2steps").finished, name
+
+
+def test_training_data_can_be_changed_from_python_in_memory_and_in_a_folder() -> None:
+    few = {"train_views": 4, "init": "random", "test_scales": (2,)}
+    in_memory = ig.fit(SPLATS, "toy.npz", "3steps", data=few)
+    kept = ig.fit(SPLATS, "toy.npz", "3steps", data=few, out="run")
+    assert len(in_memory.fit.plan.scene.train) == 4 and len(in_memory.scene.train) == 8
+    assert in_memory.scores["psnr_at_1_2"] == kept.scores["psnr_at_1_2"] == kept.evaluate()["psnr_at_1_2"]
+    provenance = json.loads(Path("run/provenance.json").read_text())
+    assert provenance["data"] == {"train_views": 4, "test_scales": [2], "init": "random"}
+    assert "--set data.train_views=4" in provenance["command"]
+    with pytest.raises(InputError, match=r"Unknown key 'data\.train_veiws'\. Did you mean 'train_views'"):
+        ig.fit(SPLATS, "toy.npz", "3steps", data={"train_veiws": 4})
+    with pytest.raises(InputError, match=r"The data cannot be 'sfm'\.\nExpected: a table"):
+        ig.fit(SPLATS, "toy.npz", "3steps", data="sfm")
+    with pytest.raises(InputError, match=r"changes the training data, .*\nGive it to .*: data=\{'train_views': 4\}\."):
+        ig.load_method("splatting/gaussians", set={"data.train_views": 4})
+
+
+def test_the_points_of_a_comparison_are_chosen_from_python(
+    in_process, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a rendered scene they are ``sfm`` unless the caller says otherwise; the hint names what ``data`` takes."""
+    scene = ig.load_scene("toy.npz")
+    exact = replace(scene, notes=scene.notes | {"points": EXACT_POINTS})
+    monkeypatch.setattr(comparing, "open_with_progress", lambda *_: exact)
+    told = ig.compare("toy.npz", [SPLATS], "2steps", out="told", data={"init": "scene", "train_views": 4})
+    assert "found in the training photographs" not in capsys.readouterr().err
+    assert told.record.scene_info.notes["training_data"] == "train_views = 4"
+    assert "--set data.train_views=4" in told.record.command and "data.init=" in told.record.command
+    with pytest.raises(InputError, match=r"Unknown key 'data\.inti'"):
+        ig.compare("toy.npz", [SPLATS], "2steps", out="untold", data={"inti": "scene"})
+    untold = ig.compare("toy.npz", [SPLATS], "2steps", out="untold")
+    assert "(data.init=sfm)" in capsys.readouterr().err and "--set data.init=sfm" in untold.record.command
+
+
+def test_a_lone_method_renderer_or_seed_needs_no_list(in_process) -> None:
+    report = ig.compare("toy.npz", SPLATS.name, "2steps", seeds=2, out="lone", render_with="gaussian-volume/exact:steps=4")
+    assert report.methods == (SPLATS.name,) and report.run(SPLATS.name, 2).finished
+    assert "--seeds 2 " in report.record.command and "--render-with gaussian-volume/exact:steps=4 " in report.record.command
+    again = ig.compare("toy.npz", SPLATS, "2steps", seeds=np.arange(1), out="loaded")
+    assert again.run(SPLATS.name, 0).finished
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: ig.compare("toy.npz", SPLATS, seeds=()), "There are no seeds."),
+        (lambda: ig.compare("toy.npz", SPLATS, seeds=["a"]), "A seed cannot be 'a'."),
+        (lambda: ig.compare("toy.npz", SPLATS, seeds=[-1]), "A seed cannot be -1."),
+        (lambda: ig.compare("toy.npz", SPLATS, seeds=None), "A seed cannot be None."),
+        (lambda: ig.fit(SPLATS, "toy.npz", seed=2**63), "A seed cannot be 9223372036854775808."),
+        (lambda: ig.fit(SPLATS, "toy.npz", seed=1.5), "A seed cannot be 1.5."),
+        (lambda: ig.ablate("training-views", seeds=()), "There are no seeds."),
+        (lambda: ig.ablate("training-views", size=(10,)), "The size cannot be (10,)."),
+        (lambda: ig.load_scene("toy.npz", size=(10,)), "The size cannot be (10,)."),
+        (lambda: ig.load_scene("toy.npz", size="10"), "The size cannot be '10'."),
+        (lambda: ig.load_run("none"), "none is not a run: it has no recipe.toml."),
+        (lambda: ig.fit(SPLATS, "toy.npz", out="run", snapshots=-1), "The number of snapshots cannot be -1."),
+        (lambda: ig.fit(SPLATS, "toy.npz", snapshots=2), "Snapshots are files of a run's folder, and this fit has none."),
+        (lambda: ig.evaluate("run", "toy.npz"), "A str cannot be scored."),
+    ],
+)
+def test_python_refuses_what_the_command_line_refuses(call: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(InputError) as caught:
+        call()
+    assert caught.value.sentence == sentence and "\n" not in caught.value.remedy
+    assert not list(Path().glob("run/*")), "nothing is left behind"
+
+
+def test_a_misspelt_argument_is_one_that_fit_does_not_have() -> None:
+    with pytest.raises(TypeError, match=r"fit\(\) got an unexpected keyword argument 'snapshot'"):
+        ig.fit(SPLATS, "toy.npz", "2steps", out="run", snapshot=2)
+
+
+def test_fits_are_scored_on_scenes_and_runs_opened_with_them() -> None:
+    fit = ig.fit(SPLATS, "toy.npz", "5steps", out="run")
+    scene = ig.load_scene("toy.npz")
+    assert ig.evaluate(fit, scene)["psnr"] == ig.evaluate(fit.model, scene)["psnr"] == fit.scores["psnr"]
+    small = ig.load_scene("toy.npz", size=12)
+    run = ig.load_run("run", small)
+    assert run.scene is small and run.evaluate()["psnr"] == ig.evaluate(fit, small)["psnr"] != fit.scores["psnr"]

@@ -3,6 +3,7 @@
 Nothing heavy is imported to *list* what there is; an object is imported when it is used.
 A stranger's package joins by declaring an entry point in the group ``invgraphics.<registry>``,
 for instance ``[project.entry-points."invgraphics.fields"] mine = "my_package:MyFieldConfig"``.
+A built-in part keeps its name: an entry point of the same name is left out, with a warning.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from typing import Any
 
+from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 
 REGISTRIES = {
@@ -48,19 +50,31 @@ def _entry_points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
 
 
 def _foreign(registry: str) -> dict[str, EntryPoint]:
-    points = _entry_points(tuple(sys.path))
-    return {point.name: point for point in points if point.group == f"invgraphics.{registry}"}
+    """A registry's entry points by name; those whose name a built-in part has are left out, with a warning."""
+    points = {}
+    for point in _entry_points(tuple(sys.path)):
+        if point.group != f"invgraphics.{registry}":
+            continue
+        if _is_built_in(registry, point.name):
+            package = point.dist.name if point.dist is not None else "unknown package"
+            leave_out(f"'{point.name}' of the {registry} ({point.value}, {package}): a built-in has this name.")
+        else:
+            points[point.name] = point
+    return points
+
+
+def _is_built_in(registry: str, name: str) -> bool:
+    return name in _own(registry) or (registry == "recipes" and (find("renderers") / f"{name}.toml").is_file())
 
 
 def names(registry: str) -> dict[str, str]:
     """List a registry's entries, name -> ``"module:object"``, built-in ones first; imports no implementation."""
-    foreign = {name: point.value for name, point in _foreign(registry).items()}
-    return _own(registry) | {name: value for name, value in foreign.items() if name not in _own(registry)}
+    return _own(registry) | {name: point.value for name, point in _foreign(registry).items()}
 
 
 def origin(registry: str, name: str) -> str:
     """Distribution that provides ``name``, or ``"built in"``."""
-    if name in _own(registry):
+    if _is_built_in(registry, name):
         return "built in"
     point = _foreign(registry).get(name)
     return point.dist.name if point is not None and point.dist is not None else "unknown package"
@@ -85,7 +99,7 @@ def used_plugins(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
     found = {}
     for registry in REGISTRIES:
         for name, point in _foreign(registry).items():
-            if name in used and name not in _own(registry) and point.dist is not None:
+            if name in used and point.dist is not None:
                 found[name] = f"{point.dist.name} {point.dist.version}"
     return found
 

@@ -36,6 +36,12 @@ broken = broken_parts:Field
 [invgraphics.scenes]
 broken = broken_parts:Loader
 """
+TAKEN_NAMES = """
+[invgraphics.fields]
+gaussians = fine_parts:Gaussians
+[invgraphics.recipes]
+volumetric/nerf = fine_parts:NERF
+"""
 RAISED = {
     "value": ("raise ValueError('needs\\na GPU.')", "ValueError: needs a GPU."),
     "import": ("import a_module_that_is_not_there", "ModuleNotFoundError: No module named 'a_module_that_is_not_there'."),
@@ -56,6 +62,25 @@ def said(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.syspath_prepend(info.parent)
     plugins.leave_out.cache_clear()
     return words
+
+
+def test_a_name_that_a_built_in_has_is_left_out_with_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = tmp_path / "stranger_taken-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger-taken\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(TAKEN_NAMES)
+    monkeypatch.syspath_prepend(tmp_path)
+    plugins.leave_out.cache_clear()
+    assert plugins.names("fields")["gaussians"] == plugins._own("fields")["gaussians"] and not plugins.names("recipes")
+    assert load_method("volumetric/nerf").name == "volumetric/nerf"
+    assert {plugins.origin("fields", "gaussians"), plugins.origin("recipes", "volumetric/nerf")} == {"built in"}
+    assert not plugins.used_plugins({"field": {"type": "gaussians"}}, "volumetric/nerf")
+    assert capsys.readouterr().err.splitlines() == [
+        "Left out: 'gaussians' of the fields (fine_parts:Gaussians, stranger-taken): a built-in has this name.",
+        "Left out: 'volumetric/nerf' of the recipes (fine_parts:NERF, stranger-taken): a built-in has this name.",
+    ]
 
 
 def test_lists_leave_broken_parts_out_with_a_line_each(said: str, capsys: pytest.CaptureFixture[str]) -> None:

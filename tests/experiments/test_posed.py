@@ -34,3 +34,14 @@ def test_a_scene_follows_its_fit(scene: Scene) -> None:
     torch.testing.assert_close(seen.test[0].depth, 1.25 * depth, atol=1e-4, rtol=0)
     assert seen.test[0].normal is not None
     torch.testing.assert_close(seen.test[0].normal[0, 0].double(), motion[:3, 2], atol=1e-4, rtol=0)
+
+
+def test_photographs_that_the_fit_did_not_see_follow_its_drift(scene: Scene) -> None:
+    """Fitted to a few of the training views: the scene as loaded has more of them than there are refined poses."""
+    drift = Similarity(1.25, torch.eye(3, dtype=torch.float64), torch.tensor([0.1, 0.0, -0.3], dtype=torch.float64))
+    poses = Poses.of(PosesConfig(), scene.with_views(train=scene.train[:4]))
+    poses.given.copy_(drift.poses(poses.reference))
+    seen = scene_in_fit_frame(poses, scene)
+    for before, after in zip(scene.train, seen.train, strict=True):
+        expected = drift.poses(before.camera.cam_to_world).float()
+        torch.testing.assert_close(after.camera.cam_to_world.float(), expected, atol=1e-4, rtol=0)

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from invgraphics.api.loading import MethodLike, as_scene, load_run, name_of, reopenable_scene
+from invgraphics.api.loading import (
+    MethodLike,
+    as_scene,
+    data_overrides,
+    listed,
+    load_run,
+    name_of,
+    reopenable_scene,
+    whole_seeds,
+)
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import compare as comparing
 from invgraphics.experiments.display import table_html
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.experiments.session import FolderRun, ScoreTable
-from invgraphics.recipes.recipe import expand
+from invgraphics.recipes.recipe import Method, expand
 from invgraphics.report.build import build_report
 from invgraphics.report.data.comparison import Comparison, read_comparison
 from invgraphics.report.statistics.summary import summarise
@@ -92,13 +101,14 @@ class ComparisonResult:
 
 def compare(
     scene: Scene | str,
-    methods: Sequence[MethodLike] | str = (),
+    methods: Sequence[MethodLike] | MethodLike = (),
     budget: str = "60s",
     *,
-    seeds: Sequence[int] = (0,),
+    seeds: Sequence[int] | int = (0,),
     out: str | os.PathLike[str] | None = None,
     device: Literal["cpu", "cuda"] | None = None,
-    render_with: Sequence[str] = (),
+    render_with: Sequence[str] | str = (),
+    data: Mapping[str, Any] | None = None,
 ) -> ComparisonResult:
     """Fit several methods to one scene under one budget, each in its own process, and write a report.
 
@@ -107,13 +117,17 @@ def compare(
 
     Args:
         scene: loaded, made in Python, or what `load_scene` opens.
-        methods: names, paths of recipes, tables, or loaded methods; ``all``, or a pattern such as ``volumetric/*``, takes
-            those that go with the scene; none leaves the choice to the scene.
+        methods: names, paths of recipes, tables, or loaded methods, or one of them; ``all``, or a pattern such as
+            ``volumetric/*``, takes those that go with the scene; none leaves the choice to the scene.
         budget: of each fit, ``60s`` or ``5000steps``.
         seeds: each method is fitted once per seed.
         out: folder of the report and its runs; ``None`` for ``reports/compare-SCENE``.
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
         render_with: renderers that show the fitted fields besides their own.
+        data: what is done to the training data: the keys that the command line takes as ``--set data.KEY=value``, such as
+            ``{"train_views": 4, "init": "sfm"}`` (`invgraphics.scenes.degrade.TrainingData` explains them). On a rendered
+            scene, methods that start from points are given those found in the training photographs (``sfm``) instead of
+            the exact ones, unless ``data["init"]`` says otherwise; the ``--set`` of a printed hint is ``data`` here.
 
     Raises:
         InputError: something cannot be used; found before the first fit.
@@ -128,13 +142,18 @@ def compare(
     """
     scene = as_scene(scene)
     folder = Path("reports") / f"compare-{scene.name}" if out is None else Path(out)
-    given = [methods] if isinstance(methods, str) else list(methods)
+    names, optional = _names(methods, folder)
+    _, place = reopenable_scene(scene, folder)
+    shown = tuple(listed(render_with, str))
+    settings: dict[str, Any] = {"budget": budget, "device": device, "render_with": shown, "overrides": data_overrides(data)}
+    settings |= {"seeds": whole_seeds(seeds), "out": str(folder), **place}
+    root, _ = comparing.compare(CompareRequest(methods=names, optional=optional, **settings))
+    return ComparisonResult(root)
+
+
+def _names(methods: Sequence[MethodLike] | MethodLike, folder: Path) -> tuple[tuple[str, ...], frozenset[str]]:
+    """Names of methods for other processes, those that patterns name among them, and which of them only a pattern names."""
+    given = listed(methods, (str, os.PathLike, Mapping, Method))
     expanded, optional = expand([method for method in given if isinstance(method, str)])
     others = [method for method in given if not isinstance(method, str)]
-    ordered = [*expanded, *others] if optional else given
-    names = [name_of(method, folder / "methods") for method in ordered]
-    _, place = reopenable_scene(scene, folder)
-    settings: dict[str, Any] = {"budget": budget, "device": device, "render_with": tuple(render_with), **place}
-    request = CompareRequest(methods=tuple(names), seeds=tuple(seeds), optional=optional, out=str(folder), **settings)
-    root, _ = comparing.compare(request)
-    return ComparisonResult(root)
+    return tuple(name_of(method, folder / "methods") for method in ([*expanded, *others] if optional else given)), optional

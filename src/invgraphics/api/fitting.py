@@ -4,20 +4,33 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, TypedDict, Unpack, overload
 
-from invgraphics.api.loading import MethodLike, as_scene, reopenable_scene, resolved
+from invgraphics.api.loading import MethodLike, as_scene, data_overrides, reopenable_scene, resolved, whole_seeds
 from invgraphics.core import Model, Scene
+from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import score_model
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import make_run
-from invgraphics.experiments.session import FolderRun, MemoryRun, OnStep, ScoreTable
+from invgraphics.experiments.session import FittedRun, FolderRun, MemoryRun, OnStep, ScoreTable
 from invgraphics.interruption import Terminated
 from invgraphics.runs.folder import RECIPE, RunFolder
 from invgraphics.scenes.open import source_of
+
+
+class Kept(TypedDict, total=False):
+    """What a run's folder keeps besides, on request.
+
+    Attributes:
+        snapshots: states of the model, for a time-lapse.
+    """
+
+    snapshots: int
 
 
 @overload
@@ -29,7 +42,7 @@ def fit(
     seed: int = ...,
     out: None = ...,
     device: Literal["cpu", "cuda"] | None = ...,
-    snapshots: int = ...,
+    data: Mapping[str, Any] | None = ...,
     on_step: OnStep | None = ...,
 ) -> MemoryRun: ...
 @overload
@@ -41,8 +54,9 @@ def fit(
     seed: int = ...,
     out: str | os.PathLike[str],
     device: Literal["cpu", "cuda"] | None = ...,
-    snapshots: int = ...,
+    data: Mapping[str, Any] | None = ...,
     on_step: OnStep | None = ...,
+    **kept: Unpack[Kept],
 ) -> FolderRun: ...
 def fit(
     method: MethodLike,
@@ -52,8 +66,9 @@ def fit(
     seed: int = 0,
     out: str | os.PathLike[str] | None = None,
     device: Literal["cpu", "cuda"] | None = None,
-    snapshots: int = 0,
+    data: Mapping[str, Any] | None = None,
     on_step: OnStep | None = None,
+    **kept: Unpack[Kept],
 ) -> MemoryRun | FolderRun:
     """Fit a method to a scene in this process, with a progress bar.
 
@@ -67,9 +82,11 @@ def fit(
         seed: of the initial values and of the fit.
         out: folder that keeps the run as ``invgraphics fit`` does, scores included; ``None`` keeps it in memory.
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
-        snapshots: states of the model that ``out`` keeps for a time-lapse, evenly over the fit, besides the first.
+        data: what is done to the training data: the keys that the command line takes as ``--set data.KEY=value``, such as
+            ``{"train_views": 4, "init": "sfm"}`` (`invgraphics.scenes.degrade.TrainingData` explains them).
         on_step: is given the fit before its first step and after each one, on no clock: ``fit.steps``, ``fit.seconds``,
             ``fit.progress``, ``fit.model``, ``fit.plan``.
+        **kept: ``snapshots=N``: states of the model that ``out`` keeps for a time-lapse, evenly over the fit.
 
     Raises:
         InputError: something cannot be used, or ``out`` holds another run; nothing has been computed then.
@@ -84,21 +101,30 @@ def fit(
         (torch.Size([16, 16, 3]), True, 20)
     """
     scene = as_scene(scene)
-    if out is None:
-        source = source_of(scene)
-        name, table = resolved(method, budget)
-        where = scene.name if source is None else source.spec
-        request = FitRequest(method=name, scene=where, out="", budget=budget, seed=seed, device=device)
-        return MemoryRun(Job.of(request, table), scene, on_step)
-    folder = RunFolder(Path(out))
+    snapshots = kept.pop("snapshots", 0)
+    if kept:
+        raise TypeError(f"fit() got an unexpected keyword argument '{next(iter(kept))}'")
+    settings: dict[str, Any] = {"budget": budget, "seed": whole_seeds([seed])[0], "device": device, "snapshots": snapshots}
+    source = source_of(scene)
+    where = scene.name if source is None else source.spec
+    request = FitRequest(
+        method="", scene=where, out="" if out is None else str(out), overrides=data_overrides(data), **settings
+    )
+    if out is not None:
+        return _fit_in_folder(method, scene, request, on_step)
+    name, table = resolved(method, budget)
+    return MemoryRun(Job.of(replace(request, method=name), table), scene, on_step)
+
+
+def _fit_in_folder(method: MethodLike, scene: Scene, request: FitRequest, on_step: OnStep | None) -> FolderRun:
+    """Fit into the request's folder, or go on there; the request's method and scene are still to be named."""
+    folder = RunFolder(Path(request.out))
     folder.create()
     existing: Literal["resume", "refuse"] = "resume" if folder.identity else "refuse"
-    name, table = resolved(method, budget, str(folder.root / RECIPE))  # which the run writes, once the folder is its own
-    settings: dict[str, Any] = {"budget": budget, "seed": seed, "device": device, "snapshots": snapshots}
+    name, table = resolved(method, request.budget, str(folder.root / RECIPE))  # written once the folder is the run's own
     scene, place = reopenable_scene(scene, folder.root)
-    request = FitRequest(method=name, out=str(out), existing=existing, **settings, **place)
     try:
-        make_run(Job.of(request, table), scene, on_step)
+        make_run(Job.of(replace(request, method=name, existing=existing, **place), table), scene, on_step)
     except KeyboardInterrupt as error:
         if isinstance(error, Terminated) or not folder.resumable:
             raise
@@ -106,16 +132,16 @@ def fit(
     return FolderRun(load_fitted(folder, scene))
 
 
-def evaluate(model: Model, scene: Scene | str, protocol: str = "default") -> ScoreTable:
+def evaluate(model: Model | FittedRun, scene: Scene | str, protocol: str = "default") -> ScoreTable:
     """Render a scene's test views and score them by the rules of the command line.
 
     Args:
-        model: any field and renderer.
+        model: any field and renderer, or a fit.
         scene: loaded, made in Python, or what `load_scene` opens.
         protocol: ``default`` (pictures rounded to 8 bits) or ``float``.
 
     Raises:
-        InputError: the scene or the protocol cannot be used.
+        InputError: the scene or the protocol cannot be used, or the fit has refined poses of other photographs.
 
     Example:
         >>> import invgraphics as ig
@@ -125,5 +151,15 @@ def evaluate(model: Model, scene: Scene | str, protocol: str = "default") -> Sco
         (True, 'dB')
     """
     scene = as_scene(scene)
+    if isinstance(model, FittedRun):
+        if model.poses is not None and scene.digest("train") != model.scene.digest("train"):
+            raise InputError(
+                f"{model.method.name} has refined poses of other photographs.", "Give the scene that it was fitted to."
+            )
+        return ScoreTable(score_model(model.model, scene, protocol, model.method.name, model.poses))
+    if not isinstance(model, Model):
+        raise InputError(
+            f"A {type(model).__name__} cannot be scored.", "Expected: a model, a fit, or what ig.load_run returns."
+        )
     title = f"{type(model.field).__name__} through {type(model.renderer).__name__}"
     return ScoreTable(score_model(model, scene, protocol, title))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar, cast
 
 import tomlkit
 import torch
@@ -15,17 +16,21 @@ import torch
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
-from invgraphics.experiments.fitted import open_fitted
+from invgraphics.experiments.fitted import load_fitted, open_fitted
+from invgraphics.experiments.request import DATA, check_size
 from invgraphics.experiments.session import FolderRun
 from invgraphics.files import write_text
 from invgraphics.recipes import recipe
 from invgraphics.recipes.recipe import Method
+from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.scenes.npz import save_npz
 from invgraphics.scenes.open import SceneOptions, open_scene, source_of, validate
 from invgraphics.studies.factors import override
 from invgraphics.tables import plain
 from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
+
+T = TypeVar("T")
 
 MethodLike: TypeAlias = str | os.PathLike[str] | Mapping[str, Any] | Method
 """A method's name, the path of a recipe, a recipe as a table, or a method that `load_method` returned."""
@@ -56,6 +61,7 @@ def load_scene(
         >>> len(scene.train), scene.test[0].camera.width
         (8, 16)
     """
+    check_size(size)
     return open_with_progress(os.fspath(spec), SceneOptions(size=size, test_views=test_views, spp=spp))
 
 
@@ -96,7 +102,8 @@ def load_method(method: str | os.PathLike[str], *, preset: str | None = None, se
         method: ``renderer/recipe`` or the path of a recipe.
         preset: one of the recipe's presets; ``None`` leaves the choice to the budget of the fit that gets the method, and shows
             the one for short budgets.
-        set: dotted path of a value in the recipe -> its new value.
+        set: dotted path of a value in the recipe -> its new value. What changes the training data instead (``data.init``) is
+            no part of a method: `fit` and `compare` take it as their ``data``.
 
     Raises:
         InputError: unknown method, preset or key, or a value of the wrong type.
@@ -107,16 +114,21 @@ def load_method(method: str | os.PathLike[str], *, preset: str | None = None, se
         >>> wide.recipe.field.width, wide.name
         (64, 'volumetric/hash:field.width=64')
     """
+    for path, value in (set or {}).items():
+        if path.startswith(DATA):
+            key = path.removeprefix(DATA)
+            remedy = f"Give it to ig.fit or ig.compare: data={{{key!r}: {value!r}}}."
+            raise InputError(f"'{path}' changes the training data, which is no part of a method.", remedy)
     changes = [override(path, value) for path, value in (set or {}).items()]
     return recipe.load_method(":".join([os.fspath(method), *([f"preset={preset}"] if preset else []), *changes]))
 
 
-def load_run(folder: str | os.PathLike[str], scene: str | None = None) -> FolderRun:
+def load_run(folder: str | os.PathLike[str], scene: Scene | str | None = None) -> FolderRun:
     """Open a run that `fit`, `compare` or the command line wrote: its model, its scene, its history, its scores.
 
     Args:
         folder: of the run.
-        scene: another copy of its scene, where that has moved.
+        scene: another copy of its scene, where that has moved: its place, or loaded.
 
     Raises:
         InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe.
@@ -131,7 +143,11 @@ def load_run(folder: str | os.PathLike[str], scene: str | None = None) -> Folder
         >>> exact.render(run.scene.test[0].camera.resized(24, 24)).alpha.shape
         torch.Size([24, 24])
     """
-    return FolderRun(open_fitted(Path(folder), scene))
+    root = Path(folder)
+    check_run(root)
+    if isinstance(scene, Scene):
+        return FolderRun(load_fitted(RunFolder(root), validate(scene)))
+    return FolderRun(open_fitted(root, scene))
 
 
 def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
@@ -141,6 +157,31 @@ def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
         InputError: it cannot be opened, or not be used.
     """
     return validate(scene) if isinstance(scene, Scene) else load_scene(scene)
+
+
+def data_overrides(data: Mapping[str, Any] | None) -> tuple[str, ...]:
+    """Changes of the training data as a request holds them, as ``--set data.KEY=value`` makes them.
+
+    Raises:
+        InputError: it is no table, or TOML has no such value.
+    """
+    if data is None:
+        return ()
+    if not isinstance(data, Mapping):
+        raise InputError(f"The data cannot be {data!r}.", 'Expected: a table of what to change, such as {"train_views": 4}.')
+    return tuple(override(f"{DATA}{key}", value) for key, value in data.items())
+
+
+def listed(items: T | Iterable[T], lone: type | tuple[type, ...]) -> list[T]:
+    """Items in a list, and a lone one, which has a type of ``lone``, in a list of its own."""
+    if isinstance(items, lone) or not isinstance(items, Iterable):
+        return [cast(T, items)]
+    return list(cast(Iterable[T], items))
+
+
+def whole_seeds(seeds: Sequence[int] | int) -> tuple[int, ...]:
+    """Seeds, or a lone one, with numpy's whole numbers as plain ones; what is no number stays, for the request to refuse."""
+    return tuple(int(seed) if isinstance(seed, Integral) else seed for seed in listed(seeds, str))
 
 
 def resolved(method: MethodLike, budget: str, name: str = "recipe") -> tuple[str, Method | None]:

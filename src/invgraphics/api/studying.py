@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+from invgraphics.api.loading import whole_seeds
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.report.data.studies import Study, read_study
@@ -137,6 +138,6 @@ def ablate(
     name = os.fspath(study)
     folder = Path("reports") / studies.name_of(studies.locate(name)) if out is None else Path(out)
     given: dict[str, Any] = {"budget": budget, "size": size, "device": device, "jobs": jobs}
-    given |= {} if seeds is None else {"seeds": tuple(seeds)}
+    given |= {} if seeds is None else {"seeds": whole_seeds(seeds)}
     root, _ = ablating.ablate(AblateRequest(study=name, out=str(folder), **given), confirm)
     return StudyResult(root)

@@ -71,6 +71,8 @@ def transform_camera(camera: Camera, similarity: Similarity) -> Camera:
 def scene_in_fit_frame(poses: Poses, scene: Scene) -> Scene:
     """Transform the scene to the fit's drifted frame: refined training cameras, all else transformed by `world_to_fit`.
 
+    Training cameras are transformed too where the fit has seen only some of them.
+
     Its ``world_from_local`` leads to the same world as before."""
     errors = training_errors(poses, scene)
     similarity = errors.similarity.inverse()
@@ -82,12 +84,15 @@ def scene_in_fit_frame(poses: Poses, scene: Scene) -> Scene:
         normal = None if view.normal is None else view.normal @ turn.T
         return replace(view, camera=camera, depth=depth, normal=normal, landmarks=None)
 
-    refined = zip(scene.train, poses().cpu(), strict=True)
+    fitted = poses().cpu()
+    cameras = [view.camera.moved(pose.to(view.camera.cam_to_world)) for view, pose in zip(scene.train, fitted, strict=False)]
+    if len(fitted) != len(scene.train):  # of more photographs than were fitted, none has a pose of its own
+        cameras = [transform_camera(view.camera, similarity) for view in scene.train]
     back = torch.linalg.inv(similarity.matrix)
     points, mesh = scene.points, scene.mesh
     return replace(
         scene,
-        train=tuple(moved(view, view.camera.moved(pose.to(view.camera.cam_to_world))) for view, pose in refined),
+        train=tuple(moved(view, camera) for view, camera in zip(scene.train, cameras, strict=True)),
         val=tuple(moved(view, transform_camera(view.camera, similarity)) for view in scene.val),
         test=tuple(moved(view, transform_camera(view.camera, similarity)) for view in scene.test),
         points=None if points is None else replace(points, position=similarity.points(points.position).to(points.position)),

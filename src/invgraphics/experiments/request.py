@@ -3,16 +3,51 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from numbers import Integral
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
+from invgraphics.errors import InputError
 from invgraphics.text import slug
 
 Existing = Literal["refuse", "resume", "reuse"]
 
 DATA = "data."
 """How the keys begin that change the training data rather than the recipe (`invgraphics.scenes.degrade.TrainingData`)."""
+
+LARGEST_SEED = 2**63 - 1
+"""The largest whole number that TOML and torch's generators both hold."""
+
+
+def check_size(size: object) -> None:
+    """Check the form of a size of pictures, whichever way it came in; ``None`` passes, and scenes check the numbers.
+
+    Raises:
+        InputError: it is neither a number of pixels nor a width and a height.
+    """
+    sides = size if isinstance(size, tuple) and len(size) == 2 else (size,)
+    if size is not None and not all(_is_whole(side) for side in sides):
+        raise InputError(f"The size cannot be {size!r}.", "Expected: the longest side in pixels, or (width, height).")
+
+
+def check_seeds(seeds: Sequence[object]) -> None:
+    """Check that there are seeds, and that each can be used.
+
+    Raises:
+        InputError: there is none, or one of them is no whole number between 0 and `LARGEST_SEED`.
+    """
+    expected = f"Expected: whole numbers from 0 to {LARGEST_SEED}."
+    if not seeds:
+        raise InputError("There are no seeds.", expected)
+    for seed in seeds:
+        if not (_is_whole(seed) and 0 <= seed <= LARGEST_SEED):
+            raise InputError(f"A seed cannot be {seed!r}.", expected)
+
+
+def _is_whole(value: object) -> TypeGuard[int]:
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +83,9 @@ class Settings:
     protocol: str = "default"
     checkpoint_every: str = "30s"
     render_with: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_size(self.size)
 
     @property
     def recipe_overrides(self) -> tuple[str, ...]:
@@ -94,6 +132,14 @@ class FitRequest(Settings):
     truth: str | None = None
     snapshots: int = 0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_seeds([self.seed])
+        if not _is_whole(self.snapshots) or self.snapshots < 0:
+            raise InputError(f"The number of snapshots cannot be {self.snapshots!r}.", "Expected: a whole number, 0 or more.")
+        if self.snapshots and not self.out:
+            raise InputError("Snapshots are files of a run's folder, and this fit has none.", "Name one by out.")
+
     def shell(self) -> str:
         """Shell command that repeats this fit."""
         kept = ["--snapshots", str(self.snapshots)] if self.snapshots else []
@@ -127,6 +173,10 @@ class CompareRequest(Settings):
     optional: frozenset[str] = frozenset()
     asked: str = ""
     keep: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_seeds(self.seeds)
 
     def fits(self) -> list[FitRequest]:
         """List the fit requests, one per method and seed."""
@@ -190,6 +240,11 @@ class AblateRequest:
     keep: bool = False
     cells: str | None = None
     most_seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        check_size(self.size)
+        if self.seeds is not None:
+            check_seeds(self.seeds)
 
     def shell(self) -> str:
         """Shell command that repeats this study."""

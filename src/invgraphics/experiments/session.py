@@ -20,11 +20,13 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.run import prepare, warm_up
+from invgraphics.experiments.scaled import scaled_scores
 from invgraphics.experiments.variants import as_shown, variant_named, with_renderer
 from invgraphics.interruption import Terminated
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.history import Moment, read_history
+from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.scores import Scores
 from invgraphics.scenes.degrade import degrade
 from invgraphics.training.budget import Budget
@@ -97,6 +99,7 @@ class FittedRun(ABC):
 
     method: Method
     scene: Scene
+    _data_changes: Mapping[str, object]
 
     @property
     @abstractmethod
@@ -132,7 +135,10 @@ class FittedRun(ABC):
         Raises:
             InputError: there is no such protocol.
         """
-        return ScoreTable(score_model(self.model, self.scene, protocol, self.method.name, self.poses))
+        found = score_model(self.model, self.scene, protocol, self.method.name, self.poses)
+        refined = self.poses is not None
+        quality, skipped = scaled_scores(self.model, self.scene, protocol, self._data_changes, refined=refined)
+        return ScoreTable(replace(found, quality=found.quality | quality, skipped=found.skipped | skipped))
 
     def through(self, renderer: str) -> Model:
         """Model of the fitted field with the renderer of another method; with its own, as it was fitted.
@@ -180,7 +186,7 @@ class MemoryRun(FittedRun):
 
     def __init__(self, job: Job, scene: Scene, on_step: OnStep | None = None) -> None:
         self.method, self.scene = job.method, scene
-        self._job, self._on_step = job, on_step
+        self._job, self._on_step, self._data_changes = job, on_step, job.data.changes()
         self._history: list[Moment] = []
         self._scores: ScoreTable | None = None
         configure_torch(job.device)
@@ -260,6 +266,7 @@ class FolderRun(FittedRun):
     def __init__(self, fitted: Fitted) -> None:
         self.method, self.scene, self._fitted = fitted.method, fitted.scene, fitted
         self.folder: Path = fitted.folder.root
+        self._data_changes = fitted.source.read(Provenance).data
 
     @property
     def model(self) -> Model:
