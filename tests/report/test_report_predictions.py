@@ -100,10 +100,26 @@ def test_nothing_is_claimed_from_one_seed_or_after_losses() -> None:
     (single,) = judge_predictions([held], fits(seeds=1))
     assert single.verdict == "undecided"
     assert "no interval from 1 seed" in single.cells[-1]
-    lost = [Lost("ball", {"method": SPLAT, N: "4"}), Lost("fog", {"method": SPLAT, N: "4"})]
-    (fewer,) = judge_predictions([held], fits(), lost)
+    levels = {"method": SPLAT, N: "4", "field.init": "random"}
+    lost = [Lost("ball", levels), Lost("fog", levels), Lost("ball", levels | {"field.init": "stereo"})]
+    (fewer,) = judge_predictions([held], fits(), lost)  # of the three, one is on the scene and of settings that were fitted
     assert (fewer.verdict, fewer.lost) == ("undecided", 1)
+    assert judge_predictions([held], fits(), lost[1:])[0].verdict == "held"
     assert predictions_sentence([single, fewer]) == "Of 2 predictions: 2 undecided."
+
+
+def test_digits_are_those_of_the_metric_and_of_the_bounds() -> None:
+    """A thousandth of SSIM is something; it was printed as +0.00."""
+    small = Prediction(
+        text="Better.", source="a paper", before={X: False}, after={X: True}, metric="ssim", low=0.002, high=0.0045
+    )
+    made = []
+    for level, value in (("false", 0.9), ("true", 0.9031)):
+        for seed in range(3):
+            score = Score(mean=value + 1e-5 * seed * (level == "true"), higher_is_better=True)
+            made.append(Observation(made_up_run({"ssim": score}, method="m", seed=seed), "ball", {"method": "m", X: level}))
+    (judged,) = judge_predictions([small], made)
+    assert judged.verdict == "held" and judged.cells[3] == "+0.0020 to +0.0045" and judged.cells[4].startswith("+0.0031")
 
 
 X, VIEWS = "field.isotropic", "data.train_views"

@@ -304,6 +304,84 @@ def test_a_setting_without_effect_does_not_oppose_one_that_has() -> None:
     assert rate(200, once) < 0.05
 
 
+ONE_AT_A_TIME = Factor("a.x", ("0", "1"), "0"), Factor("b.y", ("0", "1"), "0")
+
+
+def test_fits_that_a_comparison_does_not_use_are_not_lost_to_it() -> None:
+    """One factor at a time: factor b's bad level fails throughout, at a's base level, and a's effect stands."""
+    rng = np.random.default_rng(18)
+    a, b = ONE_AT_A_TIME
+    observations = observe((1, 4), lambda s, k, level: 20 - 0.5 * (level == "1") + rng.normal(0, 0.05), a, **{b.path: "0"})
+    lost = [Lost("scene-0", {METHOD: "m", a.path: "0", b.path: "1"}) for _ in range(4)]
+    whole, disturbed = (effects_of([Contrast(a.path, "0", "1")], PSNR, observations, gone)[0] for gone in ([], lost))
+    assert disturbed == whole and whole.found and whole.lost == (0, 0)
+    (own,) = effects_of([Contrast(a.path, "0", "1")], PSNR, observations, [Lost("scene-0", lost[0].levels | {b.path: "0"})])
+    assert own.lost == (1, 0) and not own.found and own.flattered  # the base, which looks better, has lost one
+
+
+@pytest.mark.parametrize(("corner", "raises"), [(("1", "1"), 1), (("0", "0"), 1), (("1", "0"), 0), (("0", "1"), 0)])
+@pytest.mark.parametrize("gain", [1.0, -1.0])
+def test_losses_at_a_corner_flatter_an_interaction_by_its_sign_there(corner: tuple[str, str], raises: int, gain: float) -> None:
+    """The worst fits go first: at (1, 1) and (0, 0) what is left is too good for the interaction, at the others too bad."""
+    rng = np.random.default_rng(19)
+    a, b = ONE_AT_A_TIME
+    observations = []
+    for level in b.levels:
+        more = gain if level == "1" else 0.0
+        made = observe((1, 8), lambda s, k, t, m=more: 20 + m * (t == "1") + rng.normal(0, 0.05), a, **{b.path: level})
+        observations += [one for one in made if (one.levels[a.path], level) != corner or one.run.seed > 2]
+    lost = [Lost("scene-0", {METHOD: "m", a.path: corner[0], b.path: corner[1]}) for _ in range(3)]
+    elsewhere = [Lost("scene-0", {METHOD: "m", a.path: "2", b.path: corner[1]})]
+    effect = effects_of([Contrast(a.path, "0", "1", against=(b.path, "0", "1"))], PSNR, observations, [*lost, *elsewhere])[0]
+    assert effect.lost == ((0, 3) if raises else (3, 0))
+    assert effect.flattered == ((gain > 0) == bool(raises)) and effect.found != effect.flattered
+    assert ("flatters" in effect_sentence(effect)) == effect.flattered
+
+
+def test_an_interaction_is_of_seeds_that_have_all_strata() -> None:
+    """The effect of a depends on c, not on b: a seed that lacks one fit must not mix levels of c into the interaction."""
+    rng = np.random.default_rng(20)
+    a, b = ONE_AT_A_TIME
+    observations = []
+    for level, c in ((level, c) for level in b.levels for c in ("0", "1")):
+        size = 4.0 * (c == "1")
+        made = observe(
+            (1, 4), lambda s, k, t, m=size: 20 + m * (t == "1") + rng.normal(0, 0.02), a, **{b.path: level, "c.z": c}
+        )
+        observations += [one for one in made if (one.run.seed, one.levels[a.path], level, c) != (0, "1", "1", "1")]
+    effect = effects_of([Contrast(a.path, "0", "1", against=(b.path, "0", "1"))], PSNR, observations)[0]
+    assert effect.estimate.mean == pytest.approx(0, abs=0.05) and effect.estimate.half_width < 0.2
+    assert effect.estimate.seeds == (3, 3)
+
+
+def test_a_setting_that_differs_contradicts_equivalence() -> None:
+    rng = np.random.default_rng(21)
+    observations = []
+    for level in range(8):
+        gain = 0.6 * (level == 3)
+        noisy = lambda s, k, t, g=gain: 20 + g * (t == "16") + rng.normal(0, 0.02)  # noqa: E731
+        observations += observe((1, 4), noisy, SIZE, **{"data.train_views": str(level)})
+    (effect,) = effects_of([Contrast(SIZE.path, "8", "16")], PSNR, observations)
+    assert effect.equivalence is not None and effect.equivalence < 0.05 and not effect.equivalent
+    assert effect.by_setting["train_views 3"].sign == 1
+
+
+def test_settings_are_one_family_over_all_comparisons() -> None:
+    """Twenty effects that are there at half of the settings, and nowhere else: few pages may see an opposite sign."""
+
+    def once(rng: np.random.Generator) -> bool:
+        factor = Factor("a.x", tuple(map(str, range(21))), "0")
+        observations = []
+        for level in map(str, range(6)):
+            gain = float(level in "012")
+            noisy = lambda s, k, t, g=gain: 20 + g * (t != "0") + rng.normal(0, 0.4)  # noqa: E731
+            observations += observe((1, 3), noisy, factor, **{"data.train_views": level})
+        contrasts = [Contrast(factor.path, "0", level) for level in factor.levels[1:]]
+        return any(effect.opposed for effect in effects_of(contrasts, PSNR, observations))
+
+    assert rate(20, once) <= 0.1
+
+
 MANY = Factor(METHOD, tuple("abcdefg"), "a")
 
 
@@ -323,7 +401,7 @@ def test_the_best_of_many_methods_is_tested_against_the_next() -> None:
     lead = lead_of((4, 3), lambda s, k, level: hard[s] + gains[level] + rng.normal(0, 0.1))
     assert lead is not None and (lead.before, lead.after) == ("g", "c") and lead.found and lead.comparisons == 7
     assert lead.estimate.mean == pytest.approx(1.0, abs=0.3)
-    assert effect_sentence(lead).startswith("best against next: c instead of g gains")
+    assert effect_sentence(lead).startswith("best in PSNR against next: c instead of g gains")
     level = lead_of((4, 3), lambda s, k, level: hard[s] + min(gains[level], 4.0) + rng.normal(0, 0.4))
     assert level is not None and {level.before, level.after} == {"c", "g"} and not level.found
     gains["a"] = 4.5  # the reference is second, and so compared with the best already

@@ -354,14 +354,14 @@ def test_the_best_of_many_levels_is_tested_against_the_next(tmp_path: Path) -> N
     factors = {"batches.rays": [1, 2, 3, 4, 5, 6]}
     bare_study(tmp_path, factors, lambda cell: [20.0 + 2 * cell["levels"]["batches.rays"] + 0.1 * (cell["seed"] * 7 % 3)])
     *others, lead = study_sentences(tmp_path)
-    assert len(others) == 5 and lead.startswith("best against next: batches.rays 6 instead of 5 gains 2.00 dB")
+    assert len(others) == 5 and lead.startswith("best in PSNR against next: batches.rays 6 instead of 5 gains 2.00 dB")
 
 
 def test_the_page_says_who_leads_among_many_levels(tmp_path: Path) -> None:
     folder = write_study(tmp_path / "many", {"balls": (0,)}, {"data.train_views": [5, 8, 20, 40, 80]}, (0, 1))
     build_study_report(folder)
     *_, lead = study_sentences(folder)
-    assert lead.startswith("best against next: data.train_views ")
+    assert lead.startswith("best in PSNR against next: data.train_views ")
     for page in ("index.html", "index.md"):
         assert lead in html.unescape((folder / page).read_text()).replace("\\", "")
 

@@ -19,7 +19,7 @@ from numpy import ndarray
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
 from invgraphics.report.statistics.values import diverged, value_of
-from invgraphics.report.wording import ABSENT, Quantity, listing, quality_quantity
+from invgraphics.report.wording import ABSENT, Quantity, listing, quality_quantity, significant_decimals
 from invgraphics.runs.study import Prediction, level_text
 
 PREDICTION_HEADS = ("Prediction", "Source", "Scenes", "Expected", "Measured", "95% interval", "Fits", "Verdict")
@@ -63,17 +63,18 @@ class JudgedPrediction:
     def cells(self) -> tuple[str, ...]:
         """Texts of the columns `PREDICTION_HEADS`."""
         one, value = self.prediction, self.estimate
-        stated = one.text, one.source, listing(self.scenes) or ABSENT, _bounds(one)
+        digits = _digits(one, self.quantity)
+        stated = one.text, one.source, listing(self.scenes) or ABSENT, _bounds(one, digits)
         if value is None or self.quantity is None:
             return *stated, ABSENT, ABSENT, ABSENT, f"{VERDICTS[self.verdict]}: {self.reason}"
-        interval = ABSENT if value.unit == "none" else f"{_signed(value.low)} to {_signed(value.high)}"
+        interval = ABSENT if value.unit == "none" else f"{_signed(value.low, digits)} to {_signed(value.high, digits)}"
         words = VERDICTS[self.verdict]
         if self.lost:
             words = f"{words}: {self.lost} {'fit' if self.lost == 1 else 'fits'} lost"
         elif value.unit == "none":
             words = f"{words}: no interval from {value.size}"
         unit = f" {self.quantity.unit}" if self.quantity.unit else ""
-        return *stated, f"{_signed(value.mean)}{unit}", interval, value.size, words
+        return *stated, f"{_signed(value.mean, digits)}{unit}", interval, value.size, words
 
 
 def judge_predictions(
@@ -104,9 +105,21 @@ def _judge(prediction: Prediction, observations: Sequence[Observation], failures
     value = over_seeds(list(known.values()))
     gone = [one for one in failures if one.scene in names]
     gone += [Lost(one.scene, one.levels) for one in observations if one.scene in names and diverged(one.run, quantity)]
-    count = sum(any(_has(one.levels, levels) for _, levels in terms) for one in gone)
+    count = _lost(terms, gone, [one for one in scored if one.scene in names])
     reason = "; ".join(dict.fromkeys(why for _, why in found.values())) if value is None else ""
     return JudgedPrediction(prediction, quantity, value, tuple(known), count, _verdict(prediction, value, count), reason)
+
+
+def _lost(terms: Terms, gone: Sequence[Lost], scored: Sequence[Observation]) -> int:
+    """Number of lost fits whose scene and factors that no term names are those of fits, lost or not, of all terms."""
+    named = frozenset(name for _, levels in terms for name in levels)
+
+    def stratum(one: Lost | Observation) -> tuple[str, Stratum]:
+        return one.scene, tuple(sorted((key, level) for key, level in one.levels.items() if key not in named))
+
+    places = [{stratum(one) for one in (*gone, *scored) if _has(one.levels, levels)} for _, levels in terms]
+    common = set.intersection(*places)
+    return sum(stratum(one) in common and any(_has(one.levels, levels) for _, levels in terms) for one in gone)
 
 
 def _verdict(prediction: Prediction, value: Estimate | None, lost: int) -> Verdict:
@@ -215,14 +228,22 @@ def _has(levels: Mapping[str, str], wanted: Mapping[str, str]) -> bool:
     return all(levels.get(name) == level for name, level in wanted.items())
 
 
-def _bounds(prediction: Prediction) -> str:
+def _digits(prediction: Prediction, quantity: Quantity | None) -> int:
+    """Digits after the point: those of the metric, of three significant ones, or as many as the stated bounds have."""
+    bounds = [bound for bound in (prediction.low, prediction.high) if bound is not None]
+    written = [len(f"{bound:.6f}".rstrip("0").partition(".")[2]) for bound in bounds]
+    own = 2 if quantity is None else quantity.decimals
+    return max(*written, significant_decimals(max(map(abs, bounds))) if own is None else own)
+
+
+def _bounds(prediction: Prediction, digits: int) -> str:
     if prediction.low is None:
         assert prediction.high is not None
-        return f"at most {_signed(prediction.high)}"
+        return f"at most {_signed(prediction.high, digits)}"
     if prediction.high is None:
-        return f"at least {_signed(prediction.low)}"
-    return f"{_signed(prediction.low)} to {_signed(prediction.high)}"
+        return f"at least {_signed(prediction.low, digits)}"
+    return f"{_signed(prediction.low, digits)} to {_signed(prediction.high, digits)}"
 
 
-def _signed(value: float) -> str:
-    return f"{value:+.2f}".replace("-", "−")
+def _signed(value: float, digits: int) -> str:
+    return f"{value:+.{digits}f}".replace("-", "−")
