@@ -150,6 +150,18 @@ def test_the_comment_says_where_a_ply_came_from(run: Path, tmp_path: Path) -> No
     assert len(comments) == 1 and "axes of the data set's world" in comments[0]
 
 
+@pytest.mark.parametrize(("to", "kept", "told"), [("ply", True, True), ("splat", None, True), ("spz", True, False)])
+def test_an_antialiased_model_says_so_where_its_format_can(
+    toy_folder: Path, tmp_path: Path, capsys, to: str, kept: bool | None, told: bool
+) -> None:
+    fitted = ["fit", "splatting/gaussians-mip", str(toy_folder), "--budget", "1steps", "--out", str(tmp_path / "run")]
+    small = [word for change in SMALL[METHOD] for word in ("--set", change)]
+    assert main.run([*fitted, *small, "--kernels", "reference"]) == main.DONE
+    assert main.run(["export", str(tmp_path / "run"), "--to", to, "--out", str(tmp_path / f"model.{to}")]) == main.DONE
+    assert ("opacity compensation" in capsys.readouterr().out) == told
+    assert read_gaussians(tmp_path / f"model.{to}")[1].antialiased == kept
+
+
 def test_what_cannot_be_exported(run: Path, toy_folder: Path, tmp_path: Path, capsys) -> None:
     neural = tmp_path / "neural"
     (tmp_path / "file").touch()

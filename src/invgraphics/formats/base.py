@@ -21,6 +21,9 @@ HEAD_BYTES = 1 << 16
 SMALLEST_SCALE = 1e-37
 """Least scale whose logarithm is written: above float32's denormals, which a process that has fitted flushes to zero."""
 
+ANTIALIASED = "anti-aliased: opacities are to be compensated"
+"""Note of a file whose format has no place for Mip-Splatting's compensation (`Splats.antialiased`)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Splats:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from invgraphics.core import Gaussians, harmonics
 from invgraphics.errors import InputError
-from invgraphics.formats.base import SMALLEST_SCALE, Splats
+from invgraphics.formats.base import ANTIALIASED, SMALLEST_SCALE, Splats
 from invgraphics.formats.ply_elements import columns, missing, read_elements, write_element
 
 POSITION, NORMAL, DC, OPACITY = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("opacity",)
@@ -60,7 +60,7 @@ class Ply:
             opacities=columns(table, OPACITY)[:, 0].sigmoid(),
             sh=coefficients(columns(table, DC), columns(table, rest) if rest else None),
         )
-        return Splats(gaussians, notes=comments)
+        return Splats(gaussians, antialiased=True if any(ANTIALIASED in note for note in comments) else None, notes=comments)
 
     def write(self, path: Path, splats: Splats) -> None:
         """Write the standard properties in the standard order, 62 floats at degree 3; notes become comments."""

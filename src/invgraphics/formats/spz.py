@@ -73,6 +73,7 @@ class Spz:
     """About a tenth of a PLY file's size, at some loss."""
 
     suffixes: ClassVar[tuple[str, ...]] = (".spz",)
+    flags_antialiasing: ClassVar[bool] = True
     axes: ClassVar[str | None] = AXES
 
     def matches(self, path: Path, head: bytes) -> bool:

@@ -16,7 +16,7 @@ from invgraphics.errors import InputError, NotComposableError
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.similarity import transform_gaussians
-from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
+from invgraphics.formats.base import ANTIALIASED, Splats, read_gaussians, write_gaussians
 from invgraphics.runs.folder import output_file
 from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_file
 
@@ -126,8 +126,10 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
     placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
     shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
-    note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
     antialiased = getattr(fitted.method.recipe.renderer, "antialiased", False)
+    flagged = getattr(plugins.load("formats", request.to), "flags_antialiasing", False)
+    shown += f"; {ANTIALIASED}" if antialiased else ""
+    note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
     write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)))
 
     _, written = read_gaussians(request.out)
@@ -142,6 +144,7 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
             "bytes": str(request.out.stat().st_size),
             "SH degree": str(degree) if degree == had else f"{degree} (the run has {had})",
             "axes": axes or "the data set's world",
+            **({"opacity compensation": "must be on where it is shown"} if antialiased and not flagged else {}),
             "PSNR to the run's own pictures": decibels(loss),
         },
     )

@@ -226,6 +226,8 @@ def write_study_markdown(page: StudyPage, folder: Folder) -> None:
         lines += ["", "## Predictions", "", *(f"| {' | '.join(map(text, row))} |" for row in rows)]
     if page.contrasts.tables:
         lines += ["", "## Effects", "", markdown_effects(page.contrasts.first)]
+    if page.crossed:
+        lines += ["", "## The same fits through two renderers", "", markdown_effects(page.crossed)]
     if across := across_scenes(study, page.quantity):
         lines += [
             "",

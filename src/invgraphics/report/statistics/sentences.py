@@ -157,8 +157,13 @@ def _contradict(effect: Effect) -> bool:
 
 
 def _averaged(effect: Effect) -> str:
-    """Over how many combinations of other factors' levels an effect is averaged."""
-    return f", averaged over {len(effect.by_setting)} settings of other factors" if effect.by_setting else ""
+    """Over how many combinations of other factors' levels an effect is averaged, and how far it goes from one to another."""
+    if not effect.by_setting:
+        return ""
+    rising = sorted(effect.by_setting.items(), key=lambda item: item[1].claim.mean)
+    ends = (f"{effect.text(one.claim.mean)} ({name})" for name, one in (rising[0], rising[-1]))
+    reach = "" if effect.opposed else f", from {' to '.join(ends)}"
+    return f", averaged over {len(effect.by_setting)} settings of other factors{reach}"
 
 
 def _settings(effect: Effect) -> str:
