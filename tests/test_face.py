@@ -167,7 +167,10 @@ def test_methods_come_in_every_shape(out: str | None) -> None:
 def test_a_comparison_of_a_scene_made_in_python() -> None:
     """Its fits have a process each, as for a user."""
     scene = toy_scene(views=8, size=24)
-    broken = ig.load_method("splatting/gaussians", set={"field.init": "field", "field.source": "nowhere"})
+    lost = ig.load_method("splatting/gaussians", set={"field.init": "field", "field.source": "nowhere"})
+    with pytest.raises(InputError, match="nowhere is not a run"):  # before any fit
+        ig.compare(scene, [SPLATS, lost], budget="2steps", out="report")
+    broken = ig.load_method("splatting/gaussians", set={"optimiser.groups.colour.lr": 1e38})
     report = ig.compare(scene, [SPLATS, broken], budget="2steps", seeds=(3,), out="report")
     assert report.methods == (SPLATS.name, broken.name)
     assert [(failure.method, failure.seed) for failure in report.failures] == [(broken.name, 3)]

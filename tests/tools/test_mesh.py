@@ -12,7 +12,6 @@ from training_fixtures import SMALL
 
 import invgraphics as ig
 from invgraphics.cli import main
-from invgraphics.cli.export import Export
 from invgraphics.core import Bounds, Camera, Context, Mesh, Quantity, Rendering
 from invgraphics.errors import InputError
 from invgraphics.experiments import fitted as opened
@@ -214,8 +213,11 @@ def test_a_run_becomes_a_file(runs: dict[str, Path], tmp_path: Path, capsys, mon
     assert vertex["red"].std() > (1 if level else 10)
 
 
-def test_bad_requests_get_a_sentence(runs: dict[str, Path], tmp_path: Path) -> None:
-    assert Export(tmp_path, "mesh", tmp_path).resolution == ExportRequest(tmp_path, "mesh", tmp_path).resolution
+def test_bad_requests_get_a_sentence(runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main.run(["export", "--help"])
+    helped, defaults = " ".join(capsys.readouterr().out.split()), ExportRequest(tmp_path, "mesh", tmp_path)
+    assert all(f"(default: {default})" in helped for default in (defaults.resolution, defaults.planes))
     with pytest.raises(InputError, match="--resolution"):
         ExportRequest(runs["volumetric/hash"], "mesh", tmp_path / "a.ply", resolution=2)
     with pytest.raises(InputError, match="no density with a level"):

@@ -29,7 +29,8 @@ from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.recipes.suitable import default_methods, is_open_space, starts_from_points
 from invgraphics.recipes.table import cell_of
 from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, SceneFacts
-from invgraphics.runs.folder import RunFolder, output_folder
+from invgraphics.runs.folder import RUNS, RunFolder, output_folder
+from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import SceneOptions, space_note
 from invgraphics.scenes.truth import POINTS as EXACT_POINTS
@@ -136,7 +137,7 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
 def _name_others(request: CompareRequest) -> None:
     """Warn of runs of earlier commands in the same folder, which are not part of this report."""
     mine = {Path(fit.out) for fit in request.fits()}
-    others = sorted(path.parent for path in Path(request.out).glob("runs/*/seed-*/provenance.json"))
+    others = sorted(path.parent for path in Path(request.out).glob(f"{RUNS}/*/seed-*/{Provenance.FILE}"))
     if left := [folder.relative_to(request.out).as_posix() for folder in others if folder not in mine]:
         warn(f"Not part of this report, but of an earlier command on {request.out}: {', '.join(left)}.")
 
