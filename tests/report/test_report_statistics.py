@@ -220,6 +220,11 @@ def test_sentences() -> None:
     assert effect_sentence(between).startswith("c/d instead of a/b gains")
 
 
+def test_nothing_has_no_sign() -> None:
+    effect = effect_with(0.1, 0.3)
+    assert (effect.text(-0.001), effect.text(-0.01), effect.text(0.0)) == ("0.00", "−0.01", "0.00")
+
+
 def test_many_levels_are_compared_with_the_reference_only() -> None:
     assert Factor("x", ("1", "2", "3"), "2").pairs() == [("2", "1"), ("2", "3"), ("1", "3")]
     assert Factor("x", tuple("12345"), "3").pairs() == [("3", "1"), ("3", "2"), ("3", "4"), ("3", "5")]

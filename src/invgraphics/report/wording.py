@@ -57,7 +57,7 @@ class Quantity:
             return ABSENT
         if math.isinf(value):
             return "∞" if value > 0 else "−∞"
-        return f"{value * self.scale:,.{self._digits(value)}f}".replace("-", "−")
+        return f"{value * self.scale:z,.{self._digits(value)}f}".replace("-", "−")
 
     def spread(self, mean: float, deviation: float) -> str:
         """``± deviation`` with the digits of its mean; empty for a cost that is the same for all seeds."""

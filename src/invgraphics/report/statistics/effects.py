@@ -142,7 +142,7 @@ class Effect:
         scale = self.quantity.scale
         size = max(abs(self.estimate.mean), self.estimate.half_width) * scale
         digits = significant_decimals(size) if self.quantity.decimals is None else self.quantity.decimals
-        return f"{value * scale:,.{digits}f}".replace("-", "−")
+        return f"{value * scale:z,.{digits}f}".replace("-", "−")
 
     def bounds(self, value: Estimate | None) -> str:
         """A confidence interval as text; empty where there is none."""
