@@ -379,6 +379,13 @@ def test_study_before_its_first_run_has_a_page(small_study: Path, edit: Callable
     assert "Nothing can be compared yet" in page
 
 
+def test_cells_of_other_code_are_told(small_study: Path, edit: Callable[..., None]) -> None:
+    told = "Cells were made by 2 versions of the code"
+    assert told not in build_study_report(small_study).read_text()
+    edit(next(small_study.rglob("provenance.json")), lambda t: t.update(code_version="0.0.1+abc"))
+    assert told in build_study_report(small_study).read_text()
+
+
 def test_an_unequal_start_is_told_of_a_study_too(small_study: Path, edit: Callable[..., None]) -> None:
     for index, run in enumerate(sorted(path.parent for path in small_study.rglob("provenance.json"))):
         edit(run / "provenance.json", lambda t: t["notes"].update(points=POINTS))

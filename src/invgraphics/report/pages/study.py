@@ -166,6 +166,9 @@ def _progress(study: Study) -> list[str]:
         sentences.append(f"{missing} of {total} cells {verb} not run yet: what follows may change.")
     if failed:
         sentences.append(f"{failed} of {total} cells failed: see below the matrix. Paired comparisons omit them.")
+    versions = {cell.run.provenance.code_version for cell in study.cells if cell.run}
+    if len(versions) > 1:
+        sentences.append(f"Cells were made by {len(versions)} versions of the code; each run's facts name its own.")
     if skipped := [cell for cell in study.cells if cell.status == "skipped"]:
         reasons = listing(dict.fromkeys(cell.error for cell in skipped))
         sentences.append(f"{len(skipped)} of {total} cells were skipped: {reasons}.")
