@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 from tyro.conf import Positional, UseAppendAction, arg
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.request import DATA
+from invgraphics.experiments.request import DATA, LARGEST_SEED
 from invgraphics.tables import LIMITS
 from invgraphics.training.budget import Budget
 
@@ -24,9 +24,6 @@ SMALLEST = 8
 
 OPTIMISED = {"poses", "exposure"}
 """What ``--optimise`` can name: tables of a recipe's ``training``."""
-
-MOST_SEED = 2**63 - 1
-"""The largest seed that the generators of random numbers take."""
 
 _BOX = "│╭╮╰╯"
 _POSITIONAL = get_args(Positional[int])[1]
@@ -242,11 +239,11 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     """Parse comma-separated seeds to integers.
 
     Raises:
-        InputError: one of them is not a whole number from 0 to `MOST_SEED`.
+        InputError: one of them is not a whole number from 0 to `LARGEST_SEED`.
     """
     items = parse_list(text, "--seeds")
-    if not all(item.isdecimal() and len(item) <= LIMITS.digits and int(item) <= MOST_SEED for item in items):
-        expected = f"Expected whole numbers from 0 to {MOST_SEED} (2^63 - 1), with commas between them: 0,1,2."
+    if not all(item.isdecimal() and len(item) <= LIMITS.digits and int(item) <= LARGEST_SEED for item in items):
+        expected = f"Expected whole numbers from 0 to {LARGEST_SEED} (2^63 - 1), with commas between them: 0,1,2."
         raise InputError(f"--seeds cannot be '{text}'.", expected)
     return tuple(int(item) for item in items)
 
@@ -255,8 +252,8 @@ def check_seed(seed: int) -> int:
     """Validate one seed.
 
     Raises:
-        InputError: it is not from 0 to `MOST_SEED`.
+        InputError: it is not from 0 to `LARGEST_SEED`.
     """
-    if not 0 <= seed <= MOST_SEED:
-        raise InputError(f"--seed cannot be {seed}.", f"Expected a whole number from 0 to {MOST_SEED} (2^63 - 1).")
+    if not 0 <= seed <= LARGEST_SEED:
+        raise InputError(f"--seed cannot be {seed}.", f"Expected a whole number from 0 to {LARGEST_SEED} (2^63 - 1).")
     return seed

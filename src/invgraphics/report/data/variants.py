@@ -36,7 +36,7 @@ BASE = "base"
 def variant_name(cell: StudyCell, factors: Sequence[Factor]) -> str:
     """Display name of a cell: its method, and in words what differs from the base; factors of other methods are left out."""
     names = short_names([factor.path for factor in factors])
-    own = [f for f in factors if f.path != METHOD and f.path in cell.levels and concerns(f.path, cell.method)]
+    own = [f for f in factors if f.path != METHOD and f.path in cell.levels and _concerns(f.path, cell.method)]
     changed = [_words(f, cell.levels[f.path], names) for f in own if cell.levels[f.path] != f.reference]
     parts = [cell.method] if any(factor.path == METHOD for factor in factors) else []
     return ", ".join([*parts, *changed]) or (BASE if own else cell.method)
@@ -65,12 +65,12 @@ def setting_words(levels: Mapping[str, str], factors: Sequence[Factor]) -> str:
     """Levels of several factors in words, the method first; factors of other methods are left out."""
     known, names = {factor.path: factor for factor in factors}, short_names(list(levels))
     method = levels.get(METHOD, "")
-    own = [(path, level) for path, level in levels.items() if path != METHOD and (not method or concerns(path, method))]
+    own = [(path, level) for path, level in levels.items() if path != METHOD and (not method or _concerns(path, method))]
     words = [_words(known[path], level, names) if path in known else level_words(names[path], level) for path, level in own]
     return ", ".join([method] * bool(method) + words)
 
 
-def concerns(path: str, method: str) -> bool:
+def _concerns(path: str, method: str) -> bool:
     """Whether a factor applies to ``method``: ``volumetric/*:batches.rays`` names the methods before its colon."""
     pattern, colon, _ = path.rpartition(":")
     return not colon or fnmatch(method, pattern)

@@ -105,7 +105,7 @@ def sample(contrast: Contrast, quantity: Quantity, observations: Sequence[Observ
     gone = [Lost(one.scene, one.levels) for one in sided if diverged(one.run, quantity)]
     known = [one for one in sided if not diverged(one.run, quantity) and value_of(one.run, quantity) is not None]
     gone += [cell for cell in lost if all(cell.levels.get(key) == value for key, value in contrast.where.items())]
-    gone = _compared(contrast, gone, known)
+    gone = lost_among(gone, known, _sides(contrast))
     missing = dict.fromkeys(cell.scene for cell in gone)
     differ = False
     scenes: dict[str, list[tuple[Sign, ndarray]]] = {}
@@ -122,29 +122,33 @@ def sample(contrast: Contrast, quantity: Quantity, observations: Sequence[Observ
     return Sample(scenes, (len(gone) - raised, raised), silent, pairs, differ)
 
 
-def _corners(contrast: Contrast) -> list[tuple[str, ...]]:
-    """Levels of the compared factors that a contrast takes fits from: its two sides, or the four corners of an interaction."""
+def _sides(contrast: Contrast) -> list[dict[str, str]]:
+    """Levels of the compared factors that a contrast takes fits from: of its two sides, or of an interaction's four corners."""
+    sides = [{contrast.factor: level} for level in contrast.levels]
     if contrast.against is None:
-        return [(level,) for level in contrast.levels]
-    return [(side, place) for side in contrast.levels for place in contrast.against[1:]]
+        return sides
+    factor, *places = contrast.against
+    return [{**side, factor: place} for side in sides for place in places]
 
 
-def _compared(contrast: Contrast, gone: Sequence[Lost], known: Sequence[Observation]) -> list[Lost]:
-    """The lost fits whose scene and other levels all sides of a contrast have, lost or not: others are not missing in it."""
-    factors = (contrast.factor, *(contrast.against or ())[:1])
-    corners = _corners(contrast)
-    places: dict[tuple[str, ...], set[tuple[Any, ...]]] = {corner: set() for corner in corners}
+def lost_among(gone: Sequence[Lost], known: Sequence[Observation], sides: Sequence[Mapping[str, str]]) -> list[Lost]:
+    """The lost fits at some sides' levels whose scene and other levels all sides have, lost or not: others are not missing.
 
-    def place(one: Lost | Observation) -> tuple[tuple[str, ...], tuple[Any, ...]]:
-        others = tuple(sorted((key, level) for key, level in one.levels.items() if key not in factors))
-        return tuple(one.levels.get(factor, "") for factor in factors), (one.scene, others)
+    Args:
+        gone: fits that failed or diverged.
+        known: fits with a score.
+        sides: factor -> level of each side of a comparison.
+    """
+    named = {factor for side in sides for factor in side}
 
-    for one in (*known, *gone):
-        corner, stratum = place(one)
-        if corner in places:
-            places[corner].add(stratum)
-    common = set.intersection(*places.values())
-    return [cell for cell in gone if place(cell)[0] in places and place(cell)[1] in common]
+    def stratum(one: Lost | Observation) -> tuple[Any, ...]:
+        return one.scene, *sorted((key, level) for key, level in one.levels.items() if key not in named)
+
+    def at(one: Lost | Observation, side: Mapping[str, str]) -> bool:
+        return all(one.levels.get(factor) == level for factor, level in side.items())
+
+    common = set.intersection(*({stratum(one) for one in (*known, *gone) if at(one, side)} for side in sides))
+    return [one for one in gone if stratum(one) in common and any(at(one, side) for side in sides)]
 
 
 def _raises(contrast: Contrast, cell: Lost) -> bool:
@@ -205,10 +209,9 @@ def _interaction(contrast: Contrast, quantity: Quantity, here: Sequence[Observat
     shared = set.intersection(*(set(table) for tables in corners for table in tables))
     if factor != METHOD or shared:  # a method may have factors that another has not
         corners = [[{key: table[key] for key in table if key in shared} for table in tables] for tables in corners]
-    together = [[table for tables in corners for table in tables]] if factor != METHOD else corners
-    corners = [
-        [_of_seeds(table, _whole_seeds(tables)) for table in own] for own, tables in zip(corners, 2 * together, strict=False)
-    ]
+    groups = corners if factor == METHOD else len(corners) * [[table for tables in corners for table in tables]]
+    seeds = map(_whole_seeds, groups)
+    corners = [[_of_seeds(table, whole) for table in tables] for tables, whole in zip(corners, seeds, strict=True)]
     sides = [_by_seed(before, after, quantity) for before, after in corners]
     if not all(sides):
         return []

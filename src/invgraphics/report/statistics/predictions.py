@@ -18,6 +18,7 @@ from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
+from invgraphics.report.statistics.pairing import lost_among
 from invgraphics.report.statistics.values import diverged, value_of
 from invgraphics.report.wording import ABSENT, Quantity, listing, quality_quantity, significant_decimals
 from invgraphics.runs.study import Prediction, level_text
@@ -105,21 +106,9 @@ def _judge(prediction: Prediction, observations: Sequence[Observation], failures
     value = over_seeds(list(known.values()))
     gone = [one for one in failures if one.scene in names]
     gone += [Lost(one.scene, one.levels) for one in observations if one.scene in names and diverged(one.run, quantity)]
-    count = _lost(terms, gone, [one for one in scored if one.scene in names])
+    count = len(lost_among(gone, [one for one in scored if one.scene in names], [levels for _, levels in terms]))
     reason = "; ".join(dict.fromkeys(why for _, why in found.values())) if value is None else ""
     return JudgedPrediction(prediction, quantity, value, tuple(known), count, _verdict(prediction, value, count), reason)
-
-
-def _lost(terms: Terms, gone: Sequence[Lost], scored: Sequence[Observation]) -> int:
-    """Number of lost fits whose scene and factors that no term names are those of fits, lost or not, of all terms."""
-    named = frozenset(name for _, levels in terms for name in levels)
-
-    def stratum(one: Lost | Observation) -> tuple[str, Stratum]:
-        return one.scene, tuple(sorted((key, level) for key, level in one.levels.items() if key not in named))
-
-    places = [{stratum(one) for one in (*gone, *scored) if _has(one.levels, levels)} for _, levels in terms]
-    common = set.intersection(*places)
-    return sum(stratum(one) in common and any(_has(one.levels, levels) for _, levels in terms) for one in gone)
 
 
 def _verdict(prediction: Prediction, value: Estimate | None, lost: int) -> Verdict:
