@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.photos import PhotoJob
 from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
 from invgraphics.scenes.photos.prepare import Preparation, natural, prepare
-from invgraphics.scenes.photos.result import max_distortion, write_scene
+from invgraphics.scenes.photos.result import _move_points, max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
 from invgraphics.scenes.pictures.lens import Lens, straighten
 from invgraphics.scenes.process import run_worker
@@ -201,6 +202,18 @@ def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None
     assert max(errors) < 0.02
     assert Image.open(tmp_path / "result/images/0.png").size == (160, 120)
     assert [path.name for path in (tmp_path / "result/masks").iterdir()] == ["0.png.png"]
+
+
+def test_features_without_a_ray_are_outside_the_straight_picture() -> None:
+    """In the corners of strong barrel distortion the lens has no inverse; a model must hold no NaN."""
+    import pycolmap
+
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1000, height=750, params=[700.0, 500.0, 375.0, -0.25])
+    middle, corner = SimpleNamespace(xy=np.array([500.0, 375.0])), SimpleNamespace(xy=np.array([0.0, 0.0]))
+    assert np.isnan(camera.cam_from_img(corner.xy[None])).any()
+    image = SimpleNamespace(points2D=[middle, corner], num_points2D=lambda: 2)
+    _move_points(image, camera, straighten(Lens("SIMPLE_RADIAL", (700.0, 500.0, 375.0, -0.25), 1000, 750)))
+    assert corner.xy.tolist() == [-1, -1] and np.abs(middle.xy - [500, 375]).max() < 5
 
 
 def test_how_much_a_lens_bends() -> None:
