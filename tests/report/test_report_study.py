@@ -7,6 +7,7 @@ import html
 import itertools
 import json
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -377,6 +378,21 @@ def test_study_before_its_first_run_has_a_page(small_study: Path, edit: Callable
     page = build_study_report(small_study).read_text()
     assert "4 of 4 cells have not run yet" in page
     assert "Nothing can be compared yet" in page
+
+
+def test_sentences_matrix_and_effects_are_of_the_studys_metric(pristine_study: Path, tmp_path: Path, edit: Any) -> None:
+    """Recomputed from the exported table; a metric that no fit has is told, and PSNR stands in."""
+    folder = Path(shutil.copytree(pristine_study, tmp_path / "views"))
+    edit(folder / "study.json", lambda t: t.update(metric="flip"))
+    page, told = build_study_report(folder).read_text(), (folder / "index.md").read_text()
+    assert "Differences are of FLIP." in told and "figures/effects-flip.svg" in told
+    table = exported(folder)
+    flip = table[(table["metric"] == "flip") & (table["status"] == "ok")].groupby("cell")["value"].mean()
+    fields = re.findall(r'<td class="done[^"]*" title="[^"]*"><a href="[^"]*">([^<]+)</a>', page)
+    assert sorted(fields) == sorted(f"{value:.3f}" for value in flip)
+    edit(folder / "study.json", lambda t: t.update(metric="psnr_at_1_8"))
+    told = "The study asks about PSNR at 1/8, which no finished fit has: what follows is of PSNR."
+    assert study_sentences(folder)[0] == told and told in build_study_report(folder).read_text()
 
 
 def test_cells_of_other_code_are_told(small_study: Path, edit: Callable[..., None]) -> None:

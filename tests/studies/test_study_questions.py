@@ -47,6 +47,8 @@ CORNERS = [(6, 8), (6, 16), (24, 8)]
     [
         (HEAD + "margins = { psrn = 1.0 }\n", r"\[margins\] names the metric 'psrn', .* Did you mean 'psnr'"),
         (HEAD + "margins = { psnr_at_1_4 = 1.0 }\n", "'psnr_at_1_4', which no fit"),
+        (HEAD + 'metric = "psrn"\n', "the key 'metric' names the metric 'psrn', .* Did you mean 'psnr'"),
+        (HEAD + 'metric = "psnr_at_1_4"\n', "'psnr_at_1_4', which no fit"),
         (HEAD + TWO + prediction(*VIEWS, 'metric = "psrn"\n'), "prediction 1 names the metric 'psrn', .* mean 'psnr'"),
         (HEAD + TWO + prediction(*VIEWS, 'metric = "fit_seconds"\n'), "'fit_seconds', which no fit"),
         (
@@ -83,6 +85,7 @@ def test_questions_without_an_answer_are_refused(study, text: str, sentence: str
     [
         HEAD + "margins = { psnr = 1.0, f_score = 0.1, pose_rotation_deg = 0.1, fit_seconds = 2.0 }\n",
         HEAD + "margins = { psnr_at_1_4 = 1.0 }\n[base]\ndata.test_scales = [2, 4]\n",
+        HEAD + 'metric = "psnr_at_1_4"\n[base]\ndata.test_scales = [2, 4]\n',
         HEAD + 'margins = { ssim_at_1_8 = 0.1 }\n[factors]\n"volumetric/*:data.test_scales" = [[2], [4, 8]]\n',
         HEAD + interaction("method", "data.train_views") + TWO,
         HEAD + interaction("splatting/*:field.isotropic", "data.train_views") + SCOPED,

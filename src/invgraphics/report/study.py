@@ -25,7 +25,7 @@ from invgraphics.report.statistics.leaders import lead_contrasts
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.predictions import judge_predictions
 from invgraphics.report.statistics.rules import headline, judge
-from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences
+from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences, unscored_sentences
 from invgraphics.report.statistics.summary import quality_columns, table_columns
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.wording import Quantity
@@ -74,9 +74,9 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
 
 
 def study_sentences(folder: Path) -> list[str]:
-    """Factor effects on a study's first metric, a sentence per pair of levels; of a study of verdicts, its headline.
+    """Factor effects on a study's metric, a sentence per pair of levels; of a study of verdicts, its headline.
 
-    Before them stands a sentence per interaction that the study asks about and that was not measured.
+    Before them stands what the study asks about and was not measured: its metric, interactions.
 
     Raises:
         InputError: a file is missing or broken.
@@ -86,7 +86,8 @@ def study_sentences(folder: Path) -> list[str]:
         return headline(judge(study.cells, study.known))
     quantities = _quantities(study, scene_comparisons(study))
     effects = headline_effects(study, quantities[0]) if quantities else []
-    missing = unmeasured_sentences(study.interactions, effects, study.factors, study.observations())
+    missing = unscored_sentences(study.metric, quantities[0] if quantities else None)
+    missing += unmeasured_sentences(study.interactions, effects, study.factors, study.observations())
     return [*missing, *map(effect_sentence, effects)]
 
 
@@ -130,12 +131,15 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
 
 
 def _quantities(study: Study, comparisons: Sequence[Comparison]) -> list[Quantity]:
-    """Union of the columns of all scenes' tables, quality first, with the study's margins; empty without a quality metric."""
+    """Union of the columns of all scenes' tables with the study's margins: its metric, other qualities, costs.
+
+    Empty where nothing has a quality.
+    """
     columns = [column for comparison in comparisons for column in table_columns(comparison)]
     found = {column.key: column for column in reversed(columns)}
     keys = dict.fromkeys(column.key for column in columns)
     unique = [replace(found[key], margin=study.margins.get(key, found[key].margin)) for key in keys]
-    quality = [column for column in unique if column.group != "cost"]
+    quality = sorted((column for column in unique if column.group != "cost"), key=lambda column: column.key != study.metric)
     return [*quality, *(column for column in unique if column.group == "cost")] if quality else []
 
 

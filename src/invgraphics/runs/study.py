@@ -141,6 +141,7 @@ class StudyRecord(Record):
         report: what the page is about, ``effects`` or ``verdicts``.
         approximations: pairs of renderers that are compared on every fit.
         known: red verdicts whose causes are known.
+        metric: key of the score that the question is about.
         each: factor that the question asks about level by level (``method``); empty where the mean answers it.
         interactions: pairs of factors whose interaction is the question.
         margins: metric -> difference that is of no interest, stated before anything ran.
@@ -171,6 +172,7 @@ class StudyRecord(Record):
     report: Literal["effects", "verdicts"] = "effects"
     approximations: tuple[Approximation, ...] = ()
     known: tuple[KnownDeviation, ...] = ()
+    metric: str = "psnr"
     each: str = ""
     interactions: tuple[tuple[str, str], ...] = ()
     margins: dict[str, float] = field(default_factory=dict)

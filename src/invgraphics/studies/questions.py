@@ -36,6 +36,7 @@ def check_questions(study: Study, where: str) -> None:
     if strange := [name for name in study.words if name not in levels]:
         raise InputError(f"{where}: [words] names '{strange[0]}', which is no level.{did_you_mean(strange[0], sorted(levels))}")
     quality = _quality_keys(study)
+    _check_metric(study.metric, quality, f"{where}: the key 'metric'")
     for metric, margin in study.margins.items():
         _check_metric(metric, [*quality, *(cost.key for cost in COSTS)], f"{where}: [margins]")
         if not 0 < margin < math.inf:

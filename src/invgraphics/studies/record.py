@@ -130,6 +130,7 @@ def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resourc
         report=study.report,
         approximations=study.approximations,
         known=study.known,
+        metric=study.metric,
         each=study.each,
         interactions=study.interactions,
         margins=study.margins,

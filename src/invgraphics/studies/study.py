@@ -59,6 +59,7 @@ class Study:
         approximations: pairs of these renderers whose pictures of the same fit are compared.
         analyses: computations beside the fits (see `invgraphics.studies.analyses`).
         known: for ``verdicts``: what is known to deviate, and why.
+        metric: key of the score that the question is about, for instance ``psnr_at_1_8`` or ``normal_deg``.
         each: factor (or ``method``) that the question asks about level by level; the report then answers for each.
         interactions: pairs of factors whose interaction is the question; the report tests it first.
         margins: metric -> difference, in its stored unit, below which levels count as equal (the report's equivalence tests);
@@ -86,6 +87,7 @@ class Study:
     approximations: tuple[Approximation, ...] = ()
     analyses: tuple[str, ...] = ()
     known: tuple[KnownDeviation, ...] = ()
+    metric: str = "psnr"
     each: str = ""
     interactions: tuple[tuple[str, str], ...] = ()
     margins: dict[str, float] = default(default_factory=dict)

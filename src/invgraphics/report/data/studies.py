@@ -44,6 +44,7 @@ class Study:
         analyses: names of the computations beside the fits.
         report: what its page is about: ``effects`` or ``verdicts``.
         known: red verdicts whose causes are known.
+        metric: key of the score that the question is about.
         each: factor that the question asks about level by level; empty where the mean answers it.
         interactions: pairs of factors whose interaction is the question.
         margins: metric -> difference that is of no interest.
@@ -69,6 +70,7 @@ class Study:
     analyses: tuple[str, ...] = ()
     report: str = "effects"
     known: tuple[KnownDeviation, ...] = ()
+    metric: str = "psnr"
     each: str = ""
     interactions: tuple[tuple[str, str], ...] = ()
     margins: Mapping[str, float] = field(default_factory=dict)
@@ -137,6 +139,7 @@ def read_study(folder: Path) -> Study:
         analyses=record.analyses,
         report=record.report,
         known=record.known,
+        metric=record.metric,
         each=record.each,
         interactions=record.interactions,
         margins=record.margins,

@@ -21,7 +21,7 @@ from invgraphics.report.pages.tables import escape_markdown, markdown_across, ma
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.intervals import CONFIDENCE, POWER
 from invgraphics.report.statistics.predictions import PREDICTION_HEADS, JudgedPrediction, predictions_sentence
-from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences
+from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences, unscored_sentences
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.statistics.verdict import unequal_start
 from invgraphics.report.wording import Quantity, budget_words, listing
@@ -64,7 +64,8 @@ class StudyPage:
         """Unfinished cells, a sentence per comparison that the question asks for, and the population of the intervals."""
         effects, study = [*self.crossed, *self.contrasts.first], self.study
         judged = [predictions_sentence(self.predictions)] if self.predictions else []
-        missing = unmeasured_sentences(study.interactions, effects, study.factors, study.observations())
+        missing = unscored_sentences(study.metric, self.quantity)
+        missing += unmeasured_sentences(study.interactions, effects, study.factors, study.observations())
         start = unequal_start([cell.run for cell in study.cells if cell.run])
         return [*_progress(study), *judged, *missing, *map(effect_sentence, effects), *start, *_scope(self)]
 

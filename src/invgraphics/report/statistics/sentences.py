@@ -9,7 +9,7 @@ from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.data.variants import level_words
 from invgraphics.report.statistics.effects import Effect, Verdict
 from invgraphics.report.statistics.intervals import POWER, Estimate
-from invgraphics.report.wording import Quantity, listing
+from invgraphics.report.wording import Quantity, listing, metric_label
 
 FEW_SCENES = 5
 """Fewer scenes than this tell little about others, and the sentence says so."""
@@ -23,6 +23,13 @@ def effect_sentence(effect: Effect) -> str:
     if effect.truths_differ:
         parts.append("The factor changes the truth itself, so the two were scored against different pictures.")
     return " ".join(part for part in parts if part)
+
+
+def unscored_sentences(metric: str, shown: Quantity | None) -> list[str]:
+    """That no fit has the score which a study asks about, and which one stands in for it; empty where one has."""
+    if shown is None or shown.key == metric:
+        return []
+    return [f"The study asks about {metric_label(metric)}, which no finished fit has: what follows is of {shown.label}."]
 
 
 def unmeasured_sentences(
