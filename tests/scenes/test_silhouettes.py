@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Points, Scene
+from invgraphics.core import Bounds, Points, Scene
 from invgraphics.scenes.degrade import FEWEST_POINTS, TrainingData, degrade
 from invgraphics.scenes.photos.triangulate import Triangulated
-from invgraphics.scenes.silhouettes import inside_silhouettes, points_inside
+from invgraphics.scenes.silhouettes import CELLS_AROUND, GRID, inside_silhouettes, points_inside, tightened
 from invgraphics.testing import TwoBalls, toy_scene
 
 
@@ -71,3 +71,47 @@ def test_they_join_few_points_unless_poses_are_disturbed(scene: Scene, monkeypat
     share = float(inside_silhouettes(found.points.position[FEWEST_POINTS:], scene.train).float().mean())
     assert (share == 1.0) == (noise == 0.0)
     assert ("silhouettes" in found.notes["points"]) == (noise == 0.0)
+
+
+def in_a_wide_box(scene: Scene, half: float = 2.0) -> Scene:
+    corner = torch.full((3,), half)
+    return replace(scene, bounds=Bounds(-corner, corner))
+
+
+def boxes_of_balls() -> tuple[torch.Tensor, torch.Tensor]:
+    balls = TwoBalls()
+    return (balls.centres - balls.radii[:, None]).amin(dim=0), (balls.centres + balls.radii[:, None]).amax(dim=0)
+
+
+def test_a_wide_box_shrinks_to_the_balls(scene: Scene) -> None:
+    """Against their box: nothing of it is lost, and no more is left around it than the grid and a pixel explain."""
+    wide = in_a_wide_box(scene)
+    tight, (lo, hi) = tightened(wide), boxes_of_balls()
+    slack = (CELLS_AROUND + 1) * 4 / GRID + 0.3  # pixels are 0.1 wide at the balls, and a hull bulges between views
+    assert bool((tight.bounds.lo <= lo).all()) and bool((tight.bounds.hi >= hi).all())
+    assert float(torch.cat([lo - tight.bounds.lo, tight.bounds.hi - hi]).max()) < slack
+    share = float((tight.bounds.half / wide.bounds.half).prod())
+    assert tight.notes["region"] == f"the box of the training views' silhouettes, {share:.0%} of the data set's"
+    assert (tight.bounds.space, tight.bounds.near) == (wide.bounds.space, wide.bounds.near)
+
+
+def test_one_wrong_alpha_in_fifty_photographs_carves_nothing(scene: Scene) -> None:
+    many = in_a_wide_box(toy_scene(views=60, size=32))
+    blank = replace(many.train[0], alpha=torch.zeros(32, 32, dtype=torch.uint8))
+    wrong = tightened(many.with_views(train=(blank, *many.train[1:])))
+    (lo, hi) = boxes_of_balls()
+    assert bool((wrong.bounds.lo <= lo).all()) and bool((wrong.bounds.hi >= hi).all())
+    assert wrong.bounds.radius < 0.8 * many.bounds.radius
+
+
+@pytest.mark.parametrize("what", ["opaque", "empty", "endless", "class", "tight"])
+def test_boxes_that_silhouettes_tell_nothing_of_stay(scene: Scene, what: str) -> None:
+    wide, views = in_a_wide_box(scene), scene.train
+    unchanged = {
+        "opaque": wide.with_views(train=(replace(views[0], alpha=None), *views[1:])),
+        "empty": wide.with_views(train=tuple(replace(view, alpha=torch.zeros(32, 32, dtype=torch.uint8)) for view in views)),
+        "endless": replace(wide, bounds=replace(wide.bounds, space="contracted")),
+        "class": wide.with_views(train=tuple(replace(view, subject=index) for index, view in enumerate(views))),
+        "tight": replace(wide, bounds=tightened(wide).bounds),
+    }[what]
+    assert tightened(unchanged) is unchanged

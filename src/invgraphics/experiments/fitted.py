@@ -13,6 +13,7 @@ from invgraphics import plugins
 from invgraphics.core import Model, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
+from invgraphics.experiments.job import in_region
 from invgraphics.experiments.posed import refined_poses, scene_in_fit_frame
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.openmp import limit_spinning
@@ -31,7 +32,7 @@ class Fitted:
     Attributes:
         folder: of the run.
         method: its recipe.
-        scene: as loaded, at the run's size and with its test views.
+        scene: at the run's size and with its test views, in the box in which it was fitted.
         model: fitted, on the run's device.
         source: the folder that holds the checkpoint: the run itself, or the run that a rendering shows.
         poses: of the training views as the fit saw them, where it refined them.
@@ -85,10 +86,11 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     provenance = folder.read(Provenance)
     method = replace(_method(folder, provenance), preset_choice=provenance.preset_choice)
     device = device_of("cuda" if provenance.device.startswith("cuda") and torch.cuda.is_available() else "cpu")
+    source = folder.fit(provenance)
+    scene = in_region(scene, source.read(Provenance).region)
     model = build_model(method, scene, provenance.seed, device, shown=provenance.fitted_run is not None)
     if provenance.fitted_run is not None:
         model = replace(model, renderer=model.renderer.untrained())
-    source = folder.fit(provenance)
     state = checkpoint.load(source.checkpoint, device)
     config = refined_poses(method)
     fitted = Fitted(folder, method, scene, model, source)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from invgraphics.config import fill
+from invgraphics.core import Scene
 from invgraphics.experiments.build import device_of
 from invgraphics.experiments.request import DATA, FitRequest
 from invgraphics.experiments.variants import RendererVariant, variant_named
 from invgraphics.metrics.protocols import Protocol, protocol_named
 from invgraphics.recipes.recipe import Method, assign, load_method
 from invgraphics.runs.folder import RunFolder
-from invgraphics.scenes.degrade import TrainingData
+from invgraphics.runs.provenance import Region
+from invgraphics.scenes.degrade import TrainingData, degrade
 from invgraphics.scenes.open import SceneOptions, longest_edge
+from invgraphics.scenes.silhouettes import tightened
 from invgraphics.training.budget import Budget, Cadence
 
 
@@ -90,6 +93,37 @@ class Job:
     def unscored(self) -> list[str]:
         """Protocols of which the folder holds no scores."""
         return [protocol for protocol in self.protocols if not self.folder.scores_path(protocol).is_file()]
+
+
+def training_scene(job: Job, scene: Scene) -> Scene:
+    """Make the scene that a job's fit sees: degraded as asked, in the box of its silhouettes where poses are known.
+
+    Args:
+        job: of the fit.
+        scene: as loaded.
+
+    Raises:
+        InputError: the scene cannot be changed like this.
+    """
+    shown, training = degrade(scene, job.data, job.request.seed), job.method.recipe.training
+    refined = training is not None and training.poses is not None and training.poses.optimise
+    return shown if refined or job.data.pose_noise else tightened(shown)
+
+
+def region_of(scene: Scene) -> Region | None:
+    """Corners of a scene's box as plain numbers; ``None`` in endless space."""
+    if scene.bounds.space != "box":
+        return None
+    (a, b, c), (d, e, f) = scene.bounds.lo.tolist(), scene.bounds.hi.tolist()
+    return (a, b, c), (d, e, f)
+
+
+def in_region(scene: Scene, region: Region | None) -> Scene:
+    """Return a scene in the box in which a run was fitted; as it is where the run names none."""
+    if region is None:
+        return scene
+    lo, hi = (torch.tensor(corner) for corner in region)
+    return replace(scene, bounds=replace(scene.bounds, lo=lo, hi=hi))
 
 
 def _training_data(request: FitRequest) -> TrainingData:

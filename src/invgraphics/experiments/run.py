@@ -26,7 +26,7 @@ from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import TruthDigest, check_existing, identify
-from invgraphics.experiments.job import Job
+from invgraphics.experiments.job import Job, region_of, training_scene
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder
@@ -44,7 +44,6 @@ from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import TRUTH, RunFolder
 from invgraphics.runs.provenance import LoadAverage, Options, Provenance
 from invgraphics.runs.schema import write_json
-from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import selection_notes, space_note
 from invgraphics.tables import read_json
 from invgraphics.training.fit import Fit, Plan
@@ -93,7 +92,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         check_existing(job)
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
-        shown = degrade(scene, job.data, request.seed)
+        shown = training_scene(job, scene)
         identity = identify(job, TruthDigest.of(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
@@ -245,6 +244,7 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str, plan: Plan | 
         plugins=plugins.used_plugins(method.table, method.name),
         command=request.shell(),
         options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
+        region=region_of(shown),
         device=str(job.device),
         test_poses=protocol_note(method),
         test_exposure=exposure_note(method, shown),

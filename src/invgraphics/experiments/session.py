@@ -16,7 +16,7 @@ from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.display import curve_svg, table_html
 from invgraphics.experiments.evaluate import score_model
 from invgraphics.experiments.fitted import Fitted
-from invgraphics.experiments.job import Job
+from invgraphics.experiments.job import Job, training_scene
 from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.run import prepare, warm_up
@@ -28,7 +28,6 @@ from invgraphics.recipes.recipe import Method
 from invgraphics.runs.history import Moment, read_history
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.scores import Scores
-from invgraphics.scenes.degrade import degrade
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 from invgraphics.training.poses import Poses
@@ -185,14 +184,16 @@ class MemoryRun(FittedRun):
     """
 
     def __init__(self, job: Job, scene: Scene, on_step: OnStep | None = None) -> None:
-        self.method, self.scene = job.method, scene
+        self.method = job.method
         self._job, self._on_step, self._data_changes = job, on_step, job.data.changes()
         self._history: list[Moment] = []
         self._scores: ScoreTable | None = None
         configure_torch(job.device)
         use_kernels(job.request.kernels, job.device)
         with PeakMemory(job.device) as memory:
-            self.fit = prepare(job, degrade(scene, job.data, job.request.seed))
+            shown = training_scene(job, scene)
+            self.scene = replace(scene, bounds=shown.bounds)
+            self.fit = prepare(job, shown)
             warm_up(self.fit, job.method, memory)
         self._run()
 

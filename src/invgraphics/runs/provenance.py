@@ -8,6 +8,9 @@ from typing import Any, ClassVar, Literal
 
 from invgraphics.runs.schema import Record
 
+Region = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Lowest and highest corner of a box, local units."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -112,6 +115,7 @@ class Provenance(Record):
         plugins: name of a component -> package that provides it.
         command: makes the run again.
         options: how the scene was opened.
+        region: lowest and highest corner of the box in which the fit sought the scene, local units; ``None`` in endless space.
         device: that computed.
         test_poses: how test poses are found; empty where they are taken as given.
         test_exposure: under which exposure test views are shown; empty where exposures are not fitted.
@@ -150,6 +154,7 @@ class Provenance(Record):
     plugins: dict[str, str] = field(default_factory=dict)
     command: str
     options: Options
+    region: Region | None = None
     device: str
     test_poses: str = ""
     test_exposure: str = ""

@@ -10,11 +10,10 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.build import build_model, build_plan, use_kernels
 from invgraphics.experiments.evaluate import expected_seconds
-from invgraphics.experiments.job import Job
+from invgraphics.experiments.job import Job, training_scene
 from invgraphics.experiments.start import CHECKPOINT_COPIES
 from invgraphics.experiments.variants import with_renderer
 from invgraphics.metrics.cost import model_bytes
-from invgraphics.scenes.degrade import degrade
 from invgraphics.text import duration
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
@@ -95,7 +94,7 @@ def try_method(job: Job, scene: Scene) -> Cost:
     seed, device = job.request.seed, job.device
     use_kernels(job.request.kernels, device)
     pixels = sum(view.camera.width * view.camera.height for view in scene.test)
-    shown = degrade(scene, job.data, seed)
+    shown = training_scene(job, scene)
     try:
         fit = Fit(build_plan(job.method, shown, job.budget, seed, device))
         step = _try_steps(fit)

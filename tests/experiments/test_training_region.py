@@ -1,0 +1,73 @@
+"""The box of a fit: made of the views that it sees, kept with the run, the data set's where poses are in doubt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import invgraphics as ig
+from invgraphics.core import Bounds, Scene
+from invgraphics.experiments.fitted import load_fitted
+from invgraphics.experiments.job import Job, training_scene
+from invgraphics.experiments.request import FitRequest
+from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
+from invgraphics.testing import toy_scene
+
+SMALL = ig.load_method("volumetric/nerf", set={"field.layers": 2, "field.width": 8, "batches.rays": 32})
+
+
+@pytest.fixture(scope="module")
+def wide() -> Scene:
+    corner = torch.full((3,), 2.0)
+    return replace(toy_scene(views=12, size=16), bounds=Bounds(-corner, corner))
+
+
+def job(*overrides: str) -> Job:
+    return Job.of(FitRequest(method="volumetric/nerf", scene="toy", overrides=overrides, budget="1steps", out="out"))
+
+
+def edges(scene: Scene) -> list[float]:
+    return [*scene.bounds.lo.tolist(), *scene.bounds.hi.tolist()]
+
+
+def test_withheld_views_have_no_part_in_it(wide: Scene) -> None:
+    """Fewer views leave a larger hull, which does not change with what the others show."""
+    all_views, few = training_scene(job(), wide), training_scene(job("data.train_views=3"), wide)
+    assert all_views.bounds.radius < few.bounds.radius < wide.bounds.radius
+    kept = {view.name for view in few.train}
+    other = tuple(
+        view
+        if view.name in kept
+        else replace(view, alpha=torch.zeros(16, 16, dtype=torch.uint8), image=torch.zeros_like(view.image))
+        for view in wide.train
+    )
+    assert edges(training_scene(job("data.train_views=3"), wide.with_views(train=other))) == edges(few)
+
+
+@pytest.mark.parametrize("overrides", [["data.pose_noise=1"], ["training.poses.optimise=true"]])
+def test_silhouettes_at_poses_in_doubt_cut_nothing_off(wide: Scene, overrides: list[str]) -> None:
+    assert edges(training_scene(job(*overrides), wide)) == edges(wide)
+
+
+def test_a_run_opens_in_the_box_of_its_fit(wide: Scene, tmp_path: Path) -> None:
+    fit = ig.fit(SMALL, wide, budget="2steps", data={"train_views": 3}, out=tmp_path / "run")
+    provenance = RunFolder(tmp_path / "run").read(Provenance)
+    model = load_fitted(RunFolder(tmp_path / "run"), wide).model
+    expected = training_scene(job("data.train_views=3"), wide)
+    assert provenance.region is not None and [*provenance.region[0], *provenance.region[1]] == edges(expected)
+    assert torch.equal(model.bounds.lo, expected.bounds.lo) and torch.equal(model.bounds.hi, expected.bounds.hi)
+    in_memory = ig.fit(SMALL, wide, budget="2steps", data={"train_views": 3})
+    for opened in (fit, in_memory):
+        assert torch.equal(opened.model.bounds.lo, expected.bounds.lo)
+        assert torch.equal(opened.scene.bounds.hi, expected.bounds.hi)
+
+
+def test_runs_from_before_have_the_data_sets_box(wide: Scene, tmp_path: Path) -> None:
+    ig.fit(SMALL, wide, budget="2steps", out=tmp_path / "run")
+    folder = RunFolder(tmp_path / "run")
+    folder.write(replace(folder.read(Provenance), region=None))
+    assert torch.equal(load_fitted(folder, wide).model.bounds.lo, wide.bounds.lo)
