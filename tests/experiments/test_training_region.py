@@ -48,8 +48,10 @@ def test_withheld_views_have_no_part_in_it(wide: Scene) -> None:
     assert edges(training_scene(job("data.train_views=3"), wide.with_views(train=other))) == edges(few)
 
 
-@pytest.mark.parametrize("overrides", [["data.pose_noise=1"], ["training.poses.optimise=true"]])
-def test_silhouettes_at_poses_in_doubt_cut_nothing_off(wide: Scene, overrides: list[str]) -> None:
+@pytest.mark.parametrize("overrides", [["data.pose_noise=1"], ["training.poses.optimise=true"], ["data.box=scene"]])
+def test_nothing_is_cut_off_where_poses_are_in_doubt_or_the_data_sets_box_is_asked_for(
+    wide: Scene, overrides: list[str]
+) -> None:
     assert edges(training_scene(job(*overrides), wide)) == edges(wide)
 
 

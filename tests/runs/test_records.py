@@ -216,6 +216,7 @@ def test_what_says_nothing_is_left_out() -> None:
     study = StudyRecord(name="n", scenes=("s",), methods=("m",), cells=(cell,))
     wanted = {"id": "a", "scene": "s", "method": "m", "seed": 0, "run": "runs/a", "status": "missing"}
     table = {"schema": 1, "name": "n", "design": "factorial", "scenes": ["s"], "methods": ["m"], "report": "effects"}
+    table |= {"metric": "psnr"}
     assert study.to_table() == table | {"cells": [wanted]}
     failed = ComparisonRecord(scene="s", methods=(), runs=(), failures=(Failure(method="m", seed=1, error="no"),))
     assert failed.to_table()["failures"] == [{"method": "m", "seed": 1, "error": "no"}]

@@ -96,7 +96,7 @@ class Job:
 
 
 def training_scene(job: Job, scene: Scene) -> Scene:
-    """Make the scene that a job's fit sees: degraded as asked, in the box of its silhouettes where poses are known.
+    """Make the scene that a job's fit sees: degraded as asked, in the box of its silhouettes unless poses are in doubt.
 
     Args:
         job: of the fit.
@@ -107,7 +107,7 @@ def training_scene(job: Job, scene: Scene) -> Scene:
     """
     shown, training = degrade(scene, job.data, job.request.seed), job.method.recipe.training
     refined = training is not None and training.poses is not None and training.poses.optimise
-    return shown if refined or job.data.pose_noise else tightened(shown)
+    return shown if refined or job.data.pose_noise or job.data.box == "scene" else tightened(shown)
 
 
 def region_of(scene: Scene) -> Region | None:

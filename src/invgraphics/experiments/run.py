@@ -174,8 +174,14 @@ def _prediction(job: Job, loaded: Scene, fit: Fit, memory: MemoryForecast) -> st
     scene = fit.plan.scene
     advice = suggestion(job.method, scene)
     notes = selection_notes(scene) + space_note(loaded) + (f"\n  try also: {advice}" if advice else "")
-    notes += _exposures_note(job.method, scene) + _depth_note(job.method, fit.plan)
+    notes += _region_note(scene) + _exposures_note(job.method, scene) + _depth_note(job.method, fit.plan)
     return f"{job.method.name} on {scene.name}: fit {fit.plan.budget}{memory}, then {evaluation}.{notes}"
+
+
+def _region_note(scene: Scene) -> str:
+    """Announce, on a line, a box that silhouettes made smaller; empty where they did not."""
+    region = scene.notes.get("region")
+    return f"\n  region: {region}, unless --set data.box=scene" if region else ""
 
 
 def _exposures_note(method: Method, scene: Scene) -> str:

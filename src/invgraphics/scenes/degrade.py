@@ -60,6 +60,8 @@ class TrainingData:
         init: points that a field may start from: ``scene``, those that came with it (of a rendered scene: exact ones, which no
             method could have; of photographs: those of structure from motion); ``sfm``, triangulated from the training
             photographs at their poses, which every method could have, with random ones where they are few; ``random``, none.
+        box: where an object is sought whose photographs have alpha: ``silhouettes``, in the box around these
+            (`invgraphics.scenes.silhouettes.tightened`), ``scene``, in the data set's. It degrades nothing.
     """
 
     train_views: int | None = None
@@ -71,6 +73,7 @@ class TrainingData:
     scales: tuple[int, ...] = (1,)
     test_scales: tuple[int, ...] = ()
     init: Literal["scene", "sfm", "random"] = "scene"
+    box: Literal["silhouettes", "scene"] = "silhouettes"
 
     @property
     def changes_photographs(self) -> bool:
@@ -142,7 +145,7 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
     chosen = chosen_views(scene, data.train_views)
     shown = [(scale, scene_at(scene, scale).train) for scale in data.scales]
     train = [_degraded(_named(views[index], scale), index, scene, data, seed) for scale, views in shown for index in chosen]
-    done = [f"{name} = {value}" for name, value in changes.items() if name != "test_scales"]
+    done = [f"{name} = {value}" for name, value in changes.items() if name not in ("test_scales", "box")]
     notes = scene.notes | ({"training_data": ", ".join(done)} if done else {})
     if data.changes_photographs and notes.pop("exposures", None):
         scene = replace(scene, exposure_spread=None)  # estimated from all photographs as they were

@@ -72,6 +72,8 @@ def protocol_facts(comparison: Comparison) -> Facts:
     facts |= preset_facts(comparison.runs, comparison.preset)
     if start := start_fact(comparison.runs):
         facts["points to start from"] = start
+    if region := region_fact(comparison.runs):
+        facts["region of the fits"] = region
     return (*facts.items(), *_scoring_facts(comparison.protocol))
 
 
@@ -129,6 +131,14 @@ def start_fact(runs: Sequence[Run]) -> str:
     if supervised := list(dict.fromkeys(run.scores.method for run in runs if run.provenance.sparse_depth)):
         starts.append(f"rays of {listing(supervised)} end there")
     return "; ".join(starts)
+
+
+def region_fact(runs: Sequence[Run]) -> str:
+    """The box in which fits sought their scene, without its share, which depends on the views; empty for the data set's."""
+    told = [(re.sub(r", \d+% of.*", "", str(run.provenance.notes.get("region", ""))), run.scores.scene) for run in runs]
+    return (
+        _grouped([(words or "the data set's box", scene) for words, scene in told]) if any(words for words, _ in told) else ""
+    )
 
 
 def _recipe(run: Run) -> Mapping[str, Any]:

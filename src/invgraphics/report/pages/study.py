@@ -142,6 +142,7 @@ def study_facts(study: Study) -> facts.Facts:
         **facts.preset_facts([replace(cell.run, method=cell.method) for cell in study.cells if cell.run], study.preset),
         "picture size": _of_the_cells(study, "size", study.size),
         "points to start from": facts.start_fact([cell.run for cell in study.cells if cell.run]),
+        "region of the fits": facts.region_fact([cell.run for cell in study.cells if cell.run]),
     }
     return tuple((name, value) for name, value in entries.items() if value)
 
