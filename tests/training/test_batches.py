@@ -44,6 +44,28 @@ def test_rays_on_the_foreground_are_the_share_asked_for(one_pixel: Scene) -> Non
     assert int((batch.alpha > 0).sum()) < 8
 
 
+@pytest.mark.parametrize("solid", [[40], [40, 41, 90], list(range(0, 144, 2))])
+@pytest.mark.parametrize("masked", [False, True])
+def test_all_of_the_foreground_is_drawn_alike(toy: Scene, solid: list[int], masked: bool) -> None:
+    """Whether it fills half of the picture, or is so small that hardly a pixel drawn at random shows it."""
+    alpha, mask = torch.zeros(144), torch.ones(144, dtype=torch.bool)
+    alpha[solid] = 1.0
+    mask[141:] = False  # none of them has alpha in the first two cases
+    view = replace(toy.train[0], alpha=alpha.view(12, 12), mask=mask.view(12, 12) if masked else None)
+    config = BatchConfig(rays=28_800, views=1, foreground=1.0)
+    rays, batch = Batches(config, replace(toy, train=(view,)), torch.Generator().manual_seed(0), CPU).rays()
+    assert len(batch.alpha) == 28_800 and bool((batch.alpha > 0).all())
+    column, row = view.camera.project(rays.origins + rays.directions)[0].floor().long().unbind(dim=1)
+    counts = torch.bincount(12 * row + column, minlength=144).double()
+    expected = 28_800 * alpha.double() * (mask if masked else 1)
+    expected *= 28_800 / expected.sum()
+    shown = expected > 0
+    assert not counts[~shown].any()
+    chi_square = float(((counts - expected)[shown] ** 2 / expected[shown]).sum())
+    freedom = int(shown.sum()) - 1
+    assert chi_square <= freedom + 4 * (2 * freedom) ** 0.5
+
+
 def test_the_foreground_has_its_share_until_then(one_pixel: Scene) -> None:
     config = BatchConfig(rays=200, views=1, foreground=0.5, foreground_until=0.3)
     batches = Batches(config, one_pixel, torch.Generator().manual_seed(0), CPU)
