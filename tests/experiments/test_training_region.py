@@ -22,8 +22,9 @@ SMALL = ig.load_method("volumetric/nerf", set={"field.layers": 2, "field.width":
 
 @pytest.fixture(scope="module")
 def wide() -> Scene:
-    corner = torch.full((3,), 2.0)
-    return replace(toy_scene(views=12, size=16), bounds=Bounds(-corner, corner))
+    corner, scene = torch.full((3,), 2.0), toy_scene(views=24, size=32)
+    views = {split: tuple(replace(view, depth=None) for view in getattr(scene, split)) for split in ("train", "val", "test")}
+    return replace(scene, bounds=Bounds(-corner, corner), **views)
 
 
 def job(*overrides: str) -> Job:
@@ -36,16 +37,16 @@ def edges(scene: Scene) -> list[float]:
 
 def test_withheld_views_have_no_part_in_it(wide: Scene) -> None:
     """Fewer views leave a larger hull, which does not change with what the others show."""
-    all_views, few = training_scene(job(), wide), training_scene(job("data.train_views=3"), wide)
+    all_views, few = training_scene(job(), wide), training_scene(job("data.train_views=8"), wide)
     assert all_views.bounds.radius < few.bounds.radius < wide.bounds.radius
     kept = {view.name for view in few.train}
     other = tuple(
         view
         if view.name in kept
-        else replace(view, alpha=torch.zeros(16, 16, dtype=torch.uint8), image=torch.zeros_like(view.image))
+        else replace(view, alpha=torch.zeros(32, 32, dtype=torch.uint8), image=torch.zeros_like(view.image))
         for view in wide.train
     )
-    assert edges(training_scene(job("data.train_views=3"), wide.with_views(train=other))) == edges(few)
+    assert edges(training_scene(job("data.train_views=8"), wide.with_views(train=other))) == edges(few)
 
 
 @pytest.mark.parametrize("overrides", [["data.pose_noise=1"], ["training.poses.optimise=true"], ["data.box=scene"]])
@@ -56,13 +57,13 @@ def test_nothing_is_cut_off_where_poses_are_in_doubt_or_the_data_sets_box_is_ask
 
 
 def test_a_run_opens_in_the_box_of_its_fit(wide: Scene, tmp_path: Path) -> None:
-    fit = ig.fit(SMALL, wide, budget="2steps", data={"train_views": 3}, out=tmp_path / "run")
+    fit = ig.fit(SMALL, wide, budget="2steps", data={"train_views": 8}, out=tmp_path / "run")
     provenance = RunFolder(tmp_path / "run").read(Provenance)
     model = load_fitted(RunFolder(tmp_path / "run"), wide).model
-    expected = training_scene(job("data.train_views=3"), wide)
+    expected = training_scene(job("data.train_views=8"), wide)
     assert provenance.region is not None and [*provenance.region[0], *provenance.region[1]] == edges(expected)
     assert torch.equal(model.bounds.lo, expected.bounds.lo) and torch.equal(model.bounds.hi, expected.bounds.hi)
-    in_memory = ig.fit(SMALL, wide, budget="2steps", data={"train_views": 3})
+    in_memory = ig.fit(SMALL, wide, budget="2steps", data={"train_views": 8})
     for opened in (fit, in_memory):
         assert torch.equal(opened.model.bounds.lo, expected.bounds.lo)
         assert torch.equal(opened.scene.bounds.hi, expected.bounds.hi)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Bounds, Points, Scene
+from invgraphics.core import Bounds, Points, Scene, View
 from invgraphics.scenes.degrade import FEWEST_POINTS, TrainingData, degrade
 from invgraphics.scenes.photos.triangulate import Triangulated
-from invgraphics.scenes.silhouettes import CELLS_AROUND, GRID, inside_silhouettes, points_inside, tightened
+from invgraphics.scenes.silhouettes import GRID, inside_silhouettes, points_inside, tightened
 from invgraphics.testing import TwoBalls, toy_scene
 
 
@@ -73,45 +73,71 @@ def test_they_join_few_points_unless_poses_are_disturbed(scene: Scene, monkeypat
     assert ("silhouettes" in found.notes["points"]) == (noise == 0.0)
 
 
-def in_a_wide_box(scene: Scene, half: float = 2.0) -> Scene:
+def photographed(scene: Scene, half: float = 2.0) -> Scene:
+    """As photographs show it: without known depth, in a box of which nothing is known."""
     corner = torch.full((3,), half)
-    return replace(scene, bounds=Bounds(-corner, corner))
+    views = {split: tuple(replace(view, depth=None) for view in getattr(scene, split)) for split in ("train", "val", "test")}
+    return replace(scene, bounds=Bounds(-corner, corner), **views)
 
 
-def boxes_of_balls() -> tuple[torch.Tensor, torch.Tensor]:
+def box_of_balls() -> tuple[torch.Tensor, torch.Tensor]:
     balls = TwoBalls()
     return (balls.centres - balls.radii[:, None]).amin(dim=0), (balls.centres + balls.radii[:, None]).amax(dim=0)
 
 
-def test_a_wide_box_shrinks_to_the_balls(scene: Scene) -> None:
-    """Against their box: nothing of it is lost, and no more is left around it than the grid and a pixel explain."""
-    wide = in_a_wide_box(scene)
-    tight, (lo, hi) = tightened(wide), boxes_of_balls()
-    slack = (CELLS_AROUND + 1) * 4 / GRID + 0.3  # pixels are 0.1 wide at the balls, and a hull bulges between views
+def without_alpha(view: View, size: int = 32) -> View:
+    return replace(view, alpha=torch.zeros(size, size, dtype=torch.uint8))
+
+
+def test_a_wide_box_shrinks_to_the_balls() -> None:
+    """Against their own box: nothing of it is lost, and no more is left around it than cells and pixels explain."""
+    wide = photographed(toy_scene(views=40, size=64))
+    tight, (lo, hi) = tightened(wide), box_of_balls()
     assert bool((tight.bounds.lo <= lo).all()) and bool((tight.bounds.hi >= hi).all())
-    assert float(torch.cat([lo - tight.bounds.lo, tight.bounds.hi - hi]).max()) < slack
+    pixel = 3.0 / 83.2  # its width at the balls; silhouettes are looked up to three of them away, and hulls bulge between views
+    assert (
+        float(torch.cat([lo - tight.bounds.lo, tight.bounds.hi - hi]).max()) < 4 * pixel + 2 * float(wide.bounds.half[0]) / GRID
+    )
     share = float((tight.bounds.half / wide.bounds.half).prod())
     assert tight.notes["region"] == f"the box of the training views' silhouettes, {share:.0%} of the data set's"
     assert (tight.bounds.space, tight.bounds.near) == (wide.bounds.space, wide.bounds.near)
 
 
-def test_one_wrong_alpha_in_fifty_photographs_carves_nothing(scene: Scene) -> None:
-    many = in_a_wide_box(toy_scene(views=60, size=32))
-    blank = replace(many.train[0], alpha=torch.zeros(32, 32, dtype=torch.uint8))
-    wrong = tightened(many.with_views(train=(blank, *many.train[1:])))
-    (lo, hi) = boxes_of_balls()
-    assert bool((wrong.bounds.lo <= lo).all()) and bool((wrong.bounds.hi >= hi).all())
-    assert wrong.bounds.radius < 0.8 * many.bounds.radius
+def test_what_is_thinner_than_a_cell_is_not_cut_off() -> None:
+    """A needle of a pixel's width, a fiftieth of a cell's, that sticks out of a ball along x."""
+    cameras = [view.camera.resized(400, 400) for view in toy_scene(views=30, size=32).train]
+    needle = torch.cat([torch.linspace(0.3, 1.2, 4000)[:, None], torch.full((4000, 2), 0.013)], dim=1)
+    ball = torch.nn.functional.normalize(torch.randn(40_000, 3), dim=1) * 0.3
+    views = []
+    for index, camera in enumerate(cameras):
+        alpha = torch.zeros(400 * 400, dtype=torch.uint8)
+        seen, pixel = camera.pixel_of(torch.cat([needle, ball]))
+        alpha[pixel[seen]] = 255
+        views.append(View(camera, torch.zeros(400, 400, 3, dtype=torch.uint8), str(index), alpha=alpha.view(400, 400)))
+    shown = photographed(toy_scene(views=30, size=32), half=3.0).with_views(train=tuple(views))
+    box = tightened(shown).bounds
+    assert float(box.hi[0]) >= 1.2 and float(box.hi[0]) < 1.5
+    assert float(box.lo.min()) < -0.3 and float(box.radius) < 1.8
 
 
-@pytest.mark.parametrize("what", ["opaque", "empty", "endless", "class", "tight"])
+def test_one_wrong_alpha_in_sixty_photographs_carves_nothing() -> None:
+    many = photographed(toy_scene(views=60, size=32))
+    tight = tightened(many.with_views(train=(without_alpha(many.train[0]), *many.train[1:])))
+    lo, hi = box_of_balls()
+    assert bool((tight.bounds.lo <= lo).all()) and bool((tight.bounds.hi >= hi).all())
+    assert tight.bounds.radius < 0.8 * many.bounds.radius
+
+
+@pytest.mark.parametrize("what", ["opaque", "empty", "endless", "class", "rendered", "tight"])
 def test_boxes_that_silhouettes_tell_nothing_of_stay(scene: Scene, what: str) -> None:
-    wide, views = in_a_wide_box(scene), scene.train
+    wide = photographed(scene)
+    views = wide.train
     unchanged = {
         "opaque": wide.with_views(train=(replace(views[0], alpha=None), *views[1:])),
-        "empty": wide.with_views(train=tuple(replace(view, alpha=torch.zeros(32, 32, dtype=torch.uint8)) for view in views)),
+        "empty": wide.with_views(train=tuple(map(without_alpha, views))),
         "endless": replace(wide, bounds=replace(wide.bounds, space="contracted")),
         "class": wide.with_views(train=tuple(replace(view, subject=index) for index, view in enumerate(views))),
+        "rendered": wide.with_views(test=scene.test),
         "tight": replace(wide, bounds=tightened(wide).bounds),
     }[what]
     assert tightened(unchanged) is unchanged

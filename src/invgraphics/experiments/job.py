@@ -120,7 +120,7 @@ def region_of(scene: Scene) -> Region | None:
 
 def in_region(scene: Scene, region: Region | None) -> Scene:
     """Return a scene in the box in which a run was fitted; as it is where the run names none."""
-    if region is None:
+    if region is None or region == region_of(scene):
         return scene
     lo, hi = (torch.tensor(corner) for corner in region)
     return replace(scene, bounds=replace(scene.bounds, lo=lo, hi=hi))

@@ -192,7 +192,7 @@ class MemoryRun(FittedRun):
         use_kernels(job.request.kernels, job.device)
         with PeakMemory(job.device) as memory:
             shown = training_scene(job, scene)
-            self.scene = replace(scene, bounds=shown.bounds)
+            self.scene = scene if shown.bounds is scene.bounds else replace(scene, bounds=shown.bounds)
             self.fit = prepare(job, shown)
             warm_up(self.fit, job.method, memory)
         self._run()

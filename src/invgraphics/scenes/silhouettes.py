@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -17,16 +17,14 @@ CANDIDATES = 100_000
 LEAST_ALPHA = 0.05
 """Alpha above which a pixel belongs to a silhouette."""
 
-GRID = 64
+GRID = 48
 """Cells along each edge of a box that is tightened."""
-CELLS_AROUND = 1.5
-"""Cells that are left on each side: the hull ends within one of its outermost vertex, and alpha within a pixel."""
 CONTRADICTIONS = 0.02
-"""Share of the photographs that may show a point outside their silhouettes before it counts as empty."""
+"""Share of the photographs that may show a cell outside their silhouettes before it counts as empty."""
 SHOWN = 0.5
-"""Parts of the hull belong to the object where this share of the views that show its most shown vertex show one of theirs."""
+"""Parts of the hull belong to the object where this share of the views that show its most shown cell show one of theirs."""
 WORTHWHILE = 0.75
-"""Share of its volume above which a box stays as it is, as those of the built-in scenes do."""
+"""Share of its volume above which a box stays as it is."""
 
 
 def points_inside(bounds: Bounds, views: Sequence[View], count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
@@ -53,63 +51,90 @@ def inside_silhouettes(points: Float[Tensor, "n 3"], views: Sequence[View]) -> B
     A pixel's neighbours count as its own, because the object may reach as far between their centres. A pixel that a view's mask
     leaves out says nothing.
     """
-    return _contradictions(points, views, 0) == 0
-
-
-def _contradictions(points: Float[Tensor, "n 3"], views: Sequence[View], most: int) -> Int[Tensor, " n"]:
-    """Count the photographs that show each point outside their silhouettes; from ``most`` + 1 on it is not counted on."""
-    count = torch.zeros(len(points), dtype=torch.int32)
+    inside = torch.ones(len(points), dtype=torch.bool)
     for view in views:
         if view.alpha is None:
             continue
-        index = (count <= most).nonzero()[:, 0]
+        index = inside.nonzero()[:, 0]
         seen, pixel = view.camera.pixel_of(points[index])
         pixel = pixel[seen]
         nearby = max_pool2d(view.opacity()[None, None], 3, stride=1, padding=1).reshape(-1)
         empty = nearby[pixel] <= LEAST_ALPHA
         if view.mask is not None:
             empty &= view.mask.reshape(-1)[pixel]
-        count[index[seen][empty]] += 1
-    return count
+        inside[index[seen][empty]] = False
+    return inside
 
 
 def tightened(scene: Scene) -> Scene:
     """Shrink a scene's box to the bounding box of its training views' visual hull (Laurentini 1994).
 
     What is outside it is empty, and samples, voxels and frequencies are not spent there: NeRF-synthetic's conventional box has
-    three times the volume of `mic`'s. The hull's vertices are those of a grid over the box that at most `CONTRADICTIONS` of
-    the views show outside their silhouettes; before lenses all is inside these, but apart from the object.
+    almost three times the volume of `mic`'s. Cells of a grid over the box belong to the hull where at most `CONTRADICTIONS` of
+    the views show all of them outside their silhouettes; then again, of a grid over what these leave.
 
     Returns:
-        ``scene`` itself where its space is endless, it shows a class of objects, a photograph is opaque, or the hull is empty
-        or nearly as large as the box; else with other bounds, and a note ``region``.
+        ``scene`` itself where its space is endless, its depth is known (the box of a rendered scene is exact), it shows a class
+        of objects, a photograph is opaque, or the hull is empty or nearly as large as the box; else with other bounds, and a
+        note ``region``.
     """
     bounds, views = scene.bounds, scene.train
-    if bounds.space != "box" or scene.is_class or any(view.alpha is None for view in views):
+    rendered = any(view.depth is not None for view in (*views, *scene.test))
+    if bounds.space != "box" or rendered or scene.is_class or any(view.alpha is None for view in views):
         return scene
-    axes = [torch.linspace(0, 1, GRID + 1)] * 3
-    vertices = bounds.from_unit(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3))
-    most = int(CONTRADICTIONS * len(views))
-    hull = vertices[_of_the_object(_contradictions(vertices, views, most) <= most, vertices, views)]
-    if len(hull) == 0:
-        return scene
-    margin = CELLS_AROUND / GRID * (bounds.hi - bounds.lo)
-    lo, hi = (hull.amin(dim=0) - margin).maximum(bounds.lo), (hull.amax(dim=0) + margin).minimum(bounds.hi)
-    share = float(((hi - lo) / (bounds.hi - bounds.lo)).prod())
-    if share > WORTHWHILE:
+    box = _hull_box(bounds, views)
+    box = None if box is None else _hull_box(box, views)
+    if box is None or (share := float((box.half / bounds.half).prod())) > WORTHWHILE:
         return scene
     region = f"the box of the training views' silhouettes, {share:.0%} of the data set's"
-    return replace(scene, bounds=replace(bounds, lo=lo, hi=hi), notes=scene.notes | {"region": region})
+    return replace(scene, bounds=box, notes=scene.notes | {"region": region})
 
 
-def _of_the_object(hull: Bool[Tensor, " n"], vertices: Float[Tensor, "n 3"], views: Sequence[View]) -> Bool[Tensor, " n"]:
-    """Drop the connected parts of a hull, on the grid of `tightened`, that few views show in all: those before lenses."""
+def _hull_box(bounds: Bounds, views: Sequence[View]) -> Bounds | None:
+    """Bounding box of the cells of a grid over a box that belong to the visual hull; ``None`` where there are none."""
+    unit = (torch.arange(GRID) + 0.5) / GRID
+    cells = bounds.from_unit(torch.stack(torch.meshgrid(unit, unit, unit, indexing="ij"), dim=-1).reshape(-1, 3))
+    half = bounds.half / GRID
+    count, most = torch.zeros(len(cells), dtype=torch.int32), int(CONTRADICTIONS * len(views))
+    for view in views:
+        index = (count <= most).nonzero()[:, 0]
+        count[index[_outside(cells[index], float(half.norm()), view)]] += 1
+    hull = cells[_of_the_object(count <= most, cells, views)]
+    if len(hull) == 0:
+        return None
+    return replace(bounds, lo=hull.amin(dim=0) - half, hi=hull.amax(dim=0) + half)
+
+
+def _outside(centres: Float[Tensor, "n 3"], radius: float, view: View) -> Bool[Tensor, " n"]:
+    """Find the balls around points that a photograph shows wholly outside its silhouette.
+
+    Silhouettes are looked up in pictures of half the size after half the size, whose pixels hold the largest alpha of four: in
+    the first whose pixels are as large as the ball, which touches one and its neighbours only. What a mask leaves out is solid.
+    """
+    camera = view.camera
+    place, z = camera.project(centres)
+    column, row = place.nan_to_num(-1).floor().long().unbind(dim=1)
+    seen = (z > radius) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    pixels = radius * float(camera.focal.max()) / z.clamp_min(radius) + 1
+    level = pixels.log2().ceil().long()
+    solid = view.opacity() if view.mask is None else torch.where(view.mask, view.opacity(), 1.0)
+    outside, picture = torch.zeros(len(centres), dtype=torch.bool), solid[None, None]
+    for size in range(int(level[seen].max()) + 1 if bool(seen.any()) else 0):
+        here = (seen & (level == size)).nonzero()[:, 0]
+        if len(here):
+            nearby = max_pool2d(picture, 3, stride=1, padding=1)[0, 0]
+            outside[here] = nearby[row[here] >> size, column[here] >> size] == 0
+        picture = max_pool2d(picture, 2, ceil_mode=True)
+    return outside
+
+
+def _of_the_object(hull: Bool[Tensor, " n"], cells: Float[Tensor, "n 3"], views: Sequence[View]) -> Bool[Tensor, " n"]:
+    """Drop the connected parts of a hull on a grid that few views show: before lenses all is inside their silhouettes."""
     from scipy.ndimage import label
 
     shown = torch.zeros(len(hull), dtype=torch.int32)
     for view in views:
-        shown[hull] += view.camera.pixel_of(vertices[hull])[0]
-    edge = GRID + 1
-    part = torch.from_numpy(label(hull.view(edge, edge, edge).numpy())[0]).reshape(-1)
+        shown[hull] += view.camera.pixel_of(cells[hull])[0]
+    part = torch.from_numpy(label(hull.view(GRID, GRID, GRID).numpy())[0]).reshape(-1)
     seen = (shown > 0) & (shown >= SHOWN * shown.max())
     return hull & torch.isin(part, part[seen].unique())

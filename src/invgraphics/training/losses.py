@@ -190,7 +190,9 @@ class MaskLoss:
         masked = (batch.alpha < 1).any()  # stays on the device
         if trace.surface is None:
             alpha = rendering.alpha.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
-            return self.weight * masked * torch.nn.functional.binary_cross_entropy(alpha, batch.alpha)
+            # Not torch's own, which raises an error of its own on NaN: a fit names the value and keeps its checkpoint.
+            entropy = -(batch.alpha * alpha.log() + (1 - batch.alpha) * torch.log1p(-alpha)).mean()
+            return self.weight * masked * entropy
         logit, sharpness = trace.surface.logit, trace.surface.sharpness * float(ctx.bounds.half.mean())
         # Rays that miss the bounds are empty whatever the field is, and have a logit that is not finite.
         met = torch.nonzero(logit.isfinite())[:, 0]
