@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -135,6 +137,7 @@ def _of_the_object(hull: Bool[Tensor, " n"], cells: Float[Tensor, "n 3"], views:
     shown = torch.zeros(len(hull), dtype=torch.int32)
     for view in views:
         shown[hull] += view.camera.pixel_of(cells[hull])[0]
-    part = torch.from_numpy(label(hull.view(GRID, GRID, GRID).numpy())[0]).reshape(-1)
+    labels, _ = cast(tuple[np.ndarray, int], label(hull.view(GRID, GRID, GRID).numpy()))
+    part = torch.from_numpy(labels).reshape(-1)
     seen = (shown > 0) & (shown >= SHOWN * shown.max())
     return hull & torch.isin(part, part[seen].unique())
