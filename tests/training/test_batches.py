@@ -66,6 +66,15 @@ def test_all_of_the_foreground_is_drawn_alike(toy: Scene, solid: list[int], mask
     assert chi_square <= freedom + 4 * (2 * freedom) ** 0.5
 
 
+def test_opaque_photographs_have_no_foreground(toy: Scene) -> None:
+    opaque = replace(toy, train=(replace(toy.train[0], alpha=None),))
+    drawn = [
+        Batches(BatchConfig(rays=40, views=1, foreground_least=least), opaque, torch.Generator().manual_seed(0), CPU).rays()[1]
+        for least in (0.0, 0.5)
+    ]
+    assert drawn[0].target.shape == (40, 3) and torch.equal(drawn[0].target, drawn[1].target)
+
+
 def test_the_foreground_has_its_share_until_then(one_pixel: Scene) -> None:
     config = BatchConfig(rays=200, views=1, foreground=0.5, foreground_until=0.3)
     batches = Batches(config, one_pixel, torch.Generator().manual_seed(0), CPU)

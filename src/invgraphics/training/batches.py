@@ -63,12 +63,9 @@ class BatchConfig:
             raise ValueError("'resolution' must hold scales in (0, 1].")
         if self.start_size < 0 or not 0 < self.start_until <= 1:
             raise ValueError("'start_size' must be at least 0, and 'start_until' in (0, 1].")
-        if not 0 <= self.foreground <= 1:
-            raise ValueError(f"'foreground' must be in [0, 1], not {self.foreground}.")
-        if not 0 <= self.foreground_least <= 1:
-            raise ValueError(f"'foreground_least' must be in [0, 1], not {self.foreground_least}.")
-        if not 0 <= self.foreground_until <= 1:
-            raise ValueError(f"'foreground_until' must be in [0, 1], not {self.foreground_until}.")
+        for name in ("foreground", "foreground_least", "foreground_until"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"'{name}' must be in [0, 1], not {getattr(self, name)}.")
 
     def scale_at(self, progress: float, edge: int) -> float:
         """Image scale at a point of the fit, of a photograph whose longer edge is ``edge`` pixels."""
@@ -176,6 +173,8 @@ class Batches:
 
     def _foreground(self, view: View, count: int) -> Tensor:
         """Flat indices of random pixels with alpha within the view's mask, by rejection; there is at least one."""
+        if count == 0:  # also of opaque photographs
+            return torch.zeros(0, dtype=torch.int64)
         drawn = self._anywhere(view, TRIES * count)
         kept = drawn[_with_alpha(view, drawn)]
         if len(kept) < count:
