@@ -11,6 +11,7 @@ import torch
 from invgraphics.config import fill
 from invgraphics.core import Scene
 from invgraphics.experiments.build import device_of
+from invgraphics.experiments.posed import refined_poses
 from invgraphics.experiments.request import DATA, FitRequest
 from invgraphics.experiments.variants import RendererVariant, variant_named
 from invgraphics.metrics.protocols import Protocol, protocol_named
@@ -105,9 +106,9 @@ def training_scene(job: Job, scene: Scene) -> Scene:
     Raises:
         InputError: the scene cannot be changed like this.
     """
-    shown, training = degrade(scene, job.data, job.request.seed), job.method.recipe.training
-    refined = training is not None and training.poses is not None and training.poses.optimise
-    return shown if refined or job.data.pose_noise or job.data.box == "scene" else tightened(shown)
+    shown = degrade(scene, job.data, job.request.seed)
+    in_doubt = job.data.pose_noise or refined_poses(job.method) is not None
+    return shown if in_doubt or job.data.box == "scene" else tightened(shown)
 
 
 def region_of(scene: Scene) -> Region | None:

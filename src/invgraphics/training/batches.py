@@ -167,18 +167,18 @@ class Batches:
         key = index, size_of(view)
         if key not in self._solid:  # counted once: 2 ms for a picture of 800 x 800 pixels
             valid = view.alpha.numel() if view.mask is None else int(view.mask.count_nonzero())
-            self._solid[key] = int(_with_alpha(view).count_nonzero()), valid
+            self._solid[key] = len(_with_alpha(view, view.alpha)), valid
         solid, valid = self._solid[key]
         return round(self._config.foreground_share(solid / valid) * count) if solid else 0
 
     def _foreground(self, view: View, count: int) -> Tensor:
         """Flat indices of random pixels with alpha within the view's mask, by rejection; there is at least one."""
-        if count == 0:  # also of opaque photographs
+        if view.alpha is None or count == 0:
             return torch.zeros(0, dtype=torch.int64)
         drawn = self._anywhere(view, TRIES * count)
-        kept = drawn[_with_alpha(view, drawn)]
+        kept = drawn[view.alpha.reshape(-1)[drawn] > 0]
         if len(kept) < count:
-            solid = _with_alpha(view).reshape(-1).nonzero()[:, 0]
+            solid = _with_alpha(view, view.alpha)
             kept = torch.cat([kept, solid[torch.randint(len(solid), (count - len(kept),), generator=self._generator)]])
         return kept[:count]
 
@@ -230,11 +230,9 @@ class Batches:
         self._order, self._rays = state["order"], int(state["rays"])
 
 
-def _with_alpha(view: View, index: Tensor | None = None) -> Tensor:
-    """Whether pixels of a view with alpha, all or those at flat indices, show anything that counts."""
-    assert view.alpha is not None
-    layers = [view.alpha] if view.mask is None else [view.alpha, view.mask]
-    return torch.stack([(layer if index is None else layer.reshape(-1)[index]) > 0 for layer in layers]).all(dim=0)
+def _with_alpha(view: View, alpha: Tensor) -> Tensor:
+    """Flat indices of a view's pixels with alpha, within its mask."""
+    return (alpha > 0 if view.mask is None else (alpha > 0) & view.mask).reshape(-1).nonzero()[:, 0]
 
 
 class _Pool:
