@@ -8,7 +8,7 @@ import torch
 from invgraphics.core import Bounds, Points, Scene, View
 from invgraphics.scenes.degrade import FEWEST_POINTS, TrainingData, degrade
 from invgraphics.scenes.photos.triangulate import Triangulated
-from invgraphics.scenes.silhouettes import GRID, _outside, inside_silhouettes, points_inside, tightened
+from invgraphics.scenes.silhouettes import GRID, inside_silhouettes, points_inside, tightened
 from invgraphics.testing import TwoBalls, toy_scene
 
 
@@ -118,20 +118,6 @@ def test_what_is_thinner_than_a_cell_is_not_cut_off() -> None:
     box = tightened(shown).bounds
     assert float(box.hi[0]) >= 1.2 and float(box.hi[0]) < 1.5
     assert float(box.lo.min()) < -0.3 and float(box.radius) < 1.8
-
-
-@pytest.mark.parametrize("radius", [0.01, 0.05, 0.2])
-def test_what_may_reach_beyond_a_picture_is_not_outside_its_silhouette(scene: Scene, radius: float) -> None:
-    """Balls along a row of an empty picture: outside in its middle, unknown where they are cut off by its edge."""
-    view = without_alpha(scene.train[0])
-    camera = view.camera
-    column = torch.linspace(0.01, 31.99, 400)
-    rays = camera.rays(torch.stack([column, torch.full_like(column, 16.0)], dim=1))
-    outside = _outside(rays.origins + 3 * rays.directions, radius, view)
-    pixels = radius * float(camera.focal.max()) / 2.4  # at least as wide as the picture shows any of them
-    to_edge = torch.minimum(column, 32 - column)
-    assert not bool(outside[to_edge < radius * float(camera.focal.max()) / 3].any())
-    assert bool(outside[to_edge > 4 * (pixels + 1)].all()) and bool((to_edge > 4 * (pixels + 1)).any()) == (radius < 0.2)
 
 
 def test_one_wrong_alpha_in_sixty_photographs_carves_nothing() -> None:

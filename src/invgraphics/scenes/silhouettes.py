@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import max_pool2d
 
 from invgraphics.core import Bounds, Scene, View
 
@@ -111,22 +111,21 @@ def _outside(centres: Float[Tensor, "n 3"], radius: float, view: View) -> Bool[T
     """Find the balls around points that a photograph shows wholly outside its silhouette.
 
     Silhouettes are looked up in pictures of half the size after half the size, whose pixels hold the largest alpha of four: in
-    the first whose pixels are as large as the ball, which touches one and its neighbours only. What a mask leaves out is solid,
-    and so is what lies beyond the picture's edges.
+    the first whose pixels are as large as the ball, which touches one and its neighbours only. What a mask leaves out is solid.
     """
     camera = view.camera
     seen, pixel = camera.pixel_of(centres)
     row, column = pixel // camera.width, pixel % camera.width
     z = (centres - camera.position) @ camera.cam_to_world[:3, 2]
-    seen &= z > radius
     pixels = radius * float(camera.focal.max()) / z.clamp_min(radius) + 1
+    seen &= z > radius
     level = pixels.log2().ceil().long()
     solid = view.opacity() if view.mask is None else torch.where(view.mask, view.opacity(), 1.0)
     outside, picture = torch.zeros(len(centres), dtype=torch.bool), solid[None, None]
     for size in range(int(level[seen].max()) + 1 if bool(seen.any()) else 0):
         here = (seen & (level == size)).nonzero()[:, 0]
         if len(here):
-            nearby = max_pool2d(pad(picture, (1, 1, 1, 1), value=1.0), 3, stride=1)[0, 0]
+            nearby = max_pool2d(picture, 3, stride=1, padding=1)[0, 0]
             outside[here] = nearby[row[here] >> size, column[here] >> size] == 0
         picture = max_pool2d(picture, 2, ceil_mode=True)
     return outside
