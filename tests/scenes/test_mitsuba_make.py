@@ -16,7 +16,9 @@ from PIL import Image
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
+from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.mitsuba import cache, llvm, make, maker
+from invgraphics.scenes.open import open_scene
 
 PROBE = llvm.status  # the fixture below replaces the attribute
 
@@ -194,6 +196,27 @@ def test_cache_hit_renders_nothing(rendered, fresh, scene_file, tmp_path):
     assert make(scene_file, out=target) == target
     assert _contents(target) == _contents(rendered)
     assert make(scene_file, out=target) == target  # already there
+
+
+def test_fewer_test_views_are_taken_from_the_cache(fresh, tmp_path, monkeypatch):
+    """What was rendered for more test views has those that a rendering of fewer makes, to the bit."""
+    work_here(monkeypatch)
+    more = tmp_path / "scene.toml"
+    more.write_text(SCENE.replace("test = 1", "test = 2"))
+    fewer = make(str(more), test=1)
+    kept = fewer.rename(tmp_path / "fewer")
+    few = open_scene(str(kept), SceneOptions(test_views=1))
+    make(str(more))
+    monkeypatch.setattr(maker, "run_worker", lambda *args, **kwargs: pytest.fail("rendered again"))
+    chosen = open_scene(str(more), SceneOptions(test_views=1))
+    assert not fewer.exists()
+    assert len(chosen.test) == 1
+    for split in ("train", "val", "test"):
+        for ours, theirs in zip(getattr(chosen, split), getattr(few, split), strict=True):
+            assert torch.equal(ours.image, theirs.image)
+            assert torch.equal(ours.camera.cam_to_world, theirs.camera.cam_to_world)
+    with pytest.raises(pytest.fail.Exception, match="rendered again"):
+        open_scene(str(more), SceneOptions(test_views=3))
 
 
 def test_damaged_cache_is_rendered_again(rendered, fresh, scene_file, monkeypatch):

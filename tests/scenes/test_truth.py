@@ -100,10 +100,10 @@ def test_fog_has_neither_surface_nor_points(tmp_path):
     assert scene.test[0].normal is None
 
 
-def test_views_are_chosen_evenly(tmp_path):
+def test_fewer_views_are_the_first(tmp_path):
     scene = Truth().load(_write(tmp_path), SceneOptions(test_views=2, train_views=1))
-    assert [view.name for view in scene.test] == ["0001", "0003"]
-    assert [view.name for view in scene.train] == ["0001"]
+    assert [view.name for view in scene.test] == ["0000", "0001"]
+    assert [view.name for view in scene.train] == ["0000"]
 
 
 def test_another_size_keeps_no_geometry(tmp_path):

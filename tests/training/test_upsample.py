@@ -1,13 +1,14 @@
 """Up-sampling: the function stays, the optimiser follows as the recipe says, and a fit resumes across it to the bit."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from invgraphics.core import Quantity, Samples
+from invgraphics.core import Bounds, Camera, Quantity, Samples
 from invgraphics.core.lattice import resampled, vertices_along
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, build_plan
@@ -18,7 +19,7 @@ from invgraphics.training.fit import Fit
 from invgraphics.training.hooks import FitState
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 from invgraphics.training.optimisers.muon import DECAY, MOMENTUM
-from invgraphics.training.upsample import Upsample, UpsampleConfig
+from invgraphics.training.upsample import Upsample, UpsampleConfig, pixel_limit
 
 ENCODINGS = {
     "voxels": {"type": "voxels", "resolution": 7, "features": 4, "spread": 0.5},
@@ -104,6 +105,28 @@ def test_counts_grow_log_linearly_or_as_listed(scene):
     assert grown == [7, 7, 14, 14, 28, 28, 56, 56, 56, 56]
     listed = sizes(fit_of(scene, "voxels", 5, at=[0.2, 0.6], resolutions=[9, 8]), 5)
     assert listed == [7, 9, 9, 8, 8]
+
+
+def test_vertices_are_never_closer_than_the_pixels_of_the_nearest_camera():
+    """A box of 2 x 2 x 4 far from two cameras: a pixel is the distance over the focal length of the nearer one."""
+    far = []
+    for distance in (400.0, 900.0):
+        pose = torch.eye(4)
+        pose[2, 3] = -distance
+        far.append(Camera(pose, torch.tensor([5000.0, 5000.0]), torch.tensor([50.0, 50.0]), 100, 100))
+    bounds = Bounds(torch.tensor([-1.0, -1.0, -2.0]), torch.tensor([1.0, 1.0, 2.0]))
+    expected = 16 ** (1 / 3) * 5000.0 / 400.0
+    assert pixel_limit(bounds, far) == pytest.approx(expected, rel=0.01)
+    assert pixel_limit(replace(bounds, space="contracted"), far) == pytest.approx(2 * expected, rel=0.01)
+
+
+def test_growth_ends_at_the_pixels(scene):
+    finest = pixel_limit(scene.bounds, [view.camera for view in scene.train])
+    schedule = {"at": [0.2, 0.6], "resolution": 500}
+    whole, half = (sizes(fit_of(scene, "voxels", 5, **schedule, min_spacing=pixels), 5) for pixels in (1.0, 2.0))
+    assert whole[0] == half[0] == 7
+    assert (whole[-1], half[-1]) == (pytest.approx(finest, abs=1), pytest.approx(finest / 2, abs=1))
+    assert sizes(fit_of(scene, "voxels", 5, **schedule, min_spacing=10.0), 5) == [7] * 5  # never coarser
 
 
 def test_several_that_are_due_at_once_are_one(scene):
@@ -244,10 +267,11 @@ def test_warming_up_leaves_the_fit_as_it_was(scene):
         {"at": (0.5,), "resolution": 9, "resolutions": (9,)},
         {"at": (0.2, 0.5), "resolutions": (9,)},
         {"at": (0.2,), "resolution": 1},
+        {"at": (0.2,), "resolution": 9, "min_spacing": -1.0},
     ],
 )
 def test_bad_schedules_are_refused(settings):
-    with pytest.raises(ValueError, match=r"at|resolution"):
+    with pytest.raises(ValueError, match=r"at|resolution|min_spacing"):
         UpsampleConfig(**settings)
 
 

@@ -204,21 +204,19 @@ def _description(spec: str) -> str | None:
 
 def _render(description: str, options: SceneOptions, progress: Callable[[int, int, str], None] | None) -> Path:
     from invgraphics.scenes.mitsuba import make
+    from invgraphics.scenes.mitsuba.maker import cached_with_more_tests
     from invgraphics.scenes.mitsuba.spec import description_path, read
 
     size, spec = options.size, read(description_path(description))
     if isinstance(size, int):
         width, height = spec.size
         size = (round(size * width / max(width, height)), round(size * height / max(width, height)))
-    return make(
-        description,
-        size=size,
-        train=None if spec.instances else options.train_views,  # of a class, every instance has its own number of views
-        test=None if spec.instances else options.test_views,
-        spp=options.spp,
-        seed=options.seed,
-        progress=progress,
-    )
+    # Of a class, every instance has its own number of views.
+    train, test = (None, None) if spec.instances else (options.train_views, options.test_views)
+    made = cached_with_more_tests(description, size, (train, test), options.spp, options.seed)
+    if made is not None:
+        return made
+    return make(description, size=size, train=train, test=test, spp=options.spp, seed=options.seed, progress=progress)
 
 
 def validate(scene: Scene) -> Scene:

@@ -14,7 +14,7 @@ from invgraphics.arrays import read_arrays
 from invgraphics.core import Bounds, Camera, Mesh, Points, Scene, View
 from invgraphics.core.believable import FARTHEST
 from invgraphics.errors import InputError
-from invgraphics.scenes.layout import SceneOptions, evenly
+from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.mitsuba import cache, ply
 from invgraphics.scenes.npz import Npz
 from invgraphics.scenes.pictures.images import Photo
@@ -57,10 +57,10 @@ class Truth:
 
     def _scene(self, path: Path, truth: Mapping[str, Any], options: SceneOptions) -> Scene:
         wanted = {"train": options.train_views, "val": None, "test": options.test_views}
+        # The first ones, which lie evenly (`mitsuba.rig.cameras`): those that a rendering of fewer would have.
         views = {
             split: tuple(
-                _view(path, split, index, truth["cameras"][split][index], options)
-                for index in evenly(range(len(truth["cameras"][split])), count)
+                _view(path, split, index, table, options) for index, table in enumerate(truth["cameras"][split][:count])
             )
             for split, count in wanted.items()
         }

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, cast
 
+import torch
 from torch import nn
 from typing_extensions import override
 
+from invgraphics.core import Bounds, Camera
 from invgraphics.core.lattice import LatticeEncoding, LatticeField, resampled, vertices_along
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
+from invgraphics.training.limits import pixel_sizes
 from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.penalties import LATTICES
 
@@ -33,11 +36,14 @@ class UpsampleConfig:
         moments: ``keep``: the optimiser's moments are interpolated as the lattices are; ``drop``: those of lattices begin anew
             (Plenoxels); ``drop_all``: those of networks too (DVGO, TensoRF: a new optimiser).
         restart_rates: whether all learning rates go back to their start, and take the rest of the fit for their schedules.
+        min_spacing: smallest distance of vertices, in pixels of the nearest training camera (`pixel_limit`): finer voxels than
+            pictures resolve overfit, and fill with fog. 0: no limit. Lattices that are finer already stay as they are.
     """
 
     at: tuple[float, ...]
     resolution: int = 0
     resolutions: tuple[int, ...] = ()
+    min_spacing: float = 0.0
     moments: Moments = "keep"
     restart_rates: bool = False
 
@@ -49,6 +55,8 @@ class UpsampleConfig:
             raise ValueError(f"'resolutions' needs one entry for each of the {len(self.at)} in 'at'.")
         if min((self.resolution or 2, *self.resolutions)) < 2:
             raise ValueError("a resolution is at least 2 vertices along an edge.")
+        if self.min_spacing < 0:
+            raise ValueError("'min_spacing' is a number of pixels, or 0 for no limit.")
 
     def build(self) -> Upsample:
         """The hook."""
@@ -72,18 +80,32 @@ class Upsample(MilestoneHook):
         if not field.lattice_encodings():
             raise InputError(f"The hook '{self.name}' needs encodings made of lattices, which this field does not have.")
         edges = field.bounds.half.tolist()
-        sizes = [(encoding, self._next(encoding, due)) for encoding in field.lattice_encodings().values()]
+        limit = pixel_limit(field.bounds, state.cameras()) / config.min_spacing if config.min_spacing else math.inf
+        sizes = [(encoding, self._next(encoding, due, limit)) for encoding in field.lattice_encodings().values()]
         change_lattices(state, partial(_resize, sizes, edges), config.moments)
         if config.restart_rates:
             state.optimiser.restart(state.ctx.progress)
 
-    def _next(self, encoding: LatticeEncoding, due: int) -> float:
+    def _next(self, encoding: LatticeEncoding, due: int, limit: float) -> float:
         """Vertices along an edge of a cube after the ``due``-th up-sampling; from the present ones, which a resumed fit has."""
-        if self._config.resolutions:
-            return self._config.resolutions[due - 1]
-        share = (due - self.done) / (len(self._config.at) - self.done)
         now = math.prod(encoding.resolution) ** (1 / 3)
-        return now ** (1 - share) * self._config.resolution**share
+        limit = max(limit, now)
+        if self._config.resolutions:
+            return min(self._config.resolutions[due - 1], limit)
+        share = (due - self.done) / (len(self._config.at) - self.done)
+        return now ** (1 - share) * min(self._config.resolution, limit) ** share
+
+
+@torch.no_grad()
+def pixel_limit(bounds: Bounds, cameras: Sequence[Camera]) -> float:
+    """Vertices along the edge of a cubic lattice that are a pixel of the nearest camera apart: the median over the box.
+
+    In contracted space the box has half of the lattice's edge.
+    """
+    axis = torch.linspace(-1, 1, 8)
+    points = bounds.centre + torch.cartesian_prod(axis, axis, axis).to(bounds.half) * bounds.half
+    edge = float((2 * bounds.half).prod()) ** (1 / 3) * (2 if bounds.space == "contracted" else 1)
+    return edge / float(pixel_sizes(points, cameras).median())
 
 
 def _resize(sizes: list[tuple[LatticeEncoding, float]], edges: list[float]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from invgraphics.core.believable import check_camera
@@ -66,6 +67,26 @@ def make(
             if cache.read_truth(folder) is None:  # that process may have made it meanwhile
                 _make(job, folder, report, lock)
     return folder if out is None else cache.copy(folder, Path(out))
+
+
+def cached_with_more_tests(
+    scene: str, size: tuple[int, int] | None, views: tuple[int | None, int | None], spp: int | None, seed: int
+) -> Path | None:
+    """Folder in the cache that has all of the scene's test views, where fewer are asked for: those are its first.
+
+    Cameras and noise of a view do not depend on how many follow, so its pictures are those that `make` would render.
+
+    Returns:
+        ``None`` where no fewer are asked for, or where nothing that would do is in the cache.
+    """
+    job = planned(scene, size, views, spp, seed)
+    own = job.spec.views.test
+    if job.spec.instances is not None or job.views.test >= own:
+        return None
+    more = replace(job, views=replace(job.views, test=own))
+    jobs = [more, averaged(more)]
+    folders = [cache.root() / found.folder_name for found in jobs if found is not None]
+    return next((folder for folder in folders if cache.read_truth(folder) is not None), None)
 
 
 def planned(
