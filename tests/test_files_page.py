@@ -10,6 +10,7 @@ import pytest
 from invgraphics.report.statistics.rules import RULES
 from invgraphics.report.wording import MARGINS
 from invgraphics.runs.study import Approximation, KnownDeviation, Prediction
+from invgraphics.scenes.degrade import TrainingData
 from invgraphics.scenes.mitsuba.build import BUILDERS
 from invgraphics.scenes.mitsuba.rig import RIGS, Forward, Hemisphere, InsideOut, Sphere, cameras, make_rig
 from invgraphics.scenes.mitsuba.spec import Counts, Instances, SamplesPerPixel, SceneSpec, read
@@ -28,6 +29,7 @@ SECTIONS = {
     "#### `forward`": Forward,
     "#### `inside_out`": InsideOut,
     "## `study.toml`": Study,
+    "### `data`": TrainingData,
     "### `approximations`": Approximation,
     "### `known`": KnownDeviation,
     "### `predictions`": Prediction,

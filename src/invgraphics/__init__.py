@@ -1,4 +1,4 @@
-"""Compare and teach differentiable rendering: NeRF volume rendering versus splatting, on one ruler.
+"""Compare and teach differentiable rendering: NeRF volume rendering versus splatting, under one protocol.
 
 >>> import invgraphics as ig
 >>> scene = ig.load_scene("bricks")                                    # doctest: +SKIP

@@ -70,3 +70,10 @@ def test_it_moves_and_its_pictures_stay_with_the_camera(scene: Scene) -> None:
         picture = away.render(scene.test[0].camera)
     assert picture.rgb.device.type == "cpu"
     torch.testing.assert_close(picture.rgb, here.rgb)
+
+
+def test_cameras_may_be_of_another_precision(small: Model, scene: Scene) -> None:
+    """NumPy's poses are float64."""
+    camera = scene.test[0].camera
+    picture = small.render(camera.to(torch.float64))
+    assert torch.equal(picture.rgb, small.render(camera).rgb)

@@ -1,14 +1,23 @@
 """The sentence about methods that lose to the mean training image, on pictures made by hand."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+from training_fixtures import SMALL
 
 from invgraphics.core import Bounds, Camera, Rendering, Scene, View
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
+from invgraphics.experiments.evaluate import evaluate_run
+from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.run import fit_run
+from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named, score, summarise
+from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.scores import Score
+from invgraphics.scenes.degrade import TrainingData, degrade
+from invgraphics.scenes.open import SceneOptions, open_scene
 
 
 def scene() -> Scene:
@@ -69,6 +78,20 @@ def test_says_when_a_small_object_has_vanished() -> None:
         found = below_baseline("hybrid/neus", quality, [coverage_and_depth(prediction, view.camera, shown)], shown, rules)
         assert words in found
         assert ("Try --set batches.foreground=0.5" in found) == (left == 0.001)
+
+
+def test_the_mean_is_over_the_photographs_that_the_method_saw(toy_folder: Path, tmp_path: Path) -> None:
+    """As the table's baseline is, also when a run is scored again."""
+    overrides = (*SMALL["splatting/gaussians"], "data.train_views=1", "data.init=random", "field.opacity=0.9")
+    scene, out = str(toy_folder), str(tmp_path / "run")
+    fit_run(FitRequest(method="splatting/gaussians", scene=scene, out=out, budget="1steps", overrides=overrides))
+    full = open_scene(str(toy_folder), SceneOptions())
+    seen, rules = degrade(full, TrainingData(train_views=1), 0), protocol_named("default")
+    own, other = (baseline_scores(one, rules)["mean image"]["psnr"].mean for one in (seen, full))
+    assert f"{own:.1f}" != f"{other:.1f}"
+    first = RunFolder(tmp_path / "run").read_scores()
+    (said,) = {first.below_baseline, evaluate_run(tmp_path / "run").below_baseline}
+    assert f"below the mean training image ({own:.1f} dB)" in said
 
 
 def test_says_nothing_where_there_is_nothing_to_compare_with() -> None:

@@ -18,6 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.executors.local import LocalExecutor, cores
 from invgraphics.experiments.request import FitRequest
+from invgraphics.interruption import Terminated
 from invgraphics.runs.folder import CHECKPOINT, RunFolder
 
 METHOD = "splatting/gaussians"
@@ -118,6 +119,36 @@ def test_ctrl_c_stops_the_fit_with_a_checkpoint(request_for, tmp_path: Path) -> 
         next(outcomes)
     assert (run / CHECKPOINT).is_file()
     assert not (run / "scores.json").exists()
+
+
+SLOW = """#!{python}
+import pathlib, signal, sys, time
+signal.signal(signal.SIGINT, lambda *_: (time.sleep(2.5), pathlib.Path("{folder}/checkpoint").touch(), sys.exit(130)))
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))
+pathlib.Path("{folder}/began").touch()
+time.sleep(60)
+"""
+
+
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize("terminated", [False, True])
+def test_an_interrupted_fit_has_time_for_a_long_step(request_for, tmp_path: Path, monkeypatch, terminated: bool) -> None:
+    """Longer than a terminated one, which ends within two seconds."""
+    program = tmp_path / "python"
+    program.write_text(SLOW.format(python=sys.executable, folder=tmp_path))
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr(Terminated, "raised", terminated)
+    outcomes = LocalExecutor().run([request_for("slow")], tmp_path / "jobs")
+
+    def interrupt() -> None:
+        wait_for(tmp_path / "began")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        next(outcomes)
+    assert (tmp_path / "checkpoint").exists() != terminated
 
 
 def test_a_fit_does_not_outlive_its_parent(request_for, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from training_fixtures import SMALL
 
-from invgraphics.core import Model
+from invgraphics.core import Model, Points, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import evaluate
 from invgraphics.experiments import run as module
@@ -176,8 +176,36 @@ def test_a_field_that_starts_from_a_changed_file_is_another_fit(toy_folder: Path
     found = []
     for content in (b"one", b"two", b"one"):
         source.write_bytes(content)
-        found.append(identify(Job.of(request), TruthDigest(("a", "b", "c"), "d"), 1))
+        found.append(identify(Job.of(request), TruthDigest(("a", "b", "c"), "d", "e"), 1))
     assert found[0] == found[2] != found[1]
+
+
+def test_whatever_a_fit_may_read_identifies_it(scene: Scene) -> None:
+    """Masks, depth, points, bounds and background, which neither pixels nor cameras tell; names and notes do not matter."""
+    first, *others = scene.train
+    points = Points(torch.zeros(2, 3), torch.ones(2, 3))
+    known = replace(scene, points=points)
+    changed = [
+        known.with_views(train=(replace(first, mask=torch.ones(first.image.shape[:2], dtype=torch.bool)), *others)),
+        known.with_views(train=(replace(first, depth=torch.ones(first.image.shape[:2])), *others)),
+        replace(known, points=replace(points, position=torch.full((2, 3), 1e-6))),
+        replace(known, points=None),
+        replace(known, bounds=replace(scene.bounds, near=0.1)),
+        replace(known, background=1 - scene.background),
+    ]
+    digests = [TruthDigest.of(one) for one in (known, *changed)]
+    assert len(set(digests)) == len(digests)
+    assert len({(digest.pixels, digest.cameras) for digest in digests}) == 1
+    assert TruthDigest.of(replace(known, notes={"resize": "none"})) == digests[0]
+
+
+def test_spelling_makes_no_other_run(run: Path, toy_folder: Path) -> None:
+    request = _request(toy_folder, run)
+    spelt = replace(request, device="cpu", budget=f" {request.budget.replace('steps', ' steps')}")
+    truth = TruthDigest(("a", "b", "c"), "d", "e")
+    assert spelt.budget != request.budget
+    assert identify(Job.of(spelt), truth, 1) == identify(Job.of(request), truth, 1)
+    check_replaceable(Job.of(spelt))
 
 
 def test_a_refused_fit_leaves_no_run_behind(toy_folder: Path, tmp_path: Path) -> None:
@@ -225,11 +253,22 @@ def test_existing_runs_are_not_overwritten(run: Path, toy_folder: Path) -> None:
         fit_run(_request(toy_folder, run))
     with pytest.raises(InputError, match="holds another run: its seed is 0, not 5"):
         fit_run(_request(toy_folder, run, seed=5, existing="resume"))
-    with pytest.raises(InputError, match="holds another run: its budget is 30steps, not 31steps"):
+    with pytest.raises(InputError, match="holds another run: its budget is 30 steps, not 31 steps"):
         fit_run(_request(toy_folder, run, budget="31steps", existing="resume"))
     stamp = (run / "scores.json").stat().st_mtime_ns
     fit_run(_request(toy_folder, run, existing="reuse"))
     assert (run / "scores.json").stat().st_mtime_ns == stamp
+
+
+def test_a_resumed_fit_keeps_its_peak_memory(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    """What is left to do, here the scores alone, needs less than what was done before."""
+    folder = shutil.copytree(run, tmp_path / "run")
+    (folder / "scores.json").unlink()
+    record = json.loads((folder / "fit.json").read_text())
+    (folder / "fit.json").write_text(json.dumps(record | {"peak_memory_bytes": 10**12}))
+    fit_run(_request(toy_folder, folder, existing="resume"))
+    assert json.loads((folder / "scores.json").read_text())["cost"]["peak_memory_bytes"] == 10**12
+    assert json.loads((folder / "fit.json").read_text())["peak_memory_bytes"] == 10**12
 
 
 def _spawn(request: FitRequest, folder: Path) -> subprocess.Popen:

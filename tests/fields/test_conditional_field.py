@@ -8,8 +8,11 @@ from torch import Tensor
 from torch.nn.functional import layer_norm
 
 from invgraphics.core import Conditional, Quantity, Samples, Scene
+from invgraphics.errors import InputError
+from invgraphics.experiments.build import build_model
 from invgraphics.fields.conditional.field import ConditionalField, ConditionalFieldConfig
 from invgraphics.fields.conditional.layers import ConcatenatedLayer, FilmLayer, HyperLayer
+from invgraphics.recipes.recipe import load_method
 from invgraphics.testing import check_field, toy_scene
 
 WAYS = ("hypernetwork", "concatenation", "film")
@@ -126,3 +129,9 @@ def test_normals_point_where_density_falls(way: str, scene: Scene) -> None:
     assert values.normal is not None and values.density is not None and not values.normal.requires_grad
     assert torch.allclose(values.normal, expected, atol=1e-6)
     assert torch.equal(values.density, field.density_no_grad(batch))
+
+
+def test_an_occupancy_grid_is_refused_which_would_know_the_mean_only(scene: Scene) -> None:
+    method = load_method("prior/volumetric", "laptop", ['renderer.sampler={type="occupancy", resolution=8}'])
+    with pytest.raises(InputError, match="shows many subjects, and an occupancy grid knows"):
+        build_model(method, scene, 0, torch.device("cpu"))

@@ -6,9 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Context, Quantity
+from invgraphics.core import Bounds, Camera, Context, Quantity
+from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError
+from invgraphics.fields.analytic import Sphere
 from invgraphics.fields.convert import visible_points
+from invgraphics.fields.depth_maps import field_depth
 from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.fields.starting import depth_points
@@ -78,3 +81,10 @@ def test_empty_and_other_fields_are_refused(scene) -> None:
     for wrong in ({"init": "field"}, {"source": "somewhere"}):
         with pytest.raises(ValueError, match="source"):
             GaussianFieldConfig(**wrong)
+
+
+def test_depth_is_found_where_the_near_plane_is_the_camera() -> None:
+    pose = look_at(torch.tensor([0.0, -3.0, 0.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    camera = Camera(pose, torch.tensor([8.0, 8.0]), torch.tensor([4.0, 4.0]), 8, 8)
+    bounds = Bounds(-torch.ones(3), torch.ones(3), "contracted", near=0.0)
+    assert float(field_depth(Sphere(50.0, 0.5), camera, bounds)[4, 4]) == pytest.approx(2.55, abs=0.15)

@@ -86,3 +86,16 @@ def test_refusals() -> None:
         fill(IntegratedConfig, {"basis": "cube"})
     with pytest.raises(InputError, match="width must be at least 1"):
         fill(DensityFieldConfig, {"width": 0})
+
+
+def test_features_are_means_of_sines_however_long_a_thin_frustum_is() -> None:
+    """Contracted covariances of long, far intervals lose their digits, and with them their sign."""
+    generator = torch.Generator().manual_seed(0)
+    directions = normalize(torch.randn(500, 3, generator=generator), dim=1)
+    rays = Rays.make(torch.randn(500, 3, generator=generator) * 0.7, directions, radius=0.0)
+    bounds = Bounds(-torch.ones(3), torch.ones(3), "contracted")
+    samples = Samples.on(rays, torch.arange(500), torch.full((500,), 20.0), torch.full((500,), 30.0))
+    mean = samples.cone_mean
+    encoding = IntegratedConfig(octaves=16, basis="icosahedron").build()
+    features = encoding(bounds.to_unit(mean), bounds.unit_covariance(mean, samples.covariance))
+    assert float(features.abs().max()) <= 1 + 1e-6

@@ -18,6 +18,7 @@ from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
+from invgraphics.testing import toy_scene
 
 D, S, G, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.GRADIENT, Quantity.RADIANCE, Quantity.NORMAL
 
@@ -352,3 +353,21 @@ def test_a_new_field_is_as_thin_in_endless_space_as_in_a_box(make_scene) -> None
         depth = (density * half * r.diff()).sum()
         start = math.log1p(math.exp(0.5))  # softplus
         assert float(depth) == pytest.approx(start * (2 - 1 / 100), rel=1e-3)
+
+
+@pytest.mark.parametrize("inputs", [(), ("position",)])
+@pytest.mark.parametrize("geometry", ["density", "sdf"])
+def test_a_crop_off_the_middle_changes_no_value_within(geometry, inputs) -> None:
+    """Networks see positions from the middle of the first box, whatever box the lattices span now."""
+    torch.manual_seed(0)
+    config = replace(SMALL, encoding=VoxelsConfig(33, features=4), geometry=geometry, colour_inputs=inputs)
+    field = config.build(toy_scene(2, 8))
+    points = torch.rand(300, 3) * torch.tensor([0.6, 0.9, 0.5]) - torch.tensor([0.3, 0.2, 0.25])
+    want = (S if geometry == "sdf" else D) | R
+    with torch.no_grad():
+        before = field.query(Samples.at(points), want)
+        field.crop(torch.tensor([-0.4, -0.3, -0.35]), torch.tensor([0.5, 0.9, 0.4]), 200)
+        after = field.query(Samples.at(points), want)
+    values = [value.sdf if geometry == "sdf" else value.density for value in (before, after)]
+    torch.testing.assert_close(values[1], values[0], atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(after.radiance, before.radiance, atol=1e-3, rtol=0)

@@ -97,3 +97,11 @@ def test_depths_lie_between_the_planes_of_the_sweep(scene: Scene) -> None:
     off = stereo_points(wall, 1 << 20).position[:, 1].abs()
     assert len(off) > 5000
     assert off.median() < 0.01
+
+
+def test_a_camera_may_stand_in_the_middle_of_the_box(scene: Scene) -> None:
+    pose = torch.eye(4)
+    pose[:3, 3] = scene.bounds.centre
+    first, *others = scene.train
+    moved = replace(first, camera=first.camera.moved(pose))
+    assert len(stereo_points(scene.with_views(train=(moved, *others)), 50)) > 0

@@ -82,6 +82,16 @@ def test_peak_memory_leaves_out_what_was_there_before() -> None:
     assert memory.peak_bytes < 16 * MB < block.nbytes
 
 
+def test_peak_memory_counts_what_an_earlier_process_needed() -> None:
+    with cost.PeakMemory() as peak:
+        peak.include(10**12)
+        peak.include(10**9)
+        assert peak.peak_bytes == 10**12
+        with peak.excluding():
+            pass
+    assert peak.peak_bytes == 10**12
+
+
 def test_memory_without_proc(monkeypatch, tmp_path) -> None:
     now = memory.resident_bytes()
     monkeypatch.setattr(memory, "STATM", tmp_path / "absent")

@@ -1,5 +1,7 @@
 """Warping by depth: the identity, a plane's homography, occlusion, and depth of a fitted field."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -104,3 +106,28 @@ def test_views_without_depth_are_refused(scene: Scene) -> None:
     blind = scene.with_views(train=tuple(View(view.camera, view.image, view.name) for view in scene.train))
     with pytest.raises(InputError, match=r"5 training views of scene 'toy' have no depth.*train0"):
         DepthMapsConfig().build(blind)
+
+
+def test_soft_edges_are_averaged_premultiplied(scene: Scene) -> None:
+    """Two columns to a pixel: opaque red beside almost transparent blue. A mean of colours times a mean alpha is no light."""
+    camera = facing(size=32)
+    colours = torch.zeros(32, 32, 3)
+    colours[:, 0::2, 0] = colours[:, 1::2, 2] = 1.0
+    alpha = torch.ones(32, 32)
+    alpha[:, 1::2] = 0.1
+    view = replace(wall(camera, 3.0, torch.ones(3)), image=colours, alpha=alpha)
+    assert view.depth is not None
+    rgb, opacity, *_ = shown(DepthMapField([view], [view.depth]), camera.resized(16, 16), scene)
+    torch.testing.assert_close(rgb[8, 8], torch.tensor([0.5, 0.0, 0.05]), atol=1e-3, rtol=0)
+    assert float(opacity[8, 8]) == pytest.approx(0.55, abs=1e-3)
+
+
+def test_pixels_that_do_not_count_are_not_warped(scene: Scene) -> None:
+    camera = facing(size=16)
+    view = wall(camera, 3.0, torch.ones(3))
+    mask = torch.ones(16, 16, dtype=torch.bool)
+    mask[:, :8] = False
+    assert view.depth is not None
+    _, opacity, *_ = shown(DepthMapField([replace(view, mask=mask)], [view.depth]), camera, scene)
+    assert float(opacity[:, :8].max()) == 0.0
+    assert float(opacity[:, 9:].min()) > 0.99

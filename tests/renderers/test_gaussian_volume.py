@@ -1,5 +1,6 @@
 """Gaussians along rays: closed forms, scipy's quadrature, Monte Carlo, finite differences, order, conventions, conformance."""
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -392,3 +393,21 @@ def test_float32_is_near_float64() -> None:
 def test_settings_out_of_range_are_refused(config: type, settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(settings))):
         config(**settings)
+
+
+@pytest.mark.parametrize("config", [EXACT, replace(EXACT, self_attenuation=False), SORTED])
+def test_contributions_are_those_of_the_picture_where_the_near_plane_cuts_gaussians(config: Any) -> None:
+    """The camera stands among them: their transmittances are shares, and the mean distance is the picture's depth."""
+    gaussians = some(40, opacities=torch.full((40,), 0.95, dtype=F64))
+    camera = Camera(torch.eye(4, dtype=F64), torch.full((2,), 8.0, dtype=F64), torch.full((2,), 4.0, dtype=F64), 8, 8)
+    ctx = replace(CTX, bounds=replace(BOUNDS, near=0.2))
+    renderer = config.build(toy_scene(2, 8))
+    picture = renderer.render_image(Fixed(gaussians), camera, ctx)[0]
+    compared = 0
+    for column, row in itertools.product(range(8), range(8)):
+        found = renderer.contributions(Fixed(gaussians), camera, (column, row), ctx)
+        assert not len(found) or float(found.transmittance.max()) <= 1 + 1e-9
+        if float(picture.alpha[row, column]) >= 0.5:
+            assert found.expected_depth == pytest.approx(float(picture.depth[row, column]), rel=1e-3)
+            compared += 1
+    assert compared > 3

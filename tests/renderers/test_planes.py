@@ -14,7 +14,7 @@ from invgraphics.core import Camera, Context, Field, Planes, Quantity, Samples, 
 from invgraphics.core.planes import homographies, inverse_depths, mean_camera, widened, widest_angle
 from invgraphics.core.transforms import look_at, transform_points
 from invgraphics.errors import InputError
-from invgraphics.fields.plane_sweep import weights_to_alphas
+from invgraphics.fields.plane_sweep import plane_sweep, weights_to_alphas
 from invgraphics.fields.planes import PlaneField, PlanesConfig
 from invgraphics.renderers.planes import PlaneRenderer
 from invgraphics.testing import check_field, check_renderer, toy_cameras, toy_scene
@@ -201,3 +201,20 @@ def test_contracts(scene: Scene) -> None:
         other.load_state_dict(field.state_dict())
         assert isinstance(other, PlaneField)
         assert torch.equal(other.rgb_logits, field.rgb_logits)
+
+
+def test_pixels_that_do_not_count_make_no_planes() -> None:
+    """The left half of each photograph is something red in the way; with masks it is never looked at."""
+    mask = torch.ones(16, 16, dtype=torch.bool)
+    mask[:, :8] = False
+    photograph = torch.full((16, 16, 3), 0.2)
+    photograph[:, :8] = torch.tensor([1.0, 0.0, 0.0])
+    cameras = [camera_at((x, -3.0, 0.0), 16, 16, 16.0).to(torch.float32) for x in (-0.05, 0.0, 0.05)]
+    found = {}
+    for masked in (False, True):
+        views = tuple(View(camera, photograph, str(i), mask=mask if masked else None) for i, camera in enumerate(cameras))
+        seen = replace(toy_scene(2, 16), train=views)
+        found[masked] = plane_sweep(seen, cameras[1], torch.tensor([2.0, 3.0, 4.0]), 3, 0.05)
+    red = [(rgb[:, 0] - rgb[:, 1])[:, :, :6].mul(alpha[:, :, :6]).amax() for rgb, alpha in found.values()]
+    assert float(red[0]) > 0.2
+    assert float(red[1]) < 1e-3

@@ -1,15 +1,17 @@
 """Rendering options of the splatter, and ellipsoids, against closed forms."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
 from test_splatting import BOUNDS, F64, Fixed, gaussians
 
-from invgraphics.core import Camera, Context
-from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.core import Bounds, Camera, Context, Gaussians
+from invgraphics.core.transforms import look_at, quaternion_to_matrix
 from invgraphics.renderers.gaussians.ellipsoids import draw_ellipsoids
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
+from invgraphics.testing import toy_scene
 
 GEOMETRY = Context(BOUNDS, geometry=True)
 
@@ -127,3 +129,21 @@ def test_refusals() -> None:
         SplattingConfig(max_grad_splats=-1)
     with pytest.raises(ValueError, match="discs"):
         SplattingConfig(shape="disc", antialiased=True)
+
+
+def test_a_floor_of_one_disc_looks_the_same_in_every_crop() -> None:
+    """A disc that reaches behind the camera may be seen anywhere, also where the principal point is far outside the picture."""
+    floor = Gaussians(
+        torch.tensor([[0.0, 0.0, -0.5]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[2.0, 2.0, 0.001]]),
+        torch.tensor([0.95]), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    pose = look_at(torch.tensor([0.0, -2.0, 0.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    camera = Camera(pose, torch.tensor([150.0, 150.0]), torch.tensor([128.0, 128.0]), 256, 256)
+    ctx = Context(Bounds(-torch.ones(3), torch.ones(3)))
+    renderer = SplattingConfig(shape="disc").build(toy_scene(2, 8))
+    whole = renderer.render_image(Fixed(floor), camera, ctx)[0].alpha
+    for x, y in ((0, 192), (0, 240), (240, 240)):
+        crop = replace(camera, centre=camera.centre - torch.tensor([float(x), float(y)]), width=16, height=16)
+        part = renderer.render_image(Fixed(floor), crop, ctx)[0].alpha
+        assert float(part.mean()) > 0.5
+        torch.testing.assert_close(part, whole[y : y + 16, x : x + 16], atol=1e-3, rtol=0)

@@ -10,11 +10,13 @@ import torch
 
 from invgraphics import kernels
 from invgraphics.core import Bounds, Camera, Context, Mesh, Quantity, harmonics
+from invgraphics.core.transforms import look_at
 from invgraphics.errors import NotComposableError
 from invgraphics.fields.analytic import Box, Sphere
 from invgraphics.fields.isosurface import extract_mesh
 from invgraphics.fields.mesh import ExtractedMesh, MeshField
 from invgraphics.formats.mesh import write_mesh
+from invgraphics.renderers import surface
 from invgraphics.renderers.surface import Surface, SurfaceConfig
 from invgraphics.scenes.mitsuba import gbuffer
 from invgraphics.testing import check_field, check_renderer, toy_scene
@@ -203,3 +205,15 @@ def test_the_reference_draws_the_same_picture(ball: Mesh, camera: Camera) -> Non
         slow = picture(ball, camera)
     torch.testing.assert_close(fast.rgb, slow.rgb, atol=1e-5, rtol=0)
     torch.testing.assert_close(fast.alpha, slow.alpha)
+
+
+def test_strips_without_a_triangle_have_normals_of_nothing(monkeypatch) -> None:
+    """The renderer works on strips of rows, of which those above and below the object see no face."""
+    monkeypatch.setattr(surface, "STRIP", 16 * 9 * 2)
+    corners = torch.tensor([[-0.2, 0.0, -0.2], [0.2, 0.0, -0.2], [0.0, 0.0, 0.2]])
+    triangle = Mesh.coloured(corners, torch.tensor([[0, 1, 2]]), torch.full((3, 3), 0.5))
+    pose = look_at(torch.tensor([0.0, -3.0, 0.0]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    view = Camera(pose, torch.tensor([16.0, 16.0]), torch.tensor([8.0, 8.0]), 16, 16)
+    found = picture(triangle, view, normals="faces")
+    assert 0 < float(found.alpha.sum()) < 16
+    assert bool((found.normal[0] == 0).all()) and bool(found.normal.isfinite().all())

@@ -280,7 +280,9 @@ def test_words() -> None:
     assert listing("abc") == "a, b and c"
     assert [times(ratio) for ratio in (1.44, 14.2, 137.0)] == ["1.4", "14", "140"]
     assert [duration(s) for s in (12, 412, 600, 7260)] == ["12 s", "6 min 52 s", "10 min", "2 h 1 min"]
-    assert [budget_words(b) for b in ("60s", "5000steps", "odd")] == ["60 s", "5,000 steps", "odd"]
+    assert [budget_words(b) for b in ("60s", "5000steps", "2m", "60 s", "1step", "odd")] == [
+        "60 s", "5,000 steps", "2 min", "60 s", "1 steps", "odd",
+    ]  # fmt: skip
     assert [significant_decimals(v) for v in (1234.0, 12.3, 0.0123)] == [0, 1, 4]
 
 

@@ -16,7 +16,7 @@ from statsmodels.stats.weightstats import DescrStatsW
 from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.statistics.effects import Effect, effects_on
 from invgraphics.report.statistics.intervals import Estimate, band, estimate, holm
-from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.pairing import Contrast, sample
 from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.run import Run
@@ -206,7 +206,9 @@ def test_sentences() -> None:
     flip = quality_quantity("flip", Score(mean=0.0, higher_is_better=False))
     assert "costs 0.030 FLIP [0.020, 0.040]" in effect_sentence(effect_with(0.03, 0.01, quantity=flip))
     alone = Estimate(-1.0, -1.0, -1.0, None, "none", 1, (1, 1))
-    assert "in the one seed there is: an observation" in effect_sentence(effect_with(0, 0, estimate=alone, adjusted=None))
+    assert "with one seed only, which cannot be told from chance" in effect_sentence(
+        effect_with(0, 0, estimate=alone, adjusted=None)
+    )
     same = Estimate(0.0, 0.0, 0.0, None, "none", 1, (3, 3))
     assert (
         effect_sentence(effect_with(0, 0, estimate=same)) == "data.train_views 20 instead of 40: no difference at all, 3 seeds."
@@ -218,6 +220,23 @@ def test_sentences() -> None:
     assert "no effect beyond ±0.20 dB (equivalence test), 0.05 dB [−0.05, 0.15], 3 seeds." in equal
     between = effect_with(1, 0.1, contrast=Contrast(METHOD, "a/b", "c/d"))
     assert effect_sentence(between).startswith("c/d instead of a/b gains")
+
+
+def test_methods_are_compared_over_the_same_levels_of_other_factors() -> None:
+    """Seeds that lack a level, as in unfinished studies, are left out on each side: 20 dB at one level, 10 at the other."""
+
+    def one(method: str, level: str, seed: int) -> Observation:
+        value = {"easy": 20.0, "hard": 10.0}[level] + 0.01 * seed
+        run = run_with("s", seed, np.array([value, value]))
+        return Observation(replace(run, method=method), "s", {METHOD: method, "k": level})
+
+    first = [one("a", level, seed) for level in ("easy", "hard") for seed in range(3)]
+    unfinished = [one("b", "easy", seed) for seed in range(3)]
+    contrast, psnr = Contrast(METHOD, "a", "b"), quality_quantity("psnr", first[0].run.scores.quality["psnr"])
+    assert not sample(contrast, psnr, [*first, *unfinished, one("b", "hard", 3)]).scenes
+    whole = sample(contrast, psnr, [*first, *unfinished, *(one("b", "hard", seed) for seed in (0, 1))])
+    assert [len(values) for _, values in whole.scenes["s"]] == [2, 3]
+    assert sum(sign * values.mean() for sign, values in whole.scenes["s"]) == pytest.approx(-0.005)
 
 
 def test_nothing_has_no_sign() -> None:

@@ -413,6 +413,19 @@ def test_an_unequal_start_is_told_of_a_study_too(small_study: Path, edit: Callab
     assert told in build_study_report(small_study).read_text() and told in (small_study / "index.md").read_text()
 
 
+def test_no_budget_is_stated_where_it_is_a_factor(tmp_path: Path) -> None:
+    folder = bare_study(tmp_path, {"budget": ["1steps", "20steps"]}, lambda cell: [20.0])
+    record = json.loads((folder / "study.json").read_text())
+    for cell in record["cells"]:
+        cell["budget"] = cell["levels"]["budget"].replace("steps", " steps")
+    (folder / "study.json").write_text(json.dumps(record))
+    assert {one.budget for one in scene_comparisons(read_study(folder))} == {""}
+    for cell in record["cells"]:
+        cell["budget"] = "1 steps"
+    (folder / "study.json").write_text(json.dumps(record))
+    assert {one.budget for one in scene_comparisons(read_study(folder))} == {"1 steps"}
+
+
 def test_many_variants_show_pictures_of_eight_from_best_to_worst(tmp_path: Path) -> None:
     folder = bare_study(tmp_path, {"a.x": list(range(20))}, lambda cell: [20.0 + (7 * cell["levels"]["a.x"]) % 20])
     comparison = scene_comparisons(read_study(folder))[0]

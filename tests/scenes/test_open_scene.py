@@ -101,6 +101,12 @@ def test_unknown_formats_are_sentences(tmp_path: Path) -> None:
         open_scene(str(tmp_path / "readme.txt"))
 
 
+def test_photographs_without_poses_are_sent_to_import_photos(tmp_path: Path) -> None:
+    (tmp_path / "IMG_1.JPG").touch()
+    with pytest.raises(InputError, match=r"holds photographs without poses\.\nRun `invgraphics import-photos "):
+        open_scene(str(tmp_path))
+
+
 def test_unknown_name_lists_the_built_in_scenes() -> None:
     with pytest.raises(InputError, match=r"'brick' is neither .* path\. Did you mean 'bricks'\?\n.*bricks"):
         open_scene("brick")

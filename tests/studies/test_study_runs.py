@@ -12,11 +12,13 @@ from training_fixtures import SMALL
 
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.executors.base import Outcome, Resources
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest, CompareRequest, FitRequest
 from invgraphics.experiments.run import fit_run
+from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.studies import ablate as module
 from invgraphics.studies.ablate import ablate
-from invgraphics.studies.forecast import Cost, Forecast, total
+from invgraphics.studies.forecast import START_SECONDS, Cost, Forecast, total, try_method
 from invgraphics.training.budget import Budget
 
 METHOD = "splatting/gaussians"
@@ -75,6 +77,13 @@ def _record(request: AblateRequest) -> dict:
 
 def _yes(forecast: Forecast) -> None:
     assert forecast.hours < 1
+
+
+def test_the_time_of_pictures_by_another_kind_of_renderer_is_forecast(toy_folder: Path, tmp_path: Path) -> None:
+    """A mesh is made of the field first."""
+    request = FitRequest(method="volumetric/hash", scene=str(toy_folder), out=str(tmp_path / "run"), budget="2steps")
+    job = Job.of(replace(request, overrides=tuple(SMALL["volumetric/hash"]), render_with=("surface/mesh",)))
+    assert try_method(job, open_scene(str(toy_folder), SceneOptions())).other > START_SECONDS
 
 
 def test_a_study_runs_once_and_then_does_nothing(executor, request_of) -> None:

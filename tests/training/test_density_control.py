@@ -204,6 +204,26 @@ def test_white_scenes_are_reset_when_growth_begins(background: float, lowered: b
     assert float(torch.sigmoid(state.field.opacity_logits).min()) == pytest.approx(0.5)  # once only
 
 
+@pytest.mark.parametrize(("step", "lowered"), [(1, False), (498, False), (499, True)])
+def test_white_scenes_are_not_reset_before_gaussians_can_recover(step: int, lowered: bool) -> None:
+    """3DGS resets after 500 of 30,000 steps; in a budget of a few that share of it would leave nothing to see."""
+    state = _state(3)
+    state.scene = replace(state.scene, background=torch.ones(3))
+    state.step, state.ctx = step, replace(state.ctx, progress=0.5)
+    DensityControlConfig(every=1000, start=0.0167, white_reset=True, reset_spacing=3000).build().after_step(state)
+    assert (float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02) == lowered
+
+
+def test_the_start_of_growth_is_kept_to_the_bit() -> None:
+    """Rounded to float32, a resumed fit would have another cap in some rounds."""
+    state = _state(3)
+    state.ctx = replace(state.ctx, progress=0.1)
+    hook, again = (DensityControlConfig(every=1000, start=0.1).build() for _ in range(2))
+    hook.after_step(state)
+    again.load_state_dict(hook.state_dict())
+    assert float(again.state_dict()["started"]) == 0.1
+
+
 def test_growth_begins_by_steps_where_the_budget_is_long() -> None:
     """At a hundredth of the fit nothing is due by progress; after 500 steps it is, once and for all."""
     state = _state(3)

@@ -42,11 +42,11 @@ class Shared:
     """Change one value of the recipe, for instance --set batches.rays=2048 (`invgraphics list METHOD` shows all of a method's
     keys), or of the training data: data.train_views=10, data.size, data.pose_noise (degrees and per cent), data.photo_noise,
     data.exposure (stops), data.background, data.scales (divisors of the size, [1, 2, 4, 8]), data.test_scales (more scores, of
-    smaller pictures)."""
+    smaller pictures), data.init (points to start from: scene, sfm, random), data.box (scene: not that of the silhouettes)."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
-    """How many test views are scored, evenly spaced."""
+    """How many test views are scored: the first of a built-in scene, which are even, or evenly spaced ones."""
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
     """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None

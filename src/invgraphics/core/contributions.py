@@ -62,6 +62,7 @@ class Contributions:
         rgb: colours in the scene's colour space.
         counted: whether the colour is in the pixel's sum; samples of negligible weight are left out.
         density: at the samples, per local unit.
+        distance: mean distance of the light of each; ``None`` where that is ``t``.
         profile: density and transmittance in between.
         marched: for splats: the same Gaussians as overlapping densities, each with the optical depth of its alpha.
         passes: earlier passes of a sampler, first to last.
@@ -77,6 +78,7 @@ class Contributions:
     rgb: Float[Tensor, "k 3"]
     counted: Bool[Tensor, " k"]
     density: Float[Tensor, " k"] | None = None
+    distance: Float[Tensor, " k"] | None = None
     profile: Profile | None = None
     marched: Profile | None = None
     passes: tuple[Pass, ...] = ()
@@ -96,8 +98,9 @@ class Contributions:
 
     @property
     def expected_depth(self) -> float:
-        """Mean distance of the light, Σ w t / Σ w; infinite where there is none."""
-        return float((self.weight * self.t).sum()) / self.opacity if self.opacity > 0 else math.inf
+        """Mean distance of the light, Σ w t / Σ w with the ``distance`` of each; infinite where there is none."""
+        distance = self.t if self.distance is None else self.distance
+        return float((self.weight * distance).sum()) / self.opacity if self.opacity > 0 else math.inf
 
     @property
     def median_depth(self) -> float:

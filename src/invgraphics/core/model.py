@@ -63,27 +63,31 @@ class Model:
         """Render a picture as evaluation does: without randomness or gradients.
 
         Args:
-            camera: on any device; the picture is returned on the same one.
+            camera: on any device, in any precision; the picture is returned on the same device, in the model's.
             normals: whether normals are rendered, where the model has some; without them a picture can be faster.
 
         Returns:
             Premultiplied colour in the scene's colour space, alpha, depth in local units and normals, (height, width).
         """
-        rendering, _ = self.renderer.render_image(self.field, camera.to(self.device), self.context(normals=normals))
+        rendering, _ = self.renderer.render_image(self.field, self._own(camera), self.context(normals=normals))
         return rendering.detach().to(camera.focal.device)
+
+    def _own(self, camera: Camera) -> Camera:
+        """The camera on the model's device, in its precision."""
+        return camera.to(self.device).to(self.bounds.lo.dtype)
 
     @torch.no_grad()
     def contributions(self, camera: Camera, pixel: tuple[int, int]) -> Contributions:
         """Everything that `render` composites into one pixel.
 
         Args:
-            camera: on any device; the contributions are returned on the same one.
+            camera: on any device, in any precision; the contributions are returned on the same device.
             pixel: column and row, from 0.
 
         Raises:
             NotComposableError: the renderer composites nothing along rays that could be listed.
         """
-        found = self.renderer.contributions(self.field, camera.to(self.device), pixel, self.context())
+        found = self.renderer.contributions(self.field, self._own(camera), pixel, self.context())
         return found.to(camera.focal.device)
 
     @torch.no_grad()

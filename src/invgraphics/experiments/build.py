@@ -59,7 +59,7 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *
     check_memory(method, scene)
     torch.manual_seed(seed)
     field, renderer = method.recipe.field.build(scene), method.recipe.renderer.build(scene)
-    check_subjects(field, scene, method.name)
+    check_subjects(field, renderer, scene, method.name)
     model = Model(as_shown(field, renderer) if shown else field, renderer, scene.bounds)
     training = method.recipe.training
     if training is not None and training.poses is not None and training.poses.optimise:

@@ -20,8 +20,8 @@ def load_average() -> float | None:
         return None
 
 
-def fit_record(steps: int, clocks: Mapping[str, float | None]) -> FitRecord:
-    """Make the record of a fit's step count and clock readings (`training.fit.Fit.clocks`)."""
+def fit_record(steps: int, clocks: Mapping[str, float | None], peak_memory_bytes: int | None = None) -> FitRecord:
+    """Make the record of a fit's step count, clock readings (`training.fit.Fit.clocks`) and peak memory."""
     return FitRecord(
         steps=steps,
         seconds=clocks["seconds"],
@@ -29,6 +29,7 @@ def fit_record(steps: int, clocks: Mapping[str, float | None]) -> FitRecord:
         ran_seconds=clocks["ran_seconds"],
         waited_seconds=clocks["waited_seconds"],
         standstill_seconds=clocks["standstill_seconds"],
+        peak_memory_bytes=peak_memory_bytes,
     )
 
 

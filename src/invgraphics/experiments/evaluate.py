@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from invgraphics import locks
+from invgraphics.config import fill
 from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.errors import NumericalError
@@ -36,6 +37,7 @@ from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.run import truth_arrays, truth_picture
 from invgraphics.runs.scores import Scores
+from invgraphics.scenes.degrade import TrainingData, degrade
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
 
@@ -79,6 +81,7 @@ def evaluate(
     Where the fit has refined its training poses, test poses are aligned and refined first (see `experiments.posed`).
     """
     folder.arrays(0).parent.mkdir(exist_ok=True)
+    provenance = folder.read(Provenance)
     found = score_model(
         model,
         scene,
@@ -86,8 +89,8 @@ def evaluate(
         method.name,
         poses,
         keep=lambda index, picture: _save_view(folder, index, picture, scene),
+        seen=degrade(scene, fill(TrainingData, provenance.data), provenance.data_seed),
     )
-    provenance = folder.read(Provenance)
     quality, skipped = scaled_scores(model, scene, protocol, provenance.data, refined=poses is not None)
     result = replace(
         found,
@@ -112,6 +115,7 @@ def score_model(
     title: str,
     poses: Poses | None = None,
     keep: Callable[[int, Rendering], None] = lambda index, picture: None,
+    seen: Scene | None = None,
 ) -> Scores:
     """Render and score all test views of ``scene`` without a run folder; returns their quality and the model's cost.
 
@@ -124,6 +128,7 @@ def score_model(
         title: what the model is called, on the progress bar, in sentences and in the scores.
         poses: of the training views, where the fit has refined them: test poses are then aligned and refined first.
         keep: is given each picture with the number of its view.
+        seen: the scene as the fit saw it, for the mean training image; ``None`` where that is ``scene``.
 
     Raises:
         NumericalError: a value of the model is not finite.
@@ -159,7 +164,7 @@ def score_model(
         cost=_model_costs(model, scene, statistics.median(seconds)),
         quality=quality | surface | ({} if posed is None else posed.quality()),
         skipped=skipped | without,
-        below_baseline=below_baseline(title, quality, statistics_of_views, scene, rules),
+        below_baseline=below_baseline(title, quality, statistics_of_views, seen or scene, rules),
     )
 
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from torch import Tensor
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
@@ -16,6 +19,7 @@ from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.open import is_rendered
 from invgraphics.text import sha256_of
+from invgraphics.training.budget import Budget
 
 
 @dataclass(frozen=True)
@@ -25,15 +29,37 @@ class TruthDigest:
     Attributes:
         pixels: of the training, validation and test views.
         cameras: of all cameras.
+        rest: all else that fits and scores may read: masks, depth, normals, points, surface, bounds, background.
     """
 
     pixels: tuple[str, str, str]
     cameras: str
+    rest: str
 
     @staticmethod
     def of(scene: Scene) -> TruthDigest:
-        """Hash the pixels and cameras of ``scene``."""
-        return TruthDigest((scene.digest("train"), scene.digest("val"), scene.digest("test")), scene.camera_digest())
+        """Hash ``scene``, but for its notes."""
+        pixels = (scene.digest("train"), scene.digest("val"), scene.digest("test"))
+        sha = hashlib.sha256()
+        _update(sha, replace(scene, notes={}))
+        return TruthDigest(pixels, scene.camera_digest(), sha.hexdigest())
+
+
+def _update(sha: hashlib._Hash, value: object) -> None:
+    """Feed a value to a hash: dataclasses, tuples and tensors by what they hold, all else by its representation."""
+    if isinstance(value, Tensor):
+        sha.update(repr((tuple(value.shape), str(value.dtype))).encode())
+        sha.update(np.ascontiguousarray(value.detach().cpu().numpy()).tobytes())
+    elif is_dataclass(value) and not isinstance(value, type):
+        for part in fields(value):
+            sha.update(f"{part.name}:".encode())
+            _update(sha, getattr(value, part.name))
+    elif isinstance(value, tuple):
+        sha.update(f"{len(value)}:".encode())
+        for part in value:
+            _update(sha, part)
+    else:
+        sha.update(f"{value!r};".encode())
 
 
 def identify(job: Job, truth: TruthDigest, threads: int) -> str:
@@ -57,6 +83,7 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
             "recipe": method.digest,
             "truth": truth.pixels,
             "cameras": truth.cameras,
+            "rest": truth.rest,
             "data": job.data.changes(),
             "request": _fit_settings(job),
             "code": code_version(),
@@ -91,7 +118,7 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
     settings = {
         "scene": (found.scene, request.scene),
         "seed": (found.seed, request.seed),
-        "budget": (found.budget, request.budget),
+        "budget": (str(Budget.parse(found.budget)), str(job.budget)),
         "size": (found.options.size, request.size),
         "number of test views": (found.options.test_views, request.test_views),
         "samples per pixel": (found.options.spp, request.spp),
@@ -158,6 +185,6 @@ def define(job: Job) -> str:
 
 
 def _fit_settings(job: Job) -> dict[str, Any]:
-    """Collect the request's settings that determine a fit; budgets are normalised, whatever their spelling."""
-    settings = {key: getattr(job.request, key) for key in ("seed", "device", "kernels")}
-    return settings | {"budget": str(job.budget)}
+    """Collect the request's settings that determine a fit; budgets and devices are normalised, whatever their spelling."""
+    device = job.request.device if job.device.type != "cpu" else None  # the default, so that studies keep their folders' names
+    return {"seed": job.request.seed, "device": device, "kernels": job.request.kernels, "budget": str(job.budget)}

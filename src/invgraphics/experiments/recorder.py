@@ -19,6 +19,7 @@ from invgraphics.experiments.clocks import fit_record
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
 from invgraphics.interruption import Terminated
+from invgraphics.metrics.cost import PeakMemory
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import Moment
@@ -93,6 +94,7 @@ class Recorder:
         title: what the progress display says.
         snapshots: how many states of the model to keep, evenly over the fit, besides the first.
         on_step: is given the fit before its first step and after each one, on no clock.
+        memory: peak of the fit, saved with each checkpoint; ``None`` where nobody measures it.
 
     Attributes:
         history: each moment at which the monitor looked.
@@ -106,9 +108,10 @@ class Recorder:
         title: str,
         snapshots: int = 0,
         on_step: Callable[[Fit], None] | None = None,
+        memory: PeakMemory | None = None,
     ) -> None:
         self._fit, self._folder, self._cadence, self._title = fit, folder, cadence, title
-        self._on_step = on_step
+        self._on_step, self._memory = on_step, memory
         self.history: list[Moment] = []
         self._monitor = Monitor(fit.plan.scene, fit.plan.device)
         self._saved_at = (fit.steps, time.monotonic())
@@ -186,7 +189,8 @@ class Recorder:
         self._check_finite()
         if self._folder is not None:
             checkpoint.save(self._folder.checkpoint, self._fit.state())
-            self._folder.write(fit_record(self._fit.steps, self._fit.clocks()))
+            peak = None if self._memory is None else self._memory.peak_bytes
+            self._folder.write(fit_record(self._fit.steps, self._fit.clocks(), peak))
         self._saved_at = (self._fit.steps, time.monotonic())
 
     def _keep_snapshot(self, progress: float) -> None:

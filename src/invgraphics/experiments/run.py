@@ -110,10 +110,10 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         with PeakMemory(job.device) as memory:
             fit = prepare(job, shown)
             resumed = same and folder.resumable
-            if resumed:
-                _resumed(fit, job)
+            earlier = _resumed(fit, job) if resumed else None
             forecast = warm_up(fit, method, memory)  # which may refuse: the folder is as it was until then
-            if resumed:
+            if earlier is not None:
+                memory.include(earlier.peak_memory_bytes or 0)
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
@@ -125,21 +125,21 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
                 prediction = _prediction(job, scene, fit, forecast)
             for sentence in (*announcements([method.choice]), prediction):
                 print(sentence, file=sys.stderr)
-            Recorder(fit, folder, job.cadence, f"{method.name} seed {request.seed}", request.snapshots, on_step).run()
+            title = f"{method.name} seed {request.seed}"
+            Recorder(fit, folder, job.cadence, title, request.snapshots, on_step, memory).run()
         load = LoadAverage(start=began_at, end=load_average())
-        spent = replace(
-            fit_record(fit.steps, fit.clocks()), peak_memory_bytes=memory.peak_bytes, cores=cores(), load_average=load
-        )
+        spent = replace(fit_record(fit.steps, fit.clocks(), memory.peak_bytes), cores=cores(), load_average=load)
         _declare_clocks(folder, spent)
         _evaluate(job, scene, fit, spent)
         render_missing(job, scene)
 
 
-def _resumed(fit: Fit, job: Job) -> None:
-    """Load the folder's checkpoint into the fit, with the clocks at that moment."""
+def _resumed(fit: Fit, job: Job) -> FitRecord:
+    """Load the folder's checkpoint into the fit, with the clocks at that moment; returns the record of the time before."""
     earlier = job.folder.read(FitRecord)
     fit.load(checkpoint.load(job.folder.checkpoint, job.device), earlier.seconds or 0.0)
     fit.resume_clocks(asdict(earlier))
+    return earlier
 
 
 def prepare(job: Job, shown: Scene) -> Fit:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from invgraphics.core import Conditional, Field, Model, Scene, View
+from invgraphics.core import Conditional, Field, Model, Renderer, Scene, View
 from invgraphics.errors import InputError
+from invgraphics.renderers.occupancy import Occupancy
 from invgraphics.scenes.mitsuba.spec import class_names
 from invgraphics.training.codes.inference import CodeInference, infer_codes
 
@@ -13,8 +14,10 @@ OBSERVED = 1
 """Observed views of each unseen instance from which a run's scores infer it."""
 
 
-def check_subjects(field: Field, scene: Scene, method: str) -> None:
+def check_subjects(field: Field, renderer: Renderer, scene: Scene, method: str) -> None:
     """Check that a class of objects meets a field with codes, and a single subject one without.
+
+    An occupancy grid would know the mean code's cells only, and cull those of the instances.
 
     Raises:
         InputError: names the method and the scene.
@@ -30,6 +33,11 @@ def check_subjects(field: Field, scene: Scene, method: str) -> None:
         raise InputError(
             f"{method} learns a prior over a class of objects, and '{scene.name}' shows one subject.",
             f"Scenes of classes: {', '.join(class_names())}; or an .npz with the key 'subject'.",
+        )
+    if conditional and any(isinstance(part, Occupancy) for part in renderer.modules()):
+        raise InputError(
+            f"{method} shows many subjects, and an occupancy grid knows the empty space of one.",
+            "Choose another sampler, such as renderer.sampler.type = 'stratified'.",
         )
 
 

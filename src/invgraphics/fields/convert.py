@@ -18,6 +18,8 @@ from invgraphics.errors import InputError
 
 SAMPLES = 512
 """Intervals along a ray."""
+NEAREST = 1e-6
+"""Share of a ray's length at which its first interval begins at the earliest, where intervals grow with distance."""
 RAYS = 512
 """Rays that are looked along at once."""
 MAX_RAYS_PER_POINT = 64
@@ -106,4 +108,6 @@ def _edges(rays: Rays, bounds: Bounds) -> Float[Tensor, "n samples_plus_1"]:
     """Interval edges along rays: linear in distance in a box, logarithmic in a contracted space."""
     s = torch.linspace(0, 1, SAMPLES + 1, device=rays.near.device)
     near, far = rays.near[:, None], rays.far[:, None]
+    if bounds.space == "contracted":
+        near = near.maximum(NEAREST * far)
     return near * (far / near) ** s if bounds.space == "contracted" else near + (far - near) * s

@@ -90,7 +90,7 @@ class DepthMapField(Field):
         depths: distance along the unit ray of each pixel, infinite or 0 where nothing is hit.
 
     Attributes:
-        depth: these, 0 where nothing is hit: what is not finite in a field stops a fit.
+        depth: these, 0 where nothing is hit or the pixel does not count: what is not finite in a field stops a fit.
 
     Raises:
         InputError: the photographs differ in size.
@@ -114,7 +114,9 @@ class DepthMapField(Field):
         self.register_buffer("rgb", torch.stack([view.colour() for view in views]))
         self.register_buffer("alpha", torch.stack([view.opacity() for view in views]))
         depth = torch.stack(list(depths))
-        self.register_buffer("depth", torch.where(depth.isinf(), 0.0, depth))
+        everywhere = torch.ones(depth.shape[1:], dtype=torch.bool)
+        masks = [everywhere if view.mask is None else view.mask for view in views]
+        self.register_buffer("depth", torch.where(depth.isinf() | ~torch.stack(masks), 0.0, depth))
         for name, values in (("poses", "cam_to_world"), ("focal", "focal"), ("centre", "centre")):
             self.register_buffer(name, torch.stack([getattr(view.camera, values) for view in views]).detach().clone())
 

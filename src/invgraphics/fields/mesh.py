@@ -99,8 +99,9 @@ class MeshFieldConfig:
         def truth(index: int) -> Rendering:
             view = views[index]
             assert view.depth is not None
-            alpha = view.depth.isfinite().float()
-            return Rendering(view.colour() * alpha[..., None], alpha, view.depth, view.normal)
+            depth = view.depth if view.mask is None else torch.where(view.mask, view.depth, torch.inf)
+            alpha = depth.isfinite().float()
+            return Rendering(view.colour() * alpha[..., None], alpha, depth, view.normal)
 
         return fuse_depth([view.camera for view in views], truth, scene.bounds, self.resolution)
 

@@ -79,6 +79,7 @@ class NeuralField(Field):
 
     lo: Tensor
     hi: Tensor
+    _middle: Tensor
     geometry_net: Mlp
     colour_net: Mlp
 
@@ -97,7 +98,8 @@ class NeuralField(Field):
         self._near = bounds.near
         self.register_buffer("lo", bounds.lo.clone())
         self.register_buffer("hi", bounds.hi.clone())
-        self._half = float(bounds.half.mean())  # at the start: no crop changes densities or distances
+        self._half = float(bounds.half.mean())  # of the box at the start: no crop changes values
+        self.register_buffer("_middle", bounds.centre.clone(), persistent=False)
         self.encoding = build_encoding(config.encoding, bounds)
         self.appearance = None if config.appearance is None else build_encoding(config.appearance, bounds)
         self.density_activation = DensityActivation(
@@ -202,7 +204,7 @@ class NeuralField(Field):
     @override
     def fused_sdf(self, bounds: Bounds) -> FusedSDF | None:
         """Detached parameters of a signed distance over ``bounds``, its own: of a hash grid or octaves (see `sdf_parts`)."""
-        if not self._covers(bounds) or self.config.geometry != "sdf":
+        if not self._covers(bounds) or self.config.geometry != "sdf" or not torch.equal(self.bounds.centre, self._middle):
             return None
         return sdf_parts(self.config, self.encoding, self.geometry_net, self.bounds.half / self._half, self._half)
 
@@ -241,9 +243,8 @@ class NeuralField(Field):
 
     def _coordinates(self, unit: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
         """Positions from the middle of the box, in its mean half-extents; after contraction where space is contracted."""
-        # The box is half as long as the unit cube in a contracted space.
-        reach = 2 if self._space == "contracted" else 1
-        return (2 * unit - 1) * (reach * self.bounds.half / self._half)
+        bounds, reach = self.bounds, 2 if self._space == "contracted" else 1  # there the box has half the unit cube's edge
+        return (2 * unit - 1) * (reach * bounds.half / self._half) + (bounds.centre - self._middle) / self._half
 
     def _encode_activated(self, unit: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
         assert isinstance(self.encoding, LatticeFeatures)

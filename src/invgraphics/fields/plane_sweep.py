@@ -9,6 +9,8 @@ from torch import Tensor
 from invgraphics.core import Camera, Scene, View
 from invgraphics.core.planes import homographies, warp
 
+WHOLE = 0.999
+"""Share of the pixels around a texel's image that must count (`View.mask`) for it to be seen."""
 FEW = 2.0
 """Views that must see a texel for their agreement to count in full."""
 
@@ -41,15 +43,18 @@ def plane_sweep(
     total = torch.zeros(len(depths), 6, size[1], size[0])
     seen, colour = torch.zeros(len(depths), size[1], size[0]), torch.zeros(len(depths), 3, size[1], size[0])
     for view in chosen:
+        mask = torch.ones(view.image.shape[:2]) if view.mask is None else view.mask.float()
+        layers = torch.cat([premultiplied(view), mask[None]])
         # The third coordinate of the inverse is positive where that of the map is: before the view, on planes before it.
         maps = torch.linalg.inv(homographies(camera, depths, view.camera))
         for plane, to_view in enumerate(maps):
-            values, inside, _ = warp(premultiplied(view)[None], to_view[None], size)
+            values, inside, _ = warp(layers[None], to_view[None], size)
             rgb, alpha = values[0, :3], values[0, 3]
-            total[plane, :3] += inside[0] * rgb
-            total[plane, 3] += inside[0] * alpha
-            total[plane, 4] += inside[0] * rgb.square().sum(dim=0) / 3
-            seen[plane] += inside[0]
+            counts = inside[0] * (values[0, 4] >= WHOLE)
+            total[plane, :3] += counts * rgb
+            total[plane, 3] += counts * alpha
+            total[plane, 4] += counts * rgb.square().sum(dim=0) / 3
+            seen[plane] += counts
     n = seen.clamp_min(1)
     colour = total[:, :3] / total[:, 3:4].clamp_min(1e-3)
     mean = total[:, :3] / n[:, None]

@@ -119,7 +119,7 @@ def depth_points(scene: Scene, most: int) -> Points:
 
 
 def _seen_points(view: View, most: int) -> Points:
-    """Unproject a view's depth map to points; transparent pixels are left out."""
+    """Unproject a view's depth map to points; pixels that show nothing or do not count are left out."""
     assert view.depth is not None
     depth = view.depth.reshape(-1)
     hit = torch.isfinite(depth)

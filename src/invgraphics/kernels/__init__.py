@@ -231,7 +231,7 @@ def splat_project(
         antialiased: opacity compensation: the filter keeps a footprint's integral, not its peak (Mip-Splatting, §4.2).
 
     Returns:
-        Conic footprints, culled where the 99% ellipsoid misses the frustum; and rgb = max(0, SH(direction) + 0.5).
+        Conic footprints, culled where what is opaquer than 1/255 misses the frustum; and rgb = max(0, SH(direction) + 0.5).
     """
     return choose("splat_project", gaussians.means)(gaussians, camera, dilation, antialiased)
 

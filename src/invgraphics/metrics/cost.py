@@ -68,6 +68,10 @@ class PeakMemory:
         self._read()
         return self._peak - self._start
 
+    def include(self, peak: int) -> None:
+        """Count a peak of earlier work, in bytes above its own start: that of the process whose fit is resumed."""
+        self._peak = max(self._peak, self._start + peak)
+
     def _restart(self) -> None:
         """Set the record of the largest amount back to what is held now."""
         if self._device.type == "cuda":

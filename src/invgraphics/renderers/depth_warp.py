@@ -70,11 +70,10 @@ class DepthWarp(Renderer):
         if ctx.geometry:
             normal = normals_from_depth(means[..., 4].detach(), alpha.detach() >= MIN_SURFACE_ALPHA, directions.detach())
         far = torch.full_like(alpha, torch.inf)
-        colour = means[..., :3] * alpha[..., None]
-        return to_rendering(colour, alpha, means[..., 4] * alpha, normal, far, directions), Trace(rays=alpha.numel())
+        return to_rendering(means[..., :3], alpha, means[..., 4] * alpha, normal, far, directions), Trace(rays=alpha.numel())
 
     def _warp(self, view: View, camera: Camera) -> tuple[Float[Tensor, "p 5"], Bool[Tensor, " p"]]:
-        """Mean colour, alpha and distance of a photograph's nearest surface in each pixel, and whether it reaches the pixel."""
+        """Mean premultiplied colour, alpha, distance of a photograph's nearest surface in each pixel, and where it is."""
         pixel, weight, distance, values = _splat(view, camera)
         count = camera.width * camera.height
         kept = distance.detach() <= _first(pixel, weight, distance, count)[pixel] * (1 + self.config.tolerance)
@@ -97,7 +96,7 @@ def _first(
 def _splat(
     view: View, camera: Camera
 ) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, "n 4"]]:
-    """Warp a photograph's pixels: the target pixels that each touches, weights, distances from ``camera``, colour and alpha."""
+    """Warp a photograph's pixels: target pixels that each touches, weights, distances from ``camera``, premultiplied RGBA."""
     assert view.depth is not None
     depth = view.depth.reshape(-1)
     hit = depth.isfinite().nonzero()[:, 0]
@@ -106,7 +105,8 @@ def _splat(
     place, z = camera.project(points)
     corner = (place.detach() - 0.5).floor()
     distance = (points - camera.position).norm(dim=1)
-    values = torch.cat([view.colour(hit), view.opacity(hit)[:, None]], dim=1)
+    alpha = view.opacity(hit)[:, None]
+    values = torch.cat([alpha * view.colour(hit), alpha], dim=1)
     parts = []
     for offset in ((0, 0), (1, 0), (0, 1), (1, 1)):
         target = corner + corner.new_tensor(offset)

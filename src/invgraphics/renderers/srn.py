@@ -181,7 +181,11 @@ class _Within(torch.autograd.Function):
 
 
 def within(x: Float[Tensor, " n"], low: Float[Tensor, " n"], high: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Clamp to [low, high]; where a value is cut off, descent may bring it back, but not push it further."""
+    """Clamp to [low, high]; where a value is cut off, descent may bring it back, but not push it further.
+
+    That is no gradient of the clamp: where points are cut off, gradients in the camera's pose, on which the limits and earlier
+    points depend too, are wrong.
+    """
     result = _Within.apply(x, low, high)
     assert isinstance(result, Tensor)
     return result

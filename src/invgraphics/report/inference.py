@@ -58,6 +58,10 @@ class Row:
     seconds: str
 
 
+ONE_FIT = "One fit of each: intervals are over instances, and say nothing of another fit."
+"""Beside differences between fits."""
+
+
 @dataclass(frozen=True)
 class Differences:
     """Table of a metric over numbers of views: each way's mean, and its difference from the first way.
@@ -95,8 +99,8 @@ def build_inference_report(folder: Path) -> Path:
         figures = [
             one for key, label in DRAWN.items() if (one := draw_few_views(record, key, label, folder / "figures")) is not None
         ]
-        worth = [_differences(record, key, [first, *baselines]) for key in DRAWN] if len(counts) > 1 else []
-        fits = [_differences(record, key, priors) for key in DRAWN] if len(priors) > 1 else []
+        worth = [_differences(record, key, [first, *baselines], bold=True) for key in DRAWN] if len(counts) > 1 else []
+        fits = [_differences(record, key, priors, bold=False) for key in DRAWN] if len(priors) > 1 else []
         context = {
             "record": record,
             "rows": rows,
@@ -108,6 +112,7 @@ def build_inference_report(folder: Path) -> Path:
             "fits": fits,
             "figures": figures,
             "strips": {n: _strips(record, n) for n in counts if n in record.pictures},
+            "one_fit": ONE_FIT,
             "count": len({one.subject for one in record.instances}),
             "environment": {"date": record.date},
         }
@@ -166,9 +171,11 @@ def _rows(record: Inference) -> list[Row]:
     return rows
 
 
-def _differences(record: Inference, metric: str, ways: Sequence[str]) -> Differences:
+def _differences(record: Inference, metric: str, ways: Sequence[str], *, bold: bool) -> Differences:
+    """Table of a metric; ``bold`` where chance is that of the instances alone, as it is not between two fits."""
+
     def words(cell: Cell) -> tuple[str, str, bool]:
-        return _text(metric, cell.mean), "" if cell.gain is None else _signed(cell.gain), cell.certain
+        return _text(metric, cell.mean), "" if cell.gain is None else _signed(cell.gain), bold and cell.certain
 
     table = table_of(record, metric, ways)
     return Differences(DRAWN[metric], {how: [words(cell) for cell in cells.values()] for how, cells in table.items()})
@@ -200,6 +207,7 @@ def _markdown(context: dict, place: Folder) -> str:
             lines.append(f"| {text(how)} | {' | '.join(words)} |")
         lines.append("")
     if context["fits"]:
+        lines += [ONE_FIT, ""]
         lines += ["| fit | parameters | budget | steps | seconds |", "|---|---|---|---|---|"]
         for how, fit in record.fits.items():
             seconds = "–" if fit.seconds is None else f"{fit.seconds:.0f}"

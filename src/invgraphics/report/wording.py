@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -159,9 +160,9 @@ def listing(items: Iterable[str]) -> str:
 
 
 def budget_words(budget: str) -> str:
-    """Format a budget: ``60s`` -> ``60 s``; ``5min`` -> ``5 min``; ``5000steps`` -> ``5,000 steps``."""
-    for unit in ("steps", "min", "h", "s"):
-        amount = budget.removesuffix(unit)
-        if amount != budget and amount.replace(".", "", 1).isdigit():
-            return f"{int(float(amount)):,} {unit}" if unit == "steps" else f"{float(amount):,g} {unit}"
-    return budget
+    """Format a budget: ``60s`` -> ``60 s``; ``5m`` and ``5min`` -> ``5 min``; ``5000steps`` -> ``5,000 steps``."""
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(steps?|s|min|m|h)\s*", budget)
+    if found is None:
+        return budget
+    amount, unit = float(found.group(1)), {"m": "min", "step": "steps"}.get(found.group(2), found.group(2))
+    return f"{int(amount):,} {unit}" if unit == "steps" else f"{amount:,g} {unit}"

@@ -20,7 +20,7 @@ class FitRecord(Record):
         ran_seconds: that busy threads had a core; ``None`` where the system does not say.
         waited_seconds: that busy threads waited for a core.
         standstill_seconds: in which the process was stopped or its machine suspended; not among ``seconds``.
-        peak_memory_bytes: most memory above what the process held before the fit; known at its end.
+        peak_memory_bytes: most memory so far above what its process held before the fit, the largest where a fit was resumed.
         cores: that the process may use; known at the end.
         load_average: known at the end.
     """

@@ -167,3 +167,9 @@ class Provenance(Record):
     fitted_run: str | None = None
     fitted_by: str | None = None
     rendered_by: str | None = None
+
+    @property
+    def data_seed(self) -> int:
+        """Seed with which the training photographs were degraded: a converted run's are those of the fit that it began as."""
+        origin = self.converted
+        return self.seed if origin is None or origin.data_seed is None else origin.data_seed

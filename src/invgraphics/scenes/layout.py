@@ -38,8 +38,9 @@ class SceneOptions:
 
     Attributes:
         size: longest side in pixels, or (width, height); ``None`` leaves pictures as they are.
-        test_views: number of views to score, evenly spaced among those held out; ``None`` means all.
-        train_views: number of views to fit, evenly spaced; ``None`` means all.
+        test_views: number of views to score, evenly spaced among those held out (of a rendered scene the
+            first, which are even); ``None`` means all.
+        train_views: number of views to fit, likewise.
         seed: seed of whatever has to be rendered first.
         spp: samples per pixel of the training views of a scene that is rendered; ``None`` for what its description says.
     """

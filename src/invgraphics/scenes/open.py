@@ -16,6 +16,7 @@ from invgraphics.core import Scene, View
 from invgraphics.core.believable import check_scene
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions
+from invgraphics.scenes.pictures.images import image_files
 from invgraphics.scenes.poses import poses
 
 __all__ = [
@@ -120,6 +121,10 @@ def find_loader(path: Path) -> Loader:
         if loader.matches(path):
             return loader
     what = "is an empty folder" if path.is_dir() and not any(path.iterdir()) else "is not a data set of a known format"
+    if path.is_dir() and image_files(path):
+        raise InputError(
+            f"{path} holds photographs without poses.", f"Run `invgraphics import-photos {path} --out SCENE`, then give SCENE."
+        )
     raise InputError(
         f"{path} {what}.",
         "Looked for truth.json, transforms_train.json, transforms.json, poses_bounds.npy, sparse/0/cameras.bin, cameras*.npz "

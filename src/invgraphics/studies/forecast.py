@@ -11,8 +11,9 @@ from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.build import build_model, build_plan, use_kernels
 from invgraphics.experiments.evaluate import expected_seconds
 from invgraphics.experiments.job import Job, training_scene
+from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.start import CHECKPOINT_COPIES
-from invgraphics.experiments.variants import with_renderer
+from invgraphics.experiments.variants import RendererVariant, with_renderer
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.text import duration
 from invgraphics.training.budget import Budget
@@ -99,14 +100,23 @@ def try_method(job: Job, scene: Scene) -> Cost:
         fit = Fit(build_plan(job.method, shown, job.budget, seed, device))
         step = _try_steps(fit)
         evaluation = expected_seconds(fit.plan.model, scene)
-        for variant in job.variants:
-            evaluation += expected_seconds(build_model(with_renderer(job.method, variant), scene, seed, device), scene)
+        check_variants(job.variants, [job.method], scene)
+        evaluation += sum(_seconds_through(variant, job, scene) for variant in job.variants)
         size = CHECKPOINT_COPIES * model_bytes(fit.plan.model.parts.values())
     except InputError:
         raise
     except (NumericalError, MemoryError, RuntimeError):  # its cell will fail with a sentence, and the others go on
         return Cost(0.0, START_SECONDS, 0)
     return Cost(step, START_SECONDS + evaluation, size + PIXEL_BYTES * pixels * (1 + len(job.variants)))
+
+
+def _seconds_through(variant: RendererVariant, job: Job, scene: Scene) -> float:
+    """Expected seconds of the pictures through another renderer; 0 where a new field has nothing that it could show, yet."""
+    model = build_model(with_renderer(job.method, variant), scene, job.request.seed, job.device, shown=True)
+    try:
+        return expected_seconds(model, scene)
+    except InputError:
+        return 0.0
 
 
 def _try_steps(fit: Fit) -> float:

@@ -117,7 +117,7 @@ def convert_run(request: ConvertRequest) -> Converted:
     _check_empty(folder)
     configure_torch(job.device)
     use_kernels(request.kernels, job.device)
-    shown = degrade(fitted.scene, job.data, _data_seed(fitted.folder.read(Provenance)))
+    shown = degrade(fitted.scene, job.data, fitted.folder.read(Provenance).data_seed)
     plan = build_plan(job.method, shown, job.budget, request.seed, job.device)
     torch.manual_seed(request.seed)
     size = request.size or request.target.size
@@ -173,12 +173,6 @@ def _scores(model: Model, fitted: Fitted, title: str) -> Scores:
     return score_model(model, fitted.scene, "default", title)
 
 
-def _data_seed(provenance: Provenance) -> int:
-    """Seed with which a run's training photographs were degraded: a converted run's are those of the fit that it began as."""
-    origin = provenance.converted
-    return provenance.seed if origin is None or origin.data_seed is None else origin.data_seed
-
-
 def _origin(request: ConvertRequest, fitted: Fitted, native: Scores, converted: Scores) -> ConvertedRun:
     return ConvertedRun(
         run=str(request.run),
@@ -188,7 +182,7 @@ def _origin(request: ConvertRequest, fitted: Fitted, native: Scores, converted: 
         hub=request.target.hub,
         native_psnr=native.quality["psnr"].mean,
         converted_psnr=converted.quality["psnr"].mean,
-        data_seed=_data_seed(fitted.folder.read(Provenance)),
+        data_seed=fitted.folder.read(Provenance).data_seed,
     )
 
 

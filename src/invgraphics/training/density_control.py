@@ -15,6 +15,9 @@ from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters, cap_at
 from invgraphics.training.hooks import FitState, Hook
 
+WHITE_RESET_STEP = 500
+"""Step of 3DGS's reset against a white background; Gaussians that are reset much sooner do not become opaque again."""
+
 
 @dataclass(frozen=True)
 class DensityControlConfig:
@@ -36,7 +39,7 @@ class DensityControlConfig:
         reset_spacing: least number of steps before the first reset and between two; one that is due sooner is left out. Within
             fewer steps Gaussians neither shrink below ``prune_pixels`` nor become opaque again, and most are pruned.
         white_reset: whether they are also reset at ``start`` where the scene's background is white, before splats of the
-            background's colour settle in front of it.
+            background's colour settle in front of it; left out before step 500 (3DGS's own) or ``reset_spacing``, if sooner.
         max_primitives: cap on the number of Gaussians; those with the largest gradients grow first.
         cap_ramp: progress, from the start of growth on, over which the cap rises from the first number to ``max_primitives``,
             by equal factors; 0 for at once.
@@ -161,13 +164,19 @@ class DensityControl(Hook):
             if state.step + 1 - self._last_reset >= config.reset_spacing:
                 self._last_reset = state.step + 1
                 self._reset_opacities(state)
-        if starts and config.white_reset and bool((state.scene.background >= 1).all()):
+        if starts and self._resets_at_start(state):
             self._reset_opacities(state)
 
     def _due_to_start(self, state: FitState) -> bool:
         """Whether growth may begin: by progress, or by steps in long budgets."""
         latest = self._config.latest_start_step
         return state.ctx.progress >= self._config.start or (0 < latest <= state.step)
+
+    def _resets_at_start(self, state: FitState) -> bool:
+        """Whether opacities are reset as growth begins: against a white background, unless that is too early to recover."""
+        soonest = min(self._config.reset_spacing, WHITE_RESET_STEP)
+        white = self._config.white_reset and bool((state.scene.background >= 1).all())
+        return white and state.step + 1 >= soonest
 
     @torch.no_grad()
     def _reset_opacities(self, state: FitState) -> None:
@@ -253,7 +262,7 @@ class DensityControl(Hook):
             "max_radius": self._max_radius,
             "resets_due": torch.tensor(self._resets_due),
             "last_reset": torch.tensor(self._last_reset),
-            "started": torch.tensor(self._started),
+            "started": torch.tensor(self._started, dtype=torch.float64),
             "first_count": torch.tensor(self._first_count),
         }
 

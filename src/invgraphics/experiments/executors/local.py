@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Generator, Sequence
@@ -14,12 +16,14 @@ from pathlib import Path
 from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.request import FitRequest
-from invgraphics.interruption import INTERRUPTED, WITH_PARENT
+from invgraphics.interruption import INTERRUPTED, WITH_PARENT, Terminated
 from invgraphics.runs.schema import write_json
 from invgraphics.tables import read_json
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables from which libraries take their number of threads."""
+PATIENCE = 30.0
+"""Seconds in which an interrupted fit ends its step, or what is being compiled."""
 
 
 def cores() -> int:
@@ -65,8 +69,18 @@ class FitProcess:
         return Outcome(self._request, status, error, time.monotonic() - self._began)
 
     def stop(self) -> None:
-        """Signal the fit to write a checkpoint and end; after Ctrl-C it does so already, a second signal changes nothing."""
-        self._process.terminate()
+        """Interrupt the fit, which ends its step and writes a checkpoint; terminate it after `PATIENCE` seconds.
+
+        After Ctrl-C at a terminal it is interrupted already, and again changes nothing. Where this process was terminated, its
+        fits are, too: there is no time for a long step.
+        """
+        if Terminated.raised:
+            self._process.terminate()
+            return
+        self._process.send_signal(signal.SIGINT)
+        last = threading.Timer(PATIENCE, self._process.terminate)
+        last.daemon = True
+        last.start()
 
     def _error(self, status: int) -> str:
         try:

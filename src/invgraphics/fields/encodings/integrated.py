@@ -72,7 +72,7 @@ class IntegratedEncoding(Windowed):
         spread = None
         if covariance is not None and self.config.integrated:
             outer = (directions[:, :, None] * directions[:, None, :]).flatten(1)
-            spread = 4 * (covariance.flatten(1) @ outer.T)
+            spread = 4 * (covariance.flatten(1) @ outer.T).clamp_min(0)  # J Σ Jᵀ loses its digits in long far intervals
         features = expected_frequencies(along, spread, self.config.octaves)
         weights = self.level_weights()
         if weights is None:

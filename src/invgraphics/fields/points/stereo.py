@@ -96,7 +96,7 @@ def _shrunk(view: View, bounds: Bounds) -> _Picture:
         size = max(1, round(camera.height * shrink)), max(1, round(camera.width * shrink))
         layers, counts = (interpolate(each[None], size, mode="area")[0] for each in (layers, counts[None]))
         camera, counts = camera.resized(size[1], size[0]), counts[0]
-    distance = float((camera.position - bounds.centre).norm())
+    distance = max(float((camera.position - bounds.centre).norm()), NEAREST * bounds.radius)
     if bounds.space == "box":
         near, far = max(distance - bounds.radius, NEAREST * distance), distance + bounds.radius
     else:

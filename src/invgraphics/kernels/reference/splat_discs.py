@@ -90,5 +90,6 @@ def half_width(
     middle = dual[:, :2, 2] / last[:, None]
     spread = (middle.square() - dual.diagonal(dim1=1, dim2=2)[:, :2] / last[:, None]).clamp_min(0.0).sqrt()
     farthest = ((middle - means2d).abs() + spread).amax(dim=1)
-    everywhere = (means2d - camera.centre).norm(dim=1) + camera.width + camera.height
+    size = means2d.new_tensor([camera.width, camera.height])
+    everywhere = torch.maximum(means2d.abs(), (size - means2d).abs()).amax(dim=1)
     return torch.where(bounded, farthest, everywhere)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from invgraphics.core import Profile, Rays
@@ -41,6 +41,21 @@ def density_profile(
 def transmittance(
     at: Float[Tensor, " p"], t: Float[Tensor, " k"], sigma: Float[Tensor, " k"], depth: Float[Tensor, " k"], rays: Rays
 ) -> Float[Tensor, " p"]:
-    """Transmittance at distances ``at`` through Gaussians of given optical depths."""
-    passed = phi((at[:, None] - t) / sigma) - phi((rays.near[0] - t) / sigma)
+    """Transmittance at distances ``at``, 1 before the near plane, through Gaussians of given optical depths."""
+    passed = phi((at.maximum(rays.near[0])[:, None] - t) / sigma) - phi((rays.near[0] - t) / sigma)
     return torch.exp(-(passed * depth).sum(dim=1))
+
+
+def mean_distances(
+    moment: Float[Tensor, " p"] | None, order: Int[Tensor, " k"], weight: Float[Tensor, " k"], t: Float[Tensor, " k"]
+) -> Float[Tensor, " k"]:
+    """Mean distance of the light of each of k Gaussians, its largest response where it gives none.
+
+    Args:
+        moment: weights times distances of all intersections.
+        order: those that are listed.
+        weight: their weights.
+        t: distances of their largest responses.
+    """
+    assert moment is not None
+    return torch.where(weight > 0, moment[order] / weight.clamp_min(torch.finfo(weight.dtype).tiny), t)

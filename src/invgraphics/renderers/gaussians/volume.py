@@ -26,7 +26,7 @@ from invgraphics.kernels.reference.gaussian_rays import (
     precompute,
 )
 from invgraphics.renderers.base import to_rendering
-from invgraphics.renderers.gaussians.profile import density_profile, transmittance
+from invgraphics.renderers.gaussians.profile import density_profile, mean_distances, transmittance
 
 TILE = 16
 """Edge in pixels of the square whose rays are searched for Gaussians together."""
@@ -203,7 +203,7 @@ class GaussianExact(GaussianRays):
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
         """Contributions by distance, with the transmittance of the whole mixture."""
-        weight, _ = self.blending_weights(intersections, rays, axis, False)
+        weight, moment = self.blending_weights(intersections, rays, axis, True)
         order = intersections.t.argsort(stable=True)
         order = order[intersections.depth[order] > 0]
         t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
@@ -217,6 +217,7 @@ class GaussianExact(GaussianRays):
             weight=weight,
             rgb=colours(primitives, intersections)[order],
             counted=torch.ones_like(order, dtype=torch.bool),
+            distance=mean_distances(moment, order, weight, t),
             profile=density_profile(t, sigma, depth, rays),
         )
 
@@ -257,7 +258,7 @@ class GaussianSorted(GaussianRays):
         self, intersections: Intersections, primitives: Primitives, rays: Rays, axis: Float[Tensor, 3]
     ) -> Contributions:
         """Contributions in compositing order, with the profile of the same Gaussians as overlapping densities."""
-        weight, _ = self.blending_weights(intersections, rays, axis, False)
+        weight, moment = self.blending_weights(intersections, rays, axis, True)
         order = self.order(intersections, rays, axis)
         order = order[intersections.depth[order] > 0]  # those below the splats' limit are on the ray all the same
         t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
@@ -272,6 +273,7 @@ class GaussianSorted(GaussianRays):
             weight=weight,
             rgb=colours(primitives, intersections)[order],
             counted=torch.ones_like(order, dtype=torch.bool),
+            distance=mean_distances(moment, order, weight, t),
             marched=density_profile(t, sigma, depth, rays),
         )
 

@@ -128,7 +128,7 @@ def read_study(folder: Path) -> Study:
         scenes=_in_stated_order([shown[scene] for scene in record.scenes], (cell.scene for cell in cells)),
         methods=_in_stated_order(record.methods, (cell.method for cell in cells)),
         seeds=tuple(sorted({cell.seed for cell in cells})),
-        budget=record.budget,
+        budget=_budget_of(cells, record.budget),
         preset=record.preset or "",
         size=_size_text(record.size),
         protocol=record.protocol,
@@ -184,6 +184,12 @@ def _comparison(
         protocol=study.protocol,
         environment=study.environment,
     )
+
+
+def _budget_of(cells: Sequence[StudyCell], stated: str) -> str:
+    """The budget that all cells share; empty where it is a factor."""
+    own = {cell.budget for cell in cells if cell.budget}
+    return stated if not own else own.pop() if len(own) == 1 else ""
 
 
 def _scene_names(scenes: Sequence[str]) -> dict[str, str]:

@@ -164,7 +164,7 @@ def _any(layer: Layer) -> bool:
 
 
 def _captioned(shown: Sequence[_Shown], pictures: Sequence[Picture], keys: Sequence[str], index: int) -> list[Picture]:
-    """Add each run's scores on the view; none is marked, since a single picture tells nothing from chance."""
+    """Add each run's scores on the view; none is marked, since a single picture cannot be told from chance."""
     captions: list[list[str]] = [[] for _ in shown]
     for key in keys:
         values = [_view_score(one.run, key, index) for one in shown]

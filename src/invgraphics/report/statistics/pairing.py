@@ -258,14 +258,15 @@ def _by_seed(before: Table, after: Table, quantity: Quantity) -> dict[int, float
 def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantity: Quantity) -> Float[ndarray, " seed"]:
     """One value per seed of one side, averaged over the strata that both sides have; seeds that lack one are left out."""
     found: dict[int, list[float]] = {}
+    strata = 0
     for key in shared:
         runs = [one.run for one in table[key].values()]
         values = run_values((*runs, *(one.run for one in other[key].values())), quantity)
         if values is not None:
+            strata += 1
             for seed, value in zip(table[key], values, strict=False):
                 found.setdefault(seed, []).append(value)
-    most = max(map(len, found.values()), default=0)
-    return np.array([sum(values) / most for values in found.values() if len(values) == most])
+    return np.array([sum(values) / strata for values in found.values() if len(values) == strata])
 
 
 def run_values(runs: Sequence[Run], quantity: Quantity) -> list[float] | None:

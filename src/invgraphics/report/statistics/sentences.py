@@ -99,7 +99,7 @@ def _unmeasured(effect: Effect, magnitude: str) -> str:
     if value.mean == 0 and (value.seeds[1] > 1 or value.scenes > 1):
         return f"{effect.label}: no difference at all, {value.size}."
     if value.seeds[1] == 1 and value.scenes == 1:
-        return f"{_subject(effect)} {magnitude} in the one seed there is: an observation, which tells nothing from chance."
+        return f"{_subject(effect)} {magnitude} with one seed only, which cannot be told from chance."
     words = f"{_subject(effect)} {magnitude} by the same amount each time, {value.size}"
     return f"{words}: no spread is known, so nothing is tested."
 

@@ -12,7 +12,7 @@ from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.intervals import mean_half_width
 from invgraphics.report.statistics.leaders import leaders
 from invgraphics.report.statistics.values import diverged, value_of
-from invgraphics.report.wording import ABSENT, COSTS, TIMES, Quantity, budget_words, metric_label, quality_quantity
+from invgraphics.report.wording import ABSENT, COSTS, TIMES, Quantity, metric_label, quality_quantity
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.run import Run
 from invgraphics.runs.scores import Score
@@ -161,7 +161,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
     """Columns of the summary: quality metrics, then the costs that any run has."""
-    time_budget = budget_words(comparison.budget).endswith(" s")
+    time_budget = bool(comparison.budget) and "step" not in comparison.budget
     costs = []
     for cost in COSTS:
         redundant = cost.key == "render_seconds_per_view"
