@@ -63,7 +63,6 @@ def _lens(**values: object) -> View:
         ({"val": (replace(view(4), image=torch.full((6, 8, 3), torch.nan)),)}, "image of val view 'v4' .* not finite"),
         ({"val": (replace(view(4), depth=torch.full((6, 8), torch.nan)),)}, "depth of val view 'v4' .* not finite"),
         ({"test": (view(2), view(1))}, "train view 'v1' and the test view 'v1' of 'toy' share a camera"),
-        ({"test": (view(2), view(3))}, "val view 'v3' and the test view 'v3' of 'toy' share a camera"),
     ],
 )
 def test_bad_scenes_are_refused(change: dict, sentence: str) -> None:
@@ -206,3 +205,18 @@ def test_poses_of_a_class_are_made_rigid_as_each_alone_is() -> None:
     for bad, words in ((matrices[3] * 2, "not rigid"), (matrices[3] * torch.tensor([1, 1, -1, 1]), "left-handed")):
         with pytest.raises(InputError, match=f"pose of view 3 is {words}"):
             poses(torch.cat([matrices[:3], bad[None], matrices[4:]]), "view {}".format)
+
+
+def test_test_views_are_not_watched_too() -> None:
+    """Data sets with one list for both: what is scored stays, what is only looked at goes."""
+    found = validate(scene().with_views(test=(view(2), view(3)), val=(view(3), view(4))))
+    assert [one.name for one in found.test] == ["v2", "v3"]
+    assert [one.name for one in found.val] == ["v4"]
+    assert found.notes["val_views"] == "1 that are test views, too, are left out"
+
+
+def test_a_principal_point_far_outside_is_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
+    validate(scene())
+    assert capsys.readouterr().err == ""
+    validate(scene().with_views(train=(view(0), _lens(centre=torch.tensor([40.0, 3.0])))))
+    assert "Warning: 'v1' has its principal point far outside the picture" in capsys.readouterr().err

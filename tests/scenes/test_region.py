@@ -49,6 +49,14 @@ def test_frame_measures_in_its_own_units() -> None:
     assert (plain.near, float(plain.hi[0])) == (NEAR, 1.0)
 
 
+def test_a_tripod_may_stand_anywhere() -> None:
+    """The mean of equal positions differs from them by rounding, which is no distance between cameras."""
+    poses = ring(0.0).double()
+    poses[:, :3, 3] = torch.tensor([0.1, 1.7, 2.3], dtype=torch.float64)
+    frame = contracted_frame(poses)
+    assert frame.scale == pytest.approx(1.0)
+
+
 def test_the_choice_of_bounds_is_described() -> None:
     assert space_note(toy_scene(views=2, size=4)) == ""
     note = space_note(toy_scene(views=2, size=4, space="contracted"))

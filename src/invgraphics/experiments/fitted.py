@@ -21,7 +21,7 @@ from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
-from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.scenes.open import SceneOptions, is_found, open_scene
 from invgraphics.training.poses import Poses
 
 
@@ -72,6 +72,9 @@ def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
     provenance = folder.read(Provenance)
     chosen = provenance.options
     options = SceneOptions(chosen.size, chosen.test_views, spp=None if scene_spec else chosen.spp)
+    if scene_spec is None and not is_found(provenance.scene):
+        sentence = f"The scene of {run}, '{provenance.scene}', is not found from here."
+        raise InputError(sentence, "Give its path with --scene, or work where the run was fitted.")
     return load_fitted(folder, open_scene(scene_spec or provenance.scene, options))
 
 

@@ -128,3 +128,27 @@ def _parameter_counts() -> dict[int, int]:
 
     models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
     return {int(model): len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params) for model in models}
+
+
+def check_images_text(path: Path) -> None:
+    """Check that each image of an ``images.txt`` has its second line, of points: COLMAP takes every second line for one.
+
+    Raises:
+        InputError: a line of points is that of another image.
+    """
+    if not path.is_file():
+        return
+    lines = [line for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if not line.startswith("#")]
+    for line in lines[1::2]:
+        last = line.split()[-1:] or ["0"]
+        if not _is_number(last[0]):
+            sentence = f"{path} has no line of points after each image: '{last[0]}' follows another image at once."
+            raise InputError(sentence, "Add an empty line after each image, as COLMAP writes it.")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.scenes.colmap_sizes import check_sizes
+from invgraphics.scenes.colmap_sizes import check_images_text, check_sizes
 from invgraphics.scenes.layout import IMAGE_FOLDERS, is_image_folder
 from invgraphics.scenes.pictures.images import file_exists
 
@@ -104,6 +104,7 @@ def _read(folder: Path) -> Model:
     from invgraphics.scenes.colmap_library import pycolmap
 
     check_sizes(folder)
+    check_images_text(folder / "images.txt")
     try:
         reconstruction = pycolmap.Reconstruction(str(folder))
     except (ValueError, IndexError, RuntimeError, MemoryError) as error:

@@ -147,11 +147,16 @@ class Frames:
             raise InputError(f"The focal length of {self._where(index)} is {fx:g}, {fy:g}, not positive.")
         return fx, fy
 
+    def _given(self, index: int, key: str) -> object:
+        """A frame's own value, or the file's; ``None`` where neither has one."""
+        own = self.frames[index].get(key)
+        return self.table.get(key) if own is None else own
+
     def _lens(self, index: int, pinhole: tuple[float, ...], size: tuple[int, int]) -> Lens | None:
         """Lens of OPENCV (k1 k2 p1 p2; rational with k3, k4) or OPENCV_FISHEYE (k1 k2 k3 k4); ``None`` for a pinhole."""
         k1, k2, p1, p2, k3, k4 = (self._number(index, key) or 0.0 for key in _COEFFICIENTS)
-        model = str(self.frames[index].get("camera_model", self.table.get("camera_model", "OPENCV")))
-        fisheye = model == "OPENCV_FISHEYE" or self.table.get("is_fisheye") is True
+        model = str(self._given(index, "camera_model") or "OPENCV")
+        fisheye = model == "OPENCV_FISHEYE" or self._given(index, "is_fisheye") is True
         if fisheye:
             lens = Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4), *size)
         elif model in _PINHOLES:

@@ -78,12 +78,29 @@ def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], lis
         raise InputError(f"The scale_mat_0 of {source} is no similarity: its determinant is {float(scale) ** 3:g}.")
     pose(torch.cat([world_from_local[:3, :3] / scale, world_from_local[:3, 3:]], dim=1), f"{source}, scale_mat_0")
     cameras = []
-    for index, file in enumerate(files):
+    for index, file in zip(_numbers(arrays, files, source), files, strict=True):
         if np.abs(_matrix(arrays, f"scale_mat_{index}", source) - sphere).max() > 1e-6 * np.abs(sphere).max():
             raise InputError(f"{source} has a scale_mat_{index} that differs from scale_mat_0.", "One sphere is expected.")
         camera = decompose(_matrix(arrays, f"world_mat_{index}", source)[:3], stored_size(file), f"{source}, world_mat_{index}")
         cameras.append(camera)
     return world_from_local, cameras
+
+
+def _numbers(arrays: Mapping[str, np.ndarray], files: list[Path], source: Path) -> list[int]:
+    """Number of each picture's matrices: that of its name where all have one with matrices, else its rank.
+
+    Raises:
+        InputError: there are more or fewer matrices than pictures, and names do not tell whose they are.
+    """
+    count = sum(key.startswith("world_mat_") and key.removeprefix("world_mat_").isdecimal() for key in arrays)
+    named = [int(file.stem) for file in files if file.stem.isdecimal() and f"world_mat_{int(file.stem)}" in arrays]
+    if len(set(named)) == len(files):
+        return named
+    if count > len(files):
+        raise InputError(
+            f"{source} has {count} cameras, and there are {len(files)} pictures.", "Name pictures by their camera's number."
+        )
+    return list(range(len(files)))
 
 
 def _matrix(arrays: Mapping[str, np.ndarray], key: str, source: Path) -> Float[np.ndarray, "4 4"]:

@@ -14,6 +14,7 @@ from invgraphics.core import Camera, Scene
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
+from invgraphics.scenes.colmap_workspace import model_folders
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, scene_name
 from invgraphics.scenes.pictures.images import Photo, image_files
 from invgraphics.scenes.poses import pose
@@ -30,8 +31,12 @@ class Llff:
     """
 
     def matches(self, path: Path) -> bool:
-        """Whether ``path`` is a folder with ``poses_bounds.npy``, or that file."""
-        return (path / SOURCE).is_file() or (path.name == SOURCE and path.is_file())
+        """Whether ``path`` is a folder with ``poses_bounds.npy``, or that file.
+
+        A folder that has the COLMAP model, too, from which LLFF made it, is COLMAP's: the model has lenses and points.
+        """
+        named = path.name == SOURCE and path.is_file()
+        return named or ((path / SOURCE).is_file() and not model_folders(path))
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Load poses, near and far bounds and photographs as an unbounded scene.

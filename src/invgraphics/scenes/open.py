@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 
 from invgraphics import plugins
 from invgraphics.core import Scene, View
-from invgraphics.core.believable import check_scene
+from invgraphics.core.believable import check_scene, is_off_picture
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.pictures.images import image_files
@@ -244,9 +245,30 @@ def validate(scene: Scene) -> Scene:
         for view, name in zip(views, names, strict=True):
             _validate_view(view, name)
     check_scene(scene)
-    for split in ("train", "val", "observed"):
+    if off := [view.name for view in scene.train if is_off_picture(view.camera)]:
+        message = f"'{off[0]}' has its principal point far outside the picture: a crop, or resized without its calibration?"
+        print(f"Warning: {message}", file=sys.stderr)
+    for split in ("train", "observed"):
         _check_apart(scene, split)
-    return scene
+    return _watching_no_test_view(scene)
+
+
+def _watching_no_test_view(scene: Scene) -> Scene:
+    """Leave out validation views that are test views, too, as where a data set has one list for both."""
+    val = tuple(view for view in scene.val if not _has_camera_of(scene.test, view))
+    left = len(scene.val) - len(val)
+    note = {"val_views": f"{left} that are test views, too, are left out"} if left else {}
+    return replace(scene, val=val, notes=scene.notes | note) if left else scene
+
+
+def is_found(spec: str) -> bool:
+    """Whether a scene is a built-in one or a path that exists from here; also where a variable says where it is."""
+    return spec.startswith("$") or _description(spec) is not None or _path(spec).exists()
+
+
+def _has_camera_of(views: Sequence[View], view: View) -> bool:
+    poses_of = torch.stack([one.camera.cam_to_world for one in views])
+    return bool(((poses_of - view.camera.cam_to_world)[:, :3].abs().amax(dim=(1, 2)) < _SAME_POSE).any())
 
 
 def _check_apart(scene: Scene, split: str) -> None:

@@ -16,6 +16,8 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.border import is_object, looked_at
 from invgraphics.scenes.pictures.images import Photo, read_pixels
 
+ROUNDING = 1e-9
+"""Share of the cameras' distance from the world's origin below which their distances from one another are rounding."""
 NEAR = 0.05
 """Closest sample to a camera in local units, where a data set does not say."""
 
@@ -233,7 +235,9 @@ def contracted_frame(
         centre = middle + distance * torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
     else:
         centre = focus if float(ahead_of(poses, focus).median()) > 0 else middle
-    radius = float((position - centre).norm(dim=1).max()) or 1.0
+    radius = float((position - centre).norm(dim=1).max())
+    if radius <= ROUNDING * max(1.0, float(centre.norm())):  # on a tripod
+        radius = 1.0
     if not math.isfinite(radius):
         raise InputError("The cameras are farther apart than numbers reach.", "Check the positions of the poses.")
     world_from_local = torch.eye(4, dtype=poses.dtype)

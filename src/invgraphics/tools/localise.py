@@ -77,8 +77,11 @@ def locate(request: LocateRequest) -> Location:
     Raises:
         InputError: the run or the photograph cannot be used, there is no such view, or the files cannot be written.
     """
-    pixels = read_pixels(request.photo)
+    pixels = read_pixels(request.photo)  # before the run is opened, which takes longer
     fitted = open_fitted(request.run, request.scene)
+    views = fitted.scene.train + fitted.scene.test
+    if own := [view.camera for view in views if Path(view.name).name in (request.photo.name, request.photo.stem)]:
+        pixels = read_pixels(request.photo, (own[0].width, own[0].height))  # the data set's own: as its pictures were read
     with output_file(request.out):
         return _locate(request, pixels, fitted)
 

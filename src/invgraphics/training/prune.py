@@ -19,6 +19,9 @@ from invgraphics.training.hooks import FitState
 from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.penalties import LATTICES
 
+RAYS_AT_ONCE = 1024
+"""Rays that are traced at once: in fog each has hundreds of samples."""
+
 
 @runtime_checkable
 class Prunable(Protocol):
@@ -73,36 +76,38 @@ class Prune(MilestoneHook):
         grids = [encoding for encoding in encodings if isinstance(encoding, Prunable)]
         if not grids or not isinstance(state.renderer, RayRenderer):
             raise InputError(f"The hook '{self.name}' needs sparse voxel grids and a renderer of rays.")
-        positions, weights = ray_weights(state, state.renderer, self._config.rays)
-        unit = cast(LatticeField, state.field).bounds.to_unit(positions)
-        for grid in grids:
-            size = cast(LatticeEncoding, grid).resolution
-            seen = heaviest(unit, weights, size) >= self._config.weight / size[2]
-            prune(state, grid, dilated(seen, self._config.dilation))
+        sizes = [cast(LatticeEncoding, grid).resolution for grid in grids]
+        bounds, most = cast(LatticeField, state.field).bounds, [torch.zeros(()) for _ in grids]
+        for position, weight in ray_weights(state, state.renderer, self._config.rays):
+            unit = bounds.to_unit(position)
+            seen = [heaviest(unit, weight, size) for size in sizes]
+            most = [torch.maximum(one.to(weight), other) for one, other in zip(most, seen, strict=True)]
+        for grid, size, weight in zip(grids, sizes, most, strict=True):
+            prune(state, grid, dilated(weight >= self._config.weight / size[2], self._config.dilation))
 
 
 def trace_random_rays(state: FitState, renderer: RayRenderer, count: int) -> Iterator[Trace]:
-    """Render ``count`` random training rays as evaluation does, an equal share per view; yields each share's trace."""
+    """Render ``count`` random training rays as evaluation does, an equal share per view; yields traces of some at a time."""
     cameras = state.cameras()
     ctx = replace(state.ctx, training=False)
     share = -(-count // len(cameras))
     for camera in cameras:
         size = torch.tensor([camera.width, camera.height])
         pixels = (torch.rand(share, 2, generator=state.ctx.generator) * size).to(camera.focal)
-        _, trace = renderer.render_rays(state.field, camera.rays(pixels).to(ctx.bounds.lo.device), ctx)
-        yield trace
+        for rays in camera.rays(pixels).to(ctx.bounds.lo.device).chunks(RAYS_AT_ONCE):
+            _, trace = renderer.render_rays(state.field, rays, ctx)
+            yield trace
 
 
 @torch.no_grad()
-def ray_weights(state: FitState, renderer: RayRenderer, count: int) -> tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]:
-    """Positions and weights of the samples on ``count`` random training rays, drawn from the context's generator."""
-    positions, weights = [], []
+def ray_weights(
+    state: FitState, renderer: RayRenderer, count: int
+) -> Iterator[tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]]:
+    """Positions and weights of the samples on ``count`` random training rays, some rays at a time."""
     for trace in trace_random_rays(state, renderer, count):
         assert trace.samples is not None
         assert trace.weights is not None
-        positions.append(trace.samples.position)
-        weights.append(trace.weights)
-    return torch.cat(positions), torch.cat(weights)
+        yield trace.samples.position, trace.weights
 
 
 def heaviest(unit: Float[Tensor, "m 3"], weights: Float[Tensor, " m"], resolution: Sequence[int]) -> Float[Tensor, "x y z"]:

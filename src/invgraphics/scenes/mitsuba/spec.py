@@ -114,6 +114,8 @@ class SceneSpec:
     instances: Instances | None = None
 
     def __post_init__(self) -> None:
+        if not self.name.isprintable() or not self.name.strip(". ") or set("/\\:") & set(self.name):
+            raise ValueError("'name' must be a word: it becomes a folder's")
         if not all(low < high for low, high in zip(self.lo, self.hi, strict=True)):
             raise ValueError("every coordinate of 'lo' must be below that of 'hi'")
         if min(self.size) < 8:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,10 @@ def with_masks_beside(photos: Sequence[Photo], images: Path) -> list[Photo]:
     folder = next((place / FOLDER for place in (images, images.parent) if (place / FOLDER).is_dir()), None)
     if folder is None:
         return list(photos)
-    return [replace(photo, mask=_named_like(photo, folder)) for photo in photos]
+    masked = [replace(photo, mask=_named_like(photo, folder)) for photo in photos]
+    if photos and not any(photo.mask for photo in masked):
+        print(f"{folder} has no mask of any photograph: expected {photos[0].name}.png.", file=sys.stderr)
+    return masked
 
 
 def _named_like(photo: Photo, folder: Path) -> Path | None:
@@ -48,7 +52,7 @@ def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]
     Raises:
         InputError: it is missing or no picture, has another shape than the photograph, or masks all of it.
     """
-    values = read_pixels(mask, (width, height))[:, :, :3].max(axis=2)
+    values = brightness(read_pixels(mask, (width, height)))
     high, wide = values.shape
     if abs(wide * height - high * width) > max(width, height, wide, high):
         raise InputError(f"{mask} has {wide}x{high} pixels, its photograph has {width}x{height}.")
@@ -57,6 +61,14 @@ def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]
     bright = values > values.max() // 2
     rows, columns = ((np.arange(count) * stored) // count for count, stored in ((height, high), (width, wide)))
     return np.repeat(np.where(bright, np.uint8(255), np.uint8(0))[rows][:, columns, None], 3, axis=2)
+
+
+def brightness(pixels: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w"]:
+    """Brightness of a mask's pixels: its alpha where that alone tells, as of a cut-out; of masks of 0 and 1, 0 and 255."""
+    values = pixels[:, :, :3].max(axis=2)
+    if pixels.shape[2] == 4 and values.min() == values.max() and pixels[:, :, 3].min() < pixels[:, :, 3].max():
+        values = pixels[:, :, 3]
+    return values * np.uint8(255) if values.max() == 1 else values
 
 
 def masks_note(photos: Sequence[Photo]) -> dict[str, str]:

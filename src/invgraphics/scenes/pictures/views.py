@@ -12,7 +12,7 @@ from invgraphics.core import Camera, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.pictures.images import Photo, read_pixels
 from invgraphics.scenes.pictures.lens import Lens, straighten, undistort
-from invgraphics.scenes.pictures.masks import read_mask
+from invgraphics.scenes.pictures.masks import brightness, read_mask
 from invgraphics.scenes.pictures.resize import area_resize, wanted_size
 
 
@@ -68,7 +68,7 @@ def _with_alpha(photo: Photo) -> UInt8[np.ndarray, "h w c"]:
     pixels = read_pixels(photo.path, like)
     if photo.alpha is None:
         return pixels
-    coverage = read_pixels(photo.alpha, like)[:, :, :3].max(axis=2, keepdims=True)
+    coverage = brightness(read_pixels(photo.alpha, like))[:, :, None]
     if coverage.shape[:2] != pixels.shape[:2]:
         (h, w), (mask_h, mask_w) = pixels.shape[:2], coverage.shape[:2]
         raise InputError(f"{photo.alpha} has {mask_w}x{mask_h} pixels, its photograph has {w}x{h}.")
