@@ -8,6 +8,7 @@ import torch
 from training_fixtures import SMALL
 
 from invgraphics.core import Bounds, Camera, Rendering, Scene, View
+from invgraphics.experiments import evaluate
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.request import FitRequest
@@ -15,6 +16,7 @@ from invgraphics.experiments.run import fit_run
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.metrics.protocols import protocol_named, score, summarise
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.scores import Score
 from invgraphics.scenes.degrade import TrainingData, degrade
 from invgraphics.scenes.open import SceneOptions, open_scene
@@ -87,6 +89,8 @@ def test_the_mean_is_over_the_photographs_that_the_method_saw(toy_folder: Path, 
     fit_run(FitRequest(method="splatting/gaussians", scene=scene, out=out, budget="1steps", overrides=overrides))
     full = open_scene(str(toy_folder), SceneOptions())
     seen, rules = degrade(full, TrainingData(train_views=1), 0), protocol_named("default")
+    black = replace(RunFolder(tmp_path / "run").read(Provenance), data={"background": "black"})
+    assert torch.equal(evaluate._as_seen(full, black).background, full.background)
     own, other = (baseline_scores(one, rules)["mean image"]["psnr"].mean for one in (seen, full))
     assert f"{own:.1f}" != f"{other:.1f}"
     first = RunFolder(tmp_path / "run").read_scores()

@@ -167,6 +167,9 @@ def test_a_fit_on_another_machine_is_not_replaced_unasked(
     job = Job.of(_request(toy_folder, folder))
     with pytest.raises(InputError, match=f"holds another run: its {said} is"):
         check_replaceable(job, threads)
+    (folder / "provenance.json").write_text(json.dumps(record | {"budget": "imported"}))
+    with pytest.raises(InputError, match="holds another run: its budget is imported, not 30 steps"):
+        check_replaceable(job)
     check_replaceable(Job.of(_request(toy_folder, run)), torch.get_num_threads())
 
 
@@ -196,7 +199,8 @@ def test_whatever_a_fit_may_read_identifies_it(scene: Scene) -> None:
     digests = [TruthDigest.of(one) for one in (known, *changed)]
     assert len(set(digests)) == len(digests)
     assert len({(digest.pixels, digest.cameras) for digest in digests}) == 1
-    assert TruthDigest.of(replace(known, notes={"resize": "none"})) == digests[0]
+    renamed = known.with_views(train=(replace(first, name="other"), *others))
+    assert TruthDigest.of(replace(renamed, name="copy", notes={"resize": "none"}, noise_ceiling=40.0)) == digests[0]
 
 
 def test_spelling_makes_no_other_run(run: Path, toy_folder: Path) -> None:

@@ -12,6 +12,7 @@ from dots import assert_dots_are_found, ring, save
 from PIL import Image
 
 from invgraphics.errors import InputError
+from invgraphics.scenes import npz
 from invgraphics.scenes.colmap import Colmap
 from invgraphics.scenes.idr import Idr
 from invgraphics.scenes.layout import SceneOptions
@@ -62,6 +63,35 @@ def test_images_without_lines_of_points_are_refused(tmp_path: Path) -> None:
     text.write_text("\n".join(line for line in text.read_text().splitlines() if line) + "\n")
     with pytest.raises(InputError, match=r"has no line of points after each image: '01\.png' follows"):
         Colmap().load(tmp_path, SceneOptions())
+
+
+@pytest.mark.parametrize("change", ["\n{}", "  # made by hand\n{}", "{}\n\n"])
+def test_blank_lines_and_comments_between_images_are_colmaps(tmp_path: Path, change: str) -> None:
+    test_colmap_loader.mixed(tmp_path)
+    text = tmp_path / "sparse" / "0" / "images.txt"
+    text.write_text(change.format(text.read_text()))
+    scene = Colmap().load(tmp_path, SceneOptions())
+    assert len(scene.train) + len(scene.test) == 9
+
+
+def test_llff_is_taken_where_the_models_photographs_are_not(tmp_path: Path) -> None:
+    eyes = test_llff_loader.forward_facing()
+    test_colmap_loader.write(tmp_path, eyes, ["PINHOLE 160 120 150 150 80 60"] * len(eyes))
+    test_llff_loader.write(tmp_path, eyes)
+    for path in (tmp_path / "images").glob("??.png"):
+        path.unlink()
+    assert type(find_loader(tmp_path)).__name__ == "Llff"
+
+
+def test_faint_alpha_stays_faint(tmp_path: Path) -> None:
+    """Only where no view has more than 1 are 0 and 1 meant."""
+    alpha = np.zeros((2, 4, 4), np.uint8)
+    alpha[0, 0, 0] = 1
+    arrays = {"alpha": alpha}
+    shown = {"images": np.zeros((2, 4, 4, 3), np.uint8)} | arrays
+    assert npz._pixels(shown, 0, tmp_path)[0, 0, 3] == 255
+    alpha[1] = 255
+    assert npz._pixels(shown, 0, tmp_path)[0, 0, 3] == 1
 
 
 def test_masks_of_every_kind_have_one_brightness() -> None:

@@ -18,7 +18,7 @@ from invgraphics import locks
 from invgraphics.config import fill
 from invgraphics.core import Camera, Model, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
-from invgraphics.errors import NumericalError
+from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
@@ -89,7 +89,7 @@ def evaluate(
         method.name,
         poses,
         keep=lambda index, picture: _save_view(folder, index, picture, scene),
-        seen=degrade(scene, fill(TrainingData, provenance.data), provenance.data_seed),
+        seen=_as_seen(scene, provenance),
     )
     quality, skipped = scaled_scores(model, scene, protocol, provenance.data, refined=poses is not None)
     result = replace(
@@ -106,6 +106,15 @@ def evaluate(
     )
     folder.write(result)
     return result
+
+
+def _as_seen(scene: Scene, provenance: Provenance) -> Scene:
+    """The scene with the photographs that the fit saw, over its own background; as it is where they are not in this copy."""
+    data = replace(fill(TrainingData, provenance.data), init="random")  # no points are needed, which take minutes
+    try:
+        return replace(degrade(scene, data, provenance.data_seed), background=scene.background)
+    except InputError:
+        return scene
 
 
 def score_model(

@@ -38,10 +38,10 @@ class TruthDigest:
 
     @staticmethod
     def of(scene: Scene) -> TruthDigest:
-        """Hash ``scene``, but for its notes."""
+        """Hash ``scene``, but for names, notes and what only describes the truth's noise."""
         pixels = (scene.digest("train"), scene.digest("val"), scene.digest("test"))
         sha = hashlib.sha256()
-        _update(sha, replace(scene, notes={}))
+        _update(sha, replace(scene, notes={}, noise_ceiling=None))
         return TruthDigest(pixels, scene.camera_digest(), sha.hexdigest())
 
 
@@ -51,7 +51,7 @@ def _update(sha: hashlib._Hash, value: object) -> None:
         sha.update(repr((tuple(value.shape), str(value.dtype))).encode())
         sha.update(np.ascontiguousarray(value.detach().cpu().numpy()).tobytes())
     elif is_dataclass(value) and not isinstance(value, type):
-        for part in fields(value):
+        for part in (part for part in fields(value) if part.name != "name"):
             sha.update(f"{part.name}:".encode())
             _update(sha, getattr(value, part.name))
     elif isinstance(value, tuple):
@@ -118,7 +118,7 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
     settings = {
         "scene": (found.scene, request.scene),
         "seed": (found.seed, request.seed),
-        "budget": (str(Budget.parse(found.budget)), str(job.budget)),
+        "budget": (_normalised(found.budget), str(job.budget)),
         "size": (found.options.size, request.size),
         "number of test views": (found.options.test_views, request.test_views),
         "samples per pixel": (found.options.spp, request.spp),
@@ -133,6 +133,14 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
         if theirs != ours:
             sentence = f"{folder.root} holds another run: its {name} is {theirs}, not {ours}."
             raise InputError(sentence, "Choose another --out, or delete that folder.")
+
+
+def _normalised(budget: str) -> str:
+    """A budget in one spelling; as it stands where a run has another word for it (``imported``)."""
+    try:
+        return str(Budget.parse(budget))
+    except InputError:
+        return budget
 
 
 def check_existing(job: Job) -> None:
@@ -185,6 +193,6 @@ def define(job: Job) -> str:
 
 
 def _fit_settings(job: Job) -> dict[str, Any]:
-    """Collect the request's settings that determine a fit; budgets and devices are normalised, whatever their spelling."""
+    """Collect the request's settings that determine a fit; budgets and the default device are normalised."""
     device = job.request.device if job.device.type != "cpu" else None  # the default, so that studies keep their folders' names
     return {"seed": job.request.seed, "device": device, "kernels": job.request.kernels, "budget": str(job.budget)}

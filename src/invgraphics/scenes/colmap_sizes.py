@@ -136,11 +136,13 @@ def check_images_text(path: Path) -> None:
     Raises:
         InputError: a line of points is that of another image.
     """
-    if not path.is_file():
+    if not path.is_file() or path.with_suffix(".bin").is_file():
         return
-    lines = [line for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if not line.startswith("#")]
-    for line in lines[1::2]:
-        last = line.split()[-1:] or ["0"]
+    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
+    for line in lines:
+        if not line.strip() or line.strip().startswith("#"):
+            continue
+        last = next(lines, "").split()[-1:] or ["0"]
         if not _is_number(last[0]):
             sentence = f"{path} has no line of points after each image: '{last[0]}' follows another image at once."
             raise InputError(sentence, "Add an empty line after each image, as COLMAP writes it.")

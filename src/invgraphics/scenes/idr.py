@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -90,11 +91,13 @@ def _numbers(arrays: Mapping[str, np.ndarray], files: list[Path], source: Path) 
     """Number of each picture's matrices: that of its name where all have one with matrices, else its rank.
 
     Raises:
-        InputError: there are more or fewer matrices than pictures, and names do not tell whose they are.
+        InputError: there are more matrices than pictures, and names do not tell whose they are.
     """
     count = sum(key.startswith("world_mat_") and key.removeprefix("world_mat_").isdecimal() for key in arrays)
     named = [int(file.stem) for file in files if file.stem.isdecimal() and f"world_mat_{int(file.stem)}" in arrays]
     if len(set(named)) == len(files):
+        if 0 not in named and count > len(files):
+            print(f"{files[0].name} has the camera world_mat_{named[0]} of {source}: names count from 0.", file=sys.stderr)
         return named
     if count > len(files):
         raise InputError(

@@ -14,7 +14,7 @@ from invgraphics.core import Camera, Scene
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import llff_to_opencv
 from invgraphics.errors import InputError
-from invgraphics.scenes.colmap_workspace import model_folders
+from invgraphics.scenes.colmap_workspace import find_model, model_folders
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, scene_name
 from invgraphics.scenes.pictures.images import Photo, image_files
 from invgraphics.scenes.poses import pose
@@ -33,10 +33,11 @@ class Llff:
     def matches(self, path: Path) -> bool:
         """Whether ``path`` is a folder with ``poses_bounds.npy``, or that file.
 
-        A folder that has the COLMAP model, too, from which LLFF made it, is COLMAP's: the model has lenses and points.
+        A folder that has the COLMAP model, too, from which LLFF made it, and that model's photographs is COLMAP's, which has
+        lenses and points.
         """
         named = path.name == SOURCE and path.is_file()
-        return named or ((path / SOURCE).is_file() and not model_folders(path))
+        return named or ((path / SOURCE).is_file() and not _is_of_colmap(path))
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Load poses, near and far bounds and photographs as an unbounded scene.
@@ -60,6 +61,14 @@ class Llff:
         # LLFF's own numbers: 10% in front of the nearest bound; focus between that and five times the farthest.
         frame = contracted_frame(poses, distance=1 / (0.25 / (0.9 * near) + 0.75 / (5 * far)), near=0.9 * near)
         return compose(scene_name(path), every_eighth(photos), frame, options, {"loader": "llff"})
+
+
+def _is_of_colmap(path: Path) -> bool:
+    """Whether a folder is a COLMAP workspace whose photographs are there."""
+    try:
+        return bool(model_folders(path)) and find_model(path).present > 0
+    except InputError:
+        return False
 
 
 def _read(source: Path) -> Float[np.ndarray, "n 17"]:

@@ -40,7 +40,6 @@ from invgraphics.errors import InputError, did_you_mean
 from invgraphics.files import write_arrays
 from invgraphics.scenes.border import background_of, looked_at
 from invgraphics.scenes.layout import HOLD_OUT, SceneOptions, evenly, local_points
-from invgraphics.scenes.pictures.masks import brightness
 from invgraphics.scenes.pictures.resize import RESIZE, wanted_size
 from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.poses import poses
@@ -225,9 +224,10 @@ def _view(path: Path, arrays: Arrays, i: int, named: tuple[Camera, str], frame: 
 
 def _pixels(arrays: Arrays, i: int, path: Path) -> UInt8[np.ndarray, "h w c"]:
     """Straight colour of a view, or colour and alpha."""
-    pixels = _bytes(arrays["images"][i], "images", path)
-    alpha = brightness(_bytes(arrays["alpha"][i], "alpha", path)[:, :, None]) if "alpha" in arrays else None
-    return pixels if alpha is None else np.dstack([pixels[:, :, :3], alpha])
+    pixels, alpha = _bytes(arrays["images"][i], "images", path), arrays.get("alpha")
+    whole = alpha is not None and alpha.dtype == np.uint8 and alpha.max() == 1  # of all views: 0 and 1 are meant
+    factor = np.uint8(255 if whole else 1)
+    return pixels if alpha is None else np.dstack([pixels[:, :, :3], factor * _bytes(alpha[i], "alpha", path)])
 
 
 def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shape"]:

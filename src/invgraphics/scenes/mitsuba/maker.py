@@ -77,16 +77,14 @@ def cached_with_more_tests(
     Cameras and noise of a view do not depend on how many follow, so its pictures are those that `make` would render.
 
     Returns:
-        ``None`` where no fewer are asked for, or where nothing that would do is in the cache.
+        ``None`` where no fewer are asked for, these are there themselves, or nothing that would do is in the cache.
     """
     job = planned(scene, size, views, spp, seed)
     own = job.spec.views.test
-    if job.spec.instances is not None or job.views.test >= own:
+    if job.spec.instances is not None or job.views.test >= own or cache.read_truth(cache.root() / job.folder_name) is not None:
         return None
-    more = replace(job, views=replace(job.views, test=own))
-    jobs = [more, averaged(more)]
-    folders = [cache.root() / found.folder_name for found in jobs if found is not None]
-    return next((folder for folder in folders if cache.read_truth(folder) is not None), None)
+    folder = cache.root() / replace(job, views=replace(job.views, test=own)).folder_name
+    return folder if cache.read_truth(folder) is not None else None
 
 
 def planned(
