@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from typing import Any
 
 
@@ -15,6 +16,11 @@ def slug(method: str) -> str:
 def file_name(key: str) -> str:
     """Convert a name to a part of a file name: letters and digits stay, all else becomes a hyphen."""
     return "".join(letter if letter.isalnum() else "-" for letter in key)
+
+
+def common_value(texts: Sequence[str]) -> str:
+    """The value that all texts share; empty where they differ, or there is none."""
+    return texts[0] if len(set(texts)) == 1 else ""
 
 
 def duration(seconds: float) -> str:

@@ -23,7 +23,7 @@ from invgraphics.experiments import evaluate
 from invgraphics.experiments import run as module
 from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.fitted import open_fitted
-from invgraphics.experiments.identity import TruthDigest, check_replaceable, identify
+from invgraphics.experiments.identity import check_replaceable, identify, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
@@ -179,7 +179,7 @@ def test_a_field_that_starts_from_a_changed_file_is_another_fit(toy_folder: Path
     found = []
     for content in (b"one", b"two", b"one"):
         source.write_bytes(content)
-        found.append(identify(Job.of(request), TruthDigest(("a", "b", "c"), "d", "e"), 1))
+        found.append(identify(Job.of(request), "truth", 1))
     assert found[0] == found[2] != found[1]
 
 
@@ -196,19 +196,18 @@ def test_whatever_a_fit_may_read_identifies_it(scene: Scene) -> None:
         replace(known, bounds=replace(scene.bounds, near=0.1)),
         replace(known, background=1 - scene.background),
     ]
-    digests = [TruthDigest.of(one) for one in (known, *changed)]
+    digests = [truth_digest(one) for one in (known, *changed)]
     assert len(set(digests)) == len(digests)
-    assert len({(digest.pixels, digest.cameras) for digest in digests}) == 1
+    assert len({(one.digest("train"), one.digest("test"), one.camera_digest()) for one in (known, *changed)}) == 1
     renamed = known.with_views(train=(replace(first, name="other"), *others))
-    assert TruthDigest.of(replace(renamed, name="copy", notes={"resize": "none"}, noise_ceiling=40.0)) == digests[0]
+    assert truth_digest(replace(renamed, name="copy", notes={"resize": "none"}, noise_ceiling=40.0)) == digests[0]
 
 
 def test_spelling_makes_no_other_run(run: Path, toy_folder: Path) -> None:
     request = _request(toy_folder, run)
     spelt = replace(request, device="cpu", budget=f" {request.budget.replace('steps', ' steps')}")
-    truth = TruthDigest(("a", "b", "c"), "d", "e")
     assert spelt.budget != request.budget
-    assert identify(Job.of(spelt), truth, 1) == identify(Job.of(request), truth, 1)
+    assert identify(Job.of(spelt), "truth", 1) == identify(Job.of(request), "truth", 1)
     check_replaceable(Job.of(spelt))
 
 

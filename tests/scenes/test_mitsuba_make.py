@@ -16,7 +16,7 @@ from PIL import Image
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
-from invgraphics.experiments.identity import TruthDigest
+from invgraphics.experiments.identity import truth_digest
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.mitsuba import cache, llvm, make, maker
 from invgraphics.scenes.open import open_scene
@@ -211,7 +211,7 @@ def test_fewer_test_views_are_taken_from_the_cache(fresh, tmp_path, monkeypatch)
     monkeypatch.setattr(maker, "run_worker", lambda *args, **kwargs: pytest.fail("rendered again"))
     chosen = open_scene(str(more), SceneOptions(test_views=1))
     assert not fewer.exists()
-    assert TruthDigest.of(chosen) == TruthDigest.of(few)
+    assert truth_digest(chosen) == truth_digest(few)
     assert len(chosen.test) == 1
     for split in ("train", "val", "test"):
         for ours, theirs in zip(getattr(chosen, split), getattr(few, split), strict=True):

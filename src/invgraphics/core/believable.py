@@ -85,8 +85,8 @@ def check_camera(camera: Camera, what: str) -> None:
     _expect(tan <= WIDEST_TAN, f"{lens}: its pixels would look backwards, or nearly so.")
 
 
-def is_off_picture(camera: Camera) -> bool:
-    """Whether the principal point lies more than half a picture outside it: of a crop, or of pictures resized without it."""
+def principal_point_far_outside(camera: Camera) -> bool:
+    """Whether the principal point lies more than half a picture outside the picture, as of a crop or a forgotten resize."""
     relative = camera.centre.double().cpu() / torch.tensor([camera.width, camera.height])
     return bool(((relative < -0.5) | (relative > 1.5)).any())
 

@@ -69,10 +69,10 @@ class Model:
         Returns:
             Premultiplied colour in the scene's colour space, alpha, depth in local units and normals, (height, width).
         """
-        rendering, _ = self.renderer.render_image(self.field, self._own(camera), self.context(normals=normals))
+        rendering, _ = self.renderer.render_image(self.field, self._like_model(camera), self.context(normals=normals))
         return rendering.detach().to(camera.focal.device)
 
-    def _own(self, camera: Camera) -> Camera:
+    def _like_model(self, camera: Camera) -> Camera:
         """The camera on the model's device, in its precision."""
         return camera.to(self.device).to(self.bounds.lo.dtype)
 
@@ -87,7 +87,7 @@ class Model:
         Raises:
             NotComposableError: the renderer composites nothing along rays that could be listed.
         """
-        found = self.renderer.contributions(self.field, self._own(camera), pixel, self.context())
+        found = self.renderer.contributions(self.field, self._like_model(camera), pixel, self.context())
         return found.to(camera.focal.device)
 
     @torch.no_grad()

@@ -34,6 +34,7 @@ from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import SceneOptions, space_note
 from invgraphics.scenes.truth import POINTS as EXACT_POINTS
+from invgraphics.text import common_value
 
 START = f"{DATA}init"
 MOST_NAMES = 6
@@ -253,9 +254,9 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
         seeds=request.seeds,
         budget=request.budget,
         size=(camera.width, camera.height),
-        preset=_common([method.preset for method in methods]),
+        preset=common_value([method.preset for method in methods]),
         presets={method.name: method.preset for method in methods},
-        preset_choice=_common([method.preset_choice for method in methods]),
+        preset_choice=common_value([method.preset_choice for method in methods]),
         preset_chosen_on={method.name: method.chosen_on for method in methods if method.chosen_on},
         render_with=request.render_with,
         command=replace(request, keep=False).shell(),
@@ -283,10 +284,5 @@ def _scene_facts(scene: Scene) -> SceneFacts:
 
 def _of_methods(notes: Mapping[str, str]) -> set[str]:
     """Notes with the method that each is about; the note alone where all methods have the same."""
-    common = _common(list(notes.values()))
+    common = common_value(list(notes.values()))
     return {common} - {""} if common else {f"{method}: {note}" for method, note in notes.items() if note}
-
-
-def _common(texts: Sequence[str]) -> str:
-    """Common value of all texts; empty where they differ."""
-    return texts[0] if len(set(texts)) == 1 else ""

@@ -37,7 +37,7 @@ from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.runs.run import truth_arrays, truth_picture
 from invgraphics.runs.scores import Scores
-from invgraphics.scenes.degrade import TrainingData, degrade
+from invgraphics.scenes.degrade import KEEP, TrainingData, degrade
 from invgraphics.training.limits import DEAD_SHARE, dead_gaussians
 from invgraphics.training.poses import Poses
 
@@ -110,9 +110,11 @@ def evaluate(
 
 def _as_seen(scene: Scene, provenance: Provenance) -> Scene:
     """The scene with the photographs that the fit saw, over its own background; as it is where they are not in this copy."""
-    data = replace(fill(TrainingData, provenance.data), init="random")  # no points are needed, which take minutes
+    data = replace(fill(TrainingData, provenance.data), init="random", background=KEEP)  # without points, which take minutes
+    if not data.changes_photographs:
+        return scene
     try:
-        return replace(degrade(scene, data, provenance.data_seed), background=scene.background)
+        return degrade(scene, data, provenance.data_seed)
     except InputError:
         return scene
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,27 +22,14 @@ from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
 
-@dataclass(frozen=True)
-class TruthDigest:
-    """Hashes of a scene as loaded, which identify it without keeping its pixels in memory.
+def truth_digest(scene: Scene) -> str:
+    """Hash all of a scene as loaded that fits and scores may read, without keeping its pixels in memory.
 
-    Attributes:
-        pixels: of the training, validation and test views.
-        cameras: of all cameras.
-        rest: all else that fits and scores may read: masks, depth, normals, points, surface, bounds, background.
+    Names, notes and the noise level of a rendered truth are no part of it.
     """
-
-    pixels: tuple[str, str, str]
-    cameras: str
-    rest: str
-
-    @staticmethod
-    def of(scene: Scene) -> TruthDigest:
-        """Hash ``scene``, but for names, notes and what only describes the truth's noise."""
-        pixels = (scene.digest("train"), scene.digest("val"), scene.digest("test"))
-        sha = hashlib.sha256()
-        _update(sha, replace(scene, notes={}, noise_ceiling=None))
-        return TruthDigest(pixels, scene.camera_digest(), sha.hexdigest())
+    sha = hashlib.sha256()
+    _update(sha, replace(scene, notes={}, noise_ceiling=None))
+    return sha.hexdigest()
 
 
 def _update(sha: hashlib._Hash, value: object) -> None:
@@ -62,7 +49,7 @@ def _update(sha: hashlib._Hash, value: object) -> None:
         sha.update(f"{value!r};".encode())
 
 
-def identify(job: Job, truth: TruthDigest, threads: int) -> str:
+def identify(job: Job, truth: str, threads: int) -> str:
     """Hash everything that determines a run's fit; equal identities mean equal bits on one machine.
 
     The protocol is no part of it: a finished fit is scored by another one from its checkpoint.
@@ -70,7 +57,7 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
     Args:
         job: of the run; its degradations of training data follow from the truth as loaded, the settings and the seed, so that
             nothing needs to be disturbed to know them.
-        truth: of the scene as loaded.
+        truth: `truth_digest` of the scene as loaded.
         threads: of the process that fits, which decide the order of sums.
     """
     method = job.method
@@ -81,9 +68,7 @@ def identify(job: Job, truth: TruthDigest, threads: int) -> str:
         | {
             "method": method.name,
             "recipe": method.digest,
-            "truth": truth.pixels,
-            "cameras": truth.cameras,
-            "rest": truth.rest,
+            "truth": truth,
             "data": job.data.changes(),
             "request": _fit_settings(job),
             "code": code_version(),

@@ -25,7 +25,7 @@ from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, l
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
-from invgraphics.experiments.identity import TruthDigest, check_existing, identify
+from invgraphics.experiments.identity import check_existing, identify, truth_digest
 from invgraphics.experiments.job import Job, region_of, training_scene
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
@@ -93,7 +93,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
         shown = training_scene(job, scene)
-        identity = identify(job, TruthDigest.of(scene), torch.get_num_threads())
+        identity = identify(job, truth_digest(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
             raise InputError(

@@ -108,6 +108,7 @@ def _edges(rays: Rays, bounds: Bounds) -> Float[Tensor, "n samples_plus_1"]:
     """Interval edges along rays: linear in distance in a box, logarithmic in a contracted space."""
     s = torch.linspace(0, 1, SAMPLES + 1, device=rays.near.device)
     near, far = rays.near[:, None], rays.far[:, None]
-    if bounds.space == "contracted":
-        near = near.maximum(NEAREST * far)
-    return near * (far / near) ** s if bounds.space == "contracted" else near + (far - near) * s
+    if bounds.space != "contracted":
+        return near + (far - near) * s
+    near = near.maximum(NEAREST * far)
+    return near * (far / near) ** s

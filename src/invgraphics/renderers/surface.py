@@ -119,12 +119,10 @@ class Surface(Renderer):
         image = kernels.mesh_interpolate(fragments, mesh.faces, torch.cat(features, dim=1))
         seen = fragments.face >= 0
         normal = image[..., 3:] if ctx.geometry else None
-        if ctx.geometry and self.config.normals == "faces" and not len(mesh.faces):
-            normal = torch.zeros_like(image[..., :3])
-        elif ctx.geometry and self.config.normals == "faces":
+        if ctx.geometry and self.config.normals == "faces":
             own = normalize(face_normals(mesh.vertices, mesh.faces), dim=1)
-            middle = mesh.vertices[mesh.faces].mean(dim=1)
-            normal = torch.where(seen[..., None], _towards(own, middle, camera)[fragments.face], 0.0)
+            facing = _towards(own, mesh.vertices[mesh.faces].mean(dim=1), camera)
+            normal = torch.cat([facing, facing.new_zeros(1, 3)])[fragments.face]  # -1, where nothing is hit, is the last row
         distance = torch.where(seen, fragments.depth, 0.0)
         return self._averaged(Rendering(image[..., :3], seen.to(image), distance, normal), rays)
 

@@ -19,6 +19,7 @@ from invgraphics.report.pages.parts import draw_part, method_contrasts
 from invgraphics.report.pages.tables import effects_caption, write_latex, write_latex_effects
 from invgraphics.report.wording import listing
 from invgraphics.runs.run import Run, read_run, truth_picture
+from invgraphics.text import common_value
 
 
 def build_report(folder: Path, out: Path | None = None, public: bool = False) -> Path:
@@ -62,12 +63,12 @@ def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Pa
     first = labelled[0]
     picture = read_picture(truth_picture(first.truth, 0))
     comparison = Comparison(
-        scene=_common([run.scores.scene for run in labelled]),
+        scene=common_value([run.scores.scene for run in labelled]),
         question=f"How {'does' if len(methods) == 1 else 'do'} {listing(methods)} show new views, and at what cost?",
         methods=methods,
         runs=tuple(labelled),
-        budget=_common([run.provenance.budget for run in labelled]),
-        preset=_common([run.scores.preset for run in labelled]),
+        budget=common_value([run.provenance.budget for run in labelled]),
+        preset=common_value([run.scores.preset for run in labelled]),
         size=(picture.shape[1], picture.shape[0]),
         protocol={"name": first.scores.protocol},
     )
@@ -93,11 +94,6 @@ def _write(comparison: Comparison, out: Path, base: Path, public: bool) -> Path:
         write_markdown(part, contrasts, folder)
         write_html(part, contrasts, folder)
     return out / "index.html"
-
-
-def _common(values: Sequence[str]) -> str:
-    """The value that all share; empty where they differ."""
-    return values[0] if len(set(values)) == 1 else ""
 
 
 def _with_unique_names(runs: Sequence[Run]) -> list[Run]:

@@ -87,7 +87,7 @@ class Frames:
 
     def _number(self, index: int, key: str) -> float | None:
         """Number under ``key`` of the frame, else of the file."""
-        value = self.frames[index].get(key, self.table.get(key))
+        value = self._given(index, key)
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):

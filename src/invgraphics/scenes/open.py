@@ -14,7 +14,7 @@ import torch
 
 from invgraphics import plugins
 from invgraphics.core import Scene, View
-from invgraphics.core.believable import check_scene, is_off_picture
+from invgraphics.core.believable import check_scene, principal_point_far_outside
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.pictures.images import image_files
@@ -121,11 +121,11 @@ def find_loader(path: Path) -> Loader:
         loader: Loader = kind()
         if loader.matches(path):
             return loader
-    what = "is an empty folder" if path.is_dir() and not any(path.iterdir()) else "is not a data set of a known format"
-    if path.is_dir() and image_files(path):
+    if image_files(path):
         raise InputError(
             f"{path} holds photographs without poses.", f"Run `invgraphics import-photos {path} --out SCENE`, then give SCENE."
         )
+    what = "is an empty folder" if path.is_dir() and not any(path.iterdir()) else "is not a data set of a known format"
     raise InputError(
         f"{path} {what}.",
         "Looked for truth.json, transforms_train.json, transforms.json, poses_bounds.npy, sparse/0/cameras.bin, cameras*.npz "
@@ -245,17 +245,17 @@ def validate(scene: Scene) -> Scene:
         for view, name in zip(views, names, strict=True):
             _validate_view(view, name)
     check_scene(scene)
-    if off := [view.name for view in scene.train if is_off_picture(view.camera)]:
+    if off := [view.name for view in scene.train if principal_point_far_outside(view.camera)]:
         message = f"'{off[0]}' has its principal point far outside the picture: a crop, or resized without its calibration?"
         print(f"Warning: {message}", file=sys.stderr)
     for split in ("train", "observed"):
         _check_apart(scene, split)
-    return _watching_no_test_view(scene)
+    return _with_val_apart(scene)
 
 
-def _watching_no_test_view(scene: Scene) -> Scene:
+def _with_val_apart(scene: Scene) -> Scene:
     """Leave out validation views that are test views, too, as where a data set has one list for both."""
-    val = tuple(view for view in scene.val if not _has_camera_of(scene.test, view))
+    val = tuple(view for view in scene.val if not _of_its_camera(scene.test, view))
     left = len(scene.val) - len(val)
     note = {"val_views": f"{left} that are test views, too, are left out"} if left else {}
     return replace(scene, val=val, notes=scene.notes | note) if left else scene
@@ -266,21 +266,20 @@ def is_found(spec: str) -> bool:
     return spec.startswith("$") or _description(spec) is not None or _path(spec).exists()
 
 
-def _has_camera_of(views: Sequence[View], view: View) -> bool:
-    poses_of = torch.stack([one.camera.cam_to_world for one in views])
-    return bool(((poses_of - view.camera.cam_to_world)[:, :3].abs().amax(dim=(1, 2)) < _SAME_POSE).any())
+def _of_its_camera(views: Sequence[View], view: View) -> list[View]:
+    """Views that have a view's pose."""
+    gap = torch.stack([one.camera.cam_to_world for one in views]) - view.camera.cam_to_world
+    return [views[index] for index in (gap[:, :3].abs().amax(dim=(1, 2)) < _SAME_POSE).nonzero()[:, 0].tolist()]
 
 
 def _check_apart(scene: Scene, split: str) -> None:
     views: tuple[View, ...] = getattr(scene, split)
     if not views:
         return
-    stacked = torch.stack([view.camera.cam_to_world for view in views])
     for test in scene.test:
-        same = ((stacked - test.camera.cam_to_world)[:, :3].abs().amax(dim=(1, 2)) < _SAME_POSE).nonzero()
-        if len(same):
-            name = views[int(same[0])].name
-            raise InputError(f"The {split} view '{name}' and the test view '{test.name}' of '{scene.name}' share a camera.")
+        if same := _of_its_camera(views, test):
+            sentence = f"The {split} view '{same[0].name}' and the test view '{test.name}' of '{scene.name}' share a camera."
+            raise InputError(sentence)
 
 
 def _validate_view(view: View, what: str) -> None:

@@ -18,7 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.executors.local import cores
-from invgraphics.experiments.identity import TruthDigest, identify
+from invgraphics.experiments.identity import identify, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.renderings import check_variants, is_kept, renderings_complete
@@ -145,7 +145,7 @@ def _execution_order(planned: Planned, study: Study, costs: dict[tuple[str, str,
     return study.seeds.index(planned.cell.seed), seconds, max(size) if isinstance(size, tuple) else size or 0
 
 
-def _open_scenes(plan: Sequence[Planned]) -> tuple[Trials, dict[tuple[str, Size], TruthDigest]]:
+def _open_scenes(plan: Sequence[Planned]) -> tuple[Trials, dict[tuple[str, Size], str]]:
     """Open every scene once per size, rendered if necessary; keeps those that costs are measured on, and the hashes of all.
 
     Raises:
@@ -162,12 +162,12 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[Trials, dict[tuple[str, Size]
             data.check(scene)
         methods = {planned.method.digest: planned.method for planned in group}.values()
         check_variants(group[0].job.variants, methods, scene)
-        truths[place] = TruthDigest.of(scene)
+        truths[place] = truth_digest(scene)
         trials |= {key: (planned.job, scene) for key, planned in first.items() if _truth_key(planned) == place}
     return trials, truths
 
 
-def _is_finished(planned: Planned, truth: TruthDigest, threads: int) -> bool:
+def _is_finished(planned: Planned, truth: str, threads: int) -> bool:
     run = planned.job.folder
     same = run.finished and run.identity == identify(planned.job, truth, threads)
     return same and renderings_complete(planned.job)

@@ -76,14 +76,14 @@ class Prune(MilestoneHook):
         grids = [encoding for encoding in encodings if isinstance(encoding, Prunable)]
         if not grids or not isinstance(state.renderer, RayRenderer):
             raise InputError(f"The hook '{self.name}' needs sparse voxel grids and a renderer of rays.")
-        sizes = [cast(LatticeEncoding, grid).resolution for grid in grids]
-        bounds, most = cast(LatticeField, state.field).bounds, [torch.zeros(()) for _ in grids]
+        bounds, sizes = cast(LatticeField, state.field).bounds, [cast(LatticeEncoding, grid).resolution for grid in grids]
+        most = {size: torch.zeros(size, device=bounds.lo.device) for size in sizes}
         for position, weight in ray_weights(state, state.renderer, self._config.rays):
             unit = bounds.to_unit(position)
-            seen = [heaviest(unit, weight, size) for size in sizes]
-            most = [torch.maximum(one.to(weight), other) for one, other in zip(most, seen, strict=True)]
-        for grid, size, weight in zip(grids, sizes, most, strict=True):
-            prune(state, grid, dilated(weight >= self._config.weight / size[2], self._config.dilation))
+            for size, largest in most.items():
+                torch.maximum(largest, heaviest(unit, weight, size), out=largest)
+        for grid, size in zip(grids, sizes, strict=True):
+            prune(state, grid, dilated(most[size] >= self._config.weight / size[2], self._config.dilation))
 
 
 def trace_random_rays(state: FitState, renderer: RayRenderer, count: int) -> Iterator[Trace]:

@@ -22,8 +22,8 @@ from invgraphics.tables import read_json
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables from which libraries take their number of threads."""
-PATIENCE = 30.0
-"""Seconds in which an interrupted fit ends its step, or what is being compiled."""
+INTERRUPT_SECONDS = 30.0
+"""Seconds in which an interrupted fit ends its step, or what is being compiled, before it is terminated."""
 
 
 def cores() -> int:
@@ -69,7 +69,7 @@ class FitProcess:
         return Outcome(self._request, status, error, time.monotonic() - self._began)
 
     def stop(self) -> None:
-        """Interrupt the fit, which ends its step and writes a checkpoint; terminate it after `PATIENCE` seconds.
+        """Interrupt the fit, which ends its step and writes a checkpoint; terminate it after `INTERRUPT_SECONDS`.
 
         After Ctrl-C at a terminal it is interrupted already, and again changes nothing. Where this process was terminated, its
         fits are, too: there is no time for a long step.
@@ -78,7 +78,7 @@ class FitProcess:
             self._process.terminate()
             return
         self._process.send_signal(signal.SIGINT)
-        last = threading.Timer(PATIENCE, self._process.terminate)
+        last = threading.Timer(INTERRUPT_SECONDS, self._process.terminate)
         last.daemon = True
         last.start()
 

@@ -18,6 +18,7 @@ from invgraphics.runs.inside import inside
 from invgraphics.runs.run import Run, read_run
 from invgraphics.runs.scores import DEFAULT
 from invgraphics.runs.study import Approximation, CellRecord, KnownDeviation, Prediction, StudyRecord, level_text
+from invgraphics.text import common_value
 
 
 @dataclass(frozen=True)
@@ -188,8 +189,8 @@ def _comparison(
 
 def _budget_of(cells: Sequence[StudyCell], stated: str) -> str:
     """The budget that all cells share; empty where it is a factor."""
-    own = {cell.budget for cell in cells if cell.budget}
-    return stated if not own else own.pop() if len(own) == 1 else ""
+    own = [cell.budget for cell in cells if cell.budget]
+    return common_value(own) if own else stated
 
 
 def _scene_names(scenes: Sequence[str]) -> dict[str, str]:
