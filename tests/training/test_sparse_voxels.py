@@ -12,6 +12,7 @@ from invgraphics.fields.encodings.sparse import SparseVoxels, SparseVoxelsConfig
 from invgraphics.kernels.reference.lattice import lattice_encode
 from invgraphics.recipes.recipe import load_method
 from invgraphics.runs import checkpoint
+from invgraphics.training import prune
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 from invgraphics.training.prune import PruneConfig, dilated, heaviest
@@ -132,6 +133,18 @@ def test_pruning_keeps_the_moments_of_the_rows_that_stay(scene):
     kept = encoding.links >= 0
     torch.testing.assert_close(moments[0], before[links[kept].long()])
     assert int(hook.state_dict()["done"]) == 1
+
+
+def test_rays_that_are_traced_a_few_at_a_time_prune_the_same_vertices(scene, monkeypatch):
+    kept = []
+    for rays in (7, 10**6):
+        monkeypatch.setattr(prune, "RAYS_AT_ONCE", rays)
+        fit = fit_of(scene, 10, "hooks.1.at=[0.9]")
+        full = len(fit.model.field.encoding.rows)
+        advance(fit, 4)
+        kept.append(fit.model.field.encoding.links >= 0)
+        assert 0 < int(kept[-1].sum()) < full
+    assert torch.equal(*kept)
 
 
 def test_resumes_to_the_bit_across_pruning_and_up_sampling(scene, tmp_path):
