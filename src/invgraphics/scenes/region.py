@@ -235,11 +235,11 @@ def contracted_frame(
         centre = middle + distance * torch.nn.functional.normalize(forward.mean(dim=0), dim=0)
     else:
         centre = focus if float(ahead_of(poses, focus).median()) > 0 else middle
-    radius = float((position - centre).norm(dim=1).max())
-    if radius <= ROUNDING * max(1.0, float(centre.norm())):  # on a tripod
-        radius = 1.0
-    if not math.isfinite(radius):
+    radius, offset = float((position - centre).norm(dim=1).max()), float(centre.norm())
+    if not math.isfinite(radius + offset):
         raise InputError("The cameras are farther apart than numbers reach.", "Check the positions of the poses.")
+    if radius <= ROUNDING * max(1.0, offset):  # on a tripod
+        radius = 1.0
     world_from_local = torch.eye(4, dtype=poses.dtype)
     world_from_local[:3, :3] = radius * _turn_z_to(-poses[:, :3, 1].mean(dim=0))
     world_from_local[:3, 3] = centre
