@@ -50,6 +50,8 @@ def test_text_becomes_values() -> None:
     [
         ({"budget": "long"}, "'long' is not a budget"),
         ({"checkpoint_every": "never"}, "'never' is no interval"),
+        ({"checkpoint_every": "0s"}, "'0s' is no interval"),
+        ({"checkpoint_every": "1.5steps"}, "'1.5steps' is no interval"),
         ({"overrides": ("data.siez=9",)}, "Unknown key 'data.siez'"),
         ({"device": "tpu"}, "--device cannot be 'tpu'"),
         ({"protocol": "flaot"}, "There is no protocol 'flaot'"),
@@ -60,6 +62,11 @@ def test_text_becomes_values() -> None:
 def test_what_cannot_be_read_is_refused(wrong: dict, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Job.of(_request(**wrong))
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("30s", 30.0), ("5min", 300.0), ("1.5m", 90.0), ("1h", 3600.0)])
+def test_checkpoints_come_at_any_unit_of_a_budget(text: str, seconds: float) -> None:
+    assert Job.of(_request(checkpoint_every=text)).cadence == Cadence(seconds=seconds)
 
 
 def test_a_budget_counts_and_not_its_spelling() -> None:

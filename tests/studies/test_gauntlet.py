@@ -52,9 +52,10 @@ def _verdicts(folder: Path) -> dict[tuple[str, str], dict[str, str]]:
         return {(row["cell"], row["rule"]): row for row in csv.DictReader(file)}
 
 
-def test_a_small_gauntlet_from_its_file_to_its_verdicts(in_process, gauntlet, toy_folder: Path) -> None:
+def test_a_small_gauntlet_from_its_file_to_its_verdicts(in_process, gauntlet, toy_folder: Path, capsys) -> None:
     in_process.fails = staticmethod(lambda fit: "Step 3: not finite." if fit.size == 16 else "")
     folder, failed = ablate(gauntlet, _yes)
+    assert capsys.readouterr().err.count("Left out: gone is not in $TOY_DATA.\n") == 1
     name = toy_folder.name
     assert [cell.label for cell in failed] == [f"splatting/gaussians {name}@16 2steps seed=0"]
     cells = _cells(gauntlet)

@@ -57,7 +57,7 @@ class Ablate:
     """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
     """Force an implementation of the hot operations: numba, or reference (plain torch)."""
-    checkpoint_every: Annotated[str, arg(metavar="30s|100steps")] = "30s"
+    checkpoint_every: Annotated[str, arg(metavar="30s|5m|100steps")] = "30s"
     """Interval between checkpoints, the most work that an interruption costs."""
     keep: bool = False
     """Keep finished cells whose recipe, scene and request are the same although the code has changed since."""

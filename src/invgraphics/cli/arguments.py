@@ -61,7 +61,7 @@ class Shared:
     """Force an implementation of the hot operations: numba, or reference (plain torch)."""
     protocol: Annotated[str, arg(metavar="NAME")] = "default"
     """How pictures are scored: default (rounded to 8 bits), or float."""
-    checkpoint_every: Annotated[str, arg(metavar="30s|100steps")] = "30s"
+    checkpoint_every: Annotated[str, arg(metavar="30s|5m|100steps")] = "30s"
     """Interval between checkpoints, the most work that an interruption costs."""
     render_with: Annotated[str, arg(metavar="A,B")] = ""
     """Show the fitted fields through the renderers of other methods, too; METHOD:key=value changes a renderer's setting."""

@@ -66,7 +66,7 @@ class Settings:
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
         kernels: implementation to force; ``None`` for the best one here.
         protocol: how to score.
-        checkpoint_every: for instance ``30s`` or ``100steps``.
+        checkpoint_every: for instance ``30s``, ``5m`` or ``100steps``.
         render_with: renderers that show the fitted field besides its own (see `invgraphics.experiments.renderings`).
     """
 
@@ -217,7 +217,7 @@ class AblateRequest:
         spp: samples per pixel of scenes that are rendered.
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
         kernels: implementation to force; ``None`` for the best one here.
-        checkpoint_every: for instance ``30s`` or ``100steps``.
+        checkpoint_every: for instance ``30s``, ``5m`` or ``100steps``.
         keep: whether finished cells count although the code has changed since, if recipe, scene and request are the same.
         cells: pattern of the labels of the cells to run (`invgraphics.studies.cells.Planned.label`); ``None`` for all.
         most_seconds: fits with a longer budget are left for later; ``None`` for none.

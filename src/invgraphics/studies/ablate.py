@@ -105,6 +105,8 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         _check_disk(forecast, folder.root)
         for sentence in announcements(planned.method.choice for planned in plan):
             print(sentence, file=sys.stderr)
+        for reason in dict.fromkeys(state.reason for state in states.values() if state.status == "skipped"):
+            print(f"Left out: {reason}.", file=sys.stderr)
         confirm(forecast)
         record.start(states | {name: CellState("missing", forecast=round(t, 1)) for name, t in expected.items()})
         write_analyses(study.analyses, folder.root)

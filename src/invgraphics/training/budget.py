@@ -36,13 +36,10 @@ class Budget:
         Raises:
             InputError: anything else, or nothing to spend.
         """
-        found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(steps?|s|min|m|h)\s*", text)
-        number = float(found.group(1)) if found else 0.0
-        if found is None or number <= 0 or (found.group(2).startswith("step") and number != int(number)):
+        amount = _read(text)
+        if amount is None:
             raise InputError(f"'{text}' is not a budget.", "Expected something like 60s, 2m, 1h or 5000steps.")
-        if found.group(2).startswith("step"):
-            return Budget(steps=int(number))
-        return Budget(seconds=number * _UNITS[found.group(2)])
+        return Budget(steps=amount) if isinstance(amount, int) else Budget(seconds=amount)
 
     def __str__(self) -> str:
         parts = ([f"{self.seconds:g} s"] if self.seconds is not None else []) + ([f"{self.steps} steps"] if self.steps else [])
@@ -58,13 +55,23 @@ class Cadence:
 
     @staticmethod
     def parse(text: str) -> Cadence:
-        """Read ``100steps`` or ``30s``.
+        """Read ``30s``, ``2m``, ``1h`` or ``100steps``.
 
         Raises:
             InputError: anything else, or nothing between two checkpoints.
         """
-        found = re.fullmatch(r"\s*([0-9]+)\s*(steps?|s)\s*", text)
-        if found is None or int(found.group(1)) == 0:
-            raise InputError(f"'{text}' is no interval for checkpoints.", "Expected something like 100steps or 30s.")
-        amount = int(found.group(1))
-        return Cadence(seconds=float(amount)) if found.group(2) == "s" else Cadence(steps=amount)
+        amount = _read(text)
+        if amount is None:
+            message = f"'{text}' is no interval for checkpoints."
+            raise InputError(message, "Expected something like 30s, 2m, 1h or 100steps.")
+        return Cadence(steps=amount) if isinstance(amount, int) else Cadence(seconds=amount)
+
+
+def _read(text: str) -> int | float | None:
+    """Parse a positive amount: whole steps, or a time in seconds; ``None`` for anything else."""
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(steps?|s|min|m|h)\s*", text)
+    if found is None or (number := float(found.group(1))) <= 0:
+        return None
+    if not found.group(2).startswith("step"):
+        return number * _UNITS[found.group(2)]
+    return int(number) if number == int(number) else None
