@@ -35,6 +35,21 @@ def test_corners_of_the_box() -> None:
     torch.testing.assert_close(bounds("contracted").to_unit(region.centre), torch.full((3,), 0.5, dtype=F64))
 
 
+def test_vertices_of_a_grid_lie_in_its_box() -> None:
+    """Also where rounding takes the corners of the unit cube out of it, as in every third box."""
+    grids = torch.Generator().manual_seed(0)
+    out = 0
+    for _ in range(50):
+        lo = 2 * torch.rand(3, generator=grids) - 2
+        region = Bounds(lo, lo + 0.5 + torch.rand(3, generator=grids))
+        out += not bool(region.contains(region.from_unit(torch.tensor([[0.0, 0, 0], [1, 1, 1]]))).all())
+        vertices = region.vertices((3, 2, 4))
+        assert bool(region.contains(vertices).all())
+        torch.testing.assert_close(vertices[[0, -1]], torch.stack([region.lo, region.hi]))
+        torch.testing.assert_close(vertices.view(3, 2, 4, 3)[1, 1, 2], lo + (region.hi - lo) * torch.tensor([0.5, 1, 2 / 3]))
+    assert out > 5
+
+
 def test_contraction_is_equation_10_of_mipnerf360() -> None:
     inside, outside = torch.tensor([[0.3, -0.2, 0.1]], dtype=F64), torch.tensor([[0.0, 3.0, 4.0]], dtype=F64)
     assert torch.equal(contract(inside), inside)

@@ -66,6 +66,17 @@ def test_look_at_puts_target_ahead_and_up_upwards() -> None:
     assert float(torch.linalg.det(pose[:3, :3])) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("up", [[0.0, 0, 1], [0.0, 2, 0], [1.0, 1, 1]])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_look_at_along_up_is_a_camera_too(up: list[float], side: float) -> None:
+    target = torch.tensor([0.3, 0.1, 0.2])
+    eye = target + side * torch.tensor(up)
+    pose = tf.look_at(eye, target, torch.tensor(up))
+    torch.testing.assert_close(pose[:3, :3].T @ pose[:3, :3], torch.eye(3))
+    assert float(torch.linalg.det(pose[:3, :3])) == pytest.approx(1.0)
+    torch.testing.assert_close(pose[:3, 2], torch.nn.functional.normalize(target - eye, dim=0))
+
+
 def test_similarity_moves_cameras_like_points() -> None:
     """What a camera sees does not change when camera and world move together."""
     pose, motion = random_pose(1), random_pose(2)

@@ -10,10 +10,12 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from processes import Running
 from training_fixtures import SMALL
@@ -239,6 +241,20 @@ def test_an_unfinished_import_of_other_photographs_is_kept(tmp_path: Path) -> No
     with pytest.raises(InputError, match="holds the unfinished import of"):
         reconstruct(PhotoJob(str(tmp_path / "other")), tmp_path / "out")
     assert (work / "database.db").read_bytes() == b"hours of work"
+
+
+def test_other_truth_for_the_same_pixels_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    scene = toy_scene(views=2, size=16)
+    first, *more = scene.test
+    masked = replace(first, mask=torch.zeros(first.image.shape[:2], dtype=torch.bool))
+    others = [
+        replace(scene, world_from_local=torch.diag(torch.tensor([1000.0, 1000, 1000, 1]))),
+        replace(scene, background=1 - scene.background),
+        replace(scene, test=(masked, *more)),
+    ]
+    folders = [save_truth(each, tmp_path) for each in (scene, *others)]
+    assert len(set(folders)) == 4
+    assert save_truth(replace(scene, train=scene.train[:1]), tmp_path) == folders[0]
 
 
 @pytest.mark.parametrize("writer", [(Image.Image, "save"), (np, "savez_compressed")], ids=["picture", "arrays"])

@@ -35,6 +35,15 @@ def test_depth_is_scored_only_where_both_show_a_surface() -> None:
     assert geometry.DEPTH_ABS_REL.compute(pair) == 0
 
 
+def test_true_depths_of_zero_are_none() -> None:
+    """Sensors write 0 where they see nothing."""
+    true = torch.full((6, 8), 3.0)
+    pair = pair_of(pred_depth=true.clone(), true_depth=true)
+    true[:, :2] = 0.0
+    for metric in (geometry.DEPTH_ABS_REL, geometry.DEPTH_RMSE):
+        assert metric.compute(pair) == 0
+
+
 def test_depth_says_why_it_is_missing() -> None:
     ones = torch.ones(6, 8)
     cases = {

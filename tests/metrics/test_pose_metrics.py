@@ -108,6 +108,13 @@ def test_extent_is_that_of_a_scene() -> None:
     assert camera_extent(true) == pytest.approx(2.2)
 
 
+@pytest.mark.parametrize("count", [1, 3, 10])
+def test_a_tripod_s_extent_is_one_unit(count: int) -> None:
+    """The mean of equal numbers is off by a rounding error, which is no extent."""
+    true = poses(np.tile([0.1, 0.2, 0.3], (count, 1)))
+    assert camera_extent(true) == 1.0
+
+
 def test_angles_agree_with_scipy() -> None:
     first, second = Rotation.random(20, random_state=1), Rotation.random(20, random_state=2)
     angles = rotation_angle(torch.from_numpy(first.as_matrix()), torch.from_numpy(second.as_matrix()))

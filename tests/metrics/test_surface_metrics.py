@@ -32,6 +32,13 @@ def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) 
     return extract_mesh(Sphere(1.0, radius, centre), BOX, 40).mesh
 
 
+def test_a_mesh_without_area_is_refused() -> None:
+    flat = Mesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]))
+    for mesh in (flat, Mesh(torch.zeros(3, 3), torch.zeros(0, 3, dtype=torch.int64))):
+        with pytest.raises(ValueError, match="no area"):
+            sample_surface(mesh, 10, torch.Generator().manual_seed(0))
+
+
 def test_distances_to_a_box_are_those_of_its_formula() -> None:
     """Exact, on twelve large triangles: no nearest sample could be so near."""
     mesh = _box(Bounds(torch.tensor([-0.5, -0.4, -0.3]), torch.tensor([0.5, 0.4, 0.3])))

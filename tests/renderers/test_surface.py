@@ -68,6 +68,17 @@ def test_a_ball_in_closed_form(ball: Mesh, camera: Camera) -> None:
     assert bool(((soft.normal.norm(dim=-1) - 1).abs() < 1e-5)[soft.alpha >= 0.5].all())
 
 
+def test_normals_do_not_cancel_along_a_silhouette(ball: Mesh, make_camera: Callable[..., Camera]) -> None:
+    """Those of triangles that reach over the horizon: near the radius of the hit, as everywhere."""
+    camera = make_camera(96, 72, 102.0).to(torch.float32)
+    seen = picture(ball, camera, supersampling=1)
+    assert seen.normal is not None
+    hit = (seen.alpha == 1).reshape(-1)
+    where = camera.rays().at(torch.where(hit, seen.depth.reshape(-1), 0.0))
+    cosine = (seen.normal.reshape(-1, 3) * torch.nn.functional.normalize(where, dim=1)).sum(dim=1)[hit]
+    assert float(cosine.min()) > 0.99
+
+
 def test_flat_normals_are_those_of_the_faces(camera: Camera) -> None:
     cube = extract_mesh(Box(1.0, (0.5, 0.5, 0.5)), BOX, 24).mesh
     seen = picture(cube, camera, supersampling=1, normals="faces")

@@ -146,6 +146,27 @@ def test_view_selector_shows_one_view_at_a_time(opened: Any) -> None:
     page.wait_for_function("location.hash && document.querySelector('.view:not([hidden])').id === location.hash.slice(1)")
 
 
+def test_a_fragment_that_is_no_address_breaks_nothing(opened: Any, built_study: Path) -> None:
+    page = opened(built_study)
+    buttons = page.locator("button.sort").count()
+    assert buttons > 0
+    page.goto((built_study / "index.html").as_uri() + "#100%")
+    page.reload()
+    assert page.locator("button.sort").count() == buttons
+    assert page.heard["complaints"] == []
+
+
+def test_what_paper_opens_is_folded_again(opened: Any, built_study: Path) -> None:
+    page = opened(built_study)
+    states = "[...document.querySelectorAll('details')].map(one => one.open)"
+    before = page.evaluate(states)
+    assert not all(before)
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert all(page.evaluate(states))
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert page.evaluate(states) == before
+
+
 def test_copy_button_copies_the_command(opened: Any) -> None:
     page = opened(permissions=["clipboard-read", "clipboard-write"])
     page.locator("button.copy").first.click()

@@ -127,6 +127,21 @@ def test_runs_from_anywhere_give_a_folder_that_can_be_moved(comparison_folder: P
             assert link.startswith(("#", "data:")) or (moved / link).is_file(), link
 
 
+def test_unequal_budgets_are_told_and_times_that_they_fix_are_not_ranked(
+    comparison_folder: Path, tmp_path: Path, edit: Callable[..., None]
+) -> None:
+    runs = [comparison_folder / RUN, comparison_folder / "runs/volumetric-nerf/seed-0"]
+    equal = build_from_runs(runs, tmp_path / "equal").read_text()
+    edit(runs[1] / "provenance.json", lambda table: table.update(budget="2m"))
+    page = build_from_runs(runs, tmp_path / "out").read_text()
+    budgets = "60 s (volumetric/hash); 2 min (volumetric/nerf)"
+    assert f"The budgets are not equal: {budgets}. A lead may be that of the longer fit." in page
+    assert f"<dt>budget per fit</dt><dd>{budgets}</dd>" in page
+    assert "Fit (s) ↓" not in text_of(page)
+    assert "budgets are not equal" not in equal and "Given 60 s each" in equal
+    assert "The grey rows" not in page, "without baselines none are explained"
+
+
 def test_same_method_and_seed_twice_is_told_apart(comparison_folder: Path, tmp_path: Path, edit: Callable[..., None]) -> None:
     longer = tmp_path / "longer"
     shutil.copytree(comparison_folder / RUN, longer)

@@ -54,6 +54,18 @@ def test_cameras_look_at_the_target(kind):
         assert depth > 0
 
 
+def test_a_window_above_the_scene_looks_down():
+    """Along the world's up, where another axis is taken as the picture's."""
+    rig = make_rig({"kind": "forward", "eye": [0.0, 0.0, 3.0]})
+    views = cameras(rig, "train", 20, (40, 30), 0)
+    for camera in views:
+        rotation = camera.cam_to_world[:3, :3]
+        assert torch.allclose(rotation.T @ rotation, torch.eye(3, dtype=torch.float64), atol=1e-12)
+    assert torch.stack([camera.position for camera in views]).std(dim=0)[:2].min() > 0.1
+    with pytest.raises(InputError, match="the same point"):
+        make_rig({"kind": "forward", "eye": [0.0, 0.0, 0.0]})
+
+
 def test_hemisphere_is_uniform_over_its_zone():
     rig = make_rig(TABLES["hemisphere"])
     offset = torch.stack([c.position for c in cameras(rig, "train", 400, (8, 8), 0)]) - torch.tensor(rig.target)

@@ -153,6 +153,12 @@ def test_a_lattice_shows_what_the_density_shows(scene: Scene, kind: Callable[[],
     torch.testing.assert_close(ours.radiance[solid], theirs.radiance[solid], atol=0.03, rtol=0)
 
 
+def test_a_lattice_takes_densities_through_a_relu_only(scene: Scene) -> None:
+    method = load_method("volumetric/plenoxels", "laptop", [*lattice_settings(8), 'field.density_activation="softplus"'])
+    with pytest.raises(InputError, match="only through a ReLU"):
+        to_lattice(model_of(TwoBalls(), scene), scene, method, 8)
+
+
 def test_planes_show_what_the_density_shows(scene: Scene) -> None:
     truth, method = model_of(TwoBalls(), scene), load_method("planes/mpi", "laptop", ["field.init='uniform'"])
     shown = Model(to_planes(truth, scene, method, 0), method.recipe.renderer.build(scene), scene.bounds)

@@ -105,6 +105,15 @@ def test_specks_are_left_out() -> None:
     assert torch.equal(left.mesh.vertices[left.mesh.faces], ball.vertices[ball.faces])
 
 
+def test_of_nothing_but_specks_the_largest_stay() -> None:
+    """A thousand tetrahedra and more, of which each has less than a thousandth of the faces."""
+    corners = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    beads = 1100
+    places = torch.cat([torch.eye(4)[:, :3] + 2 * i for i in range(beads)])
+    left = without_specks(Mesh(places, torch.cat([corners + 4 * i for i in range(beads)])))
+    assert (len(left.mesh.faces), left.dropped) == (4 * beads, 0)
+
+
 def _all_around() -> list[Camera]:
     cameras = [*toy_cameras(24, 72), *toy_cameras(8, 72, turn=0.5)]
     upside_down = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))

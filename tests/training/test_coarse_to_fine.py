@@ -14,7 +14,7 @@ from invgraphics.runs import checkpoint
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 from invgraphics.training.losses import BackgroundEntropyLoss, PointColourLoss
-from invgraphics.training.tight_box import TightBoxConfig, enlarged, occupied_box, vertex_positions
+from invgraphics.training.tight_box import TightBoxConfig, enlarged, occupied_box
 from invgraphics.training.view_rates import ViewRatesConfig, view_counts
 
 SMALL = ["batches.rays=64", "batches.samples=2048", "field.colour_width=16", "renderer.sampler.resolution=16"]
@@ -39,7 +39,7 @@ BOUNDS = Bounds(torch.tensor([-1.0, -2.0, 0.0]), torch.tensor([1.0, 2.0, 1.0]))
 
 
 def test_vertices_of_a_grid_lie_in_the_order_of_memory():
-    found = vertex_positions(BOUNDS, (3, 2, 5)).reshape(3, 2, 5, 3)
+    found = BOUNDS.vertices((3, 2, 5)).reshape(3, 2, 5, 3)
     torch.testing.assert_close(found[1, 0, 3], torch.tensor([0.0, -2.0, 0.75]))
     torch.testing.assert_close(found[2, 1, 4], BOUNDS.hi)
 
@@ -105,7 +105,7 @@ def test_rates_follow_the_views_and_end(scene):
         if fit.steps in (1, 2, 4):
             assert rates is not None
             assert rates.shape == (expected,) * 3
-    points = vertex_positions(fit.model.field.bounds, (15, 15, 15))
+    points = fit.model.field.bounds.vertices((15, 15, 15))
     counts = view_counts(points, [view.camera for view in zoomed.train]).reshape(15, 15, 15)
     torch.testing.assert_close(fit._optimiser.row_rates("field.appearance.levels.0"), counts / counts.max())
     assert 0 < float(counts.min() / counts.max()) < 1 or float(counts.min()) == 0

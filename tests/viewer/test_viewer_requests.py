@@ -21,7 +21,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.runs.folder import CHECKPOINT
-from invgraphics.viewer.launch import ViewerConfig, check_address, is_loopback, open_viewer
+from invgraphics.viewer.launch import ViewerConfig, browsable, check_address, is_loopback, open_viewer
 from invgraphics.viewer.loaded_run import open_run
 
 
@@ -90,6 +90,23 @@ def test_a_checkpoint_of_another_recipe(runs: dict[str, Path], tmp_path: Path, c
 @pytest.mark.parametrize(("host", "answer"), [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False)])
 def test_loopback(host: str, answer: bool) -> None:
     assert is_loopback(host) is answer
+
+
+@pytest.mark.parametrize(
+    ("listens", "opened"),
+    [
+        ("127.0.0.1", "127.0.0.1"),
+        ("::1", "[::1]"),
+        ("localhost", "localhost"),
+        ("0.0.0.0", "localhost"),
+        ("::", "localhost"),
+        ("192.0.2.2", "192.0.2.2"),
+        ("fe80::1", "[fe80::1]"),
+        ("desk.lan", "desk.lan"),
+    ],
+)
+def test_the_address_that_is_printed_is_served(listens: str, opened: str) -> None:
+    assert browsable(listens) == opened
 
 
 def test_the_page_is_opened_where_there_is_a_screen_only(monkeypatch) -> None:

@@ -158,7 +158,7 @@ def _check_points(position: Float[Tensor, "n 3"], what: str) -> None:
 
 def _check_geometry(view: View, what: str) -> None:
     if view.depth is not None:
-        _expect(bool((view.depth >= 0).all()), f"The depth of {what} has values that are not positive.")  # NaN neither
+        _expect(bool((view.depth >= 0).all()), f"The depth of {what} has values that are negative or no numbers.")
     if view.normal is not None:
         length = view.normal.square().sum(dim=-1).sqrt()
         good = ((length - 1).abs() <= UNIT) | (length == 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -61,6 +62,17 @@ class Bounds:
         """Inverse of `to_unit`; corners of the cube beyond the contracted ball are pulled onto its rim."""
         x = uncontract((unit * 2 - 1) * 2) if self.space == "contracted" else unit * 2 - 1
         return self.centre + x * self.half
+
+    def vertices(self, resolution: Sequence[int]) -> Float[Tensor, "n 3"]:
+        """Positions of a voxel grid's vertices, of which the outermost lie on the unit cube's faces; z runs fastest.
+
+        Args:
+            resolution: vertices along x, y and z.
+        """
+        axes = [torch.linspace(0, 1, size, device=self.lo.device, dtype=self.lo.dtype) for size in resolution]
+        position = self.from_unit(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3))
+        # Rounding must not put those of a box outside it, where a field has no density.
+        return position.clamp(self.lo, self.hi) if self.space == "box" else position
 
     def unit_covariance(self, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3"]:
         """Transform covariances to the unit cube by the linearised map, J Σ Jᵀ (mip-NeRF 360, equation 9).

@@ -19,6 +19,9 @@ Pose = Float[Tensor, "4 4"]
 AXES = {"opencv": "RDF", "opengl": "RUB", "z-up": "RFU"}
 """Frames by name, as the letters that `axes_to_opencv` reads."""
 
+PARALLEL = 1e-6
+"""Sine of the angle between two directions below which their cross product is rounding noise."""
+
 _DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 
 
@@ -102,9 +105,15 @@ def rigid(rotation: Float[Tensor, "3 3"], translation: Float[Tensor, 3]) -> Pose
 
 
 def look_at(eye: Float[Tensor, 3], target: Float[Tensor, 3], up: Float[Tensor, 3]) -> Pose:
-    """The pose of a camera at ``eye`` that sees ``target`` in the middle and ``up`` upwards."""
+    """The pose of a camera at ``eye`` that sees ``target`` in the middle and ``up`` upwards.
+
+    A camera that looks along ``up`` has the axis of the world that is most across its view upwards instead.
+    """
     forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    right = torch.linalg.cross(forward, up)
+    if float(right.norm()) <= PARALLEL * float(up.norm()):
+        right = torch.linalg.cross(forward, torch.eye(3).to(up)[forward.abs().argmin()])
+    right = torch.nn.functional.normalize(right, dim=0)
     return rigid(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1), eye)
 
 

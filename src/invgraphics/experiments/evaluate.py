@@ -22,7 +22,7 @@ from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
-from invgraphics.experiments.identity import check_truth
+from invgraphics.experiments.identity import check_truth, truth_digest
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
 from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.experiments.scaled import scaled_scores
@@ -250,7 +250,7 @@ def display(colour: torch.Tensor, scene: Scene) -> torch.Tensor:
 
 def save_truth(scene: Scene, root: Path) -> Path:
     """Write the test views' truth to ``root/<sha of content>``: pictures, and arrays of what those cannot hold."""
-    folder = root / scene.digest("test")[:16]
+    folder = root / truth_digest(replace(scene, train=(), val=(), observed=(), points=None))[:16]
     folder.mkdir(parents=True, exist_ok=True)
     with locks.locked(folder, folder / locks.INSIDE, waiting=lambda holder: None):  # runs of a study share it
         for index, view in enumerate(scene.test):

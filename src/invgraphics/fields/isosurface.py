@@ -186,7 +186,7 @@ def marching_cubes(
 
 
 def without_specks(mesh: Mesh) -> Extracted:
-    """Remove the smallest connected components of a mesh."""
+    """Remove the smallest connected components of a mesh; of its largest, at least one stays."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -195,7 +195,7 @@ def without_specks(mesh: Mesh) -> Extracted:
     graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     pieces, label = connected_components(graph, directed=False)
     sizes = np.bincount(label[faces[:, 0]], minlength=pieces)
-    kept = sizes >= SPECK * len(faces)
+    kept = sizes >= min(SPECK * len(faces), sizes.max())
     chosen = torch.from_numpy(faces[kept[label[faces[:, 0]]]]).to(mesh.faces.device)
     return Extracted(compacted(replace(mesh, faces=chosen)), int(((sizes > 0) & ~kept).sum()))
 

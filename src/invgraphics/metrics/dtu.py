@@ -17,8 +17,6 @@ SPACING = 0.2
 """Distance to which predicted points are thinned, mm."""
 FARTHEST = 20.0
 """Distances beyond this are outliers and do not count, mm."""
-MARGIN = 60.0
-"""Predicted points farther than this outside the observed box are not looked at for completeness either, mm."""
 MOST_POINTS = 2_000_000
 
 
@@ -60,9 +58,7 @@ def dtu_score(mesh: Mesh, scan: Scan, seed: int = 0) -> DtuScore:
     seen = points[scan.sees(points)]
     if not len(seen):
         raise ValueError("no point of the predicted surface lies where the scanner looked")
-    lo, hi = scan.points.amin(dim=0).double() - MARGIN, scan.points.amax(dim=0).double() + MARGIN
-    around = points[((points >= lo) & (points <= hi)).all(dim=1)]
-    return DtuScore(_mean_distance(seen, scan.points), _mean_distance(scan.above_table(), around))
+    return DtuScore(_mean_distance(seen, scan.points), _mean_distance(scan.above_table(), points))
 
 
 def _thinned(points: Float[Tensor, "n 3"]) -> Float[Tensor, "k 3"]:

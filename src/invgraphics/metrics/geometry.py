@@ -38,7 +38,7 @@ def _scored_depths(pair: Pair, smooth: bool) -> tuple[Float[Tensor, " k"], Float
         raise Skip("the scene has no true depth")
     if pair.pred_depth is None:
         raise Skip("the prediction has no depth")
-    where = shared_surface(pair) & pair.true_depth.isfinite()
+    where = shared_surface(pair) & pair.true_depth.isfinite() & (pair.true_depth > 0)
     if smooth:
         where &= smooth_depth(pair.true_depth)
     if not where.any():

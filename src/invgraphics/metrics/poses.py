@@ -19,6 +19,9 @@ from invgraphics.core.transforms import rigid, transform_points
 THINNEST = 0.05
 """Spread of camera centres across their main axis, relative to that along it, below which they count as lying on a line."""
 
+ROUNDING = 1e-12
+"""Spread of camera centres over their distance from the origin, below which all stand in one place."""
+
 MARGIN = 1.1
 """Extent of a set of cameras over the largest distance of one from their mean: 3DGS's, as in `Scene.extent`."""
 
@@ -110,7 +113,7 @@ def align_similarity(
     covariance = target.T @ source / len(source)
     spreads = [float(points.square().sum(dim=1).mean().sqrt()) for points in (source, target)]
     place = sum(float(mean.abs().max()) for mean in (source_mean, target_mean))
-    apart = min(spreads) > 1e-12 * (place + max(spreads))
+    apart = min(spreads) > ROUNDING * (place + max(spreads))
     evidence = covariance / (spreads[0] * spreads[1]) if apart else torch.zeros_like(covariance)
     if source_rotations is not None and target_rotations is not None and min(map(_width, (source, target))) < THINNEST:
         evidence = evidence + (target_rotations.double() @ source_rotations.double().mT).mean(dim=0)
@@ -153,7 +156,9 @@ def pose_errors(
 def camera_extent(cam_to_world: Float[Tensor, "n 4 4"]) -> float:
     """The extent of a set of cameras in their units, by the rule of `Scene.extent`; 1 where all stand in one place."""
     centres = cam_to_world[:, :3, 3].double()
-    return MARGIN * float((centres - centres.mean(dim=0)).norm(dim=1).max()) or 1.0
+    middle = centres.mean(dim=0)
+    spread = float((centres - middle).norm(dim=1).max())
+    return MARGIN * spread if spread > ROUNDING * (float(middle.norm()) + spread) else 1.0
 
 
 def rotation_angle(first: Float[Tensor, "*n 3 3"], second: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n"]:

@@ -119,11 +119,16 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
         mesh: triangles are drawn by area.
         count: points wanted.
         generator: source of randomness.
+
+    Raises:
+        ValueError: the mesh has no area.
     """
     a, b, c = mesh.vertices.double()[mesh.faces].unbind(dim=1)
     normals = torch.linalg.cross(b - a, c - a)
     # torch.multinomial takes at most 2^24 classes.
     cumulative = normals.norm(dim=1).cumsum(0)
+    if not len(cumulative) or not float(cumulative[-1]) > 0:
+        raise ValueError("the mesh has no area")
     chosen = torch.searchsorted(cumulative, torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1])
     chosen = chosen.clamp_max(len(mesh.faces) - 1)
     u, v = torch.rand(2, count, 1, generator=generator, dtype=torch.float64)

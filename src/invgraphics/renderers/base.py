@@ -11,6 +11,8 @@ from invgraphics.core import Rendering
 
 MIN_SURFACE_ALPHA = 0.5
 """A pixel with less alpha than this has no depth and no normal (CONVENTIONS.md)."""
+BEHIND = 0.5
+"""Cosine between a normal and its ray from which on the surface is seen from behind."""
 
 
 def to_rendering(
@@ -29,16 +31,23 @@ def to_rendering(
         distance: sum of w * t.
         normal: sum of w * normal, or ``None``.
         far: depth of pixels with alpha below `MIN_SURFACE_ALPHA`.
-        directions: unit ray directions, which tell a normal's front from its back; needed where there are normals.
+        directions: unit ray directions, towards which no normal points in the result; needed where there are normals.
     """
     seen = alpha >= MIN_SURFACE_ALPHA
     depth = torch.where(seen, distance / alpha.clamp_min(MIN_SURFACE_ALPHA), far)
     if normal is not None:
         assert directions is not None
-        unit = normalize(normal, dim=-1)
-        unit = torch.where((unit * directions).sum(dim=-1, keepdim=True) > 0, -unit, unit)
-        normal = torch.where(seen[..., None], unit, 0.0)
+        normal = torch.where(seen[..., None], _facing(normalize(normal, dim=-1), directions), 0.0)
     return Rendering(rgb, alpha, depth, normal)
+
+
+def _facing(normal: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+    """Turn unit normals against their rays: a surface seen from behind by half a turn, other normals until they lie across.
+
+    Along a silhouette, half a turn would make the largest error of a small one.
+    """
+    away = (normal * directions).sum(dim=-1, keepdim=True)
+    return torch.where(away > BEHIND, -normal, normalize(normal - away.clamp_min(0) * directions, dim=-1))
 
 
 def normals_from_depth(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

@@ -115,14 +115,14 @@ class Surface(Renderer):
             fragments = differentiable(fragments, mesh, rays)
         features = [self._colours(field, mesh, camera, ctx)]
         if ctx.geometry and self.config.normals == "vertices":
-            features.append(_towards(mesh.outwards(), mesh.vertices, camera))
+            features.append(mesh.outwards())
         image = kernels.mesh_interpolate(fragments, mesh.faces, torch.cat(features, dim=1))
         seen = fragments.face >= 0
-        normal = image[..., 3:] if ctx.geometry else None
-        if ctx.geometry and self.config.normals == "faces":
-            own = normalize(face_normals(mesh.vertices, mesh.faces), dim=1)
-            facing = _towards(own, mesh.vertices[mesh.faces].mean(dim=1), camera)
-            normal = torch.cat([facing, facing.new_zeros(1, 3)])[fragments.face]  # -1, where nothing is hit, is the last row
+        normal = None
+        if ctx.geometry:
+            normal = _facing(mesh, fragments, rays)
+            if self.config.normals == "vertices":
+                normal = _aligned(image[..., 3:], normal)
         distance = torch.where(seen, fragments.depth, 0.0)
         return self._averaged(Rendering(image[..., :3], seen.to(image), distance, normal), rays)
 
@@ -190,10 +190,19 @@ def _numbering(kept: Bool[Tensor, " n"]) -> Int[Tensor, " n"]:
     return kept.cumsum(0) - 1
 
 
-def _towards(normals: Float[Tensor, "n 3"], places: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
-    """Normals turned towards the camera: triangles are seen from both sides."""
-    away = (normals * (places - camera.position)).sum(dim=1, keepdim=True) > 0
-    return torch.where(away, -normals, normals)
+def _facing(mesh: Mesh, fragments: Fragments, rays: Rays) -> Float[Tensor, "h w 3"]:
+    """Unit normals of the triangles that were hit, turned against the rays: they are seen from both sides. 0 without a hit."""
+    own = normalize(face_normals(mesh.vertices, mesh.faces), dim=1)
+    normals = torch.cat([own, own.new_zeros(1, 3)])[fragments.face]  # -1, where nothing is hit, is the last row
+    return _aligned(normals, -rays.directions.view(normals.shape))
+
+
+def _aligned(normals: Float[Tensor, "h w 3"], sides: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Normals turned to the sides that others point to.
+
+    Interpolated normals follow their triangle, not the ray, beside which they may lie on either side along a silhouette.
+    """
+    return torch.where((normals * sides).sum(dim=2, keepdim=True) < 0, -normals, normals)
 
 
 def _interval(rays: Rays, bounds: Bounds, camera: Camera) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:

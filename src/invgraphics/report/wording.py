@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -166,3 +166,13 @@ def budget_words(budget: str) -> str:
         return budget
     amount, unit = float(found.group(1)), {"m": "min", "step": "steps"}.get(found.group(2), found.group(2))
     return f"{int(amount):,} {unit}" if unit == "steps" else f"{amount:,g} {unit}"
+
+
+def grouped(pairs: Sequence[tuple[str, str]]) -> str:
+    """The value that all owners have; else each value with its owners in brackets, empty values left out."""
+    owners: dict[str, list[str]] = {}
+    for value, owner in dict.fromkeys(pairs):
+        owners.setdefault(value, []).append(owner)
+    if len(owners) <= 1:
+        return "".join(owners)
+    return "; ".join(f"{value} ({listing(names)})" for value, names in owners.items() if value)

@@ -20,7 +20,7 @@ from invgraphics.scenes.pictures.lens import Lens
 from invgraphics.scenes.poses import pose
 from invgraphics.tables import read_json
 
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _LONGEST_PATH = 1000
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
@@ -153,20 +153,19 @@ class Frames:
         return self.table.get(key) if own is None else own
 
     def _lens(self, index: int, pinhole: tuple[float, ...], size: tuple[int, int]) -> Lens | None:
-        """Lens of OPENCV (k1 k2 p1 p2; rational with k3, k4) or OPENCV_FISHEYE (k1 k2 k3 k4); ``None`` for a pinhole."""
-        k1, k2, p1, p2, k3, k4 = (self._number(index, key) or 0.0 for key in _COEFFICIENTS)
+        """Lens of OPENCV (k1 k2 p1 p2; rational with k3 to k6) or OPENCV_FISHEYE (k1 k2 k3 k4); ``None`` for a pinhole."""
+        k1, k2, p1, p2, *more = (self._number(index, key) or 0.0 for key in _COEFFICIENTS)
         model = str(self._given(index, "camera_model") or "OPENCV")
         fisheye = model == "OPENCV_FISHEYE" or self._given(index, "is_fisheye") is True
         if fisheye:
-            lens = Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4), *size)
+            lens = Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, *more[:2]), *size)
         elif model in _PINHOLES:
             return None
         elif model in ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV"):
-            if not any((k1, k2, p1, p2, k3, k4)):  # known without pycolmap, whose import takes as long as many a scene
+            if not any((k1, k2, p1, p2, *more)):  # known without pycolmap, whose import takes as long as many a scene
                 return None
-            extended = bool(k3 or k4)
-            more = (k3, k4, 0.0, 0.0) if extended else ()
-            lens = Lens("FULL_OPENCV" if extended else "OPENCV", (*pinhole, k1, k2, p1, p2, *more), *size)
+            kind, rational = ("FULL_OPENCV", more) if any(more) else ("OPENCV", [])
+            lens = Lens(kind, (*pinhole, k1, k2, p1, p2, *rational), *size)
         else:
             remedy = "Known: OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL, RADIAL, FULL_OPENCV, PINHOLE, SIMPLE_PINHOLE."
             raise InputError(f"{self.path} has the camera model '{model}', which is not supported.", remedy)

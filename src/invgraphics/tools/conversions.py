@@ -222,9 +222,11 @@ def to_lattice(model: Model, scene: Scene, method: Method, size: int) -> Field:
         raise InputError(f"{method.name} has no voxel grid of densities.", "Use --method volumetric/plenoxels.")
     grid, colours = field.encoding, field.appearance
     assert isinstance(colours, SparseVoxels)
-    index = torch.stack(torch.meshgrid(*(torch.arange(n) for n in grid.resolution), indexing="ij"), dim=-1).view(-1, 3)
-    vertices = model.bounds.from_unit((index / (torch.tensor(grid.resolution) - 1)).to(model.bounds.lo))
-    # Features of 1 have the density of a unit, whatever activation and unit of length the field has.
+    vertices = model.bounds.vertices(grid.resolution)
+    activation = field.density_activation
+    if activation.kind != "relu" or activation.bias != 0 or activation.interpolation == "pre":
+        raise InputError("Densities go into a voxel grid only through a ReLU without a bias.", "Leave the recipe as it is.")
+    # Features of 1 have the density of a unit, whatever unit of length the field has.
     grid.rows.fill_(1.0)
     unit = torch.cat([_density(field, part) for part in vertices.split(CHUNK)])
     density = torch.cat([_density(model.field, part) for part in vertices.split(CHUNK)])

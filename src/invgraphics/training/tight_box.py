@@ -7,7 +7,6 @@ from functools import partial
 from typing import cast
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
@@ -100,7 +99,7 @@ def occupied_box(field: Field, bounds: Bounds, resolution: tuple[int, int, int],
     """
     if Quantity.DENSITY not in field.provides:
         raise InputError(f"The hook 'tight_box' needs a density, which {type(field).__name__} does not have.")
-    position = vertex_positions(bounds, resolution)
+    position = bounds.vertices(resolution)
     density = torch.cat([field.density_no_grad(Samples.at(part)) for part in position.split(chunk)])
     cells = torch.tensor([size - 1 for size in resolution], device=position.device)
     voxel = 2 * bounds.half / cells
@@ -114,9 +113,3 @@ def enlarged(box: Box, scale: float, within: Bounds) -> Box:
     """Scale a box about its middle, and cut off what leaves ``within``."""
     middle, half = (box[0] + box[1]) / 2, scale * (box[1] - box[0]) / 2
     return (middle - half).maximum(within.lo), (middle + half).minimum(within.hi)
-
-
-def vertex_positions(bounds: Bounds, resolution: tuple[int, int, int]) -> Float[Tensor, "n 3"]:
-    """Positions of a voxel grid's vertices, local frame, in the order of memory (z fastest)."""
-    axes = [torch.linspace(0, 1, size, device=bounds.lo.device, dtype=bounds.lo.dtype) for size in resolution]
-    return bounds.from_unit(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3))

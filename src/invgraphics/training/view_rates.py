@@ -16,7 +16,6 @@ from invgraphics.core.lattice import Lattice, LatticeField
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState, Hook
 from invgraphics.training.penalties import LATTICES
-from invgraphics.training.tight_box import vertex_positions
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class ViewRates(Hook):
 
 def _rates(lattice: Lattice, field: LatticeField, cameras: Sequence[Camera]) -> Float[Tensor, "x y z"]:
     x, y, z = lattice.resolution
-    views = view_counts(vertex_positions(field.bounds, (x, y, z)), cameras)
+    views = view_counts(field.bounds.vertices((x, y, z)), cameras)
     return (views / views.max().clamp_min(1)).reshape(x, y, z)
 
 

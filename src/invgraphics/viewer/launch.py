@@ -75,6 +75,17 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def browsable(host: str) -> str:
+    """Host of a URL at which this machine's browser finds a server; of all interfaces, "localhost"."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    if address.is_unspecified:
+        return "localhost"
+    return f"[{host}]" if address.version == 6 else host
+
+
 def check_address(host: str, port: int) -> None:
     """Check that an address and port can be bound, before anything is loaded.
 

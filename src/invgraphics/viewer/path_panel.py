@@ -24,6 +24,7 @@ ECHO = 0.5
 SAMPLES = 24
 """Segments of the drawn path between two keyframes."""
 LINE = (0, 158, 115)
+FILM = "An MP4 file at full size: of one run, the second where that is shown alone, and of its prediction for truth and error."
 
 
 @dataclass(frozen=True)
@@ -64,16 +65,18 @@ class PathPanel:
         self._line: Any = None
         with gui.add_folder("Camera path", expand_by_default=False):
             add = gui.add_button("Add keyframe", hint="The current view, after the keyframe that is selected below.")
-            self.selected = gui.add_dropdown("Keyframe", (NONE,), hint="Selecting one goes there.")
+            self.selected = gui.add_dropdown("Keyframe", (NONE,), hint="Selecting another one goes there.")
+            back = gui.add_button("Go to keyframe", hint="The selected one.")
             delete = gui.add_button("Delete keyframe")
             self.seconds = gui.add_slider("Seconds between", 0.2, 10.0, 0.1, self.path.seconds)
             self.loop = gui.add_checkbox("Loop", False, hint="Returns to the first keyframe.")
             self._play = gui.add_button("Play")
             save = gui.add_button("Save path", hint="A JSON file, for `invgraphics render RUN --path FILE.json`.")
-            self._export = gui.add_button("Export film", hint="An MP4 file of what is shown, at full size.")
+            self._export = gui.add_button("Export film", hint=FILM)
             self._status = gui.add_html("")
         for button, handler in (
             (add, self._add),
+            (back, self._return),
             (delete, self._delete),
             (self._play, self._toggle_play),
             (save, self._save),
@@ -125,6 +128,9 @@ class PathPanel:
         if self.selected.value in (self._listed, NONE) or time.monotonic() - self._listed_at < ECHO:
             return
         self._listed = self.selected.value
+        await self._return()
+
+    async def _return(self) -> None:
         if (index := self._index) is not None:
             self._callbacks.move(self.path.keyframes[index])
 
@@ -133,8 +139,11 @@ class PathPanel:
         self._changed()
 
     def _changed(self) -> None:
-        """Update status and drawing."""
+        """Update status and drawing; a path that plays goes on with its next camera, or stops where it has become too short."""
         self.show_status("")
+        if self._playing is not None and len(self.path.keyframes) < 2:
+            self.close()
+            self._stopped()
         if self._line is not None:
             self._line.remove()
             self._line = None

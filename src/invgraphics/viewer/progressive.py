@@ -61,6 +61,7 @@ class Frame:
         size: rendered (width, height).
         seconds: render time.
         final: whether this is the finest level.
+        output: what is shown: prediction, truth, error, depth and so on.
         legend: of the colours.
         psnr: of each run against the photograph in dB, where it is rendered whole and at full size; else empty.
     """
@@ -69,6 +70,7 @@ class Frame:
     size: tuple[int, int]
     seconds: float
     final: bool
+    output: str
     legend: str = ""
     psnr: tuple[float, ...] = ()
 
@@ -253,6 +255,7 @@ class ProgressiveRenderer:
             (finest.width, finest.height),
             sum(took for _, _, took in latest),
             not any(side.scales for side in sides),
+            request.output,
             seen.legend,
             self._psnr(request, panels, renderings),
         )
@@ -276,4 +279,4 @@ class ProgressiveRenderer:
             (view.camera.width, view.camera.height) if letterbox is None else (letterbox.camera.width, letterbox.camera.height)
         )
         picture = true_image(view, self.runs[0].scene, size)
-        return Frame(letterboxed(picture, letterbox), size, 0.0, True, f"the photograph {view.name}")
+        return Frame(letterboxed(picture, letterbox), size, 0.0, True, "truth", f"the photograph {view.name}")

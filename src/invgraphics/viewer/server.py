@@ -147,8 +147,10 @@ class Viewer:
     def _report_error(self, key: Hashable, error: Exception) -> None:
         sentence = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         print(f"The viewer: {sentence}", file=sys.stderr, flush=True)
-        for session in tuple(self._sessions.values()):
-            session.show_error(sentence)
+        task, client = key if isinstance(key, tuple) else (key, None)
+        for number, session in tuple(self._sessions.items()):
+            if client in (None, number):
+                session.show_error(str(task), sentence)
 
 
 def upward(scene: Scene) -> tuple[float, float, float]:

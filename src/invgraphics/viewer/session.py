@@ -104,10 +104,14 @@ class Session:
         self._submit("overlays", self._update_overlays())
         self._request_frame(skip_coarse=True)
 
-    def show_error(self, sentence: str) -> None:
-        """Show an error as a notification; called by the render thread."""
-        if not self._closed:
-            self._client.add_notification("The picture could not be made", sentence, color="red")
+    def show_error(self, task: str, sentence: str) -> None:
+        """Show the error of a task, "film" or another, as a notification; called by the render thread."""
+        if self._closed:
+            return
+        if task == "film":
+            self._path.show_status("The film could not be made.", exporting=False)
+        title = "The film could not be made" if task == "film" else "The picture could not be made"
+        self._client.add_notification(title, sentence, color="red")
 
     @property
     def _runs(self) -> tuple[LoadedRun, ...]:
@@ -179,10 +183,11 @@ class Session:
     async def _save_image(self) -> None:
         """Send the current image as a PNG file."""
         if self._frame is None:
+            self._controls.show_status("Nothing to save: splats are drawn by the browser. Switch that off first.")
             return
         content = io.BytesIO()
         Image.fromarray(self._frame.image).save(content, format="PNG")
-        self._download(f"{self._scene.name}-{self._controls.output.value}.png", content.getvalue())
+        self._download(f"{self._scene.name}-{self._frame.output}.png", content.getvalue())
 
     def _download(self, name: str, content: bytes) -> None:
         self._client.send_file_download(name, content, save_immediately=True)
@@ -200,7 +205,10 @@ class Session:
 
     def _move_to(self, keyframe: Keyframe) -> None:
         """Move the camera to a keyframe."""
+        at_photograph = self._view_index is not None
         self._view_index, self._notice = None, ""
+        if at_photograph:
+            self._submit("overlays", self._update_overlays())  # shows its frustum again
         self._controls.view.value = FREE_CAMERA
         pose = keyframe.local_pose(self._scene)
         self._set_camera(pose, keyframe.fov)
@@ -209,8 +217,9 @@ class Session:
         """Render a film of the path in the render thread and send it to the browser."""
         run = self._runs[-1 if self._controls.layout.value == "second" else 0]
         output, box = self._controls.output.value, self._crop.box
+        output = "prediction" if output in NEEDS_TRUTH else output
         look = FilmLook(
-            "prediction" if output in NEEDS_TRUTH else output,
+            output,
             BACKGROUNDS[self._controls.background.value],
             None if box is None else run.crop_to_local(box, self._scene),
         )
@@ -224,7 +233,9 @@ class Session:
         def on_film(content: bytes) -> None:
             if not self._closed:
                 self._download(f"{self._scene.name}-path.mp4", content)
-                self._path.show_status(f"Film of {count} frames, {RATE} a second, sent to the browser.", exporting=False)
+                method = f" of {run.fitted.method.name}" if len(self._runs) > 1 else ""
+                frames = f"{count} frame{'s' * (count != 1)}"
+                self._path.show_status(f"Film of {frames}: the {output}{method}. Sent to the browser.", exporting=False)
 
         self._submit("film", export_film(run, cameras, look, on_progress, on_film))
 
@@ -273,6 +284,7 @@ class Session:
 
     def _clear_background(self) -> Task:
         """Clear the image to the scene's background, behind splats drawn by the browser."""
+        self._frame = None
         plain = display(self._scene.background.expand(2, 2, 3), self._scene)
         self._client.scene.set_background_image(plain.numpy(), format="png")
         self._controls.show_status("Drawn by the browser: colours without view dependence.")

@@ -11,7 +11,7 @@ from typing import Any
 from invgraphics.recipes.suitable import starts_from_points
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.wording import budget_words, listing
+from invgraphics.report.wording import budget_words, grouped, listing
 from invgraphics.runs.folder import PUBLISHED, RECIPE
 from invgraphics.runs.run import Run
 from invgraphics.runs.schema import plain
@@ -64,6 +64,8 @@ def protocol_facts(comparison: Comparison) -> Facts:
     facts: dict[str, str] = {"methods": comparison.method_choice} if comparison.method_choice else {}
     if comparison.budget:
         facts["budget per fit"] = f"{budget_words(comparison.budget)} of optimisation"
+    elif budgets := grouped([(budget_words(run.provenance.budget), run.method) for run in comparison.runs]):
+        facts["budget per fit"] = budgets
     if comparison.size:
         facts["picture size"] = f"{comparison.size[0]} × {comparison.size[1]}"
     if comparison.runs:
@@ -100,7 +102,7 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
         runs: the fits.
         stated: preset of the whole comparison, for where no run says more.
     """
-    presets = _grouped([(run.scores.preset or stated, run.method) for run in runs]) or stated
+    presets = grouped([(run.scores.preset or stated, run.method) for run in runs]) or stated
     choices = {run.provenance.preset_choice for run in runs}
     if choices - {""}:
         presets += f", {choices.pop()}" if len(choices) == 1 else ", chosen from each fit's budget"
@@ -111,7 +113,7 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
 def _chosen_on(runs: Sequence[Run]) -> str:
     """Scenes on which presets were chosen, by method; those whose recipe does not say are listed where another's does."""
     told = [(_text(run.provenance.preset_chosen_on), run.method) for run in runs]
-    return _grouped([(scenes or "not stated", method) for scenes, method in told]) if any(scenes for scenes, _ in told) else ""
+    return grouped([(scenes or "not stated", method) for scenes, method in told]) if any(scenes for scenes, _ in told) else ""
 
 
 def start_fact(runs: Sequence[Run]) -> str:
@@ -124,7 +126,7 @@ def start_fact(runs: Sequence[Run]) -> str:
     others = [(recipe, run) for recipe, (words, run) in zip(recipes, own, strict=True) if not words]
     users = [(recipe, run) for recipe, run in others if not recipe or starts_from_points(recipe)]
     scenes = [(_start(run), run.scores.scene) for _, run in users or others]
-    starts = [_grouped([(start or "none", scene) for start, scene in scenes])] if any(start for start, _ in scenes) else []
+    starts = [grouped([(start or "none", scene) for start, scene in scenes])] if any(start for start, _ in scenes) else []
     for words in dict.fromkeys(words for words, _ in own if words):
         methods = list(dict.fromkeys(run.scores.method for each, run in own if each == words))
         starts.append(words if all(each == words for each, _ in own) else f"{words} ({listing(methods)})")
@@ -136,9 +138,7 @@ def start_fact(runs: Sequence[Run]) -> str:
 def region_fact(runs: Sequence[Run]) -> str:
     """The box in which fits sought their scene, without its share, which depends on the views; empty for the data set's."""
     told = [(re.sub(r", \d+% of.*", "", str(run.provenance.notes.get("region", ""))), run.scores.scene) for run in runs]
-    return (
-        _grouped([(words or "the data set's box", scene) for words, scene in told]) if any(words for words, _ in told) else ""
-    )
+    return grouped([(words or "the data set's box", scene) for words, scene in told]) if any(words for words, _ in told) else ""
 
 
 def _recipe(run: Run) -> Mapping[str, Any]:
@@ -156,16 +156,6 @@ def _start(run: Run) -> str:
     """Points of a run's scene in words, without their numbers, which differ between seeds."""
     words = run.provenance.notes.get("points", "")
     return re.sub(r"^[\d,]+ (points )?|\b[\d,]+ (?=random ones)", "", words)
-
-
-def _grouped(pairs: Sequence[tuple[str, str]]) -> str:
-    """The value that all owners have; else each value with its owners in brackets, empty values left out."""
-    owners: dict[str, list[str]] = {}
-    for value, owner in dict.fromkeys(pairs):
-        owners.setdefault(value, []).append(owner)
-    if len(owners) <= 1:
-        return "".join(owners)
-    return "; ".join(f"{value} ({listing(names)})" for value, names in owners.items() if value)
 
 
 def scene_facts(comparison: Comparison) -> Facts:

@@ -236,7 +236,8 @@ def _write_markdown(page: VerdictPage, folder: Folder) -> None:
             cause = (
                 f" Known cause: {verdict.cause}{f' (issue {verdict.issue})' if verdict.issue else ''}" if verdict.cause else ""
             )
-            lines.append(f"- {field.sign} {text(f'{field.judged.cell.method} {field.name}')}: {text(verdict.sentence + cause)}")
+            sign = "△" if verdict.outcome == "known" else "✗"
+            lines.append(f"- {sign} {text(f'{field.judged.cell.method} {field.name}')}: {text(verdict.sentence + cause)}")
     if page.disturbances:
         lines += ["", "## Disturbed clocks", "", *(f"- {text(sentence)}" for sentence in page.disturbances)]
     lines += ["", "## Cells", "", f"PSNR in dB. {', '.join(f'{sign} {words}' for words, sign in STANDINGS.values())}.", ""]

@@ -202,7 +202,7 @@ def _monitor(run: Run) -> Verdict:
                 f"at {entry.progress:.0%} of the budget" if entry.progress is not None else f"at step {entry.step}",
             )
     ended = best - curve[-1][1]
-    end = f"ended {ended:.2f} dB below its best of {best:.2f} dB" if ended > 0 else f"ended at its best, {best:.2f} dB"
+    end = f"ended {ended:.2f} dB below its best of {best:.2f} dB" if ended >= 0.005 else f"ended at its best, {best:.2f} dB"
     sentence = f"Fell {fall:.2f} dB below the best so far {place} and {end}." if fall > 0 else f"Never fell, and {end}."
     return _verdict("monitor", fall > MONITOR_DB, sentence, fall, MONITOR_DB)
 

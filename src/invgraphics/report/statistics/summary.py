@@ -161,7 +161,8 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
     """Columns of the summary: quality metrics, then the costs that any run has."""
-    time_budget = bool(comparison.budget) and "step" not in comparison.budget
+    budgets = {comparison.budget, *(run.provenance.budget for run in comparison.runs)}
+    time_budget = any(budget and "step" not in budget for budget in budgets)
     costs = []
     for cost in COSTS:
         redundant = cost.key == "render_seconds_per_view"

@@ -12,7 +12,7 @@ from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.rules import DEAD_SHARE
 from invgraphics.report.statistics.sentences import detectable_words
 from invgraphics.report.statistics.summary import Row, Summary
-from invgraphics.report.wording import Quantity, budget_words, listing, times
+from invgraphics.report.wording import Quantity, budget_words, grouped, listing, times
 from invgraphics.runs.run import Run
 
 EXACT_POINTS = "exact surface points"
@@ -145,8 +145,15 @@ def unequal_start(runs: Sequence[Run]) -> list[str]:
     ]
 
 
+def _unequal_budgets(comparison: Comparison) -> list[str]:
+    budgets = [(budget_words(run.provenance.budget), run.method) for run in comparison.runs if run.provenance.budget]
+    if comparison.budget or len({budget for budget, _ in budgets}) < 2:
+        return []
+    return [f"The budgets are not equal: {grouped(budgets)}. A lead may be that of the longer fit."]
+
+
 def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
-    sentences = unequal_start(comparison.runs)
+    sentences = _unequal_budgets(comparison) + unequal_start(comparison.runs)
     columns = [column for column in summary.columns if column.group != "cost"]
     reference = _best_baseline(summary, columns[0]) if columns else None
     if reference is not None:

@@ -74,6 +74,7 @@
     frame.addEventListener("pointermove", (event) => {
       const before = down.get(event.pointerId);
       if (!before) return;
+      if (!event.buttons) return down.delete(event.pointerId); // released where the frame did not see it
       const now = place(frame, event);
       down.set(event.pointerId, now);
       if (down.size === 2) {
@@ -116,7 +117,9 @@
   }
   // An address inside something folded opens it; an address of a view chooses it.
   const arrive = () => {
-    const target = document.getElementById(decodeURIComponent(location.hash.slice(1)));
+    let name = location.hash.slice(1);
+    try { name = decodeURIComponent(name); } catch { /* no encoded address: taken as it stands */ }
+    const target = document.getElementById(name);
     if (!target) return;
     for (let fold = target.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
     const own = target.querySelector(":scope > details");
@@ -174,7 +177,13 @@
   }
 
   // On paper everything is open.
+  const folded = new Set();
   addEventListener("beforeprint", () => {
-    for (const details of document.querySelectorAll("details")) details.open = true;
+    for (const details of document.querySelectorAll("details:not([open])")) folded.add(details);
+    for (const details of folded) details.open = true;
+  });
+  addEventListener("afterprint", () => {
+    for (const details of folded) details.open = false;
+    folded.clear();
   });
 })();

@@ -81,6 +81,10 @@ class Forward:
 
     dimensions: ClassVar[int] = 2
 
+    def __post_init__(self) -> None:
+        if self.eye == self.target:
+            raise ValueError("'eye' and 'target' cannot be the same point")
+
     def pose(self, unit: Float[Tensor, " d"]) -> Float[Tensor, "4 4"]:
         """The camera at a point of the window."""
         frame = look_at(_tensor(self.eye), _tensor(self.target), _tensor(UP))
