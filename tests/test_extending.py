@@ -23,7 +23,8 @@ from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.scenes.open import Loader
 from invgraphics.testing import TwoBalls, toy_scene
-from invgraphics.training import losses
+from invgraphics.training import losses, penalties
+from invgraphics.training.hooks import Hook
 
 PAGE = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
 
@@ -80,8 +81,14 @@ def test_signatures_on_the_page_are_those_of_the_contract() -> None:
     called = zip(("rendering", "trace", "batch", "ctx"), arguments, strict=True)
     signature = ", ".join(f"{name}: {kind.__name__}" for name, kind in called)
     assert f"`__call__({signature}) -> {result.__name__}`" in PAGE and f"def __call__(self, {signature})" in PAGE
+    arguments, result = get_args(penalties.Penalty)
+    called = zip(("field", "renderer", "ctx"), arguments, strict=True)
+    signature = ", ".join(f"{name}: {kind.__name__}" for name, kind in called)
+    assert f"`__call__({signature}) -> {result.__name__}`" in PAGE and f"def __call__(self, {signature})" in PAGE
+    for name in ("before_step", "after_backward", "after_step"):
+        assert Hook.__dict__[name].__annotations__ == {"state": "FitState", "return": "None"} and f"`{name}`" in PAGE
     assert "`compute(pair: Pair) -> float`" in PAGE and get_type_hints(Metric)["compute"] == Callable[[Pair], float]
-    owners = dict(zip(("rendering", "trace", "batch", "ctx"), arguments, strict=True), pair=Pair)
+    owners = dict(zip(("rendering", "trace", "batch", "ctx"), get_args(losses.Loss)[0], strict=True), pair=Pair)
     named = re.findall(r"`(rendering|trace|batch|ctx|pair)\.(\w+)`", PAGE)
     assert {owner for owner, _ in named} == set(owners)
     for owner, name in named:
@@ -135,3 +142,35 @@ def test_the_loss_clears_what_the_metric_sees(environment: dict[str, str], turnt
     early, late, without, cleared = map(float, _run(environment, "-c", code).split())
     assert (early, late) == (0.0, 2 * (0.5 + 0.25) / 4)
     assert 0 < cleared < 0.8 * without, (without, cleared)
+
+
+def test_the_penalty_smooths_and_the_hook_clears(environment: dict[str, str], turntable: Path) -> None:
+    code = (
+        "import torch, invgraphics as ig\n"
+        "from torch.nn.functional import softplus\n"
+        f"scene = ig.load_scene({str(turntable)!r})\n"
+        "for name in ('volumetric/voxels', 'volumetric/voxels-smooth'):\n"
+        "    method = ig.load_method(name, set={'field.resolution': 8, 'batches.rays': 64})\n"
+        "    grid = ig.fit(method, scene, '60steps').model.field.grid.detach()\n"
+        "    rough = sum(float(grid.diff(dim=axis).square().mean()) for axis in (1, 2, 3))\n"
+        "    density = softplus(grid[3])\n"
+        "    print(rough, int(((density > 1e-3) & (density < 0.05)).sum()))\n"
+    )
+    rough, hazy, smooth, clear = map(float, _run(environment, "-c", code).split())
+    assert clear == 0 < hazy
+    assert smooth < 2 * rough, "emptied corners are steps"
+
+
+def test_a_scene_made_in_python(environment: dict[str, str]) -> None:
+    code = (
+        "import numpy as np, torch, invgraphics as ig\n"
+        "from invgraphics.testing import toy_scene\n"
+        "from voxel_world import scene_of\n"
+        "views = toy_scene(views=9, size=12).train\n"
+        "pictures = np.stack([view.image.numpy() for view in views])\n"
+        "poses = np.stack([view.camera.cam_to_world.double().numpy() for view in views])\n"
+        "scene = scene_of(pictures, poses, float(views[0].camera.focal[0]))\n"
+        "print(len(scene.train), len(scene.test), ig.fit('splatting/gaussians', scene, '5steps').scores['psnr'])\n"
+    )
+    train, test, psnr = _run(environment, "-c", code).split()
+    assert (train, test) == ("7", "2") and float(psnr) > 5

@@ -90,3 +90,24 @@ def test_lists_of_tables_and_numpys_values_can_be_set() -> None:
 def test_values_on_one_line_of_toml_read_as_they_were(value: object) -> None:
     text = override("a", value).removeprefix("a=")
     assert "\n" not in text and parse_toml(f"value = {text}", "it")["value"] == value
+
+
+def test_wrong_kinds_of_arguments_are_sentences() -> None:
+    for call, sentence in (
+        (lambda: ig.fit(ONE, "toy.npz", 20), "'20' is not a budget"),
+        (lambda: ig.load_method("volumetric/hash", set="field.width=64"), "'set' cannot be 'field.width=64'"),
+        (lambda: ig.load_method("voxels"), r"Did you mean|There is no method 'voxels'"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            call()
+    every, few = ig.load_scene("toy.npz", test_views="all"), ig.load_scene("toy.npz", test_views=1)
+    assert len(every.test) > len(few.test) == 1
+    assert ig.fit(ONE, few, "1steps", device=torch.device("cpu")).scores["psnr"] > 0
+
+
+def test_another_copy_of_a_run_s_scene_is_the_same_scene(tmp_path: Path) -> None:
+    run = ig.fit(ONE, "toy.npz", "1steps", out="kept-with-its-scene")
+    assert ig.load_run("kept-with-its-scene", scene="toy.npz").scores["psnr"] == run.scores["psnr"]
+    other = ig.save_scene(toy_scene(views=6, size=12), tmp_path / "other.npz")
+    with pytest.raises(InputError, match="are not those that kept-with-its-scene was fitted beside"):
+        ig.load_run("kept-with-its-scene", scene=str(other))

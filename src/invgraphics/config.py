@@ -63,7 +63,10 @@ def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
     if not isinstance(table, Mapping) or "type" not in table:
         raise InputError(f"'{path}' needs a 'type' key.", f"Known {registry}: {', '.join(sorted(plugins.names(registry)))}.")
     rest = {key: value for key, value in table.items() if key != "type"}
-    return fill(plugins.load(registry, str(table["type"])), rest, path)
+    schema = plugins.load(registry, str(table["type"]))
+    if not dataclasses.is_dataclass(schema):
+        raise InputError(f"'{table['type']}' of the {registry} is {schema!r}, no dataclass.", "See docs/extending.md.")
+    return fill(schema, rest, path)
 
 
 def to_table(config: Any) -> dict[str, Any]:

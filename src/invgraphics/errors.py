@@ -46,5 +46,6 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """
     known = list(known)
     full = {name.rpartition("/")[2].lower(): name for name in reversed(known)} | {name.lower(): name for name in known}
-    close = difflib.get_close_matches(word.lower(), full, n=1, cutoff=0.7)
+    begun = [name for name in full if len(word) > 2 and name.startswith(word.lower())]
+    close = begun if len(begun) == 1 else difflib.get_close_matches(word.lower(), full, n=1, cutoff=0.7)
     return f" Did you mean '{full[close[0]]}'?" if close else ""

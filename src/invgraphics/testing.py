@@ -177,7 +177,11 @@ def check_field(field: Field, scene: Scene) -> None:
         values = field.query(Samples.at(position, direction), quantity)
         value = getattr(values, _POINTWISE[quantity])
         assert value is not None, f"asked for {quantity.words()}, got nothing"
-        assert len(value) == 37 and bool(value.isfinite().all()), f"{quantity.words()} is not finite"
+        shape = (37,) if quantity in (Quantity.DENSITY, Quantity.SDF) else (37, value.shape[-1])
+        assert tuple(value.shape) == shape, f"the shape of {quantity.words()} of 37 samples is {tuple(value.shape)}"
+        assert bool(value.isfinite().all()), f"{quantity.words()} is not finite"
+        if quantity in (Quantity.RADIANCE, Quantity.NORMAL):
+            assert value.shape[1] == 3, f"{quantity.words()} has {value.shape[1]} components"
         if quantity is Quantity.DENSITY:
             assert bool((value >= 0).all()), "a density is negative"
         if quantity is Quantity.FEATURES:

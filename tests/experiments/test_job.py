@@ -53,7 +53,7 @@ def test_text_becomes_values() -> None:
         ({"checkpoint_every": "0s"}, "'0s' is no interval"),
         ({"checkpoint_every": "1.5steps"}, "'1.5steps' is no interval"),
         ({"overrides": ("data.siez=9",)}, "Unknown key 'data.siez'"),
-        ({"device": "tpu"}, "--device cannot be 'tpu'"),
+        ({"device": "tpu"}, "The device cannot be 'tpu'"),
         ({"protocol": "flaot"}, "There is no protocol 'flaot'"),
         ({"render_with": ("gaussian-volume/exatc",)}, "There is no method 'gaussian-volume/exatc'"),
         ({"size": 0}, "size 0 is not positive"),

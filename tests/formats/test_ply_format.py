@@ -9,6 +9,7 @@ import torch
 from gaussian_files import cloud, worst_psnr
 from plyfile import PlyData, PlyElement
 
+from invgraphics.errors import InputError
 from invgraphics.formats.base import Splats, read_gaussians, write_gaussians
 
 STANDARD = (
@@ -48,6 +49,15 @@ def test_what_is_read_back_looks_the_same(tmp_path: Path, degree: int) -> None:
     name, back = read_gaussians(tmp_path / "a.ply")
     assert name == "ply" and back.axes is None and back.gaussians.sh.shape == gaussians.sh.shape
     assert worst_psnr(gaussians, back.gaussians) > 100
+
+
+def test_another_format_s_ending_is_refused(tmp_path: Path) -> None:
+    """Programs that go by it would not read the file."""
+    for name, file in (("ply", "a.splat"), ("spz", "a.PLY"), ("splat", "a.compressed.ply")):
+        with pytest.raises(InputError, match=f"has another ending than {name} files"):
+            write_gaussians(tmp_path / file, name, Splats(cloud(degree=0)))
+    write_gaussians(tmp_path / "without", "ply", Splats(cloud(degree=0)))
+    assert [path.name for path in tmp_path.iterdir()] == ["without"]
 
 
 def _table(names: list[str], kind: str, n: int = 5) -> np.ndarray:

@@ -62,12 +62,34 @@ def _lens(**values: object) -> View:
         ({"train": (_lens(width=9),)}, "image of train view 'v1' of 'toy' has 8x6 pixels, its camera 9x6"),
         ({"val": (replace(view(4), image=torch.full((6, 8, 3), torch.nan)),)}, "image of val view 'v4' .* not finite"),
         ({"val": (replace(view(4), depth=torch.full((6, 8), torch.nan)),)}, "depth of val view 'v4' .* not finite"),
+        ({"val": (replace(view(4), image=torch.full((6, 8, 3), 200.0)),)}, "image of val view 'v4' .* values from 200 to 200"),
+        ({"val": (replace(view(4), image=torch.full((6, 8, 3), -0.1)),)}, "image of val view 'v4' .* values from -0.1"),
+        ({"val": (replace(view(4), alpha=torch.full((6, 8), 1.1)),)}, "alpha of val view 'v4' .* values from 1.1"),
+        ({"val": (replace(view(4), image=torch.zeros(6, 8, 4)),)}, "image of val view 'v4' .* shape .6, 8, 4.; expected"),
+        ({"val": (replace(view(4), image=np.zeros((6, 8, 3), np.uint8)),)}, "image of val view 'v4' .* is a ndarray, not a"),
+        ({"val": (replace(view(4), mask=torch.ones(6, 8)),)}, "mask of val view 'v4' .* is torch.float32"),
+        ({"train": (replace(view(0), mask=torch.zeros(6, 8, dtype=torch.bool)),)}, "masks of 'toy' leave no pixel"),
+        ({"train": (_lens(width=8.0),)}, "width of the camera of train view 'v1' .* is 8.0"),
         ({"test": (view(2), view(1))}, "train view 'v1' and the test view 'v1' of 'toy' share a camera"),
     ],
 )
 def test_bad_scenes_are_refused(change: dict, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         validate(scene().with_views(**change))
+
+
+def test_double_precision_becomes_single() -> None:
+    """As NumPy's arrays are; 8-bit pictures stay what they are."""
+    plain = scene()
+    floats = replace(view(0), image=torch.full((6, 8, 3), 0.25).double(), camera=view(0).camera.to(torch.float64))
+    one = torch.ones(3, dtype=torch.float64)
+    made = validate(replace(plain, train=(floats, view(1)), background=one, bounds=Bounds(-one, one)))
+    first, second = made.train
+    tensors = (first.image, first.camera.cam_to_world, first.camera.focal, made.background, made.bounds.lo, made.bounds.hi)
+    assert {values.dtype for values in tensors} == {torch.float32}
+    assert second.image.dtype == torch.uint8
+    assert float(first.image.max()) == 0.25
+    assert validate(replace(plain, colour="linear", val=(replace(view(4), image=torch.full((6, 8, 3), 7.0)),))).val
 
 
 def test_infinite_depth_is_allowed() -> None:

@@ -111,6 +111,7 @@ def test_folders_are_named_by_what_defines_the_run(study, tmp_path: Path) -> Non
         (HEAD + "desing = 3\n", r"trial\.toml: Unknown key 'desing'"),
         (HEAD.replace('["a", "b"]', "[]"), "'scenes' has no entries"),
         (HEAD.replace('"b"', '"a"'), "'scenes' has 'a' twice"),
+        (HEAD.replace('"b"', '"./a"'), "'scenes' has one data set twice, as 'a' and './a'"),
         (HEAD.replace("[0, 1]", "[1, 1]"), "'seeds' has 1 twice"),
         (HEAD.replace("[0, 1]", "[-1]"), "seeds must be 0 or more"),
         (HEAD + 'budget = "long"\n', "'long' is not a budget"),

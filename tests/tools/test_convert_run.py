@@ -35,7 +35,7 @@ from invgraphics.tools.conversions import (
     to_planes,
     to_points,
 )
-from invgraphics.tools.convert import ConvertRequest
+from invgraphics.tools.convert import ConvertRequest, convert_run
 
 RADIUS, CENTRE = 0.6, torch.tensor([0.1, -0.1, 0.05])
 
@@ -198,6 +198,9 @@ def test_a_converted_run_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[
     overrides = (*SMALL["volumetric/hash"], "data.train_views=4")
     request = FitRequest(scene=str(data), out=str(native), method="volumetric/hash", budget="100steps", overrides=overrides)
     fit_run(request)
+    for to, method in (("gaussians", "volumetric/nerf"), ("mesh", "splatting/gaussians")):
+        with pytest.raises(InputError, match=f"--method {method} has another field than --to {to} makes"):
+            convert_run(ConvertRequest(run=native, to=to, out=tmp_path / "other", method=method))
     out = tmp_path / "gaussians"
     command = ["convert", str(native), "--to", "gaussians", "--size", "300", "--refit", "30steps", "--out", str(out)]
     assert main.run(command) == 0

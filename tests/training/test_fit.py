@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from invgraphics.core import Scene, View
-from invgraphics.errors import NumericalError
+from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.recorder import Monitor
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.training.clock import SchedulerTimes
+from invgraphics.training.fit import Fit
 
 METHODS = ["volumetric/nerf", "volumetric/hash", "splatting/gaussians"]
 STEPS = {"volumetric/nerf": 200, "volumetric/hash": 220, "splatting/gaussians": 120}
@@ -196,3 +197,22 @@ def test_every_fit_sees_to_waiting_threads(scene, make_fit, monkeypatch) -> None
     monkeypatch.setattr("invgraphics.training.fit.limit_spinning", lambda: calls.append(1))
     make_fit("volumetric/nerf", scene, 1)
     assert calls == [1]
+
+
+def test_losses_and_hooks_that_break_their_contract_are_named(scene, make_fit) -> None:
+    """As those of a plug-in may."""
+    fit = make_fit("splatting/gaussians", scene, 3)
+
+    def per_pixel(rendering, trace, batch, ctx) -> torch.Tensor:
+        return rendering.rgb - batch.target
+
+    fit.plan = replace(fit.plan, losses=[per_pixel])
+    with pytest.raises(InputError, match=r"loss builtins.function returned a tensor of shape \("):
+        fit.step()
+    fit.plan = replace(fit.plan, losses=[lambda *_: 0.0])
+    with pytest.raises(InputError, match="returned 0.0"):
+        fit.step()
+    with pytest.raises(InputError, match="neither losses nor penalties"):
+        Fit(replace(fit.plan, losses=[], penalties=()))
+    with pytest.raises(InputError, match="The hook builtins.object is no training.hooks.Hook"):
+        Fit(replace(fit.plan, hooks=[object()]))

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar, cast
+from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import tomlkit
 import torch
@@ -40,7 +40,7 @@ def load_scene(
     spec: str | os.PathLike[str],
     *,
     size: int | tuple[int, int] | None = None,
-    test_views: int | None = 16,
+    test_views: int | Literal["all"] | None = 16,
     spp: int | None = None,
 ) -> Scene:
     """Open a scene: posed training views to fit, and held-out views to score.
@@ -49,7 +49,7 @@ def load_scene(
         spec: a built-in scene (``bricks``; it is rendered at first use and cached), the path of a data set in a known format,
             or a folder that ``invgraphics import-photos`` wrote.
         size: longest side of the pictures in pixels, or (width, height); ``None`` for the scene's own.
-        test_views: how many views score, evenly spaced; ``None`` for all.
+        test_views: how many views score, evenly spaced; ``"all"`` or ``None`` for all.
         spp: samples per pixel of a scene that is rendered; ``None`` for its own.
 
     Raises:
@@ -62,14 +62,16 @@ def load_scene(
         (8, 16)
     """
     check_size(size)
-    return open_with_progress(os.fspath(spec), SceneOptions(size=size, test_views=test_views, spp=spp))
+    views = None if test_views == "all" else test_views
+    return open_with_progress(os.fspath(spec), SceneOptions(size=size, test_views=views, spp=spp))
 
 
 def save_scene(scene: Scene, path: str | os.PathLike[str]) -> Path:
     """Write a scene as one ``.npz`` that `load_scene` opens: views, cameras, bounds and points.
 
     Args:
-        scene: of sRGB pictures, without validation views.
+        scene: of 8-bit sRGB pictures of one size in a box, without masks. Names of views, noise level and spread of exposures
+            are not kept, nor which photographs show which points.
         path: to write, ending in ``.npz``.
 
     Returns:
@@ -114,6 +116,8 @@ def load_method(method: str | os.PathLike[str], *, preset: str | None = None, se
         >>> wide.recipe.field.width, wide.name
         (64, 'volumetric/hash:field.width=64')
     """
+    if set is not None and not isinstance(set, Mapping):
+        raise InputError(f"'set' cannot be {set!r}.", 'Expected: a table such as {"field.width": 64}.')
     for path, value in (set or {}).items():
         if path.startswith(DATA):
             key = path.removeprefix(DATA)
@@ -128,7 +132,7 @@ def load_run(folder: str | os.PathLike[str], scene: Scene | str | None = None) -
 
     Args:
         folder: of the run.
-        scene: another copy of its scene, where that has moved: its place, or loaded.
+        scene: another copy of its scene, where that has moved; or a loaded scene, whose test views may be others.
 
     Raises:
         InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe.

@@ -108,7 +108,12 @@ def look_at(eye: Float[Tensor, 3], target: Float[Tensor, 3], up: Float[Tensor, 3
     """The pose of a camera at ``eye`` that sees ``target`` in the middle and ``up`` upwards.
 
     A camera that looks along ``up`` has the axis of the world that is most across its view upwards instead.
+
+    Raises:
+        ValueError: ``eye`` and ``target`` are one point.
     """
+    if torch.equal(eye, target):
+        raise ValueError("a camera cannot look at its own position")
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.linalg.cross(forward, up)
     if float(right.norm()) <= PARALLEL * float(up.norm()):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from invgraphics import kernels
-from invgraphics.core import Model, RayRenderer, Renderer, Scene
+from invgraphics.core import Field, Model, RayRenderer, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.memory_check import check_memory
 from invgraphics.experiments.progress import Reporter
@@ -21,19 +21,20 @@ from invgraphics.training.views.exposure import make_exposures
 from invgraphics.training.views.sparse_depth import make_sparse_depth
 
 
-def device_of(name: str | None) -> torch.device:
+def device_of(name: str | torch.device | None) -> torch.device:
     """Resolve the torch device of a run: the requested one, else the CPU.
 
     Raises:
         InputError: no such device here.
     """
-    if name in (None, "cpu"):
+    name = "cpu" if name is None else str(name)
+    if name == "cpu":
         return torch.device("cpu")
     if name == "cuda":
         if not torch.cuda.is_available():
-            raise InputError("--device cuda: this machine offers torch no CUDA device.", "Use --device cpu.")
+            raise InputError("The device cannot be 'cuda': this machine offers torch none.", "Use cpu.")
         return torch.device("cuda")
-    raise InputError(f"--device cannot be '{name}'.", "Expected: cpu or cuda.")
+    raise InputError(f"The device cannot be '{name}'.", "Expected: cpu or cuda.")
 
 
 def open_with_progress(spec: str, options: SceneOptions) -> Scene:
@@ -59,6 +60,9 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *
     check_memory(method, scene)
     torch.manual_seed(seed)
     field, renderer = method.recipe.field.build(scene), method.recipe.renderer.build(scene)
+    for part, kind in ((field, Field), (renderer, Renderer)):
+        if not isinstance(part, kind):
+            raise InputError(f"{part!r}, which {method.name} builds, is no {kind.__name__}.", "See docs/extending.md.")
     check_subjects(field, renderer, scene, method.name)
     model = Model(as_shown(field, renderer) if shown else field, renderer, scene.bounds)
     training = method.recipe.training

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -113,8 +114,9 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     Raises:
         InputError: anything that could be wrong, before any time is spent.
     """
-    if len(set(request.methods)) != len(request.methods) or len(set(request.seeds)) != len(request.seeds):
-        raise InputError("A method or a seed is named twice.")
+    for what, named in (("method", request.methods), ("seed", request.seeds)):
+        if twice := [one for one, count in Counter(named).items() if count > 1]:
+            raise InputError(f"The {what} '{twice[0]}' is named twice.", "Name it once.")
     _check_folders(request)
     jobs, refused = _jobs(request)
     full = opened or open_with_progress(request.scene, jobs[0].options)

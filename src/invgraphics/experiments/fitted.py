@@ -13,6 +13,7 @@ from invgraphics import plugins
 from invgraphics.core import Model, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
+from invgraphics.experiments.identity import check_truth
 from invgraphics.experiments.job import in_region
 from invgraphics.experiments.posed import refined_poses, scene_in_fit_frame
 from invgraphics.kernels.allocator import keep_freed_memory
@@ -65,7 +66,8 @@ def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
     """Open a run, on its own scene or on another copy of it.
 
     Raises:
-        InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe.
+        InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe; or another
+            copy of the scene has other test views.
     """
     torch.set_flush_denormal(True)  # as in fits (`build.configure_torch`), before the scene is opened and threads start
     folder = RunFolder(run)
@@ -75,7 +77,10 @@ def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
     if scene_spec is None and not is_found(provenance.scene):
         sentence = f"The scene of {run}, '{provenance.scene}', is not found from here."
         raise InputError(sentence, "Give its path with --scene, or work where the run was fitted.")
-    return load_fitted(folder, open_scene(scene_spec or provenance.scene, options))
+    scene = open_scene(scene_spec or provenance.scene, options)
+    if scene_spec is not None:
+        check_truth(folder, scene, scene_spec)
+    return load_fitted(folder, scene)
 
 
 def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:

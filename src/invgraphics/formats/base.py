@@ -95,11 +95,15 @@ def write_gaussians(path: Path, name: str, splats: Splats) -> None:
     """Write a file in the format ``name``, whole or not at all.
 
     Raises:
-        InputError: the format is unknown or cannot be written, there are no Gaussians, or they do not fit into the format.
+        InputError: the format is unknown or cannot be written, the file has another format's ending, there are no Gaussians, or
+            they do not fit into the format.
     """
     form = plugins.load("formats", name)()
     if not isinstance(form, WritableFormat):
         raise InputError(f"The format '{name}' can only be read.")
+    known = {suffix for other in plugins.names("formats") for suffix in plugins.load("formats", other).suffixes}
+    if path.suffix.lower() in known and not path.name.lower().endswith(form.suffixes):
+        raise InputError(f"'{path}' has another ending than {name} files.", f"Expected: {' or '.join(form.suffixes)}.")
     splats = checked(splats, path)
     with replacing(path) as temporary:
         form.write(temporary, splats)

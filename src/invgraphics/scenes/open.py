@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 from weakref import WeakKeyDictionary
 
-import torch
-
 from invgraphics import plugins
-from invgraphics.core import Scene, View
-from invgraphics.core.believable import check_scene, principal_point_far_outside
+from invgraphics.core import Scene
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.pictures.images import image_files
-from invgraphics.scenes.poses import poses
+from invgraphics.scenes.validation import validate
 
 __all__ = [
     "Loader",
@@ -33,8 +29,6 @@ __all__ = [
     "space_note",
     "validate",
 ]
-
-_SAME_POSE = 1e-6  # entries of two poses that are closer than this are one camera
 
 
 class Loader(Protocol):
@@ -225,72 +219,6 @@ def _render(description: str, options: SceneOptions, progress: Callable[[int, in
     return make(description, size=size, train=train, test=test, spp=options.spp, seed=options.seed, progress=progress)
 
 
-def validate(scene: Scene) -> Scene:
-    """Validate a scene's poses, pixels, splits and ranges; returns the scene.
-
-    Raises:
-        InputError: a pose is not rigid, pixels are not finite or not of the camera's size, a split is empty, a test camera is
-            also a training camera, or something is not believable (`core.believable`). The sentence names the view.
-    """
-    for split in ("train", "test"):
-        if not getattr(scene, split):
-            raise InputError(
-                f"The scene '{scene.name}' has no {split} views.", "At least one to fit and one to score is needed."
-            )
-    for split in ("train", "val", "test", "observed"):
-        views = getattr(scene, split)
-        names = [f"{split} view '{view.name}' of '{scene.name}'" for view in views]
-        if views:
-            poses(torch.stack([view.camera.cam_to_world for view in views]), names.__getitem__)
-        for view, name in zip(views, names, strict=True):
-            _validate_view(view, name)
-    check_scene(scene)
-    if off := [view.name for view in scene.train if principal_point_far_outside(view.camera)]:
-        message = f"'{off[0]}' has its principal point far outside the picture: a crop, or resized without its calibration?"
-        print(f"Warning: {message}", file=sys.stderr)
-    for split in ("train", "observed"):
-        _check_apart(scene, split)
-    return _with_val_apart(scene)
-
-
-def _with_val_apart(scene: Scene) -> Scene:
-    """Leave out validation views that are test views, too, as where a data set has one list for both."""
-    val = tuple(view for view in scene.val if not _of_its_camera(scene.test, view))
-    left = len(scene.val) - len(val)
-    note = {"val_views": f"{left} that are test views, too, are left out"} if left else {}
-    return replace(scene, val=val, notes=scene.notes | note) if left else scene
-
-
 def is_found(spec: str) -> bool:
     """Whether a scene is a built-in one or a path that exists from here; also where a variable says where it is."""
     return spec.startswith("$") or _description(spec) is not None or _path(spec).exists()
-
-
-def _of_its_camera(views: Sequence[View], view: View) -> list[View]:
-    """Views that have a view's pose."""
-    gap = torch.stack([one.camera.cam_to_world for one in views]) - view.camera.cam_to_world
-    return [views[index] for index in (gap[:, :3].abs().amax(dim=(1, 2)) < _SAME_POSE).nonzero()[:, 0].tolist()]
-
-
-def _check_apart(scene: Scene, split: str) -> None:
-    views: tuple[View, ...] = getattr(scene, split)
-    if not views:
-        return
-    for test in scene.test:
-        if same := _of_its_camera(views, test):
-            sentence = f"The {split} view '{same[0].name}' and the test view '{test.name}' of '{scene.name}' share a camera."
-            raise InputError(sentence)
-
-
-def _validate_view(view: View, what: str) -> None:
-    camera = view.camera
-    for name, values in (("image", view.image), ("alpha", view.alpha), ("depth", view.depth), ("normal", view.normal)):
-        if values is None:
-            continue
-        if tuple(values.shape[:2]) != (camera.height, camera.width):
-            height, width = values.shape[:2]
-            raise InputError(f"The {name} of {what} has {width}x{height} pixels, its camera {camera.width}x{camera.height}.")
-        if values.dtype == torch.uint8:
-            continue
-        if bool(values.isnan().any()) or (name != "depth" and not bool(values.isfinite().all())):
-            raise InputError(f"The {name} of {what} has pixels that are not finite.")

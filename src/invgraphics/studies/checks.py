@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -57,6 +58,7 @@ def checked(study: Study, where: str) -> Study:
     """Validate a study: it can be expanded, and no run would be in vain."""
     for what in NARROWING:
         _check_list(getattr(study, what), f"{where}: '{what}'")
+    _check_scenes(study.scenes, f"{where}: 'scenes'")
     _check_narrowing(study, where)
     _check_count(study, where)
     for name, levels in study.factors.items():
@@ -139,3 +141,11 @@ def _check_list(items: Sequence[Any], what: str) -> None:
     for index, item in enumerate(items):
         if item in items[:index]:
             raise InputError(f"{what} has {item!r} twice.")
+
+
+def _check_scenes(scenes: Sequence[str], what: str) -> None:
+    """Check that no two entries lead to the same data set, by whatever path."""
+    places = [os.path.realpath(os.path.expandvars(scene)) for scene in scenes]
+    for index, place in enumerate(places):
+        if place in places[:index]:
+            raise InputError(f"{what} has one data set twice, as {scenes[places.index(place)]!r} and {scenes[index]!r}.")

@@ -21,6 +21,7 @@ from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.request import DATA, FitRequest
 from invgraphics.experiments.run import describe
 from invgraphics.metrics.cost import PeakMemory
+from invgraphics.recipes.recipe import load_method
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import ConvertedRun, Provenance
 from invgraphics.runs.scores import Scores
@@ -147,6 +148,11 @@ def _job(request: ConvertRequest, fitted: Fitted) -> Job:
     size = request.size or target.size
     options = provenance.options
     # The refit sees the photographs that the fit saw.
+    if request.method is not None:
+        field, usual = (load_method(name).recipe.field for name in (request.method, target.method))
+        if type(field) is not type(usual):
+            sentence = f"--method {request.method} has another field than --to {request.to} makes."
+            raise InputError(sentence, f"Expected {target.method}, or a recipe with the same type of field.")
     data = tuple(f"{DATA}{key}={inline_toml(value)}" for key, value in provenance.data.items())
     return Job.of(
         FitRequest(

@@ -69,8 +69,8 @@ class Cadence:
 
 def _read(text: str) -> int | float | None:
     """Parse a positive amount: whole steps, or a time in seconds; ``None`` for anything else."""
-    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(steps?|s|min|m|h)\s*", text)
-    if found is None or (number := float(found.group(1))) <= 0:
+    found = isinstance(text, str) and re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(steps?|s|min|m|h)\s*", text)
+    if not found or (number := float(found.group(1))) <= 0:
         return None
     if not found.group(2).startswith("step"):
         return number * _UNITS[found.group(2)]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from invgraphics.core import Batch, Context, Model, RayRenderer, Rendering, Scene, Trace
 from invgraphics.core.finite import non_finite_values
-from invgraphics.errors import NumericalError
+from invgraphics.errors import InputError, NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.training.batches import BatchConfig, Batches
@@ -78,7 +78,11 @@ class Fit:
     """
 
     def __init__(self, plan: Plan) -> None:
+        if not plan.losses and not plan.penalties:
+            raise InputError("The recipe has neither losses nor penalties: there is nothing to fit.")
         for hook in plan.hooks:
+            if not isinstance(hook, Hook):
+                raise InputError(f"The hook {_name(hook)} is no training.hooks.Hook.", "Derive it from that class.")
             hook.check(plan.model.field)
         for penalty in plan.penalties:
             check_penalty(penalty, plan.model.field)
@@ -134,10 +138,13 @@ class Fit:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
         composited = _counted(replace(rendering, rgb=rendering.over(batch.background)), batch)
+        objective = (*plan.losses, *plan.penalties)
         losses = [loss(composited, trace, batch, ctx) for loss in plan.losses]
+        losses += [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties]
+        terms = torch.stack([_single(value, term) for value, term in zip(losses, objective, strict=True)])
         if self.steps == 0:
-            self.idle_losses = tuple(index for index, term in enumerate(losses) if not term.requires_grad)
-        terms = torch.stack(losses + [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties])
+            idle = (index for index, value in enumerate(losses[: len(plan.losses)]) if not value.requires_grad)
+            self.idle_losses = tuple(idle)
         loss = terms.sum()
         value = loss.item()
         if not torch.isfinite(loss):
@@ -258,3 +265,15 @@ def _counted(rendering: Rendering, batch: Batch) -> Rendering:
         return rendering
     rgb = torch.where(batch.mask[..., None], rendering.rgb, batch.target)
     return replace(rendering, rgb=rgb, alpha=torch.where(batch.mask, rendering.alpha, batch.alpha))
+
+
+def _single(value: Tensor, term: Loss | Penalty) -> Tensor:
+    """Check that a loss or penalty returned one number, as a tensor."""
+    if not isinstance(value, Tensor) or value.ndim:
+        what = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
+        raise InputError(f"The loss {_name(term)} returned {what}.", "Expected: a tensor without dimensions, as of mean().")
+    return value
+
+
+def _name(part: object) -> str:
+    return f"{type(part).__module__}.{type(part).__name__}"
