@@ -210,9 +210,9 @@ def test_losses_and_hooks_that_break_their_contract_are_named(scene, make_fit) -
     with pytest.raises(InputError, match=r"loss builtins.function returned a tensor of shape \("):
         fit.step()
     fit.plan = replace(fit.plan, losses=[lambda *_: 0.0])
-    with pytest.raises(InputError, match="returned 0.0"):
+    with pytest.raises(InputError, match=r"returned 0\.0"):
         fit.step()
     with pytest.raises(InputError, match="neither losses nor penalties"):
         Fit(replace(fit.plan, losses=[], penalties=()))
-    with pytest.raises(InputError, match="The hook builtins.object is no training.hooks.Hook"):
+    with pytest.raises(InputError, match=r"The hook builtins\.object is no training\.hooks\.Hook"):
         Fit(replace(fit.plan, hooks=[object()]))
