@@ -1,13 +1,14 @@
 """A model: refused where its parts do not fit, and rendered as its renderer renders, without randomness or gradients."""
 
 import doctest
+from dataclasses import replace
 
 import pytest
 import torch
 from other_device import other_device
 
 from invgraphics.core import Context, Model, Scene, model
-from invgraphics.errors import NotComposableError
+from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.samplers import StratifiedConfig
@@ -77,3 +78,21 @@ def test_cameras_may_be_of_another_precision(small: Model, scene: Scene) -> None
     camera = scene.test[0].camera
     picture = small.render(camera.to(torch.float64))
     assert torch.equal(picture.rgb, small.render(camera).rgb)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"width": 16.5}, "size of the camera is 16.5x"),
+        ({"height": 0}, "x0 pixels"),
+        ({"focal": torch.tensor(20.0)}, "shapes of the camera"),
+        ({"cam_to_world": torch.eye(4) * 2}, "pose of the camera is not rigid"),
+        ({"cam_to_world": torch.full((4, 4), torch.nan)}, "pose of the camera is not rigid"),
+        ({"cam_to_world": torch.tensor([[1.0, 0, 0, torch.inf], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}, "not finite"),
+    ],
+)
+def test_cameras_that_are_none_are_refused(small: Model, scene: Scene, change: dict, sentence: str) -> None:
+    camera = replace(scene.test[0].camera, **change)
+    for use in (small.render, lambda one: small.contributions(one, (0, 0))):
+        with pytest.raises(InputError, match=sentence):
+            use(camera)

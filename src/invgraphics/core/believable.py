@@ -85,6 +85,23 @@ def check_camera(camera: Camera, what: str) -> None:
     _expect(tan <= WIDEST_TAN, f"{lens}: its pixels would look backwards, or nearly so.")
 
 
+def check_pose(camera: Camera, what: str) -> None:
+    """Check that a camera has a size and a rigid pose, which kernels take for granted; ``what`` names it in messages.
+
+    Raises:
+        InputError: it has not.
+    """
+    size = camera.width, camera.height
+    if not all(isinstance(edge, int) and edge > 0 for edge in size):
+        raise InputError(f"The size of {what} is {size[0]}x{size[1]} pixels.", "Expected: positive whole numbers.")
+    if camera.cam_to_world.shape != (4, 4) or camera.focal.shape != (2,) or camera.centre.shape != (2,):
+        raise InputError(f"The shapes of {what} are not (4, 4) of its pose, (2,) of its focal lengths and principal point.")
+    rotation = camera.cam_to_world[:3, :3].detach().double()
+    error = float((rotation.T @ rotation - torch.eye(3).to(rotation)).abs().max())
+    if not error <= UNIT or not _finite(camera.cam_to_world):
+        raise InputError(f"The pose of {what} is not rigid, or not finite.", "Expected: a rotation and a position.")
+
+
 def principal_point_far_outside(camera: Camera) -> bool:
     """Whether the principal point lies more than half a picture outside the picture, as of a crop or a forgotten resize."""
     relative = camera.centre.double().cpu() / torch.tensor([camera.width, camera.height])

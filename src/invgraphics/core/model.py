@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from invgraphics.core.believable import check_pose
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.contributions import Contributions
@@ -73,7 +74,12 @@ class Model:
         return rendering.detach().to(camera.focal.device)
 
     def _like_model(self, camera: Camera) -> Camera:
-        """The camera on the model's device, in its precision."""
+        """The camera on the model's device, in its precision.
+
+        Raises:
+            InputError: it has no size, or a pose that is not rigid.
+        """
+        check_pose(camera, "the camera")
         return camera.to(self.device).to(self.bounds.lo.dtype)
 
     @torch.no_grad()
