@@ -218,18 +218,16 @@ def to_lattice(model: Model, scene: Scene, method: Method, size: int) -> Field:
     """
     require_density(model.field)
     field = method.recipe.field.build(scene).to(model.device)
-    if not isinstance(field, NeuralField) or not isinstance(field.encoding, SparseVoxels):
+    grid, colours = getattr(field, "encoding", None), getattr(field, "appearance", None)
+    if not (isinstance(field, NeuralField) and isinstance(grid, SparseVoxels) and isinstance(colours, SparseVoxels)):
         raise InputError(f"{method.name} has no voxel grid of densities.", "Use --method volumetric/plenoxels.")
-    grid, colours = field.encoding, field.appearance
-    assert isinstance(colours, SparseVoxels)
     vertices = model.bounds.vertices(grid.resolution)
     activation = field.density_activation
     if activation.kind != "relu" or activation.bias != 0 or activation.interpolation == "pre":
         raise InputError("Densities go into a voxel grid only through a ReLU without a bias.", "Leave the recipe as it is.")
     # Features of 1 have the density of a unit, whatever unit of length the field has.
     grid.rows.fill_(1.0)
-    unit = torch.cat([_density(field, part) for part in vertices.split(CHUNK)])
-    density = torch.cat([_density(model.field, part) for part in vertices.split(CHUNK)])
+    unit, density = (torch.cat([_density(one, part) for part in vertices.split(CHUNK)]) for one in (field, model.field))
     grid.rows.copy_((density / unit.clamp_min(1e-12))[:, None])
     edge = 2 * float(model.bounds.half.mean()) / max(grid.resolution)
     visible = (1 - torch.exp(-density * edge) > VISIBLE).nonzero()[:, 0]

@@ -148,7 +148,7 @@ def _job(request: ConvertRequest, fitted: Fitted) -> Job:
     size = request.size or target.size
     options = provenance.options
     # The refit sees the photographs that the fit saw.
-    if request.method is not None:
+    if request.method:
         field, usual = (load_method(name).recipe.field for name in (request.method, target.method))
         if type(field) is not type(usual):
             sentence = f"--method {request.method} has another field than --to {request.to} makes."
