@@ -64,7 +64,7 @@ def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
         raise InputError(f"'{path}' needs a 'type' key.", f"Known {registry}: {', '.join(sorted(plugins.names(registry)))}.")
     rest = {key: value for key, value in table.items() if key != "type"}
     schema = plugins.load(registry, str(table["type"]))
-    if not dataclasses.is_dataclass(schema):
+    if not (isinstance(schema, type) and dataclasses.is_dataclass(schema)):
         raise InputError(f"'{table['type']}' of the {registry} is {schema!r}, no dataclass.", "See docs/extending.md.")
     return fill(schema, rest, path)
 
