@@ -51,7 +51,7 @@ def test_frame_measures_in_its_own_units() -> None:
 
 def test_a_tripod_may_stand_anywhere() -> None:
     """The mean of equal positions differs from them by rounding, which is no distance between cameras."""
-    poses = ring(0.0, count=7)
+    poses = ring(1.0, count=7)
     poses[:, :3, 3] = torch.tensor([0.1, 1.7, 2.3], dtype=F64)
     assert bool((poses[:, :3, 3] != poses[:, :3, 3].mean(dim=0)).any())
     frame = contracted_frame(poses)
