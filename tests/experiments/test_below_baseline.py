@@ -90,7 +90,7 @@ def test_the_mean_is_over_the_photographs_that_the_method_saw(toy_folder: Path, 
     full = open_scene(str(toy_folder), SceneOptions())
     seen, rules = degrade(full, TrainingData(train_views=1), 0), protocol_named("default")
     black = replace(RunFolder(tmp_path / "run").read(Provenance), data={"background": "black"})
-    assert torch.equal(evaluate._as_seen(full, black).background, full.background)
+    assert torch.equal(evaluate._scene_as_trained(full, black).background, full.background)
     own, other = (baseline_scores(one, rules)["mean image"]["psnr"].mean for one in (seen, full))
     assert f"{own:.1f}" != f"{other:.1f}"
     first = RunFolder(tmp_path / "run").read_scores()

@@ -11,7 +11,7 @@ import torch
 import invgraphics as ig
 from invgraphics.core import Bounds, Scene
 from invgraphics.experiments.fitted import load_fitted
-from invgraphics.experiments.job import Job, training_scene
+from invgraphics.experiments.job import Job, make_training_scene
 from invgraphics.experiments.request import FitRequest
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
@@ -37,7 +37,7 @@ def edges(scene: Scene) -> list[float]:
 
 def test_withheld_views_have_no_part_in_it(wide: Scene) -> None:
     """Fewer views leave a larger hull, which does not change with what the others show."""
-    all_views, few = training_scene(job(), wide), training_scene(job("data.train_views=8"), wide)
+    all_views, few = make_training_scene(job(), wide), make_training_scene(job("data.train_views=8"), wide)
     assert all_views.bounds.radius < few.bounds.radius < wide.bounds.radius
     kept = {view.name for view in few.train}
     other = tuple(
@@ -46,21 +46,21 @@ def test_withheld_views_have_no_part_in_it(wide: Scene) -> None:
         else replace(view, alpha=torch.zeros(32, 32, dtype=torch.uint8), image=torch.zeros_like(view.image))
         for view in wide.train
     )
-    assert edges(training_scene(job("data.train_views=8"), wide.with_views(train=other))) == edges(few)
+    assert edges(make_training_scene(job("data.train_views=8"), wide.with_views(train=other))) == edges(few)
 
 
 @pytest.mark.parametrize("overrides", [["data.pose_noise=1"], ["training.poses.optimise=true"], ["data.box=scene"]])
 def test_nothing_is_cut_off_where_poses_are_in_doubt_or_the_data_sets_box_is_asked_for(
     wide: Scene, overrides: list[str]
 ) -> None:
-    assert edges(training_scene(job(*overrides), wide)) == edges(wide)
+    assert edges(make_training_scene(job(*overrides), wide)) == edges(wide)
 
 
 def test_a_run_opens_in_the_box_of_its_fit(wide: Scene, tmp_path: Path) -> None:
     fit = ig.fit(SMALL, wide, budget="2steps", data={"train_views": 8}, out=tmp_path / "run")
     provenance = RunFolder(tmp_path / "run").read(Provenance)
     model = load_fitted(RunFolder(tmp_path / "run"), wide).model
-    expected = training_scene(job("data.train_views=8"), wide)
+    expected = make_training_scene(job("data.train_views=8"), wide)
     assert provenance.region is not None and [*provenance.region[0], *provenance.region[1]] == edges(expected)
     assert torch.equal(model.bounds.lo, expected.bounds.lo) and torch.equal(model.bounds.hi, expected.bounds.hi)
     in_memory = ig.fit(SMALL, wide, budget="2steps", data={"train_views": 8})

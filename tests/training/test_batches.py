@@ -167,8 +167,8 @@ def test_small_pictures_lie_together_and_not_between_what_they_were_made_from(to
     storages, shown = set(), {}
     for _ in large.train:
         _, batch = batches.image(0.0)
-        storages.add(batches._small[batch.view][1].image.untyped_storage().data_ptr())
-        shown[batch.view] = batches._small[batch.view][1]
+        storages.add(batches._scaled_views[batch.view][1].image.untyped_storage().data_ptr())
+        shown[batch.view] = batches._scaled_views[batch.view][1]
     assert len(shown) == len(large.train) > 1
     assert len(storages) == 1
     for index, view in shown.items():

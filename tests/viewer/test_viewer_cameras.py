@@ -15,7 +15,7 @@ from invgraphics.viewer.cameras import (
     ViewerCamera,
     fov_and_aspect,
     limit_size,
-    nearest_view,
+    nearest_view_index,
     rotation_quaternion,
     subregion,
 )
@@ -118,7 +118,7 @@ def test_the_nearest_photograph() -> None:
     for index, view in enumerate(scene.train):
         pose = view.camera.cam_to_world.clone()
         pose[:3, 3] *= 1.1
-        assert nearest_view(scene.train, ViewerCamera(pose, 1.0, 1.0), scene.extent) == index
+        assert nearest_view_index(scene.train, ViewerCamera(pose, 1.0, 1.0), scene.extent) == index
 
 
 def test_up_is_the_frames_unless_the_photographs_disagree() -> None:

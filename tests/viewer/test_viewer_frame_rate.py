@@ -11,7 +11,7 @@ import torch
 from invgraphics.core import Camera, Rendering, Scene
 from invgraphics.testing import toy_scene
 from invgraphics.viewer.cameras import ViewerCamera
-from invgraphics.viewer.progressive import Frame, ProgressiveRenderer, RenderRequest
+from invgraphics.viewer.progressive import ProgressiveRenderer, RenderRequest, ViewerFrame
 
 TENTH = 0.1
 
@@ -43,18 +43,18 @@ class FakeRun:
         return Rendering(torch.full((*size, 3), 0.5), torch.ones(size), torch.ones(size))
 
 
-def _moving(runs: tuple[FakeRun, ...], clock: Clock, encoding: float, layout: str) -> Callable[[], tuple[float, Frame]]:
+def _moving(runs: tuple[FakeRun, ...], clock: Clock, encoding: float, layout: str) -> Callable[[], tuple[float, ViewerFrame]]:
     """A function that moves the camera and returns the seconds until the frame, and the frame."""
     renderer = ProgressiveRenderer(runs, clock)  # type: ignore[arg-type]
     angles = itertools.count()
 
-    def move() -> tuple[float, Frame]:
+    def move() -> tuple[float, ViewerFrame]:
         angle = next(angles) / 50
         pose = torch.eye(4)
         pose[0, 3], pose[2, 3] = math.sin(angle), -math.cos(angle)
-        frames: list[Frame] = []
+        frames: list[ViewerFrame] = []
 
-        def encode(frame: Frame) -> None:
+        def encode(frame: ViewerFrame) -> None:
             clock.now += encoding
             frames.append(frame)
 
@@ -115,7 +115,7 @@ def test_refinement_over_empty_background_does_not_slow_the_next_movement() -> N
     request = RenderRequest(ViewerCamera(torch.eye(4), 0.8, 1.5), (900, 600))
     for _ in range(12):
         next(renderer.render(request, lambda _: None))
-    frames: list[Frame] = []
+    frames: list[ViewerFrame] = []
     for _ in renderer.render(request, frames.append):
         pass
     assert frames[-1].final

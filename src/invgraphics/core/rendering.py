@@ -162,3 +162,8 @@ class Context:
     generator: torch.Generator | None = None
     chunk: int = 1 << 16
     geometry: bool = False
+
+    def rand(self, shape: tuple[int, ...], like: Tensor) -> Tensor:
+        """Uniform random numbers in [0, 1) of ``like``'s type, drawn on the generator's device: the same on CPU and GPU."""
+        device = like.device if self.generator is None else self.generator.device
+        return torch.rand(shape, generator=self.generator, dtype=like.dtype, device=device).to(like.device)

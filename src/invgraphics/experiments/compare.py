@@ -39,7 +39,7 @@ from invgraphics.text import common_value
 
 START = f"{DATA}init"
 MOST_NAMES = 6
-"""Methods that the question of a comparison names; of more it says how many there are."""
+"""Methods that the question of a comparison names; of more only the number is given."""
 
 
 def compare(request: CompareRequest) -> tuple[Path, int]:
@@ -197,7 +197,7 @@ def _jobs(request: CompareRequest) -> tuple[list[Job], list[Refusal]]:
 
 
 def _start_for_all(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> str:
-    """Override that gives methods the points which photographs tell; empty where the request, or the scene, says what from.
+    """Override that gives methods points from the photographs to start from; empty where request or scene decide otherwise.
 
     Points of a rendered scene are exact: no method could find them, and most have no use for them. In an open space all have
     (see `invgraphics.training.views.sparse_depth`), and some data sets come without any.

@@ -24,7 +24,7 @@ CUDA_PACKAGES = ("triton",)
 
 @cache
 def code_version() -> str:
-    """Package version with a hash of all source files, which tells an edited working copy from a release."""
+    """Package version with a hash of all source files, which distinguishes an edited working copy from a release."""
     root = Path(__file__).resolve().parents[1]
     sha = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):

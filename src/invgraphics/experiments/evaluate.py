@@ -88,8 +88,8 @@ def evaluate(
         protocol,
         method.name,
         poses,
-        keep=lambda index, picture: _save_view(folder, index, picture, scene),
-        seen=_as_seen(scene, provenance),
+        on_picture=lambda index, picture: _save_view(folder, index, picture, scene),
+        training_scene=_scene_as_trained(scene, provenance),
     )
     quality, skipped = scaled_scores(model, scene, protocol, provenance.data, refined=poses is not None)
     result = replace(
@@ -108,8 +108,8 @@ def evaluate(
     return result
 
 
-def _as_seen(scene: Scene, provenance: Provenance) -> Scene:
-    """The scene with the photographs that the fit saw, over its own background; as it is where they are not in this copy."""
+def _scene_as_trained(scene: Scene, provenance: Provenance) -> Scene:
+    """The scene with the photographs of the fit, over its own background; unchanged where this copy cannot give them."""
     data = replace(fill(TrainingData, provenance.data), init="random", background=KEEP)  # without points, which take minutes
     if not data.changes_photographs:
         return scene
@@ -125,8 +125,8 @@ def score_model(
     protocol: str,
     title: str,
     poses: Poses | None = None,
-    keep: Callable[[int, Rendering], None] = lambda index, picture: None,
-    seen: Scene | None = None,
+    on_picture: Callable[[int, Rendering], None] = lambda index, picture: None,
+    training_scene: Scene | None = None,
 ) -> Scores:
     """Render and score all test views of ``scene`` without a run folder; returns their quality and the model's cost.
 
@@ -138,8 +138,8 @@ def score_model(
         protocol: name of the rules.
         title: what the model is called, on the progress bar, in sentences and in the scores.
         poses: of the training views, where the fit has refined them: test poses are then aligned and refined first.
-        keep: is given each picture with the number of its view.
-        seen: the scene as the fit saw it, for the mean training image; ``None`` where that is ``scene``.
+        on_picture: called with the number of each view and its rendering.
+        training_scene: the scene as the fit saw it, for the mean training image; ``None`` where that is ``scene``.
 
     Raises:
         NumericalError: a value of the model is not finite.
@@ -155,18 +155,18 @@ def score_model(
         for index, view in enumerate(scene.test):
             camera = view.camera if posed is None else posed.camera(view)
             timed = index % ceil(len(scene.test) / TIMED) == 0
-            shown = model if unseen is None else unseen.of(view)
-            picture, took = _picture(shown, camera, normals=view.normal is not None, timed=timed)
-            seconds += took
+            view_model = model if unseen is None else unseen.of(view)
+            picture, view_seconds = _picture(view_model, camera, normals=view.normal is not None, timed=timed)
+            seconds += view_seconds
             picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
-            keep(index, picture)
+            on_picture(index, picture)
             scores.append(score(picture, view, scene, rules))
             if sentence := non_finite_pixels(picture):
                 warn(f"Warning: view {view.name}: {sentence}.")
             statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
-    surface, without = surface_scores(model, scene if poses is None else scene_in_fit_frame(poses, scene))
+    surface, surface_skipped = surface_scores(model, scene if poses is None else scene_in_fit_frame(poses, scene))
     return Scores(
         method=title,
         scene=scene.name,
@@ -174,8 +174,8 @@ def score_model(
         views=tuple(view.name for view in scene.test),
         cost=_model_costs(model, scene, statistics.median(seconds)),
         quality=quality | surface | ({} if posed is None else posed.quality()),
-        skipped=skipped | without,
-        below_baseline=below_baseline(title, quality, statistics_of_views, seen or scene, rules),
+        skipped=skipped | surface_skipped,
+        below_baseline=below_baseline(title, quality, statistics_of_views, training_scene or scene, rules),
     )
 
 

@@ -29,7 +29,7 @@ class Job:
     """A `FitRequest` resolved and checked: method, budget, cadence, data and device as typed values.
 
     Attributes:
-        request: as it was asked for; its values that need no reading (seed, scene, folders) stand there.
+        request: as made; values that need no parsing (seed, scene, folders) are read from it.
         method: its recipe, under the request's preset (or its budget's) and overrides.
         budget: of the fit.
         cadence: of its checkpoints.
@@ -55,7 +55,7 @@ class Job:
         """Resolve a request.
 
         Args:
-            request: what is asked for.
+            request: of the fit.
             method: its method, where it has been resolved before.
 
         Raises:
@@ -96,8 +96,8 @@ class Job:
         return [protocol for protocol in self.protocols if not self.folder.scores_path(protocol).is_file()]
 
 
-def training_scene(job: Job, scene: Scene) -> Scene:
-    """Make the scene that a job's fit sees: degraded as asked, in the box of its silhouettes unless poses are in doubt.
+def make_training_scene(job: Job, scene: Scene) -> Scene:
+    """Make the scene that a job's fit sees: degraded as requested, in the box of its silhouettes unless poses are in doubt.
 
     Args:
         job: of the fit.

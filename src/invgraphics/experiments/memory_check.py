@@ -112,10 +112,10 @@ def _build(config: Any, name: str, scene: Scene) -> nn.Module | None:
         with torch.device("meta"):
             return config.build(scene)
     except InputError:
-        return None  # it does not go with the scene, and says so where it is built
+        return None  # incompatible with the scene: the error is raised where it is built
     except (RuntimeError, OverflowError, TypeError) as error:
         if "overflow" not in str(error).lower():
-            return None  # it says itself what it cannot do
+            return None  # building it raises the same error
         remedy = "Lower its sizes, or the 'resolution' of hooks."
         raise InputError(f"The field of {name} has more parameters than can be counted.", remedy) from error
 

@@ -11,7 +11,7 @@ from invgraphics.core.transforms import axes_to_opencv, opencv_to_axes
 from invgraphics.formats.mesh import AXES, check_suffix, read_mesh
 
 UP = "z-up"
-"""How the world's axes point for glTF, where nothing else is said: +z is up (CONVENTIONS.md)."""
+"""How the world's axes point for glTF, by default: +z is up (CONVENTIONS.md)."""
 
 
 def mesh_from_file(path: Path, scene: Scene) -> Mesh:

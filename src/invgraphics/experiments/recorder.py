@@ -77,7 +77,7 @@ class Monitor:
 
 
 def _some_pixels(view: View, most: int, generator: torch.Generator) -> Tensor:
-    """Flat indices of random pixels that count, all where there are no more than ``most``."""
+    """Flat indices of random valid pixels, all where there are no more than ``most``."""
     valid = torch.arange(view.camera.width * view.camera.height)
     if view.mask is not None and bool(view.mask.any()):
         valid = valid[view.mask.reshape(-1)]
@@ -91,13 +91,13 @@ class Recorder:
         fit: what to run.
         folder: where to write; ``None`` to write nothing.
         cadence: how often to write a checkpoint.
-        title: what the progress display says.
+        title: of the progress display.
         snapshots: how many states of the model to keep, evenly over the fit, besides the first.
         on_step: is given the fit before its first step and after each one, on no clock.
         memory: peak of the fit, saved with each checkpoint; ``None`` where nobody measures it.
 
     Attributes:
-        history: each moment at which the monitor looked.
+        history: each evaluation by the monitor.
     """
 
     def __init__(

@@ -64,9 +64,9 @@ def renderings_complete(job: Job) -> bool:
 
 
 def is_kept(job: Job) -> bool:
-    """Whether a finished run counts although the code has changed since: by the same recipe, with every requested rendering.
+    """Whether a finished run is kept although the code has changed since: by the same recipe, with every requested rendering.
 
-    Its folder, or `check_replaceable`, tells that scene and request are the same.
+    Its folder, or `check_replaceable`, ensures that scene and request are the same.
     """
     if not job.folder.finished or not renderings_complete(job):
         return False

@@ -163,9 +163,9 @@ class CompareRequest(Settings):
     Attributes:
         methods: in the order of the report; empty leaves the choice to the scene (`recipes.suitable`).
         seeds: each method is fitted once per seed.
-        optional: methods that are left out, with the reason, where they do not go with the scene; others are an error.
-        asked: the methods as they were asked for, patterns included; empty for ``methods`` themselves.
-        keep: whether finished runs count although the code has changed since, if recipe, scene and request are the same.
+        optional: methods that are skipped, with the reason, where they do not go with the scene; others are an error.
+        asked: the methods as requested, patterns included; empty for ``methods`` themselves.
+        keep: whether finished runs are kept although the code has changed since, if recipe, scene and request are the same.
     """
 
     methods: tuple[str, ...]
@@ -218,7 +218,7 @@ class AblateRequest:
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
         kernels: implementation to force; ``None`` for the best one here.
         checkpoint_every: for instance ``30s``, ``5m`` or ``100steps``.
-        keep: whether finished cells count although the code has changed since, if recipe, scene and request are the same.
+        keep: whether finished cells are kept although the code has changed since, if recipe, scene and request are the same.
         cells: pattern of the labels of the cells to run (`invgraphics.studies.cells.Planned.label`); ``None`` for all.
         most_seconds: fits with a longer budget are left for later; ``None`` for none.
     """

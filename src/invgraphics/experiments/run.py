@@ -26,7 +26,7 @@ from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import check_existing, identify, truth_digest
-from invgraphics.experiments.job import Job, region_of, training_scene
+from invgraphics.experiments.job import Job, make_training_scene, region_of
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder
@@ -92,7 +92,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         check_existing(job)
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
-        shown = training_scene(job, scene)
+        training_scene = make_training_scene(job, scene)
         identity = identify(job, truth_digest(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
@@ -108,7 +108,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         use_kernels(request.kernels, job.device)
         began_at = load_average()
         with PeakMemory(job.device) as memory:
-            fit = prepare(job, shown)
+            fit = prepare(job, training_scene)
             resumed = same and folder.resumable
             earlier = _resumed(fit, job) if resumed else None
             forecast = warm_up(fit, method, memory)  # which may refuse: the folder is as it was until then
@@ -117,7 +117,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            described = describe(job, (scene, shown), identity, fit.plan)
+            described = describe(job, scene, training_scene, identity, fit.plan)
             folder.write(replace(described, memory_forecast_bytes=forecast.bytes))
             if "inconsistent_poses" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
@@ -142,13 +142,13 @@ def _resumed(fit: Fit, job: Job) -> FitRecord:
     return earlier
 
 
-def prepare(job: Job, shown: Scene) -> Fit:
+def prepare(job: Job, training_scene: Scene) -> Fit:
     """Build a job's fit, before its first step, on the degraded training data.
 
     Raises:
         InputError: method and scene do not go together, or what the method starts from cannot be used.
     """
-    plan = build_plan(job.method, shown, job.budget, job.request.seed, job.device)
+    plan = build_plan(job.method, training_scene, job.budget, job.request.seed, job.device)
     return Fit(initialise_field(plan, job.method, job.request.scene))
 
 
@@ -186,17 +186,17 @@ def _region_note(scene: Scene) -> str:
 
 def _exposures_note(method: Method, scene: Scene) -> str:
     """Announce, on a line, exposures that are fitted because the photographs differ in them; empty where they are not."""
-    asked = method.recipe.training is not None and method.recipe.training.exposure is not None
-    if asked or not exposure_note(method, scene):
+    configured = method.recipe.training is not None and method.recipe.training.exposure is not None
+    if configured or not exposure_note(method, scene):
         return ""
     return f"\n  exposures: {scene.notes['exposures']}; fitted too, unless --set training.exposure.optimise=false"
 
 
 def _depth_note(method: Method, plan: Plan) -> str:
     """Announce, on a line, depths that are supervised because the photographs came with points; empty where they are not."""
-    asked = method.recipe.training is not None and method.recipe.training.sparse_depth is not None
+    configured = method.recipe.training is not None and method.recipe.training.sparse_depth is not None
     what = sparse_depth_note(plan)
-    return "" if asked or not what else f"\n  depth: {what}, unless --set training.sparse_depth.weight=0"
+    return "" if configured or not what else f"\n  depth: {what}, unless --set training.sparse_depth.weight=0"
 
 
 def _declare_clocks(folder: RunFolder, spent: FitRecord) -> None:
@@ -213,17 +213,17 @@ def _evaluate(job: Job, scene: Scene, fit: Fit, spent: FitRecord) -> None:
         evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
 
 
-def describe(job: Job, scenes: tuple[Scene, Scene], identity: str, plan: Plan | None = None) -> Provenance:
+def describe(job: Job, scene: Scene, training_scene: Scene, identity: str, plan: Plan | None = None) -> Provenance:
     """Write the run's recipe, environment and truth; return its provenance as known before the fit.
 
     Args:
         job: of the run.
-        scenes: as loaded, and as the fit sees it.
+        scene: as loaded.
+        training_scene: as the fit sees it.
         identity: of the run.
         plan: of the fit; ``None`` for none.
     """
     request, method, folder = job.request, job.method, job.folder
-    scene, shown = scenes
     folder.write_recipe(method.table)
     folder.write(environment(job.device))
     truth = save_truth(scene, Path(request.truth) if request.truth else folder.root / TRUTH)
@@ -239,21 +239,21 @@ def describe(job: Job, scenes: tuple[Scene, Scene], identity: str, plan: Plan | 
         seed=request.seed,
         budget=request.budget,
         truth_sha256=scene.digest("test"),
-        train_sha256=shown.digest("train"),
+        train_sha256=training_scene.digest("train"),
         cameras_sha256=scene.camera_digest(),
         truth=Path(*_relative(truth, folder.root)).as_posix(),
         background=(red, green, blue),
         colour=scene.colour,
         data=job.data.changes(),
-        notes=shown.notes,
+        notes=training_scene.notes,
         code_version=code_version(),
         plugins=plugins.used_plugins(method.table, method.name),
         command=request.shell(),
         options=Options(size=request.size, test_views=request.test_views, spp=request.spp),
-        region=region_of(shown),
+        region=region_of(training_scene),
         device=str(job.device),
         test_poses=protocol_note(method),
-        test_exposure=exposure_note(method, shown),
+        test_exposure=exposure_note(method, training_scene),
         sparse_depth="" if plan is None else sparse_depth_note(plan),
     )
 

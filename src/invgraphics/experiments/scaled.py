@@ -25,7 +25,7 @@ def scaled_scores(
         refined: whether the fit has refined its poses: test views at other scales are then not aligned, and not scored.
 
     Returns:
-        ``psnr_at_1_8`` and the like, for each divisor, and what was left out and why.
+        ``psnr_at_1_8`` and the like, for each divisor, and what was skipped and why.
     """
     rules, quality, skipped = protocol_named(protocol), {}, {}
     reason = "the fit has refined its poses" if refined else ""

@@ -16,7 +16,7 @@ from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.display import curve_svg, table_html
 from invgraphics.experiments.evaluate import score_model
 from invgraphics.experiments.fitted import Fitted
-from invgraphics.experiments.job import Job, in_region, region_of, training_scene
+from invgraphics.experiments.job import Job, in_region, make_training_scene, region_of
 from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.run import prepare, warm_up
@@ -191,7 +191,7 @@ class MemoryRun(FittedRun):
         configure_torch(job.device)
         use_kernels(job.request.kernels, job.device)
         with PeakMemory(job.device) as memory:
-            shown = training_scene(job, scene)
+            shown = make_training_scene(job, scene)
             self.scene = in_region(scene, region_of(shown))
             self.fit = prepare(job, shown)
             warm_up(self.fit, job.method, memory)

@@ -31,9 +31,9 @@ PICTURE_BYTES = 300
 CHECKPOINT_COPIES = 3
 """A checkpoint holds each parameter and Adam's two moments."""
 MARGIN = 1.25
-"""Memory that is freed and asked for again in other sizes leaves gaps."""
+"""Memory that is freed and allocated again in other sizes leaves gaps."""
 GROWTH_MARGIN = 1.5
-"""As `MARGIN`, of primitives that are still to be made, whose arrays are asked for in each size once. Grown by MCMC from 5,000
+"""As `MARGIN`, of primitives that are still to be made, whose arrays are allocated once in each size. Grown by MCMC from 5,000
 to 150,000, Gaussians took 400 MB; as many from the first step on took 230."""
 BASE_BYTES = 95 * 10**6
 """Of work arrays of threads and libraries, whatever the method, and of gaps that freed arrays leave: NeRF's third monitor pass

@@ -20,7 +20,7 @@ class RendererVariant:
     """A named renderer, with its settings, for rendering a fitted field.
 
     Attributes:
-        name: as it was asked for, ``METHOD`` or ``METHOD:key=value:key=value`` with keys of the recipe's renderer.
+        name: as requested, ``METHOD`` or ``METHOD:key=value:key=value`` with keys of the recipe's renderer.
         table: the resolved ``[renderer]`` of its recipe.
     """
 
@@ -44,7 +44,7 @@ def variant_named(name: str, preset: str = "") -> RendererVariant:
 
     Args:
         name: of the variant; ``preset=NAME`` among its settings takes the renderer of that preset.
-        preset: of the fit that is rendered, which counts where the name says none and its recipe has one of that name.
+        preset: of the fit that is rendered, which applies where the name has none and its recipe has one of that name.
 
     Raises:
         InputError: unknown method, preset or setting, or a renderer of several parts whose recipe does not say which.

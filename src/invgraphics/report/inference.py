@@ -17,12 +17,12 @@ from invgraphics.report.pages.tables import escape_markdown
 from invgraphics.report.statistics.instances import (
     Cell,
     counts_of,
-    made,
     mean_of,
+    methods_of,
     paired,
+    scores_of,
     subjects_of,
     table_of,
-    ways_of,
 )
 from invgraphics.report.statistics.intervals import Estimate
 from invgraphics.runs.inference import Inference
@@ -41,17 +41,17 @@ DRAWN = {"psnr": "PSNR (dB)", "normal_deg": "normal error (degrees)"}
 
 @dataclass(frozen=True)
 class Row:
-    """A way of making instances, from one number of observed views.
+    """One inference method, from one number of observed views.
 
     Attributes:
-        how: its name.
+        method: its name.
         observed: number of views.
         cells: a text for each metric.
         input_psnr: of the observed views.
         seconds: of optimisation, for all instances.
     """
 
-    how: str
+    method: str
     observed: int
     cells: tuple[str, ...]
     input_psnr: str
@@ -93,7 +93,7 @@ def build_inference_report(folder: Path) -> Path:
     record = Inference.read(folder / Inference.FILE)
     rows, sentences, counts = _rows(record), inference_sentences(folder), counts_of(record)
     priors, first = list(record.runs), next(iter(record.runs))
-    baselines = [how for how in ways_of(record) if how not in record.runs]
+    baselines = [method for method in methods_of(record) if method not in record.runs]
     with writing(folder):
         place = Folder(folder)
         figures = [
@@ -130,12 +130,12 @@ def inference_sentences(folder: Path) -> list[str]:
     record = Inference.read(folder / Inference.FILE)
     first, observed = next(iter(record.runs)), min(counts_of(record), default=1)
     sentences = []
-    for other in sorted(ways_of(record), key=lambda how: how in record.runs):  # the baselines first
+    for other in sorted(methods_of(record), key=lambda method: method in record.runs):  # the baselines first
         gain = None if other == first else paired(record, "psnr", observed, (first, other))
         if gain is None:
             continue
         sentence = f"From {_views(observed)}, {first} against {other}: {_signed(gain)} dB of PSNR on other views"
-        errors = [mean_of(record, "normal_deg", observed, how) for how in (first, other)]
+        errors = [mean_of(record, "normal_deg", observed, method) for method in (first, other)]
         turned = paired(record, "normal_deg", observed, (first, other))
         if errors[0] is not None and errors[1] is not None and turned is not None:
             sentence += f"; normals are off by {errors[0].mean:.1f} instead of {errors[1].mean:.1f} degrees ({_signed(turned)})"
@@ -159,34 +159,34 @@ def _signed(gain: Estimate) -> str:
 def _rows(record: Inference) -> list[Row]:
     rows = []
     for observed in counts_of(record):
-        for how in ways_of(record):
-            found = made(record, observed, how)
+        for method in methods_of(record):
+            found = scores_of(record, observed, method)
             if not found:
                 continue
-            means = {metric: mean_of(record, metric, observed, how) for metric in SHOWN}
+            means = {metric: mean_of(record, metric, observed, method) for metric in SHOWN}
             cells = tuple(_text(metric, None if mean is None else mean.mean) for metric, mean in means.items())
             spent = [one.seconds for one in found if one.seconds is not None]
             seen = float(np.mean([one.input_psnr for one in found]))
-            rows.append(Row(how, observed, cells, f"{seen:.2f}", f"{sum(spent):.0f}" if spent else "–"))
+            rows.append(Row(method, observed, cells, f"{seen:.2f}", f"{sum(spent):.0f}" if spent else "–"))
     return rows
 
 
-def _differences(record: Inference, metric: str, ways: Sequence[str], *, bold: bool) -> Differences:
+def _differences(record: Inference, metric: str, methods: Sequence[str], *, bold: bool) -> Differences:
     """Table of a metric; ``bold`` where chance is that of the instances alone, as it is not between two fits."""
 
     def words(cell: Cell) -> tuple[str, str, bool]:
         return _text(metric, cell.mean), "" if cell.gain is None else _signed(cell.gain), bold and cell.certain
 
-    table = table_of(record, metric, ways)
-    return Differences(DRAWN[metric], {how: [words(cell) for cell in cells.values()] for how, cells in table.items()})
+    table = table_of(record, metric, methods)
+    return Differences(DRAWN[metric], {method: [words(cell) for cell in cells.values()] for method, cells in table.items()})
 
 
 def _strips(record: Inference, observed: int) -> list[Strip]:
     strips = []
     for subject in subjects_of(record, observed):
         texts = []
-        for how in record.columns[str(observed)]:
-            own = [one for one in made(record, observed, how) if one.subject == subject]
+        for method in record.columns[str(observed)]:
+            own = [one for one in scores_of(record, observed, method) if one.subject == subject]
             values = [value for one in own for value in one.quality.get("psnr", ()) if value is not None]
             texts.append(f"{np.mean(values):.1f} dB" if values else "")
         strips.append(Strip(subject, f"pictures/{observed}/{subject:04d}.png", tuple(texts)))
@@ -202,21 +202,21 @@ def _markdown(context: dict, place: Folder) -> str:
     for title, one in ((title, one) for title, tables in titles for one in tables):
         lines += [f"{title}: {one.label}, mean over instances; in brackets the difference from the first row.", ""]
         lines += ["| made by | " + " | ".join(_views(n) for n in counts) + " |", "|---" * (1 + len(counts)) + "|"]
-        for how, cells in one.rows.items():
+        for method, cells in one.rows.items():
             words = [f"{mean} ({'**' + gain + '**' if sure else gain})" if gain else mean for mean, gain, sure in cells]
-            lines.append(f"| {text(how)} | {' | '.join(words)} |")
+            lines.append(f"| {text(method)} | {' | '.join(words)} |")
         lines.append("")
     if context["fits"]:
         lines += [ONE_FIT, ""]
         lines += ["| fit | parameters | budget | steps | seconds |", "|---|---|---|---|---|"]
-        for how, fit in record.fits.items():
+        for method, fit in record.fits.items():
             seconds = "–" if fit.seconds is None else f"{fit.seconds:.0f}"
-            lines.append(f"| {text(how)} | {fit.parameters:,} | {fit.budget} | {fit.steps or '–'} | {seconds} |")
+            lines.append(f"| {text(method)} | {fit.parameters:,} | {fit.budget} | {fit.steps or '–'} | {seconds} |")
         lines.append("")
     names = (f"{name} ({unit})" if unit else name for name, unit in SHOWN.values())
     head = ["observed views", "made by", *names, "PSNR of the input (dB)", "seconds"]
     lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in context["rows"]:
-        lines.append(f"| {row.observed} | {text(row.how)} | " + " | ".join([*row.cells, row.input_psnr, row.seconds]) + " |")
+        lines.append(f"| {row.observed} | {text(row.method)} | " + " | ".join([*row.cells, row.input_psnr, row.seconds]) + " |")
     lines += markdown_figures(figures, place)
     return "\n".join([*lines, "", f"`{record.command}`, {record.date}", ""])

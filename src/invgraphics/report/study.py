@@ -28,7 +28,7 @@ from invgraphics.report.statistics.rules import headline, judge
 from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences, unscored_sentences
 from invgraphics.report.statistics.summary import quality_columns, table_columns
 from invgraphics.report.statistics.values import value_of
-from invgraphics.report.wording import Quantity
+from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.text import file_name
 
 MOST_PICTURES = 8
@@ -91,7 +91,7 @@ def study_sentences(folder: Path) -> list[str]:
     return [*missing, *map(effect_sentence, effects)]
 
 
-def headline_effects(study: Study, quantity: Quantity, clean: Callable[[str], str] = str) -> list[Effect]:
+def headline_effects(study: Study, quantity: MeasuredQuantity, clean: Callable[[str], str] = str) -> list[Effect]:
     """The effects that answer a study's question: of approximations on the same fits where it names some, then of levels."""
     observations = study.observations()
     crossed = cross_effects(observations, study.approximations, study.factors, clean)
@@ -99,7 +99,7 @@ def headline_effects(study: Study, quantity: Quantity, clean: Callable[[str], st
     return [*crossed, *asked]
 
 
-def study_contrasts(study: Study, quantity: Quantity | None) -> list[Contrast]:
+def study_contrasts(study: Study, quantity: MeasuredQuantity | None) -> list[Contrast]:
     """The comparisons that a study's question asks for, and what leads in the first quantity where there are many levels."""
     among = study.methods if study.each == METHOD else ()
     among = among or next((factor.levels for factor in study.factors if factor.path == study.each), ())
@@ -130,7 +130,7 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
     return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None, analyses, crossed, judged)
 
 
-def _quantities(study: Study, comparisons: Sequence[Comparison]) -> list[Quantity]:
+def _quantities(study: Study, comparisons: Sequence[Comparison]) -> list[MeasuredQuantity]:
     """Union of the columns of all scenes' tables with the study's margins: its metric, other qualities, costs.
 
     Empty where nothing has a quality.

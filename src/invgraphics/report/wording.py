@@ -18,7 +18,7 @@ ABSENT = "–"
 
 
 @dataclass(frozen=True)
-class Quantity:
+class MeasuredQuantity:
     """A measured quantity of a run, a column of the summary: label, unit, direction and number format.
 
     Attributes:
@@ -106,16 +106,16 @@ _GEOMETRY = ("depth_", "normal_", "alpha_", "pose_", "chamfer", "surface_", "f_s
 _UNITS = {"deg": "°", "degrees": "°", "degree": "°", "world units": "units"}
 
 COSTS = (
-    Quantity("fit_seconds", "Fit", "s", "lower", "cost"),
-    Quantity("fit_cpu_seconds", "Fit, all threads", "CPU s", "none", "cost"),
-    Quantity("steps", "Steps", "", "none", "cost", decimals=0),
-    Quantity("render_seconds_per_view", "Render", "s/view", "lower", "cost"),
-    Quantity("render_fps", "Render", "FPS", "higher", "cost"),
-    Quantity("peak_memory_bytes", "Memory", "MB", "lower", "cost", scale=1e-6),
-    Quantity("model_bytes", "Model", "MB", "lower", "cost", scale=1e-6),
-    Quantity("parameters", "Params", "M", "none", "cost", scale=1e-6),
-    Quantity("primitives", "Primitives", "", "none", "cost", decimals=0),
-    Quantity("dead", "Dead", "%", "none", "cost", scale=100, decimals=2),
+    MeasuredQuantity("fit_seconds", "Fit", "s", "lower", "cost"),
+    MeasuredQuantity("fit_cpu_seconds", "Fit, all threads", "CPU s", "none", "cost"),
+    MeasuredQuantity("steps", "Steps", "", "none", "cost", decimals=0),
+    MeasuredQuantity("render_seconds_per_view", "Render", "s/view", "lower", "cost"),
+    MeasuredQuantity("render_fps", "Render", "FPS", "higher", "cost"),
+    MeasuredQuantity("peak_memory_bytes", "Memory", "MB", "lower", "cost", scale=1e-6),
+    MeasuredQuantity("model_bytes", "Model", "MB", "lower", "cost", scale=1e-6),
+    MeasuredQuantity("parameters", "Params", "M", "none", "cost", scale=1e-6),
+    MeasuredQuantity("primitives", "Primitives", "", "none", "cost", decimals=0),
+    MeasuredQuantity("dead", "Dead", "%", "none", "cost", scale=100, decimals=2),
 )
 """Costs in the order of the table; 1 MB = 10⁶ bytes."""
 
@@ -131,14 +131,14 @@ def metric_label(key: str) -> str:
     return f"{label} at 1/{divisor}" if scaled else label
 
 
-def quality_quantity(key: str, score: Score) -> Quantity:
+def quality_quantity(key: str, score: Score) -> MeasuredQuantity:
     """Quantity of a quality metric, with unit and direction from its stored score."""
     name = key.partition(SCALED)[0]
     decimals = _NAMES[name][1] if name in _NAMES else None
     better: Direction = "higher" if score.higher_is_better else "lower"
     group: Group = "geometry" if key.startswith(_GEOMETRY) else "image"
     unit = _UNITS.get(score.unit, score.unit)
-    return Quantity(key, metric_label(key), unit, better, group, decimals=decimals, margin=MARGINS.get(name))
+    return MeasuredQuantity(key, metric_label(key), unit, better, group, decimals=decimals, margin=MARGINS.get(name))
 
 
 def significant_decimals(value: float, digits: int = 3) -> int:

@@ -10,7 +10,7 @@ from invgraphics.scenes.layout import SceneOptions, Split, compose, evenly, exis
 from invgraphics.scenes.pictures.images import Photo
 from invgraphics.scenes.region import BOX_HALF, photo_frame
 
-_VAL_VIEWS = 4  # looked at during a fit, never scored
+_VAL_VIEWS = 4  # monitored during a fit, never scored
 
 
 class Blender:

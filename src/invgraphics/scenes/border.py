@@ -15,7 +15,7 @@ from invgraphics.core import View
 T = TypeVar("T")
 
 LOOKED_AT = 8
-"""Pictures that are looked at, about."""
+"""Number of pictures that are examined, about."""
 CLEAR_SHARE = 0.05
 """Share of transparent pixels from which an object stands by itself; fewer are a window, or what undistortion left blank."""
 PLAIN_SHARE = 0.9

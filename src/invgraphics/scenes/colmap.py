@@ -57,7 +57,7 @@ class Colmap:
 
 
 def _with_tracks(scene: Scene, model: Model) -> Scene:
-    """Add to a scene and its notes what tracks tell of training photographs: landmarks, and the spread of exposures."""
+    """Add to a scene and its notes what tracks give for training photographs: landmarks, and the spread of exposures."""
     if scene.points is None:
         return scene
     rows = {number: row for row, number in enumerate(model.reconstruction.points3D)}

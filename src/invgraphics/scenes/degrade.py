@@ -32,7 +32,7 @@ FEWEST_POINTS, ENOUGH_POINTS = 16, 5000
 """Fewer SfM points than the first are no start. Fewer than the second, as small pictures give them, are joined by as many
 random ones, inside the silhouettes where photographs have alpha: a few hundred alone begin below a random start. PSNR of
 `splatting/gaussians` at 128 px after 400 steps, bricks and textured: SfM 24.9 and 25.0 dB, random 27.1 and 25.6, both 27.2 and
-26.3, both with silhouettes 28.4 and 27.7; exact points 29.1 and 28.6. After 1500 steps on bricks the start no longer tells:
+26.3, both with silhouettes 28.4 and 27.7; exact points 29.1 and 28.6. After 1500 steps on bricks the start no longer matters:
 SfM 31.2, random 31.4, both 31.5 and exact points 31.4 dB."""
 
 KEEP = "random"
@@ -160,7 +160,7 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
 
 
 def _with_points(scene: Scene, data: TrainingData, seed: int) -> Scene:
-    """Replace a degraded scene's points by what its photographs tell of them, and note which they are."""
+    """Replace a degraded scene's points by those that its own photographs give, and note which they are."""
     if data.init == "random":
         return replace(scene, points=None, notes=scene.notes | {"points": "none: a random start"})
     if data.init == "scene" and (scene.points is None or not data.changes_photographs):

@@ -21,7 +21,7 @@ from invgraphics.scenes.dtu import find_scan
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth
 from invgraphics.scenes.pictures.images import Photo, image_files, stored_size
 from invgraphics.scenes.poses import pose
-from invgraphics.scenes.region import NEAR, Frame
+from invgraphics.scenes.region import NEAR, LocalFrame
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 
@@ -61,7 +61,7 @@ class Idr:
         bounds = Bounds(-torch.ones(3), torch.ones(3), "box" if masks else "contracted", NEAR)
         scan, lacks = find_scan(path if path.is_dir() else path.parent)
         notes = {"loader": "idr", "cameras": source.name, "reference_scan": lacks.lstrip("; ") or "with mask and plane"}
-        scene = compose(path.resolve().name, every_eighth(photos), Frame(bounds, world_from_local), options, notes)
+        scene = compose(path.resolve().name, every_eighth(photos), LocalFrame(bounds, world_from_local), options, notes)
         return replace(scene, scan=scan)
 
 

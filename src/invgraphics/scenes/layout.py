@@ -19,7 +19,7 @@ from invgraphics.scenes.pictures.images import Photo, file_exists, match_sizes
 from invgraphics.scenes.pictures.masks import masks_note
 from invgraphics.scenes.pictures.resize import RESIZE, wanted_size
 from invgraphics.scenes.pictures.views import load_view
-from invgraphics.scenes.region import Frame
+from invgraphics.scenes.region import LocalFrame
 
 T = TypeVar("T")
 
@@ -67,7 +67,7 @@ class Split:
     Attributes:
         train: to fit.
         test: to score.
-        val: to look at during a fit.
+        val: to monitor during a fit.
         rule: how they were told apart, for the scene's notes.
     """
 
@@ -132,7 +132,7 @@ def existing_photos(photos: Sequence[Photo], source: Path) -> tuple[list[Photo],
     return found, {"missing": f"{len(absent)} of {len(photos)} listed files are absent: {shown}"}
 
 
-def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes: dict[str, str]) -> Scene:
+def compose(name: str, split: Split, frame: LocalFrame, options: SceneOptions, notes: dict[str, str]) -> Scene:
     """Read the chosen photographs and compose the scene: cameras in the local frame, bounds, background, notes.
 
     Scenes with alpha are declared to be on white, those whose pictures have a plain border on its colour, others on black.
@@ -166,7 +166,7 @@ def compose(name: str, split: Split, frame: Frame, options: SceneOptions, notes:
     )
 
 
-def local_points(frame: Frame) -> Points | None:
+def local_points(frame: LocalFrame) -> Points | None:
     """Transform the frame's points from the world to the local frame; ``None`` without points."""
     if frame.points is None:
         return None

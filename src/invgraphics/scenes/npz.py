@@ -13,7 +13,7 @@ normal         (n, h, w, 3), optional         unit normals, world frame, facing 
 points         (m, 3), optional               known surface points, world frame
 points_rgb     (m, 3), optional               their colours, as ``images``; default: grey
 test           (n,) booleans, optional        which views are scored; default: every 8th
-val            (n,) booleans, optional        which views are only looked at during a fit
+val            (n,) booleans, optional        which views are only monitored during a fit
 subject        (n,) integers, optional        of a class of objects: which one each view shows; scored ones are unseen
 observed       (n,) booleans, optional        of a class: views from which the unseen instances are inferred
 bounds         (2, 3), optional               lowest and highest corner of a box that holds all there is; default: unbounded
@@ -43,7 +43,7 @@ from invgraphics.scenes.layout import HOLD_OUT, SceneOptions, evenly, local_poin
 from invgraphics.scenes.pictures.resize import RESIZE, wanted_size
 from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.poses import poses
-from invgraphics.scenes.region import Frame, box_frame, contracted_frame, object_frame
+from invgraphics.scenes.region import LocalFrame, box_frame, contracted_frame, object_frame
 
 Arrays = Mapping[str, np.ndarray]
 _REQUIRED = ("images", "cam_to_world", "focal")
@@ -132,7 +132,7 @@ def _read(path: Path) -> Arrays:
     return arrays
 
 
-def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> Frame:
+def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> LocalFrame:
     points = None
     if "points" in arrays:
         position = arrays["points"]
@@ -152,11 +152,11 @@ def _frame(arrays: Arrays, world: Float[Tensor, "n 4 4"], path: Path) -> Frame:
     if not bool((lo < hi).all()):
         raise InputError(f"'bounds' of {path} is {arrays['bounds'].tolist()}: the first corner must be below the second.")
     own = bool(arrays.get("own_units", False))
-    return Frame(Bounds(lo.float(), hi.float()), points=points) if own else box_frame(lo, hi, points)
+    return LocalFrame(Bounds(lo.float(), hi.float()), points=points) if own else box_frame(lo, hi, points)
 
 
 def _splits(arrays: Arrays, n: int, path: Path) -> tuple[list[int], list[int], list[int], list[int]]:
-    """Views to fit, to look at, to score, and from which unseen instances are inferred.
+    """Views to fit, to monitor, to score, and from which unseen instances are inferred.
 
     Raises:
         InputError: they overlap, or the subjects do not fit to them.
@@ -207,7 +207,7 @@ def _names(arrays: Arrays) -> list[str]:
     return names
 
 
-def _view(path: Path, arrays: Arrays, i: int, named: tuple[Camera, str], frame: Frame, final: tuple[int, int]) -> View:
+def _view(path: Path, arrays: Arrays, i: int, named: tuple[Camera, str], frame: LocalFrame, final: tuple[int, int]) -> View:
     view = make_view(named[0], _pixels(arrays, i, path), named[1], final)
     if "subject" in arrays:
         view = replace(view, subject=int(arrays["subject"][i]))

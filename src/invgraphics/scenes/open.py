@@ -148,11 +148,11 @@ def is_rendered(spec: str) -> bool:
 
 
 def longest_edge(spec: str, size: int | Sequence[int] | None) -> int | None:
-    """Longest edge in pixels of a scene's pictures; ``None`` where only the scene itself tells.
+    """Longest edge in pixels of a scene's pictures; ``None`` where it is known only once the scene is loaded.
 
     Args:
         spec: the scene's name or path.
-        size: as asked for, if it was.
+        size: as requested; ``None`` where it was not.
     """
     from invgraphics.scenes.mitsuba.spec import description_path, read
 
@@ -198,8 +198,10 @@ def _description(spec: str) -> str | None:
     from invgraphics.scenes.mitsuba.spec import FILE
 
     path = _path(spec)
+    if spec in _built_in():
+        return spec
     own = path if path.name == FILE else path / FILE
-    return spec if spec in _built_in() else str(own) if own.is_file() else None
+    return str(own) if own.is_file() else None
 
 
 def _render(description: str, options: SceneOptions, progress: Callable[[int, int, str], None] | None) -> Path:

@@ -19,7 +19,7 @@ from invgraphics.scenes.pictures.images import Photo, read_pixels
 ROUNDING = 1e-9
 """Share of the cameras' distance from the world's origin below which their distances from one another are rounding."""
 NEAR = 0.05
-"""Closest sample to a camera in local units, where a data set does not say."""
+"""Closest sample to a camera in local units, where a data set gives none."""
 
 BOX_HALF = 1.5
 """Longest half-edge in local units of a box that is scaled; NeRF-synthetic lies within it (instant-ngp and TensoRF use it)."""
@@ -36,7 +36,7 @@ OFF_CENTRE = 0.5
 PARALLEL = 0.01
 """Mean squared sine of the angle between viewing directions (6°) below which they have no common focus."""
 SUBJECT_SHARE = 0.75
-"""Share of the points that counts as the subject; the others are its surroundings, or wrong."""
+"""Share of the points that is the subject; the others are its surroundings, or wrong."""
 MARGIN = 1.5
 """Half-edge of the box over the subject's radius."""
 SMALLEST = 0.05
@@ -47,13 +47,13 @@ NEAREST_SHARE = 0.02
 CLEARANCE = 0.7
 """Distance of the first sample over that of the nearest points."""
 VIEW_ANGLE = 45.0
-"""Degrees from the optical axis within which points count as seen."""
+"""Degrees from the optical axis within which points are seen."""
 FEWEST = 16
-"""Fewer points than this say nothing."""
+"""Fewer points than this are no estimate."""
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class LocalFrame:
     """Local frame of a scene, its bounds and known points.
 
     Attributes:
@@ -143,7 +143,7 @@ def near_plane(poses: Float[Tensor, "k 4 4"], points: Float[Tensor, "n 3"]) -> f
     return CLEARANCE * min(nearest) if nearest else None
 
 
-def photo_frame(photos: Sequence[Photo], points: Points | None = None, conventional: float | None = None) -> Frame:
+def photo_frame(photos: Sequence[Photo], points: Points | None = None, conventional: float | None = None) -> LocalFrame:
     """Compute the local frame of photographs: of an object in a box, if they show one (`object_frame`), else of endless space.
 
     Args:
@@ -165,7 +165,7 @@ def object_frame(
     pictures: Sequence[UInt8[np.ndarray, "h w c"]],
     points: Points | None = None,
     conventional: float | None = None,
-) -> Frame | None:
+) -> LocalFrame | None:
     """Compute the local frame of an object in a box, from what its pictures show; ``None`` where they show more, or no focus.
 
     Args:
@@ -173,7 +173,7 @@ def object_frame(
         pictures: those of some of the cameras, straight colour or colour and alpha.
         points: known surface points, world frame; kept.
         conventional: half-edge of the box around the origin in which data sets of this format have objects; taken where it fits
-            the pictures. Without it a black border may be the rim of a lens, and tells nothing.
+            the pictures. Without it a black border may be the rim of a lens, and is no evidence.
     """
     if not is_object(pictures, black=conventional is not None) or (seen := pictured_ball(cameras)) is None:
         return None
@@ -186,7 +186,7 @@ def object_frame(
     return box_frame(centre - half, centre + half, points)
 
 
-def box_frame(lo: Float[Tensor, 3], hi: Float[Tensor, 3], points: Points | None = None) -> Frame:
+def box_frame(lo: Float[Tensor, 3], hi: Float[Tensor, 3], points: Points | None = None) -> LocalFrame:
     """Compute the local frame of an object in a box: the world itself, or the box moved to the origin and scaled to `BOX_HALF`.
 
     Densities per length and the near distance are made for boxes of about that size; a box far smaller, larger or farther away
@@ -201,17 +201,17 @@ def box_frame(lo: Float[Tensor, 3], hi: Float[Tensor, 3], points: Points | None 
     least, most = BOX_HALVES
     usual = least <= half <= most and float(centre.abs().max()) <= most
     if usual or not math.isfinite(half):  # what is not finite is refused with the scene
-        return Frame(Bounds(lo.float(), hi.float()), points=points)
+        return LocalFrame(Bounds(lo.float(), hi.float()), points=points)
     world_from_local = torch.eye(4, dtype=torch.float64)
     world_from_local[:3, :3] *= half / BOX_HALF
     world_from_local[:3, 3] = centre
     corner = ((hi - lo) / 2 / half * BOX_HALF).float()
-    return Frame(Bounds(-corner, corner), world_from_local, points)
+    return LocalFrame(Bounds(-corner, corner), world_from_local, points)
 
 
 def contracted_frame(
     poses: Float[Tensor, "n 4 4"], points: Points | None = None, distance: float | None = None, near: float | None = None
-) -> Frame:
+) -> LocalFrame:
     """Compute the local frame of an unbounded scene: +z is the mean up, the subject at the origin, cameras in the unit ball.
 
     The subject is where the optical axes come closest to each other. Where they are too parallel for that it lies ``distance``
@@ -247,7 +247,7 @@ def contracted_frame(
     near = near_plane(poses, known) if near is None else near
     half = torch.full((3,), subject_half((known - centre) / radius))
     bounds = Bounds(-half, half, "contracted", near=NEAR if near is None else near / radius)
-    return Frame(bounds, world_from_local, points)
+    return LocalFrame(bounds, world_from_local, points)
 
 
 def _turn_z_to(up: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:

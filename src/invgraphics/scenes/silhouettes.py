@@ -1,4 +1,4 @@
-"""What the silhouettes of photographs with alpha tell: points inside all of them, and a box around these."""
+"""Silhouettes of photographs with alpha: points inside all of them, and a box around these."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ LEAST_ALPHA = 0.05
 GRID = 48
 """Cells along each edge of a box that is tightened."""
 CONTRADICTIONS = 0.02
-"""Share of the photographs that may show a cell outside their silhouettes before it counts as empty."""
+"""Share of the photographs that may show a cell outside their silhouettes before it is empty."""
 SHOWN = 0.5
-"""Parts of the hull belong to the object where this share of the views that show its most shown cell show one of theirs."""
+"""A connected component is kept if at least this share of the number of views that see the most seen cell see one of it."""
 WORTHWHILE = 0.75
 """Share of its volume above which a box stays as it is."""
 
@@ -50,8 +50,8 @@ def points_inside(bounds: Bounds, views: Sequence[View], count: int, generator: 
 def inside_silhouettes(points: Float[Tensor, "n 3"], views: Sequence[View]) -> Bool[Tensor, " n"]:
     """Find the points that every photograph with alpha shows inside its silhouette, or does not show at all.
 
-    A pixel's neighbours count as its own, because the object may reach as far between their centres. A pixel that a view's mask
-    leaves out says nothing.
+    Silhouettes are dilated by a pixel, because the object may reach as far between pixel centres. Masked-out pixels rule out
+    no point.
     """
     inside = torch.ones(len(points), dtype=torch.bool)
     for view in views:
@@ -110,8 +110,8 @@ def _hull_box(bounds: Bounds, views: Sequence[View]) -> Bounds | None:
 def _outside(centres: Float[Tensor, "n 3"], radius: float, view: View) -> Bool[Tensor, " n"]:
     """Find the balls around points that a photograph shows wholly outside its silhouette.
 
-    Silhouettes are looked up in pictures of half the size after half the size, whose pixels hold the largest alpha of four: in
-    the first whose pixels are as large as the ball, which touches one and its neighbours only. What a mask leaves out is solid.
+    Silhouettes are read from a pyramid of pictures of half the size each, whose pixels hold the largest alpha of four: from the
+    first whose pixels are as large as the ball, which touches one and its neighbours only. Masked-out pixels are solid.
     """
     camera = view.camera
     seen, pixel = camera.pixel_of(centres)

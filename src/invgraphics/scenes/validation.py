@@ -44,7 +44,7 @@ def validate(scene: Scene) -> Scene:
         for view, name in zip(views, names, strict=True):
             _validate_view(view, name, scene.colour)
     if not any(view.mask is None or bool(view.mask.any()) for view in scene.train):
-        raise InputError(f"The masks of '{scene.name}' leave no pixel of any training view.", "True marks pixels that count.")
+        raise InputError(f"The masks of '{scene.name}' leave no pixel of any training view.", "True marks valid pixels.")
     check_scene(scene)
     if off := [view.name for view in scene.train if principal_point_far_outside(view.camera)]:
         message = f"'{off[0]}' has its principal point far outside the picture: a crop, or resized without its calibration?"
@@ -131,7 +131,7 @@ def _validate_view(view: View, what: str, colour: str) -> None:
 def _validate_values(name: str, values: Tensor, what: str, colour: str) -> None:
     if name == "mask":
         if values.dtype != torch.bool:
-            raise InputError(f"The mask of {what} is {values.dtype}, not torch.bool.", "True marks pixels that count.")
+            raise InputError(f"The mask of {what} is {values.dtype}, not torch.bool.", "True marks valid pixels.")
         return
     if values.dtype == torch.uint8:
         return

@@ -10,7 +10,7 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.build import build_model, build_plan, use_kernels
 from invgraphics.experiments.evaluate import expected_seconds
-from invgraphics.experiments.job import Job, training_scene
+from invgraphics.experiments.job import Job, make_training_scene
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.start import CHECKPOINT_COPIES
 from invgraphics.experiments.variants import RendererVariant, with_renderer
@@ -95,7 +95,7 @@ def try_method(job: Job, scene: Scene) -> Cost:
     seed, device = job.request.seed, job.device
     use_kernels(job.request.kernels, device)
     pixels = sum(view.camera.width * view.camera.height for view in scene.test)
-    shown = training_scene(job, scene)
+    shown = make_training_scene(job, scene)
     try:
         fit = Fit(build_plan(job.method, shown, job.budget, seed, device))
         step = _try_steps(fit)

@@ -1,4 +1,4 @@
-"""Runs on one class of objects: opened on one scene, and named by what tells them apart."""
+"""Runs on one class of objects: opened on one scene, and named by what distinguishes them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from invgraphics.runs.study import level_text
 from invgraphics.scenes.open import SceneOptions, open_scene
 
 MOST_WORDS = 3
-"""Settings that a run's name may list; beyond them its folder tells it apart."""
+"""Settings that a run's name may list; beyond them its folder does."""
 
 
 def open_class_runs(folders: Sequence[Path], scene_spec: str | None = None) -> list[Fitted]:

@@ -40,7 +40,7 @@ WIDEST = 1.5
 EDGE = 0.05
 """Relative step of the depth between neighbouring pixels from which on neither is taken for a surface point."""
 DIRECTIONS = 12
-"""Training cameras from which a vertex's radiance is looked at, to fit its spherical harmonics."""
+"""Training cameras from which a vertex's radiance is evaluated, to fit its spherical harmonics."""
 RIDGE = 0.1
 """Weight of the squared coefficients of view-dependent bands in that fit, per direction."""
 QUICK_RATES = tuple(
@@ -263,7 +263,7 @@ class Target:
     """What a run is converted to.
 
     Attributes:
-        method: whose field is made and refitted, unless another is asked for.
+        method: whose field is made and refitted, unless another is requested.
         hub: what the conversion goes through, in words.
         size: number of primitives, or of vertices or voxels along an edge; 0 where the method alone decides.
         convert: makes the field of a model, on a scene, for a method, of a size.
@@ -277,24 +277,21 @@ class Target:
     overrides: tuple[str, ...] = ()
 
 
-def _size(to: str) -> int:
-    return CONVERSION_SIZES[to][0]
-
-
+_SIZES = {name: sizes[0] for name, sizes in CONVERSION_SIZES.items()}
 GAUSSIANS = (*QUICK_RATES, NO_GROWTH)
 TARGETS = {
-    "gaussians": Target("splatting/gaussians", "surface points with normals", _size("gaussians"), to_gaussians, GAUSSIANS),
+    "gaussians": Target("splatting/gaussians", "surface points with normals", _SIZES["gaussians"], to_gaussians, GAUSSIANS),
     "lattice": Target(
         "volumetric/plenoxels",
         "density and colour",
-        _size("lattice"),
+        _SIZES["lattice"],
         to_lattice,
         ("field.encoding.resolution={size}", "field.appearance.resolution={size}", "hooks=[]"),
     ),
     "mesh": Target(
-        "surface/mesh", "density or distance", _size("mesh"), to_mesh, ("field.source='{run}'", "field.resolution={size}")
+        "surface/mesh", "density or distance", _SIZES["mesh"], to_mesh, ("field.source='{run}'", "field.resolution={size}")
     ),
     "mpi": Target("planes/mpi", "density and colour", 0, to_planes, ("field.init='uniform'",)),
-    "points": Target("volumetric/point-nerf", "surface points with normals", _size("points"), to_points),
+    "points": Target("volumetric/point-nerf", "surface points with normals", _SIZES["points"], to_points),
 }
 """Targets by the name that ``convert --to`` takes."""

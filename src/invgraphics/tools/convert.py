@@ -131,7 +131,7 @@ def convert_run(request: ConvertRequest) -> Converted:
         _check_empty(folder)
         folder.clear()
         origin = _origin(request, fitted, native, converted)
-        provenance = describe(job, (fitted.scene, shown), _identity(job, origin), plan)
+        provenance = describe(job, fitted.scene, shown, _identity(job, origin), plan)
         folder.write(replace(provenance, command=request.shell(), converted=origin, threads=torch.get_num_threads()))
         with PeakMemory(job.device) as memory:
             fit = Fit(plan)

@@ -87,7 +87,7 @@ def import_run(request: ImportRequest) -> Path:
     with folder.held():
         _check_empty(folder)
         folder.clear()
-        provenance = describe(job, (scene, scene), _identity(job.method, scene, origin))
+        provenance = describe(job, scene, scene, _identity(job.method, scene, origin))
         folder.write(replace(provenance, budget=IMPORTED, command=request.shell(), imported=origin))
         model = build_model(job.method, scene, job.request.seed, job.device)
         assert isinstance(model.field, GaussianField)

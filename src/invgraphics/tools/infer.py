@@ -101,17 +101,17 @@ def infer(request: InferRequest) -> Inference:
     observed = observed_views(scene, subjects, max(request.views))
     with output_folder(request.out), Reporter("infer") as reporter:
         record = _begin(request, names)
-        for how, one in names.items():  # by which `report --check` knows the recipes
-            copy = RunFolder(request.out / "runs" / slug(how).replace(", ", "-"))
+        for name, one in names.items():  # by which `report --check` knows the recipes
+            copy = RunFolder(request.out / "runs" / slug(name).replace(", ", "-"))
             copy.create()
             copy.write(one.folder.read(Provenance))
-        ways = _Ways(names, request)
+        methods = _InferenceMethods(names, request)
         todo = [(subject, count) for subject in subjects for count in request.views]
         for place, (subject, count) in enumerate(todo):
             if record.holds(subject, count) and _picture(request.out, subject, count).is_file():
                 continue
             reporter.show(place / len(todo), f"instance {subject} from {count} view{'' if count == 1 else 's'}")
-            record = _with_instance(record, ways, observed[subject][:count], request.out)
+            record = _with_instance(record, methods, observed[subject][:count], request.out)
             record.write(request.out / Inference.FILE)
     return record
 
@@ -122,7 +122,7 @@ def _begin(request: InferRequest, names: Mapping[str, Fitted]) -> Inference:
     Raises:
         InputError: the folder's is of other runs, settings or code.
     """
-    runs = {how: one.folder.read(Provenance).cell_sha256 for how, one in names.items()}
+    runs = {name: one.folder.read(Provenance).cell_sha256 for name, one in names.items()}
     settings = {"tests": request.tests, "no_prior": request.no_prior, "steps": request.steps}
     scene = next(iter(names.values())).scene
     identity = sha256_of(settings | {"runs": runs, "truth": scene.digest("test"), "code": code_version()})
@@ -138,8 +138,8 @@ def _begin(request: InferRequest, names: Mapping[str, Fitted]) -> Inference:
         request = replace(request, views=views, instances=instances)
     return Inference(
         scene=scene.name,
-        runs={how: str(one.folder.root) for how, one in names.items()},
-        fits={how: _fit(one) for how, one in names.items()},
+        runs={name: str(one.folder.root) for name, one in names.items()},
+        fits={name: _fit(one) for name, one in names.items()},
         identity=identity,
         command=request.shell(),
         date=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -162,8 +162,8 @@ def _picture(out: Path, subject: int, count: int) -> Path:
     return out / "pictures" / str(count) / f"{subject:04d}.png"
 
 
-class _Ways:
-    """Ways to make an instance from views of it: by each run's prior, and by the baselines of the first run."""
+class _InferenceMethods:
+    """Methods that infer an instance from views of it: each run's prior, and the baselines of the first run."""
 
     def __init__(self, names: Mapping[str, Fitted], request: InferRequest) -> None:
         self._names, self._request = names, request
@@ -172,7 +172,7 @@ class _Ways:
         self._nearest = NearestInstance(self._first.model, self.scene)
 
     def of(self, views: Sequence[View]) -> Iterator[tuple[str, Callable[[], Model]]]:
-        """Name and maker of the instance's model, each way."""
+        """Name of each method, and the function that makes its model of the instance."""
         config = CodeInference(steps=self._request.steps)
         for name, one in self._names.items():
             yield name, lambda one=one: with_prior(one.model, self.scene, views, config)
@@ -182,7 +182,7 @@ class _Ways:
             budget = Budget.parse(self._request.no_prior)
             yield NO_PRIOR, lambda: without_prior(self._first.method, self.scene, views, budget)
 
-    def score(self, model: Model, views: Sequence[View], how: str, seconds: float) -> InstanceScores:
+    def score(self, model: Model, views: Sequence[View], method: str, seconds: float) -> InstanceScores:
         """Scores of an instance on its test views, rounded to 8 bits as everywhere."""
         rules, scene, subject = protocol_named("default"), self.scene, views[0].subject
         assert subject is not None
@@ -192,7 +192,7 @@ class _Ways:
         return InstanceScores(
             subject=subject,
             observed=len(views),
-            how=how,
+            how=method,
             quality={metric: tuple(one.values.get(metric) for one in found) for metric in METRICS},
             input_psnr=sum(one.values["psnr"] for one in seen) / len(seen),
             seconds=seconds,
@@ -205,17 +205,17 @@ def with_prior(model: Model, scene: Scene, views: Sequence[View], config: CodeIn
     return replace(model, field=model.field.at(infer_codes(model, scene, [views], config)[0]))
 
 
-def _with_instance(record: Inference, ways: _Ways, views: Sequence[View], out: Path) -> Inference:
-    """Infer an instance each way, draw it, and add it to the record."""
+def _with_instance(record: Inference, methods: _InferenceMethods, views: Sequence[View], out: Path) -> Inference:
+    """Infer an instance by each method, draw it, and add it to the record."""
     models: dict[str, Model] = {}
     scores = []
-    for how, make in ways.of(views):
+    for method, make in methods.of(views):
         began = time.perf_counter()
-        models[how] = make()
+        models[method] = make()
         seconds = time.perf_counter() - began
-        scores.append(ways.score(models[how], views, how, seconds))
+        scores.append(methods.score(models[method], views, method, seconds))
     subject, count = scores[0].subject, len(views)
-    draw_instance(_picture(out, subject, count), ways.scene, models, views[0])
+    draw_instance(_picture(out, subject, count), methods.scene, models, views[0])
     kept = (one for one in record.instances if (one.subject, one.observed) != (subject, count))
     return replace(
         record,

@@ -33,12 +33,12 @@ LEVELS = ((0.25, 0.5, 2e-2, 4e-3), (0.5, 0.25, 6e-3, 1e-3), (1.0, 0.25, 2e-3, 1e
 SPREAD = 10.0
 """Of random starts around the training views: degrees, and per cent of the scene's extent."""
 SAME = 2.5
-"""Mean difference in 8-bit steps up to which the photograph counts as one of the test views."""
+"""Mean difference in 8-bit steps up to which the photograph is taken for one of the test views."""
 
 
 @dataclass(frozen=True)
 class LocateRequest:
-    """What to look for, and where to begin.
+    """Photograph to localise, and where the search begins.
 
     Attributes:
         run: folder of the fit.
@@ -96,7 +96,7 @@ def _locate(request: LocateRequest, pixels: UInt8[np.ndarray, "h w c"], fitted: 
         found, tried = _search(
             fitted, [replace(v, camera=transform_camera(v.camera, drift)) for v in starts], request, reporter
         )
-    return _location_record(request, fitted, (found, tried), drift.inverse())
+    return _location_record(request, fitted, found, tried, drift.inverse())
 
 
 def _photo(pixels: UInt8[np.ndarray, "h w c"], request: LocateRequest, scene: Scene) -> View:
@@ -162,8 +162,7 @@ def _search(fitted: Fitted, starts: list[View], request: LocateRequest, reporter
     return kept[0][0], [Start(start=i, loss_at_start=losses[i], rounds=rounds[i]) for i in order]
 
 
-def _location_record(request: LocateRequest, fitted: Fitted, result: tuple[View, list[Start]], back: Similarity) -> Location:
-    found, tried = result
+def _location_record(request: LocateRequest, fitted: Fitted, found: View, tried: list[Start], back: Similarity) -> Location:
     scene = fitted.scene
     loss = photometric_error(fitted.model, found, scene)
     pose = transform_camera(found.camera, back).cam_to_world

@@ -31,7 +31,7 @@ def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress:
         job: which photographs, and how.
         out: folder of the scene.
         truth: a data set with the true poses of these photographs, matched by file name. Without it, the folder of the
-            photographs and the one above are looked at for one.
+            photographs and the one above are searched for one.
         progress: called with (done, in all, what is being done).
 
     Returns:

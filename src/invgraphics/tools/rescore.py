@@ -144,13 +144,16 @@ def _scores(pictures: PictureSet, protocol: Protocol, views: Sequence[ViewScore]
     run, own = pictures.provenance, scores_of(pictures, DEFAULT)
     eight_bit = pictures.eight_bit and protocol.prediction == "none"
     caution = ("The protocol needs unrounded predictions; 8-bit pictures were used.",) if eight_bit and not lacking else ()
+    scene = "" if run is None else run.scene
+    if own is not None:
+        scene = own.scene
     truth = ScoredTruth(
         sha256=pictures.sha256, size=pictures.size, background=pictures.background, transparency=pictures.transparency
     )
     return Scores(
         method=pictures.folder.name if run is None else run.method,
         preset="" if run is None else run.preset,
-        scene=own.scene if own is not None else "" if run is None else run.scene,
+        scene=scene,
         seed=None if run is None else run.seed,
         protocol=protocol.name,
         views=pictures.names,

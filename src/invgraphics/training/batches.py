@@ -14,8 +14,8 @@ from invgraphics.core import Batch, Camera, Rays, Scene, View
 from invgraphics.core.camera import rays_through
 from invgraphics.scenes.scales import resized_view
 
-TRIES = 16
-"""Pixels drawn for each that is to have alpha, before those with alpha are listed: enough where a tenth of them has it."""
+REJECTION_FACTOR = 16
+"""Candidates drawn per foreground pixel before all foreground pixels are listed: enough where a tenth of all pixels is."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ class BatchConfig:
 
     def favours_foreground(self, progress: float) -> bool:
         """Whether pixels with alpha may be drawn more often than others, at a point of the fit."""
-        asked = max(self.foreground, self.foreground_least) > 0
-        return asked and (progress < self.foreground_until or self.foreground_until == 1)
+        favoured = max(self.foreground, self.foreground_least) > 0
+        return favoured and (progress < self.foreground_until or self.foreground_until == 1)
 
     def foreground_share(self, covered: float) -> float:
         """Share of a view's rays drawn among its pixels with alpha, which are the share ``covered`` of all its pixels."""
@@ -119,8 +119,8 @@ class Batches:
         self._config, self._scene, self._generator, self._device = config, scene, generator, device
         self._order = torch.zeros(0, dtype=torch.int64)
         self._rays = config.rays
-        self._small: dict[int, tuple[float, View]] = {}
-        self._solid: dict[tuple[int, tuple[int, int]], tuple[int, int]] = {}
+        self._scaled_views: dict[int, tuple[float, View]] = {}
+        self._foreground_counts: dict[tuple[int, tuple[int, int]], tuple[int, int]] = {}
         self._pool = _Pool()
 
     def background(self) -> Float[Tensor, 3]:
@@ -142,9 +142,9 @@ class Batches:
         views = [self._scaled(int(view), progress) for view in chosen]
         inside = [0] * count
         if config.favours_foreground(progress):
-            inside = [self._on_foreground(*one) for one in zip(chosen.tolist(), views, shares, strict=True)]
+            inside = [self._foreground_ray_count(*one) for one in zip(chosen.tolist(), views, shares, strict=True)]
         drawn = zip(views, shares, inside, strict=True)
-        flat = [torch.cat([self._foreground(view, solid), self._anywhere(view, share - solid)]) for view, share, solid in drawn]
+        flat = [torch.cat([self._sample_foreground(view, k), self._sample_valid(view, n - k)]) for view, n, k in drawn]
         which = torch.repeat_interleave(torch.arange(count), torch.tensor(shares))
         wide = torch.tensor([view.camera.width for view in views])[which]
         index = torch.cat(flat)
@@ -160,29 +160,31 @@ class Batches:
         batch = Batch(*_composited(views, flat, background), background)
         return rays.to(self._device), batch.to(self._device)
 
-    def _on_foreground(self, index: int, view: View, count: int) -> int:
-        """How many of a view's ``count`` rays are drawn among its pixels with alpha only."""
+    def _foreground_ray_count(self, index: int, view: View, count: int) -> int:
+        """Number of a view's ``count`` rays that are drawn from its foreground, the pixels with alpha."""
         if view.alpha is None:
             return 0
         key = index, size_of(view)
-        if key not in self._solid:  # counted once: 2 ms for a picture of 800 x 800 pixels
+        if key not in self._foreground_counts:  # computed once per view and size: 2 ms for a picture of 800 x 800 pixels
             valid = view.alpha.numel() if view.mask is None else int(view.mask.count_nonzero())
-            self._solid[key] = len(_with_alpha(view, view.alpha)), valid
-        solid, valid = self._solid[key]
-        return round(self._config.foreground_share(solid / valid) * count) if solid else 0
+            self._foreground_counts[key] = len(_with_alpha(view, view.alpha)), valid
+        foreground, valid = self._foreground_counts[key]
+        return round(self._config.foreground_share(foreground / valid) * count) if foreground else 0
 
-    def _foreground(self, view: View, count: int) -> Tensor:
+    def _sample_foreground(self, view: View, count: int) -> Tensor:
         """Flat indices of random pixels with alpha within the view's mask, by rejection; there is at least one."""
         if view.alpha is None or count == 0:
             return torch.zeros(0, dtype=torch.int64)
-        drawn = self._anywhere(view, TRIES * count)
+        drawn = self._sample_valid(view, REJECTION_FACTOR * count)
         kept = drawn[view.alpha.reshape(-1)[drawn] > 0]
         if len(kept) < count:
-            solid = _with_alpha(view, view.alpha)
-            kept = torch.cat([kept, solid[torch.randint(len(solid), (count - len(kept),), generator=self._generator)]])
+            foreground = _with_alpha(view, view.alpha)
+            more = torch.randint(len(foreground), (count - len(kept),), generator=self._generator)
+            kept = torch.cat([kept, foreground[more]])
         return kept[:count]
 
-    def _anywhere(self, view: View, count: int) -> Tensor:
+    def _sample_valid(self, view: View, count: int) -> Tensor:
+        """Flat indices of random pixels within the view's mask."""
         if view.mask is None:
             return torch.randint(view.camera.width * view.camera.height, (count,), generator=self._generator)
         valid = view.mask.reshape(-1).nonzero()[:, 0]
@@ -211,15 +213,15 @@ class Batches:
         view = self._scene.train[index]
         scale = self._config.scale_at(progress, max(size_of(view)))
         if scale == 1:
-            self._small.pop(index, None)
+            self._scaled_views.pop(index, None)
             return view
-        if index not in self._small or self._small[index][0] != scale:
+        if index not in self._scaled_views or self._scaled_views[index][0] != scale:
             width, height = (max(1, round(edge * scale)) for edge in size_of(view))
             small = resized_view(view, width, height)
             if small.mask is not None and not bool(small.mask.any()):
-                return view  # what is valid of it is thinner than these pixels
-            self._small[index] = scale, self._pool.kept(small)
-        return self._small[index][1]
+                return view  # its valid pixels are narrower than these
+            self._scaled_views[index] = scale, self._pool.store(small)
+        return self._scaled_views[index][1]
 
     def state(self) -> dict[str, Tensor]:
         """Tensors that a resumed fit needs."""
@@ -238,7 +240,7 @@ def _with_alpha(view: View, alpha: Tensor) -> Tensor:
 class _Pool:
     """Storage of many small pictures in few large blocks, each of which is freed when none of its pictures is in use.
 
-    A picture that stayed where it was made would lie in the room of the large temporary ones it was made from, which the
+    A picture that stayed where it was made would lie in the memory of the large temporary ones it was made from, which the
     allocator could then not reuse: 100 photographs of 800 x 800 pixels took 0.8 GB.
     """
 
@@ -248,8 +250,8 @@ class _Pool:
     def __init__(self) -> None:
         self._block, self._used = torch.empty(0, dtype=torch.uint8), 0
 
-    def kept(self, view: View) -> View:
-        """The view with its picture, alpha and mask copied to the pool."""
+    def store(self, view: View) -> View:
+        """Copy a view's picture, alpha and mask to the pool; returns the view with the copies."""
         names = [name for name in ("image", "alpha", "mask") if getattr(view, name) is not None]
         return replace(view, **{name: self._copy(getattr(view, name)) for name in names})
 
@@ -257,9 +259,9 @@ class _Pool:
         size = tensor.numel() * tensor.element_size()
         if self._used + size > len(self._block):
             self._block, self._used = torch.empty(max(self.BLOCK, size), dtype=torch.uint8, device=tensor.device), 0
-        room = self._block[self._used : self._used + size].view(tensor.dtype).view(tensor.shape)
+        place = self._block[self._used : self._used + size].view(tensor.dtype).view(tensor.shape)
         self._used += -(-size // self.ALIGNMENT) * self.ALIGNMENT
-        return room.copy_(tensor)
+        return place.copy_(tensor)
 
 
 def size_of(view: View) -> tuple[int, int]:
@@ -274,7 +276,7 @@ def _pictures_to(view: View, device: torch.device) -> View:
 
 
 def _whole(view: View, background: Tensor, index: int) -> Batch:
-    """A batch of all pixels of a view; those that do not count are empty, lest windows that overlap them see them."""
+    """A batch of all pixels of a view; masked-out ones become background, so that SSIM windows over them are unaffected."""
     colour, alpha = view.over(background), view.opacity()
     if view.mask is None:
         return Batch(colour, alpha, background, index)

@@ -14,7 +14,7 @@ _UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 class Budget:
     """Either ``seconds`` or ``steps`` (or both: whichever ends first).
 
-    Seconds count optimisation only: compilation, evaluation and writing of checkpoints are left out.
+    Seconds count optimisation only: compilation, evaluation and writing of checkpoints are excluded.
     """
 
     seconds: float | None = None

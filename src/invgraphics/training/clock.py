@@ -1,6 +1,6 @@
 """Scheduler times of this process: CPU time against time waiting for a core.
 
-They tell a loaded machine from serial code, and a machine that stood still from both.
+They distinguish a loaded machine from serial code, and a machine that stood still from both.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class SchedulerTimes:
         self._waited = _waited(self._before)
 
     def seconds(self) -> tuple[float, float] | None:
-        """(ran, waited) since the start; ``None`` where the system does not say. Threads that have ended are left out."""
+        """(ran, waited) since the start; ``None`` where the system does not report it. Threads that have ended are excluded."""
         now = _thread_times()
         changes = []
         for thread, (ran, waited) in now.items():
@@ -44,8 +44,8 @@ class SchedulerTimes:
         """Seconds, of ``seconds`` by the wall clock since a step of CPU work began, in which the process stood still.
 
         It was stopped then (Ctrl-Z), or its machine suspended or paused: no thread ran, or waited for a core that another
-        program had. A step that waits for a disk, on which memory was swapped, cannot be told from that. At least `STANDSTILL`;
-        else, or where the system does not say, 0.
+        program had. A step that waits for a disk, on which memory was swapped, cannot be distinguished from that. At least
+        `STANDSTILL`; else, or where the system does not report it, 0.
 
         Args:
             seconds: of the step.

@@ -8,12 +8,13 @@ from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters, cap_at
 from invgraphics.training.hooks import FitState, Hook
+from invgraphics.training.rows import replace_rows
 
 WHITE_RESET_STEP = 500
 """Step of 3DGS's reset against a white background; Gaussians that are reset much sooner do not become opaque again."""
@@ -36,10 +37,10 @@ class DensityControlConfig:
         prune_extent: share of the scene's extent above which a Gaussian is pruned, after the first reset.
         prune_pixels: radius in pixels above which a Gaussian is pruned, after the first reset; 0 never.
         resets: progress values at which opacities are reset to at most twice ``prune_opacity``.
-        reset_spacing: least number of steps before the first reset and between two; one that is due sooner is left out. Within
+        reset_spacing: least number of steps before the first reset and between two; one that is due sooner is skipped. Within
             fewer steps Gaussians neither shrink below ``prune_pixels`` nor become opaque again, and most are pruned.
         white_reset: whether they are also reset at ``start`` where the scene's background is white, before splats of the
-            background's colour settle in front of it; left out before step 500 (3DGS's own) or ``reset_spacing``, if sooner.
+            background's colour settle in front of it; skipped before step 500 (3DGS's own) or ``reset_spacing``, if sooner.
         max_primitives: cap on the number of Gaussians; those with the largest gradients grow first.
         cap_ramp: progress, from the start of growth on, over which the cap rises from the first number to ``max_primitives``,
             by equal factors; 0 for at once.
@@ -150,7 +151,7 @@ class DensityControl(Hook):
 
     @override
     def after_step(self, state: FitState) -> None:
-        """Grow, prune and reset where the schedule says so."""
+        """Grow, prune and reset as scheduled."""
         config, progress = self._config, state.ctx.progress
         field = cast(GaussianParameters, state.field)
         starts = self._started < 0 and self._due_to_start(state)
@@ -187,7 +188,7 @@ class DensityControl(Hook):
 
     @torch.no_grad()
     def _grow_and_prune(self, state: FitState) -> None:
-        """One round: clone small Gaussians with large gradients, split large ones, prune the rest's transparent and huge."""
+        """One round: clone small Gaussians with large gradients, split large ones, prune transparent and oversized ones."""
         config, field = self._config, cast(GaussianParameters, state.field)
         gradient = self._gradient_sum / self._views.clamp_min(1)
         largest = field.log_scales.exp().amax(dim=1)
@@ -196,13 +197,12 @@ class DensityControl(Hook):
         may_grow = keep & torch.where(small, config.clone, config.split)
         room = self._cap(state.ctx.progress, len(keep)) - int(keep.sum())
         grows = self._to_grow(torch.where(may_grow, gradient, 0.0), room)
-        cloned, split = (grows & small).nonzero()[:, 0], (grows & ~small).nonzero()[:, 0]
-        keep[split] = False
-        if not bool(keep.any()) and len(split) == 0:
-            keep[torch.argmax(field.opacity_logits)] = True  # a field of nothing could never grow again
-        divided = grows & ~small
-        self.last_round = GrowthRound(state.step + 1, grows & small, divided, ~(keep | divided))
-        self._rebuild(state, keep.nonzero()[:, 0], cloned, split)
+        to_clone, to_split = grows & small, grows & ~small
+        keep &= ~to_split
+        if not bool((keep | to_split).any()):
+            keep[torch.argmax(field.opacity_logits)] = True  # an empty field could never grow again
+        self.last_round = GrowthRound(state.step + 1, to_clone, to_split, ~(keep | to_split))
+        self._rebuild(state, *(mask.nonzero()[:, 0] for mask in (keep, to_clone, to_split)))
 
     def _cap(self, progress: float, count: int) -> int:
         """Most Gaussians at this point of the fit."""
@@ -232,8 +232,7 @@ class DensityControl(Hook):
 
     def _rebuild(self, state: FitState, keep: Int[Tensor, " k"], cloned: Int[Tensor, " c"], split: Int[Tensor, " s"]) -> None:
         """Replace the field's rows by those to keep, the clones, and the parts of those to split."""
-        field = state.field
-        old = {name: parameter.detach() for name, parameter in field.named_parameters()}
+        old = {name: parameter.detach() for name, parameter in state.field.named_parameters()}
         parts = split.repeat(self.SPLIT_INTO)
         rows = torch.cat([keep, cloned, parts])
         new = {name: values[rows].clone() for name, values in old.items()}
@@ -246,9 +245,7 @@ class DensityControl(Hook):
         rotation = quaternion_to_matrix(old["quaternions"][parts])
         new["means"][first:] += (rotation @ offset[:, :, None])[:, :, 0]
         new["log_scales"][first:] -= math.log(self.SPLIT_SHRINK)
-        cast(GaussianParameters, field).replace(new)
-        for name, parameter in field.named_parameters():
-            state.optimiser.reindex_rows(f"field.{name}", cast(nn.Parameter, parameter), keep, len(rows) - len(keep))
+        replace_rows(state, new, keep, len(rows) - len(keep))
         self._clear_statistics(len(rows), new["means"])
 
     def _clear_statistics(self, count: int, like: Tensor) -> None:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from invgraphics.core import Batch, Context, Field, Quantity, Renderer, Rendering, Samples, Trace
 from invgraphics.errors import InputError
-from invgraphics.renderers.samplers import uniform
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class EikonalPenalty:
         """
         _check_distance(self.name, field)
         lo, hi = ctx.bounds.lo, ctx.bounds.hi
-        position = torch.lerp(lo, hi, uniform((self.points, 3), ctx, like=lo))
+        position = torch.lerp(lo, hi, ctx.rand((self.points, 3), like=lo))
         values = field.query(Samples.at(position), Quantity.SDF | Quantity.GRADIENT)
         assert values.sdf is not None
         assert values.gradient is not None
@@ -67,7 +66,7 @@ class EikonalPenalty:
 class CurvaturePenalty:
     """Mean |∇²f| near the surface: of a distance, the sum of the principal curvatures (Neuralangelo, Li et al. 2023, §3.3).
 
-    The Laplacian is one of central differences: what is finer than their distance counts by its mean. Points near the surface
+    The Laplacian is one of central differences: detail finer than their distance is averaged. Points near the surface
     are those of `EikonalPenalty`.
 
     Attributes:
@@ -100,7 +99,7 @@ class CurvaturePenalty:
         """
         _check_distance(self.name, field)
         lo, hi, half = ctx.bounds.lo, ctx.bounds.hi, ctx.bounds.half.mean()
-        position = torch.lerp(lo, hi, uniform((self.points, 3), ctx, like=lo))
+        position = torch.lerp(lo, hi, ctx.rand((self.points, 3), like=lo))
         with torch.no_grad():
             values = field.query(Samples.at(position), Quantity.SDF | Quantity.GRADIENT)
         assert values.sdf is not None
@@ -112,7 +111,7 @@ class CurvaturePenalty:
 
 @dataclass(frozen=True)
 class EikonalLoss:
-    """Mean of (|∇f| - 1)² at the samples of a step, for renderers that ask for the gradient there anyway (NeuS).
+    """Mean of (|∇f| - 1)² at the samples of a step, for renderers that query the gradient there anyway (NeuS).
 
     Attributes:
         weight: factor (NeuS: 0.1).
@@ -124,7 +123,7 @@ class EikonalLoss:
         """The weighted mean; 0 where no ray has a sample.
 
         Raises:
-            InputError: the renderer did not ask for gradients.
+            InputError: the renderer did not query gradients.
         """
         gradient = None if trace.values is None else trace.values.gradient
         if gradient is None:
@@ -163,7 +162,7 @@ def near_surface(
     """Feet of points on the surface, moved at random by ``spread`` half-extents of the box, inside it."""
     lo, hi = ctx.bounds.lo, ctx.bounds.hi
     # Sums of three uniform numbers are as good as normal ones, and come from the context's generator.
-    noise = 2 * uniform((3, *position.shape), ctx, like=lo).sum(dim=0) - 3
+    noise = 2 * ctx.rand((3, *position.shape), like=lo).sum(dim=0) - 3
     return (foot_points(position, sdf, gradient) + spread * ctx.bounds.half.mean() * noise).clamp(lo, hi)
 
 

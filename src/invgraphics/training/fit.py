@@ -137,7 +137,7 @@ class Fit:
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
-        composited = _counted(replace(rendering, rgb=rendering.over(batch.background)), batch)
+        composited = _mask_rendering(replace(rendering, rgb=rendering.over(batch.background)), batch)
         objective = (*plan.losses, *plan.penalties)
         losses = [loss(composited, trace, batch, ctx) for loss in plan.losses]
         losses += [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties]
@@ -211,8 +211,8 @@ class Fit:
         self.resume_clocks(clocks)
 
     def clocks(self) -> dict[str, float | None]:
-        """Seconds of the steps (of all threads together: ``cpu_seconds``), those left out because the process stood still, and
-        those in which busy threads ran, and waited for a core, since the fit began; ``None`` where the system does not say."""
+        """Seconds of the steps (of all threads together: ``cpu_seconds``), those excluded because the process stood still, and
+        those in which busy threads ran, and waited for a core, since the fit began; ``None`` where the system reports none."""
         here = self._scheduler.seconds()
         ran, waited = (None, None) if here is None else (self._earlier[0] + here[0], self._earlier[1] + here[1])
         return {
@@ -259,8 +259,8 @@ class Fit:
         self.steps, self.seconds = int(state["fit"]["steps"]), seconds
 
 
-def _counted(rendering: Rendering, batch: Batch) -> Rendering:
-    """The rendering, as the truth where pixels do not count: no loss, not even one of windows, then has a gradient there."""
+def _mask_rendering(rendering: Rendering, batch: Batch) -> Rendering:
+    """Replace masked-out pixels by the ground truth: no loss has a gradient there, window-based ones (SSIM) included."""
     if batch.mask is None:
         return rendering
     rgb = torch.where(batch.mask[..., None], rendering.rgb, batch.target)

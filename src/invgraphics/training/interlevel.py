@@ -17,9 +17,9 @@ LEAST_WEIGHT = torch.finfo(torch.float32).eps
 
 @dataclass(frozen=True)
 class InterlevelLoss:
-    """Mip-NeRF 360's proposal loss (equations 12 and 13): rendered weight beyond what a proposal leaves room for.
+    """Mip-NeRF 360's proposal loss (equations 12 and 13): rendered weight above the proposal's upper bound.
 
-    The room for an interval is the sum of the proposal's weights in the intervals that it overlaps. Gradients reach the
+    The bound for an interval is the sum of the proposal's weights in the intervals that it overlaps. Gradients reach the
     proposals' weights only, not the rendered ones, and no level's samples.
 
     Attributes:
@@ -29,7 +29,7 @@ class InterlevelLoss:
     weight: float = 1.0
 
     def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
-        """The weighted sum over levels of means over intervals; exactly 0 where every level leaves room enough."""
+        """The weighted sum over levels of means over intervals; exactly 0 where no weight exceeds its bound."""
         total = batch.target.new_zeros(())
         if trace.samples is None or trace.weights is None or len(trace.samples) == 0:
             return total
@@ -37,8 +37,8 @@ class InterlevelLoss:
         for level in trace.levels:
             if level.samples is None or level.weights is None or not level.weights.requires_grad:
                 continue
-            room = outer_measure(t0, t1, *per_ray(level.samples, level.weights))
-            excess = (weights - room).clamp_min(0)
+            bound = outer_measure(t0, t1, *per_ray(level.samples, level.weights))
+            excess = (weights - bound).clamp_min(0)
             total = total + (excess.square() / (weights + LEAST_WEIGHT)).mean()
         return self.weight * total
 
@@ -58,7 +58,7 @@ def outer_measure(
 ) -> Float[Tensor, "k n"]:
     """Sum of the weights of all intervals [lower, upper] that overlap [t0, t1].
 
-    Summed in float64, so that in float32 a histogram leaves room for itself to the last bit.
+    Summed in float64, so that in float32 a histogram bounds itself to the last bit.
 
     Args:
         t0: where the intervals begin.

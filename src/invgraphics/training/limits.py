@@ -18,7 +18,7 @@ from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters
 from invgraphics.training.hooks import FitState, Hook
 
 VANISHING_SLOPE = 2.0**-23
-"""Slope of the sigmoid, in float32, below which an opacity counts as saturated: the rounding of 1."""
+"""Slope of the sigmoid, in float32, below which an opacity is saturated: the rounding of 1."""
 COLLAPSED = 1e-4
 """Largest standard deviation, in pixels of the nearest training camera, below which a scale no longer changes a footprint: its
 square is lost beside the low-pass filter's 0.3 px² in float32."""

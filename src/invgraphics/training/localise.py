@@ -60,7 +60,7 @@ def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) ->
         for step in range(descent.steps):
             adam.param_groups[0]["lr"] = descent.rate(step)
             camera = start.moved(start.cam_to_world @ motion_about(twist * reach, pivot))
-            colour, target = _predicted_and_true(model, camera, (small, scene), ctx, (descent.rays, generator))
+            colour, target = _predicted_and_true(model, camera, small, scene, ctx, descent.rays, generator)
             loss = (colour - target).square().mean()
             adam.zero_grad()
             loss.backward()
@@ -74,9 +74,9 @@ def photometric_error(model: Model, view: View, scene: Scene, scale: float = 1.0
     """Mean squared error between a view's photograph and its camera's rendering, both over the scene's background."""
     small = _at_scale(view, scale)
     picture = model.render(small.camera, normals=False)
-    counted = torch.ones_like(small.opacity(), dtype=torch.bool) if small.mask is None else small.mask
+    valid = torch.ones_like(small.opacity(), dtype=torch.bool) if small.mask is None else small.mask
     error = (picture.over(scene.background) - small.over(scene.background)).square()
-    return float(error[counted].mean())
+    return float(error[valid].mean())
 
 
 def _at_scale(view: View, scale: float) -> View:
@@ -85,15 +85,14 @@ def _at_scale(view: View, scale: float) -> View:
 
 
 def _predicted_and_true(
-    model: Model, camera: Camera, truth: tuple[View, Scene], ctx: Context, draw: tuple[int, torch.Generator]
+    model: Model, camera: Camera, view: View, scene: Scene, ctx: Context, rays: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Rendered and true colours at the pixels of one step."""
-    view, scene = truth
+    """Rendered and true colours at the pixels of one step; of a ray renderer at up to ``rays`` random ones."""
     background = scene.background.to(camera.focal.device)
     batch = Batch(view.over(scene.background), view.opacity(), background)
     valid = torch.arange(batch.alpha.numel()) if view.mask is None else view.mask.reshape(-1).nonzero()[:, 0]
     if isinstance(model.renderer, RayRenderer):
-        flat = valid[torch.randint(len(valid), (min(draw[0], len(valid)),), generator=draw[1])]
+        flat = valid[torch.randint(len(valid), (min(rays, len(valid)),), generator=generator)]
         pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
         picture, _ = model.renderer.render_rays(model.field, camera.rays(pixels.to(background)), ctx)
         return picture.over(background), batch.target.reshape(-1, 3)[flat].to(background)

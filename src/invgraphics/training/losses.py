@@ -13,8 +13,8 @@ from torch import Tensor
 from invgraphics import kernels
 from invgraphics.core import Batch, Bounds, Context, Rendering, Trace
 from invgraphics.core.compositing import over
+from invgraphics.core.spacing import to_spacing
 from invgraphics.errors import InputError
-from invgraphics.renderers.samplers import to_spacing
 
 Loss = Callable[[Rendering, Trace, Batch, Context], Tensor]
 """A term of the objective. The rendering's ``rgb`` is in front of ``batch.background`` already, composited once per step by
@@ -134,7 +134,7 @@ class DistortionLoss:
 
 @dataclass(frozen=True)
 class BackgroundEntropyLoss:
-    """Entropy of the light that a ray lets through (DVGO, Sun et al. 2022, equation 12): 0 for rays that meet all or nothing.
+    """Entropy of rays' transmittance (DVGO, Sun et al. 2022, equation 12): 0 for rays that are fully opaque or transparent.
 
     Attributes:
         weight: factor; DVGO uses 0.01 in its coarse stage and 0.001 in the fine one.
@@ -144,8 +144,8 @@ class BackgroundEntropyLoss:
 
     def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
         """The weighted mean over pixels, in nats."""
-        through = (1 - rendering.alpha).clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
-        return self.weight * -(through * through.log() + (1 - through) * (1 - through).log()).mean()
+        transmittance = (1 - rendering.alpha).clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
+        return self.weight * -(transmittance * transmittance.log() + (1 - transmittance) * (1 - transmittance).log()).mean()
 
 
 @dataclass(frozen=True)
@@ -173,11 +173,11 @@ class PointColourLoss:
 class MaskLoss:
     """Binary cross-entropy of the opacity with the photographs' alpha (IDR, Yariv et al. 2020, equation 8; NeuS).
 
-    Where sphere tracing says what its opacity is the sigmoid of, the loss is taken there and divided by the sigmoid's sharpness
-    per half-extent of the box, as in IDR: its slope in the signed distance then neither grows with the sharpness nor vanishes
-    where the opacity saturates. Other opacities are clamped to [1e-6, 1 - 1e-6], where NeuS takes 1e-3: a distance's density
-    falls off exponentially, so that the gradient of the logarithm is still large where a surface has vanished, and brings it
-    back. The loss is 0 of batches without a transparent pixel, such as those of opaque photographs.
+    Where the trace holds the logit of the opacity (sphere tracing), the loss is computed from the logit and divided by the
+    sigmoid's sharpness per half-extent of the box, as in IDR: its slope in the signed distance then neither grows with the
+    sharpness nor vanishes where the opacity saturates. Other opacities are clamped to [1e-6, 1 - 1e-6], where NeuS takes 1e-3:
+    a distance's density falls off exponentially, so that the gradient of the logarithm is still large where a surface has
+    vanished, and brings it back. The loss is 0 of batches without a transparent pixel, such as those of opaque photographs.
 
     Attributes:
         weight: factor (IDR: 100; NeuS: 0.1).

@@ -1,4 +1,4 @@
-"""Adam, and Muon where asked for, with named parameter groups whose learning rates follow the fit's progress."""
+"""Adam, and Muon if configured, with named parameter groups whose learning rates follow the fit's progress."""
 
 from __future__ import annotations
 
@@ -106,16 +106,11 @@ class Optimiser:
             known = ", ".join(sorted(parameters))
             raise InputError(f"'optimiser.groups.{unused[0]}' matches no parameter ('{first}').", f"Parameters: {known}.")
         betas = (config.beta1, config.beta2)
-        dense, masked = (
-            [group for group in groups if config.groups[str(group["name"])].skip_zero == skip] for skip in (False, True)
-        )
+        dense = [group for group in groups if not config.groups[str(group["name"])].skip_zero]
+        masked = [group for group in groups if config.groups[str(group["name"])].skip_zero]
         hidden = []
         if config.muon > 0:
-            own = {id(parameter) for name, parameter in parameters.items() if takes_muon(name, parameter)}
-            hidden, dense = (
-                [{**group, "params": [one for one in group["params"] if (id(one) in own) == wanted]} for group in dense]
-                for wanted in (True, False)
-            )
+            hidden, dense = _split_params(dense, [one for name, one in parameters.items() if takes_muon(name, one)])
         self._optimisers: list[GroupedOptimiser] = []
         if dense:
             self._optimisers.append(DenseAdam(dense, betas, config.eps))
@@ -123,7 +118,7 @@ class Optimiser:
             self._optimisers.append(MaskedAdam(masked, betas, config.eps))
         if hidden:
             self._optimisers.append(Muon(hidden, config.muon))
-        self._since = 0.0
+        self._restart_progress = 0.0
         self.set_progress(0.0)
 
     def _group_of(self, name: str) -> str:
@@ -143,15 +138,16 @@ class Optimiser:
         )
 
     def set_progress(self, progress: float) -> None:
-        """Set every group's learning rate for this point of the fit, of whose rest after `restart` a schedule makes all."""
-        progress = (progress - self._since) / (1 - self._since) if self._since else progress
+        """Set every group's learning rate; after `restart(p)`, schedules run over the remaining interval [p, 1]."""
+        if self._restart_progress:
+            progress = (progress - self._restart_progress) / (1 - self._restart_progress)
         for group in self._groups():
             config = self._config.groups[group["name"]]
             group["lr"] = config.rate(progress) * (self._extent if config.per_extent else 1.0)
 
     def restart(self, progress: float) -> None:
-        """Begin all learning rates' schedules anew at this point of the fit, from which they take as long as is left."""
-        self._since = min(progress, LATEST_RESTART)
+        """Begin all learning rates' schedules anew at this point of the fit, stretched over the rest of it."""
+        self._restart_progress = min(progress, LATEST_RESTART)
         self.set_progress(progress)
 
     def rates(self) -> dict[str, float]:
@@ -244,7 +240,7 @@ class Optimiser:
 
     def state(self) -> dict[str, Tensor]:
         """Moments, step counts and rates per row by parameter name, and when rates were restarted, if they were."""
-        restarted = {RESTARTED: torch.tensor(self._since, dtype=torch.float64)} if self._since else {}
+        restarted = {RESTARTED: torch.tensor(self._restart_progress, dtype=torch.float64)} if self._restart_progress else {}
         return restarted | {
             f"{name}/{key}": value
             for name, parameter in self._names.items()
@@ -255,7 +251,17 @@ class Optimiser:
         """Inverse of `state`."""
         for path, value in state.items():
             if path == RESTARTED:
-                self._since = float(value)
+                self._restart_progress = float(value)
                 continue
             name, _, key = path.rpartition("/")
             self._optimiser_of(name).state[self._names[name]][key] = value.clone()
+
+
+def _split_params(
+    groups: list[dict[str, Any]], chosen: list[nn.Parameter]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Split each group into the parameters that are among ``chosen`` and the others; returns both lists of groups."""
+    ids = {id(parameter) for parameter in chosen}
+    within = [{**group, "params": [one for one in group["params"] if id(one) in ids]} for group in groups]
+    others = [{**group, "params": [one for one in group["params"] if id(one) not in ids]} for group in groups]
+    return within, others

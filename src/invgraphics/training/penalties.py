@@ -14,7 +14,6 @@ from torch import Tensor
 from invgraphics.core import Context, Field, Quantity, Renderer, Samples
 from invgraphics.core.lattice import Lattice, LatticeField, Role
 from invgraphics.errors import InputError
-from invgraphics.renderers.samplers import uniform
 from invgraphics.training.requirement import Requirement
 
 Penalty = Callable[[Field, Renderer, Context], Tensor]
@@ -28,7 +27,7 @@ _ROOT_EPS = 1e-9
 
 
 def check_penalty(penalty: Any, field: Field | type[Field]) -> None:
-    """Refuse a field, or a class of fields, that lacks what a penalty says that it ``requires``.
+    """Refuse a field, or a class of fields, that lacks what a penalty ``requires``.
 
     Raises:
         InputError: names the penalty, what it needs, and the field.
@@ -49,7 +48,7 @@ class TotalVariationPenalty:
         weight: factor (Plenoxels, synthetic scenes: 1e-5 for density, 1e-3 for harmonics).
         role: which lattices.
         norm: ``isotropic``: length of the gradient (Plenoxels); ``squared``: its square (TensoRF).
-        fraction: share of the vertices that a step looks at, contiguous in memory from a random one (Plenoxels: 0.01).
+        fraction: share of the vertices that a step evaluates, contiguous in memory from a random one (Plenoxels: 0.01).
         until: progress at which it ends (Plenoxels: the first up-sampling).
     """
 
@@ -78,7 +77,7 @@ class TotalVariationPenalty:
         return self.weight * total
 
     def _vertices(self, lattice: Lattice, ctx: Context) -> Int[Tensor, " k"]:
-        """Flat indices of the vertices that this step looks at."""
+        """Flat indices of the vertices that this step evaluates."""
         count, device = math.prod(lattice.resolution), lattice.features.device
         if self.fraction == 1:
             return torch.arange(count, device=device)
@@ -180,7 +179,7 @@ class SparsityPenalty:
         """
         if Quantity.DENSITY not in field.provides:
             raise InputError(f"The penalty '{self.name}' needs a density, which {type(field).__name__} does not have.")
-        position = ctx.bounds.from_unit(uniform((self.points, 3), ctx, like=ctx.bounds.lo))
+        position = ctx.bounds.from_unit(ctx.rand((self.points, 3), like=ctx.bounds.lo))
         density = field.query(Samples.at(position), Quantity.DENSITY).density
         assert density is not None
         return self.weight * torch.log1p(2 * density.square()).mean()

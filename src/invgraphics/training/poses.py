@@ -37,7 +37,7 @@ class PosesConfig:
         translation_lr: learning rate of translations at the start, in units of the scene's extent.
         translation_final: at the end.
         rotation_warmup: part of the fit over which the rate of rotations rises from 1% to its value. They come later than
-            translations: what tells a turn about the scene from a shift is fine, and not there while the scene is a blur.
+            translations: the detail that distinguishes a turn about the scene from a shift is absent while the scene is a blur.
         translation_warmup: the same of translations.
         window: progress at which the finer levels of frequency and hash encodings begin to come in, and at which all are in
             (BARF: 0.1 and 0.5).
@@ -131,7 +131,7 @@ class Poses(nn.Module):
         rotation: rotation vectors of the motions, radians.
         translation: their translations, local units.
         given: what the fit starts from.
-        reference: the poses that count as true, where they are known; the given ones elsewhere.
+        reference: the true poses, where they are known; the given ones elsewhere.
         pivot: depth of the points about which the motions turn, local units.
     """
 

@@ -42,7 +42,7 @@ class PruneConfig:
         weight: a vertex is kept that has a sample of this weight in one of its cells, times 1 / vertices along z (Plenoxels:
             0.256).
         dilation: vertices around it that are kept too (Plenoxels: 2).
-        rays: random training rays that are looked at (Plenoxels: all).
+        rays: random training rays that are traced (Plenoxels: all).
     """
 
     at: tuple[float, ...]
@@ -111,7 +111,7 @@ def ray_weights(
 
 
 def heaviest(unit: Float[Tensor, "m 3"], weights: Float[Tensor, " m"], resolution: Sequence[int]) -> Float[Tensor, "x y z"]:
-    """Largest weight of a sample in one of the cells around each vertex; samples outside the unit cube do not count."""
+    """Largest weight of a sample in one of the cells around each vertex; samples outside the unit cube are ignored."""
     inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
     unit, weights = unit[inside], weights[inside]
     cells = torch.tensor(resolution, device=unit.device) - 1

@@ -7,12 +7,13 @@ from typing import cast
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core.transforms import quaternion_to_matrix
 from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters, cap_at
 from invgraphics.training.hooks import FitState, Hook
+from invgraphics.training.rows import replace_rows
 
 MOST_COPIES = 51
 """Most Gaussians that take the place of one at once (the authors' code)."""
@@ -31,7 +32,7 @@ class RelocationConfig:
         start: progress at which relocating and growing begins (paper: 500 of 30,000 steps).
         stop: progress at which it ends (paper: 25,000 of 30,000).
         every: steps between two rounds.
-        dead: opacity up to which a Gaussian counts as dead.
+        dead: opacity up to which a Gaussian is dead.
         growth: most new Gaussians of a round, as a share of those there are, until there are ``max_primitives``.
         max_primitives: cap.
         cap_ramp: progress, from ``start`` on, over which the cap rises from the first number, by equal factors; 0 for at once.
@@ -87,8 +88,8 @@ class Relocation(Hook):
         opacities = torch.sigmoid(cast(GaussianParameters, state.field).opacity_logits)
         dead = (opacities <= self._config.dead).nonzero()[:, 0]
         if 0 < len(dead) < len(opacities):
-            chances = torch.where(opacities <= self._config.dead, 0.0, opacities)
-            self._copy(state, _draw(chances, len(dead), state), dead)
+            probabilities = torch.where(opacities <= self._config.dead, 0.0, opacities)
+            self._copy(state, _draw(probabilities, len(dead), state), dead)
 
     def _grow(self, state: FitState) -> None:
         opacities = torch.sigmoid(cast(GaussianParameters, state.field).opacity_logits)
@@ -109,8 +110,7 @@ class Relocation(Hook):
 
     def _copy(self, state: FitState, source: Int[Tensor, " k"], target: Int[Tensor, " k"]) -> None:
         """Copy rows ``source`` to rows ``target``, which may lie behind the last, with opacities and scales by equation 9."""
-        field = state.field
-        old = {name: parameter.detach() for name, parameter in field.named_parameters()}
+        old = {name: parameter.detach() for name, parameter in state.field.named_parameters()}
         n, total = len(old["means"]), max(len(old["means"]), int(target.max()) + 1)
         new = {name: torch.cat([values, values.new_zeros(total - n, *values.shape[1:])]) for name, values in old.items()}
         parents, copies = torch.unique(source, return_counts=True)
@@ -119,18 +119,16 @@ class Relocation(Hook):
         new["log_scales"][parents] += shrink.log()[:, None]
         for values in new.values():
             values[target] = values[source]
-        cast(GaussianParameters, field).replace(new)
-        rows = torch.arange(n, device=source.device)
-        for name, parameter in field.named_parameters():
-            state.optimiser.reindex_rows(f"field.{name}", cast(nn.Parameter, parameter), rows, total - n)
+        replace_rows(state, new, torch.arange(n, device=source.device), total - n)
+        for name in new:
             state.optimiser.reset_moments(f"field.{name}", torch.cat([parents, target]))
 
 
-def _draw(chances: Float[Tensor, " n"], count: int, state: FitState) -> Int[Tensor, " k"]:
+def _draw(probabilities: Float[Tensor, " n"], count: int, state: FitState) -> Int[Tensor, " k"]:
     """Multinomial sample of rows with replacement; on the CPU, where the fit's generator lives."""
-    cumulated = chances.double().cpu().cumsum(0)
+    cumulated = probabilities.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=state.ctx.generator, dtype=torch.float64) * cumulated[-1]
-    return torch.searchsorted(cumulated, draws, right=True).clamp_max(len(chances) - 1).to(chances.device)
+    return torch.searchsorted(cumulated, draws, right=True).clamp_max(len(probabilities) - 1).to(probabilities.device)
 
 
 def relocated_opacity(
@@ -143,7 +141,7 @@ def relocated_opacity(
 
     Args:
         opacity: of the one, in [0, 1].
-        copies: N, at least 1; more than `MOST_COPIES` count as so many.
+        copies: N, at least 1; clamped to `MOST_COPIES`.
     """
     wide, n = opacity.double().clamp_max(LARGEST_OPACITY), copies.double().clamp_max(MOST_COPIES)
     each = 1 - (1 - wide) ** (1 / n)

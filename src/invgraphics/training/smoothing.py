@@ -26,8 +26,8 @@ class SmoothingConfig:
     Attributes:
         every: steps between two computations; there is one more after each change in number.
         variance: of the filter, in squares of the pixel distance at the Gaussian.
-        margin: part of the image by which a Gaussian may lie outside it and still count as photographed.
-        near: Gaussians nearer than this along the optical axis do not count, local units.
+        margin: part of the image by which a Gaussian may lie outside it and still be in view.
+        near: Gaussians nearer than this along the optical axis are ignored, local units.
     """
 
     every: int = 100

@@ -135,7 +135,7 @@ def rescale(camera: Camera, scale: float) -> Camera:
     return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
 
 
-def nearest_view(views: Sequence[View], viewer_camera: ViewerCamera, extent: float) -> int:
+def nearest_view_index(views: Sequence[View], viewer_camera: ViewerCamera, extent: float) -> int:
     """Index of the view nearest to a camera: distance in scene extents plus angle in radians."""
     poses = torch.stack([view.camera.cam_to_world for view in views])
     distance = (poses[:, :3, 3] - viewer_camera.pose[:3, 3]).norm(dim=1) / extent

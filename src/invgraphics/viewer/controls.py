@@ -9,7 +9,7 @@ from typing import Any
 
 from invgraphics.tools.colorize import OUTPUTS
 from invgraphics.viewer.loaded_run import LoadedRun
-from invgraphics.viewer.progressive import LAYOUTS, Frame
+from invgraphics.viewer.progressive import LAYOUTS, ViewerFrame
 
 FREE_CAMERA = "free camera"
 """Entry of the view list for a camera that is at no photograph."""
@@ -92,7 +92,7 @@ class Controls:
         """Update name, training progress and scores of the runs."""
         self._facts.content = "".join(_facts_of(run) for run in self._runs)
 
-    def show_frame(self, frame: Frame, note: str = "") -> None:
+    def show_frame(self, frame: ViewerFrame, note: str = "") -> None:
         """Show size, render time, PSNR and legend of a frame."""
         width, height = frame.size
         took = f" in {frame.seconds:.2f} s" if frame.seconds else ""

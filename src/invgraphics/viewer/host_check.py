@@ -58,7 +58,7 @@ class HostCheck:
         """Apply the check to every websockets server that is started within the context, before its own ``process_request``.
 
         Viser starts its server in its constructor and passes on no ``process_request``, so the public entry point
-        `websockets.asyncio.server.serve` is exchanged for that time. `active` says afterwards whether the check is in place.
+        `websockets.asyncio.server.serve` is exchanged for that time. `active` reports afterwards whether the check is in place.
         """
         serve = websockets.asyncio.server.serve
 

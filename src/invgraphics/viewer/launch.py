@@ -49,7 +49,7 @@ def open_viewer(config: ViewerConfig, say: Callable[[str], None]) -> Viewer:
         say: called with a sentence before each long wait.
 
     Raises:
-        InputError: viser is missing, a run cannot be looked at, the runs do not fit together, or the address cannot be bound.
+        InputError: viser is missing, a run cannot be shown, the runs do not fit together, or the address cannot be bound.
     """
     if importlib.util.find_spec("viser") is None:
         raise InputError("The viewer needs viser, which is not installed.", "`pip install 'invgraphics[viewer]'`")

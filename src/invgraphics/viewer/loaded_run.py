@@ -143,8 +143,8 @@ def _scores(folder: RunFolder) -> str:
         quality = folder.read_scores().quality
     except InputError:
         return ""
-    said = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}"}
-    return ", ".join(words.format(quality[name].mean) for name, words in said.items() if name in quality)
+    templates = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}"}
+    return ", ".join(words.format(quality[name].mean) for name, words in templates.items() if name in quality)
 
 
 def file_stamps(folder: RunFolder, source: RunFolder) -> Stamps:

@@ -53,7 +53,7 @@ class RenderRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ViewerFrame:
     """A rendered image of the window.
 
     Attributes:
@@ -134,7 +134,7 @@ class ProgressiveRenderer:
         self._clock = clock
         self.resolutions = {run: AdaptiveResolution() for run in self.runs}
 
-    def render(self, request: RenderRequest, on_frame: Callable[[Frame], None]) -> Task:
+    def render(self, request: RenderRequest, on_frame: Callable[[ViewerFrame], None]) -> Task:
         """Task for the render thread that calls ``on_frame`` with frames from coarse to fine."""
         side_by_side = request.layout == "side by side" and request.output != "truth"
         window = (max(1, request.window[0] // (1 + side_by_side)), max(1, request.window[1]))
@@ -226,7 +226,7 @@ class ProgressiveRenderer:
             parts.append(run.render(strip, geometry, crop))
         return Rendering.cat(parts)
 
-    def _compose(self, request: RenderRequest, sides: Sequence[_Side], letterbox: LetterboxedView | None) -> Frame:
+    def _compose(self, request: RenderRequest, sides: Sequence[_Side], letterbox: LetterboxedView | None) -> ViewerFrame:
         """Colorize the latest rendering of all sides with one scale, upsample to the finest, and assemble the window."""
         latest = [side.latest for side in sides if side.latest is not None]
         panels, renderings = [panel for panel, _, _ in latest], [rendering for _, rendering, _ in latest]
@@ -250,7 +250,7 @@ class ProgressiveRenderer:
             picture = side_by_side_image([letterboxed(picture, letterbox) for picture in pictures])
         else:
             picture = letterboxed(side_by_side_image(pictures), letterbox)
-        return Frame(
+        return ViewerFrame(
             picture,
             (finest.width, finest.height),
             sum(took for _, _, took in latest),
@@ -274,9 +274,9 @@ class ProgressiveRenderer:
         scores = [score(each, view, self.runs[0].scene, PROTOCOLS["default"], only=["psnr"]) for each in renderings]
         return tuple(found.values["psnr"] for found in scores if "psnr" in found.values)
 
-    def _truth(self, view: View, letterbox: LetterboxedView | None) -> Frame:
+    def _truth(self, view: View, letterbox: LetterboxedView | None) -> ViewerFrame:
         size = (
             (view.camera.width, view.camera.height) if letterbox is None else (letterbox.camera.width, letterbox.camera.height)
         )
         picture = true_image(view, self.runs[0].scene, size)
-        return Frame(letterboxed(picture, letterbox), size, 0.0, True, "truth", f"the photograph {view.name}")
+        return ViewerFrame(letterboxed(picture, letterbox), size, 0.0, True, "truth", f"the photograph {view.name}")

@@ -21,7 +21,7 @@ from invgraphics.viewer.cameras import (
     ViewerCamera,
     fov_and_aspect,
     limit_size,
-    nearest_view,
+    nearest_view_index,
     rotation_quaternion,
 )
 from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Controls, jump_notice, on_change
@@ -32,7 +32,7 @@ from invgraphics.viewer.journey import Journey
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.overlays import Overlays
 from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
-from invgraphics.viewer.progressive import Frame, RenderRequest
+from invgraphics.viewer.progressive import RenderRequest, ViewerFrame
 from invgraphics.viewer.render_thread import Task
 from invgraphics.viewer.shared_state import SharedState
 
@@ -63,7 +63,7 @@ class Session:
         self._overlays = Overlays(client.scene, shared.renderer.runs[0], shared.frustums, self._frustum_clicked)
         self._closed = False
         self._notice = ""
-        self._frame: Frame | None = None
+        self._frame: ViewerFrame | None = None
         client.camera.on_update(self._camera_changed)
         self.go_to_view(shared.start)
 
@@ -167,7 +167,7 @@ class Session:
 
     async def _output_changed(self) -> None:
         if self._controls.output.value in NEEDS_TRUTH and self._view_index is None:
-            index = nearest_view([view for _, view in self._shared.views], self._camera, self._scene.extent)
+            index = nearest_view_index([view for _, view in self._shared.views], self._camera, self._scene.extent)
             self._notice = jump_notice(self._controls.output.value, self._shared.views[index][0])
             self.go_to_view(index)
         else:
@@ -273,7 +273,7 @@ class Session:
             runs = {"first": self._runs[:1], "second": self._runs[-1:]}.get(request.layout, self._runs)
             note = " ".join(filter(None, (note, *dict.fromkeys(crop_note(run.fitted.model.renderer) for run in runs))))
 
-        def on_frame(frame: Frame) -> None:
+        def on_frame(frame: ViewerFrame) -> None:
             if self._closed:
                 return
             self._frame = frame

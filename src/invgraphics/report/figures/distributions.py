@@ -11,12 +11,12 @@ from typing import Any
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.figures.style import GRID, INK, PAGE, PANEL, Figure, canvas, save, series_style
 from invgraphics.report.statistics.summary import Summary
-from invgraphics.report.wording import Quantity
+from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.runs.run import Run
 from invgraphics.text import file_name
 
 
-def draw_distributions(comparison: Comparison, summary: Summary, folder: Path) -> list[tuple[Quantity, Figure]]:
+def draw_distributions(comparison: Comparison, summary: Summary, folder: Path) -> list[tuple[MeasuredQuantity, Figure]]:
     """One strip plot per quality metric: a dot per test view, with median and quartiles."""
     figures = []
     for column in (column for column in summary.columns if column.group != "cost"):
@@ -40,7 +40,7 @@ def per_view(runs: Sequence[Run], key: str) -> list[float]:
     return means
 
 
-def _draw(summary: Summary, column: Quantity, values: dict[int, list[float]], stem: Path) -> Figure:
+def _draw(summary: Summary, column: MeasuredQuantity, values: dict[int, list[float]], stem: Path) -> Figure:
     shown = [row for row in summary.methods if values[row.series]]
     with canvas(PANEL[0], 92 + 46 * len(shown)) as (figure, axes):
         for line, row in enumerate(shown):

@@ -17,7 +17,7 @@ from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.intervals import Estimate
 from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.values import value_of
-from invgraphics.report.wording import Quantity
+from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.text import file_name
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class HeatMap:
     matched: bool
 
 
-def heat_map(pair: tuple[Factor, Factor], quantity: Quantity, observations: Sequence[Observation]) -> HeatMap | None:
+def heat_map(pair: tuple[Factor, Factor], quantity: MeasuredQuantity, observations: Sequence[Observation]) -> HeatMap | None:
     """Heat map over the runs that all combinations share, else over all runs; ``None`` unless the factors are crossed."""
     down, across = pair
     cells: dict[tuple[str, str], dict[tuple[Any, ...], float]] = {}
@@ -190,7 +190,7 @@ def heat_map(pair: tuple[Factor, Factor], quantity: Quantity, observations: Sequ
 
 
 def draw_heat_maps(
-    factors: Sequence[Factor], quantity: Quantity, observations: Sequence[Observation], folder: Path
+    factors: Sequence[Factor], quantity: MeasuredQuantity, observations: Sequence[Observation], folder: Path
 ) -> list[Figure]:
     """A heat map for each pair of factors, at most ``MOST_HEAT_MAPS``; the factor with fewer levels goes down the side."""
     figures = []
@@ -202,7 +202,7 @@ def draw_heat_maps(
     return figures
 
 
-def _draw_heat(table: HeatMap, quantity: Quantity, stem: Path) -> Figure:
+def _draw_heat(table: HeatMap, quantity: MeasuredQuantity, stem: Path) -> Figure:
     import matplotlib as mpl
     import numpy as np
 

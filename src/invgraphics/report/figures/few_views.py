@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from invgraphics.report.figures.style import PAGE, Figure, canvas, save, series_style
-from invgraphics.report.statistics.instances import counts_of, mean_of, ways_of
+from invgraphics.report.statistics.instances import counts_of, mean_of, methods_of
 from invgraphics.runs.inference import Inference
 
 SIZE = (480.0, 400.0)
 DODGE = 0.045
-"""Of neighbouring ways, in powers of two, so that their intervals stay apart."""
+"""Of neighbouring methods, in powers of two, so that their intervals stay apart."""
 
 
 def draw_few_views(record: Inference, metric: str, label: str, folder: Path) -> Figure | None:
@@ -23,14 +23,14 @@ def draw_few_views(record: Inference, metric: str, label: str, folder: Path) -> 
         folder: of the figure.
     """
     counts = counts_of(record)
-    ways = [how for how in ways_of(record) if any(mean_of(record, metric, n, how) for n in counts)]
-    if len(counts) < 2 or not ways:
+    methods = [method for method in methods_of(record) if any(mean_of(record, metric, n, method) for n in counts)]
+    if len(counts) < 2 or not methods:
         return None
     words = []
     with canvas(*SIZE) as (figure, axes):
-        for index, how in enumerate(ways):
-            found = [(n, value) for n in counts if (value := mean_of(record, metric, n, how)) is not None]
-            look, shift = series_style(index), 2.0 ** (DODGE * (index - (len(ways) - 1) / 2))
+        for index, method in enumerate(methods):
+            found = [(n, value) for n in counts if (value := mean_of(record, metric, n, method)) is not None]
+            look, shift = series_style(index), 2.0 ** (DODGE * (index - (len(methods) - 1) / 2))
             axes.errorbar(
                 [n * shift for n, _ in found],
                 [value.mean for _, value in found],
@@ -43,9 +43,9 @@ def draw_few_views(record: Inference, metric: str, label: str, folder: Path) -> 
                 markersize=6,
                 markeredgecolor=PAGE.light,
                 markeredgewidth=0.6,
-                label=how,
+                label=method,
             )
-            words.append(f"{how} {', '.join(f'{value.mean:.1f} from {n}' for n, value in found)}")
+            words.append(f"{method} {', '.join(f'{value.mean:.1f} from {n}' for n, value in found)}")
         axes.set_xscale("log", base=2)
         axes.set_xticks(counts, [str(n) for n in counts])
         axes.set_xlabel("observed views")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from invgraphics.report.figures.style import INK, MUTED, PAGE, PANEL, Figure, canvas, save, series_style
 from invgraphics.report.statistics.summary import Row, Summary, pareto_front
-from invgraphics.report.wording import Quantity, listing
+from invgraphics.report.wording import MeasuredQuantity, listing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,7 +56,7 @@ def draw_tradeoffs(summary: Summary, folder: Path) -> list[Figure]:
     return figures
 
 
-def _points(summary: Summary, quality: Quantity, cost: Quantity) -> list[Point]:
+def _points(summary: Summary, quality: MeasuredQuantity, cost: MeasuredQuantity) -> list[Point]:
     points = []
     for row in summary.methods:
         x, y = summary.cell(row, cost.key), summary.cell(row, quality.key)
@@ -68,7 +68,7 @@ def _points(summary: Summary, quality: Quantity, cost: Quantity) -> list[Point]:
     return points
 
 
-def _draw(points: Sequence[Point], quality: Quantity, cost: Quantity, stem: Path) -> Figure:
+def _draw(points: Sequence[Point], quality: MeasuredQuantity, cost: MeasuredQuantity, stem: Path) -> Figure:
     front = _front(points, quality, cost)
     title = f"{quality.label} against {SUBJECTS[cost.key]}"
     with canvas(*PANEL) as (figure, axes):
@@ -93,7 +93,7 @@ def _draw(points: Sequence[Point], quality: Quantity, cost: Quantity, stem: Path
     return Figure(path, None, title, f"{title}. On the Pareto front: {best}.")
 
 
-def _front(points: Sequence[Point], quality: Quantity, cost: Quantity) -> list[Point]:
+def _front(points: Sequence[Point], quality: MeasuredQuantity, cost: MeasuredQuantity) -> list[Point]:
     """Pareto front by cost, over methods that are ranked in both (over all if none is): no seed lost, no clock disturbed."""
     ranked = [point for point in points if point.row.ranked_in(cost) and point.row.ranked_in(quality)] or list(points)
     # Costs are compared as written, to three digits: a hundredth of a second more does not change the front.
@@ -128,7 +128,7 @@ def _cost_axis(axes: Axes, values: Sequence[float]) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-def _staircase(axes: Axes, front: Sequence[Point], cost: Quantity, quality: Quantity) -> None:
+def _staircase(axes: Axes, front: Sequence[Point], cost: MeasuredQuantity, quality: MeasuredQuantity) -> None:
     """Draw the boundary of the region that the Pareto front dominates, extended to the plot's edges."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     xs, ys = [front[0].cost], [bottom if quality.better == "higher" else top]

@@ -18,7 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.report.data.assets import Folder, gradient, save_normals, save_scalar
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.pictures import Arrays, read_arrays, read_picture
-from invgraphics.report.wording import Quantity, quality_quantity
+from invgraphics.report.wording import MeasuredQuantity, quality_quantity
 from invgraphics.runs.run import Run, truth_arrays, truth_picture
 
 ERROR_COLOURS, DEPTH_COLOURS = "magma", "viridis_r"
@@ -128,7 +128,7 @@ def publish_truth(run: Run, index: int, folder: Folder) -> str:
     return folder.publish(run.truth, truth_picture(run.truth, index).name, f"pictures/truth-{index:04d}.png")
 
 
-def _mean_over(runs: Sequence[Run], key: str, view: int, quantity: Quantity) -> float:
+def _mean_over(runs: Sequence[Run], key: str, view: int, quantity: MeasuredQuantity) -> float:
     found = [
         run.scores.quality[key].per_view[view] for run in runs if key in run.scores.quality and run.scores.quality[key].per_view
     ]
@@ -175,7 +175,7 @@ def _captioned(shown: Sequence[_Shown], pictures: Sequence[Picture], keys: Seque
     return [replace(picture, caption=" · ".join(caption)) for picture, caption in zip(pictures, captions, strict=True)]
 
 
-def _unit(quantity: Quantity) -> str:
+def _unit(quantity: MeasuredQuantity) -> str:
     return quantity.unit if quantity.unit == "°" else f" {quantity.unit}" if quantity.unit else ""
 
 

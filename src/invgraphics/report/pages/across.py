@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from invgraphics.report.data.factors import StudyCell
 from invgraphics.report.data.studies import Study
 from invgraphics.report.statistics.values import diverged, value_of
-from invgraphics.report.wording import ABSENT, Quantity
+from invgraphics.report.wording import ABSENT, MeasuredQuantity
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class AcrossRow:
 class AcrossScenes:
     """Rows by mean, best first, rows without one last in the study's order; ``quantity`` formats their values."""
 
-    quantity: Quantity
+    quantity: MeasuredQuantity
     scenes: tuple[str, ...]
     rows: tuple[AcrossRow, ...]
 
@@ -42,7 +42,7 @@ class AcrossScenes:
         return ABSENT if value is None else self.quantity.text(value)
 
 
-def across_scenes(study: Study, quantity: Quantity | None) -> AcrossScenes | None:
+def across_scenes(study: Study, quantity: MeasuredQuantity | None) -> AcrossScenes | None:
     """Mean over seeds of every variant on every scene, and over scenes where it has a value on all.
 
     Returns:
@@ -64,7 +64,7 @@ def across_scenes(study: Study, quantity: Quantity | None) -> AcrossScenes | Non
     return AcrossScenes(quantity, study.scenes, tuple(rows))
 
 
-def _mean(cells: list[StudyCell], quantity: Quantity) -> float | None:
+def _mean(cells: list[StudyCell], quantity: MeasuredQuantity) -> float | None:
     values = [None if cell.run is None or diverged(cell.run, quantity) else value_of(cell.run, quantity) for cell in cells]
     known = [value for value in values if value is not None and math.isfinite(value)]
     return statistics.fmean(known) if known and len(known) == len(values) else None

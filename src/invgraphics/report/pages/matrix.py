@@ -9,7 +9,7 @@ from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.figures.views import Picture
 from invgraphics.report.pages.parts import Part
 from invgraphics.report.statistics.summary import Row, Summary
-from invgraphics.report.wording import Quantity
+from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.runs.comparison import Refusal
 
 LEAST_METHODS = 5
@@ -55,7 +55,7 @@ class Matrix:
         several_seeds: whether scores are means over seeds.
     """
 
-    quantity: Quantity
+    quantity: MeasuredQuantity
     columns: tuple[str, ...]
     rows: tuple[tuple[str, tuple[tuple[Entry, ...], ...]], ...]
     refused: tuple[Refusal, ...]

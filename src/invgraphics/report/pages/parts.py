@@ -21,7 +21,7 @@ from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.summary import Row, Summary, quality_columns, summarise
 from invgraphics.report.statistics.time_to_quality import TimeToQuality, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
-from invgraphics.report.wording import Quantity
+from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.runs.study import Approximation
 
 TINY = 320
@@ -41,7 +41,7 @@ class Drawn:
 
     curves: Figure | None
     tradeoffs: list[Figure]
-    distributions: list[tuple[Quantity, Figure]]
+    distributions: list[tuple[MeasuredQuantity, Figure]]
     views: tuple[ViewPage, ...]
 
     @property
@@ -68,7 +68,7 @@ class Contrasts:
         figure: interval plot of the first metric.
     """
 
-    tables: tuple[tuple[Quantity, list[Effect]], ...]
+    tables: tuple[tuple[MeasuredQuantity, list[Effect]], ...]
     figure: Figure | None
 
     @property
@@ -168,7 +168,7 @@ def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[A
 
 
 def draw_contrasts(
-    quantities: Sequence[Quantity],
+    quantities: Sequence[MeasuredQuantity],
     contrasts: Sequence[Contrast],
     observed: tuple[Sequence[Observation], Sequence[Lost]],
     folder: Folder,

@@ -24,7 +24,7 @@ from invgraphics.report.statistics.predictions import PREDICTION_HEADS, JudgedPr
 from invgraphics.report.statistics.sentences import effect_sentence, unmeasured_sentences, unscored_sentences
 from invgraphics.report.statistics.values import value_of
 from invgraphics.report.statistics.verdict import unequal_start
-from invgraphics.report.wording import Quantity, budget_words, listing
+from invgraphics.report.wording import MeasuredQuantity, budget_words, listing
 from invgraphics.text import duration
 
 DESIGNS = {
@@ -54,7 +54,7 @@ class StudyPage:
     parts: tuple[Part, ...]
     contrasts: Contrasts
     heat: list[Figure]
-    quantity: Quantity | None
+    quantity: MeasuredQuantity | None
     analyses: list[AnalysisPart]
     crossed: list[Effect] = field(default_factory=list)
     predictions: list[JudgedPrediction] = field(default_factory=list)
@@ -203,7 +203,7 @@ def _matrix(page: StudyPage, folder: Folder) -> list[MatrixRow]:
     return rows
 
 
-def _field(cell: StudyCell, index: int, quantity: Quantity | None, folder: Folder) -> MatrixCell:
+def _field(cell: StudyCell, index: int, quantity: MeasuredQuantity | None, folder: Folder) -> MatrixCell:
     where = f"{cell.variant}, {cell.scene}, seed {cell.seed}"
     took = f", {duration(cell.seconds)}" if cell.seconds is not None else ""
     if cell.status == "failed":

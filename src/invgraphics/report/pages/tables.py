@@ -10,7 +10,7 @@ from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.pages.across import AcrossScenes
 from invgraphics.report.statistics.effects import Effect
 from invgraphics.report.statistics.summary import Cell, Row, Summary
-from invgraphics.report.wording import Quantity, budget_words
+from invgraphics.report.wording import MeasuredQuantity, budget_words
 
 
 def escape_markdown(text: str) -> str:
@@ -101,7 +101,7 @@ def _latex_line(cells: list[str]) -> str:
     return f"    {' & '.join(cells)} \\\\"
 
 
-def _latex_row(row: Row, columns: tuple[Quantity, ...]) -> str:
+def _latex_row(row: Row, columns: tuple[MeasuredQuantity, ...]) -> str:
     name = escape_latex(row.label)
     if row.kind == "failed":
         width = max(1, len(columns))

@@ -41,8 +41,8 @@ UNITS = ("dB", "", "", "s", "", "", "", "", "MB", "MB", "dB", "")
 
 
 @dataclass(frozen=True)
-class Field:
-    """A field of the matrix of cells: verdicts, score, numbers and links.
+class VerdictCell:
+    """A cell of the matrix of verdicts: score, numbers and links.
 
     Attributes:
         judged: the cell and its verdicts.
@@ -96,8 +96,8 @@ class VerdictPage:
     """
 
     study: Study
-    fields: tuple[Field, ...]
-    rows: tuple[tuple[str, str, tuple[Field | None, ...]], ...]
+    fields: tuple[VerdictCell, ...]
+    rows: tuple[tuple[str, str, tuple[VerdictCell | None, ...]], ...]
     figures: list[Figure]
     stale: tuple[KnownDeviation, ...]
 
@@ -107,7 +107,7 @@ class VerdictPage:
         return headline([field.judged for field in self.fields])
 
     @property
-    def broken(self) -> list[tuple[Field, Verdict]]:
+    def broken(self) -> list[tuple[VerdictCell, Verdict]]:
         """Every broken rule, those without a known cause first."""
         pairs = [(field, verdict) for field in self.fields for verdict in field.judged.red]
         return sorted(pairs, key=lambda pair: pair[1].outcome == "known")
@@ -162,7 +162,7 @@ def _name(cell: StudyCell, study: Study) -> str:
     return name.removesuffix(f"seed={cell.seed}").strip() if len(study.seeds) == 1 else name
 
 
-def _field(one: JudgedCell, name: str, anchor: str, folder: Folder) -> Field:
+def _field(one: JudgedCell, name: str, anchor: str, folder: Folder) -> VerdictCell:
     cell, run = one.cell, one.cell.run
     psnr = psnr_of(cell)
     text = ABSENT if psnr is None else f"{psnr:.2f}"
@@ -170,7 +170,7 @@ def _field(one: JudgedCell, name: str, anchor: str, folder: Folder) -> Field:
     took, forecast = (ABSENT if value is None else duration(value) for value in (cell.seconds, cell.forecast))
     if run is None:
         rest = [ABSENT] * (len(COLUMNS) - 6)
-        return Field(one, name, anchor, text, (ABSENT, cell.budget, ABSENT, ABSENT, took, forecast, *rest), ())
+        return VerdictCell(one, name, anchor, text, (ABSENT, cell.budget, ABSENT, ABSENT, took, forecast, *rest), ())
     worst, share = worst_view(run), dead_share(run)
     numbers = (
         text,
@@ -188,16 +188,16 @@ def _field(one: JudgedCell, name: str, anchor: str, folder: Folder) -> Field:
     )
     names = [name for name in PUBLISHED if run.files.path(name).is_file()]
     files = tuple((name, folder.publish(run.folder, name, f"runs/{cell.id}/{name}")) for name in names)
-    return Field(one, name, anchor, text, numbers, files)
+    return VerdictCell(one, name, anchor, text, numbers, files)
 
 
 def _number(value: float | None, scale: float = 1.0) -> str:
     return ABSENT if value is None else f"{value * scale:,.0f}"
 
 
-def _matrix(study: Study, fields: Sequence[Field]) -> tuple[tuple[str, str, tuple[Field | None, ...]], ...]:
+def _matrix(study: Study, fields: Sequence[VerdictCell]) -> tuple[tuple[str, str, tuple[VerdictCell | None, ...]], ...]:
     """Rows of the matrix, by scene in the study's order, then size, then budget; one field per method."""
-    rows: dict[tuple[str, str], dict[str, Field]] = {}
+    rows: dict[tuple[str, str], dict[str, VerdictCell]] = {}
     order: dict[tuple[str, str], tuple[Any, ...]] = {}
     for field in fields:
         cell = field.judged.cell

@@ -14,7 +14,7 @@ from invgraphics.report.statistics.effects import Effect, effects_of
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.summary import quality_columns
 from invgraphics.report.statistics.values import value_of
-from invgraphics.report.wording import Quantity, quality_quantity
+from invgraphics.report.wording import MeasuredQuantity, quality_quantity
 from invgraphics.runs.inside import inside
 from invgraphics.runs.renderings import OWN, Difference, Renderings
 from invgraphics.runs.run import Run, read_run
@@ -100,7 +100,7 @@ class CrossTable:
         seeds: fits behind each number.
     """
 
-    quantity: Quantity
+    quantity: MeasuredQuantity
     renderers: tuple[str, ...]
     rows: tuple[CrossRow, ...]
     steps: tuple[StepRow, ...]
@@ -189,12 +189,12 @@ def cross_effects(
     return effects_of(contrasts, quality_quantity("psnr", score), shown, factors=factors)
 
 
-def _score(fits: Sequence[CrossRendered], name: str, quantity: Quantity) -> float | None:
+def _score(fits: Sequence[CrossRendered], name: str, quantity: MeasuredQuantity) -> float | None:
     values = [value for fit in fits if name in fit.seen and (value := value_of(fit.seen[name], quantity)) is not None]
     return statistics.fmean(values) if values else None
 
 
-def _cell(fits: Sequence[CrossRendered], name: str, quantity: Quantity, folder: Folder) -> CrossCell | None:
+def _cell(fits: Sequence[CrossRendered], name: str, quantity: MeasuredQuantity, folder: Folder) -> CrossCell | None:
     score = _score(fits, name, quantity)
     if score is None:
         return None
@@ -208,7 +208,7 @@ def _cell(fits: Sequence[CrossRendered], name: str, quantity: Quantity, folder: 
 
 
 def _mark_best(
-    fits: Sequence[CrossRendered], renderers: Sequence[str], cells: Sequence[CrossCell | None], quantity: Quantity
+    fits: Sequence[CrossRendered], renderers: Sequence[str], cells: Sequence[CrossCell | None], quantity: MeasuredQuantity
 ) -> tuple[CrossCell | None, ...]:
     """Mark the renderer that shows these fits better than every other one by more than chance, paired by fit."""
     scores = {

@@ -10,7 +10,7 @@ from invgraphics.report.data.factors import Factor, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, holm, over_seeds
 from invgraphics.report.statistics.pairing import Contrast, Sample, contrast_words, sample
 from invgraphics.report.statistics.settings import ALPHA, SettingEffect, across_scenes, effects_by_setting
-from invgraphics.report.wording import Quantity, significant_decimals
+from invgraphics.report.wording import MeasuredQuantity, significant_decimals
 
 Verdict = Literal["higher", "lower", "undecided", "untested"]
 """Of one scene: sign of a significant difference, none, or no test because there is a single fit."""
@@ -55,7 +55,7 @@ class Effect:
     """
 
     contrast: Contrast
-    quantity: Quantity
+    quantity: MeasuredQuantity
     estimate: Estimate
     across: Estimate | None
     adjusted: float | None
@@ -199,7 +199,7 @@ def _interaction(one: Factor, two: Factor) -> Contrast:
 
 
 def effects_on(
-    quantity: Quantity, factors: Sequence[Factor], observations: Sequence[Observation], lost: Iterable[Lost] = ()
+    quantity: MeasuredQuantity, factors: Sequence[Factor], observations: Sequence[Observation], lost: Iterable[Lost] = ()
 ) -> list[Effect]:
     """Effects of all compared levels on one quantity, corrected as one family (Holm 1979).
 
@@ -210,7 +210,7 @@ def effects_on(
 
 def effects_of(
     contrasts: Sequence[Contrast],
-    quantity: Quantity,
+    quantity: MeasuredQuantity,
     observations: Sequence[Observation],
     lost: Iterable[Lost] = (),
     factors: Sequence[Factor] = (),
@@ -251,7 +251,11 @@ def effects_of(
 
 
 def _effect(
-    contrast: Contrast, quantity: Quantity, values: Sample, observations: Sequence[Observation], factors: Sequence[Factor]
+    contrast: Contrast,
+    quantity: MeasuredQuantity,
+    values: Sample,
+    observations: Sequence[Observation],
+    factors: Sequence[Factor],
 ) -> Effect | None:
     groups = list(values.scenes.values())
     whole = over_seeds(groups)

@@ -33,8 +33,8 @@ def counts_of(record: Inference) -> list[int]:
     return sorted({one.observed for one in record.instances})
 
 
-def ways_of(record: Inference) -> list[str]:
-    """What made instances: the priors, then the baselines."""
+def methods_of(record: Inference) -> list[str]:
+    """Names of the inference methods: the priors, then the baselines."""
     return list(dict.fromkeys([*record.runs, *(one.how for one in record.instances)]))
 
 
@@ -43,32 +43,32 @@ def subjects_of(record: Inference, observed: int) -> list[int]:
     return sorted({one.subject for one in record.instances if one.observed == observed})
 
 
-def made(record: Inference, observed: int, how: str) -> list[InstanceScores]:
-    """Scores of all instances that were made one way from so many views."""
-    return [one for one in record.instances if one.how == how and one.observed == observed]
+def scores_of(record: Inference, observed: int, method: str) -> list[InstanceScores]:
+    """Scores of all instances that one method inferred from so many views."""
+    return [one for one in record.instances if one.how == method and one.observed == observed]
 
 
-def mean_of(record: Inference, metric: str, observed: int, how: str) -> Estimate | None:
+def mean_of(record: Inference, metric: str, observed: int, method: str) -> Estimate | None:
     """Mean of a metric over the test views of each instance, then over instances, with its 95 % interval."""
-    return estimate([[_values(one, metric)] for one in made(record, observed, how)], over="scenes")
+    return estimate([[_values(one, metric)] for one in scores_of(record, observed, method)], over="scenes")
 
 
 def paired(record: Inference, metric: str, observed: int, pair: tuple[str, str]) -> Estimate | None:
-    """Mean difference of a metric between two ways on the same test views; instances are the sample."""
-    first, second = ({one.subject: one for one in made(record, observed, how)} for how in pair)
+    """Mean difference of a metric between two methods on the same test views; instances are the sample."""
+    first, second = ({one.subject: one for one in scores_of(record, observed, method)} for method in pair)
     differences = [[_values(first[s], metric) - _values(second[s], metric)] for s in first if s in second]
     return estimate(differences, over="scenes")
 
 
-def table_of(record: Inference, metric: str, ways: Sequence[str]) -> dict[str, dict[int, Cell]]:
-    """Way -> number of views -> mean and difference from the first of ``ways``, one family of tests."""
-    counts, first = counts_of(record), ways[0]
-    gains = {(how, n): None if how == first else paired(record, metric, n, (how, first)) for how in ways for n in counts}
+def table_of(record: Inference, metric: str, methods: Sequence[str]) -> dict[str, dict[int, Cell]]:
+    """Method -> number of views -> mean and difference from the first of ``methods``, one family of tests."""
+    counts, first = counts_of(record), methods[0]
+    gains = {(name, n): None if name == first else paired(record, metric, n, (name, first)) for name in methods for n in counts}
     adjusted = dict(zip(gains, holm([None if gain is None else gain.p for gain in gains.values()]), strict=True))
-    table: dict[str, dict[int, Cell]] = {how: {} for how in ways}
-    for (how, n), gain in gains.items():
-        mean, p = mean_of(record, metric, n, how), adjusted[how, n]
-        table[how][n] = Cell(None if mean is None else mean.mean, gain, p is not None and p < 1 - CONFIDENCE)
+    table: dict[str, dict[int, Cell]] = {name: {} for name in methods}
+    for (name, n), gain in gains.items():
+        mean, p = mean_of(record, metric, n, name), adjusted[name, n]
+        table[name][n] = Cell(None if mean is None else mean.mean, gain, p is not None and p < 1 - CONFIDENCE)
     return table
 
 

@@ -44,7 +44,7 @@ class Estimate:
         low: lower end of the interval; equal to the mean where there is none.
         high: its upper end.
         p: two-sided p-value of a true mean of zero, dual to the interval; ``None`` without an interval.
-        unit: what the interval counts as independent; ``none`` where no spread is known: a single unit, or units that agree to
+        unit: what the interval treats as independent; ``none`` where no spread is known: a single unit, or units that agree to
             the last digit, whose spread is not zero but unknown.
         scenes: number of scenes.
         seeds: (fewest, most) seeds per scene.

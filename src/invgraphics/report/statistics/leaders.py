@@ -10,11 +10,11 @@ from invgraphics.report.data.factors import ALL_PAIRS, METHOD, Factor, Lost, Obs
 from invgraphics.report.statistics.effects import ALPHA, Effect, effects_of, places_of
 from invgraphics.report.statistics.intervals import holm
 from invgraphics.report.statistics.pairing import Contrast, contrast_words
-from invgraphics.report.wording import TIMES, Quantity
+from invgraphics.report.wording import TIMES, MeasuredQuantity
 
 
 def leaders(
-    comparison: Comparison, means: Sequence[tuple[Quantity, Mapping[str, float]]], tables: int = 1
+    comparison: Comparison, means: Sequence[tuple[MeasuredQuantity, Mapping[str, float]]], tables: int = 1
 ) -> dict[str, tuple[str, Effect]]:
     """Methods that lead a column significantly: better than every other one, corrected over the columns of the page.
 
@@ -48,7 +48,7 @@ def leaders(
 
 def lead_contrasts(
     factors: Sequence[Factor],
-    quantity: Quantity,
+    quantity: MeasuredQuantity,
     observations: Sequence[Observation],
     lost: Iterable[Lost] = (),
     places: tuple[str, Sequence[str]] = ("", ()),

@@ -18,7 +18,7 @@ from numpy import ndarray
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.data.variants import level_words
 from invgraphics.report.statistics.values import clipped, diverged, value_of
-from invgraphics.report.wording import Quantity
+from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.runs.run import Run
 
 Sign = float
@@ -32,7 +32,7 @@ class Contrast:
         factor: dotted path, or ``method``.
         before: level that is subtracted.
         after: level that it is subtracted from.
-        where: factor -> the only level that counts.
+        where: factor -> the only level that is included.
         against: (factor, level, level) for an interaction: the difference at the second level minus that at the first.
         name: what the contrast is called, where the levels of ``factor`` alone do not say, as of an interaction.
     """
@@ -91,7 +91,9 @@ Table = dict[tuple[Any, ...], dict[int, Observation]]
 """(scene, other levels) -> seed -> run."""
 
 
-def sample(contrast: Contrast, quantity: Quantity, observations: Sequence[Observation], lost: Iterable[Lost] = ()) -> Sample:
+def sample(
+    contrast: Contrast, quantity: MeasuredQuantity, observations: Sequence[Observation], lost: Iterable[Lost] = ()
+) -> Sample:
     """Collect the values of a contrast from a study's runs.
 
     Args:
@@ -180,7 +182,7 @@ def settings_of(contrast: Contrast, observations: Sequence[Observation]) -> list
     return [({key: level for key, level in levels if (key, level) not in shared}, both[levels]) for levels in sorted(both)]
 
 
-def _difference(contrast: Contrast, quantity: Quantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
+def _difference(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
     """Signed groups of one scene: a single group of paired differences, or one group per side."""
     before, after = (_table(contrast.factor, level, here) for level in (contrast.before, contrast.after))
     shared = [key for key in before if key in after]
@@ -194,7 +196,7 @@ def _difference(contrast: Contrast, quantity: Quantity, here: Sequence[Observati
     return [(1.0, values)] if len(values) else []
 
 
-def _interaction(contrast: Contrast, quantity: Quantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
+def _interaction(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
     """Differences of paired differences; two independent groups of them where one factor is the method."""
     assert contrast.against is not None
     factor, low, high = contrast.against
@@ -240,11 +242,11 @@ def _table(path: str, level: str, observations: Sequence[Observation], drop: str
     return table
 
 
-def _paired(before: Table, after: Table, quantity: Quantity) -> Float[ndarray, " seed"]:
+def _paired(before: Table, after: Table, quantity: MeasuredQuantity) -> Float[ndarray, " seed"]:
     return np.array(list(_by_seed(before, after, quantity).values()))
 
 
-def _by_seed(before: Table, after: Table, quantity: Quantity) -> dict[int, float]:
+def _by_seed(before: Table, after: Table, quantity: MeasuredQuantity) -> dict[int, float]:
     """Seed -> paired difference on shared views; other factors are averaged, since they add no independent seed."""
     found: dict[int, list[float]] = {}
     for key, runs in before.items():
@@ -255,7 +257,7 @@ def _by_seed(before: Table, after: Table, quantity: Quantity) -> dict[int, float
     return {seed: sum(values) / len(values) for seed, values in found.items()}
 
 
-def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantity: Quantity) -> Float[ndarray, " seed"]:
+def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantity: MeasuredQuantity) -> Float[ndarray, " seed"]:
     """One value per seed of one side, averaged over the strata that both sides have; seeds that lack one are left out."""
     found: dict[int, list[float]] = {}
     strata = 0
@@ -269,7 +271,7 @@ def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantit
     return np.array([sum(values) / strata for values in found.values() if len(values) == strata])
 
 
-def run_values(runs: Sequence[Run], quantity: Quantity) -> list[float] | None:
+def run_values(runs: Sequence[Run], quantity: MeasuredQuantity) -> list[float] | None:
     """Mean of each run over the views in which all of them have a finite score; over all where single views have none."""
     if quantity.group != "cost":
         tables = [_views(run, quantity) for run in runs]
@@ -281,7 +283,7 @@ def run_values(runs: Sequence[Run], quantity: Quantity) -> list[float] | None:
     return known if len(known) == len(values) else None
 
 
-def _views(run: Run, quantity: Quantity) -> dict[str, float]:
+def _views(run: Run, quantity: MeasuredQuantity) -> dict[str, float]:
     """View -> finite score; empty where single views have none."""
     score = run.scores.quality.get(quantity.key)
     if score is None or not score.per_view:

@@ -20,7 +20,7 @@ from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
 from invgraphics.report.statistics.pairing import lost_among
 from invgraphics.report.statistics.values import diverged, value_of
-from invgraphics.report.wording import ABSENT, Quantity, listing, quality_quantity, significant_decimals
+from invgraphics.report.wording import ABSENT, MeasuredQuantity, listing, quality_quantity, significant_decimals
 from invgraphics.runs.study import Prediction, level_text
 
 PREDICTION_HEADS = ("Prediction", "Source", "Scenes", "Expected", "Measured", "95% interval", "Fits", "Verdict")
@@ -53,7 +53,7 @@ class JudgedPrediction:
     """
 
     prediction: Prediction
-    quantity: Quantity | None
+    quantity: MeasuredQuantity | None
     estimate: Estimate | None
     scenes: tuple[str, ...]
     lost: int
@@ -134,7 +134,7 @@ def _terms(prediction: Prediction) -> Terms:
     ]
 
 
-def _groups(terms: Terms, quantity: Quantity, here: Sequence[Observation]) -> tuple[Groups, str]:
+def _groups(terms: Terms, quantity: MeasuredQuantity, here: Sequence[Observation]) -> tuple[Groups, str]:
     """Signed groups of one scene, one for each method that the terms name, and why there are none."""
     named = frozenset(name for _, levels in terms for name in levels)
     tables = [_strata(here, levels, named, quantity) for _, levels in terms]
@@ -155,7 +155,9 @@ def _groups(terms: Terms, quantity: Quantity, here: Sequence[Observation]) -> tu
     return groups, ""
 
 
-def _strata(here: Sequence[Observation], wanted: Mapping[str, str], named: frozenset[str], quantity: Quantity) -> Strata:
+def _strata(
+    here: Sequence[Observation], wanted: Mapping[str, str], named: frozenset[str], quantity: MeasuredQuantity
+) -> Strata:
     """Scores of the fits at some levels; over factors that other terms alone name they are means, where none is missing."""
     found: dict[tuple[Stratum, int], dict[Stratum, float]] = {}
     for one in here:
@@ -217,7 +219,7 @@ def _has(levels: Mapping[str, str], wanted: Mapping[str, str]) -> bool:
     return all(levels.get(name) == level for name, level in wanted.items())
 
 
-def _digits(prediction: Prediction, quantity: Quantity | None) -> int:
+def _digits(prediction: Prediction, quantity: MeasuredQuantity | None) -> int:
     """Digits after the point: those of the metric, of three significant ones, or as many as the stated bounds have."""
     bounds = [bound for bound in (prediction.low, prediction.high) if bound is not None]
     written = [len(f"{bound:.6f}".rstrip("0").partition(".")[2]) for bound in bounds]

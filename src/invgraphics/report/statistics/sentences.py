@@ -9,7 +9,7 @@ from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.data.variants import level_words
 from invgraphics.report.statistics.effects import Effect, Verdict
 from invgraphics.report.statistics.intervals import POWER, Estimate
-from invgraphics.report.wording import Quantity, listing, metric_label
+from invgraphics.report.wording import MeasuredQuantity, listing, metric_label
 
 FEW_SCENES = 5
 """Fewer scenes than this tell little about others, and the sentence says so."""
@@ -25,7 +25,7 @@ def effect_sentence(effect: Effect) -> str:
     return " ".join(part for part in parts if part)
 
 
-def unscored_sentences(metric: str, shown: Quantity | None) -> list[str]:
+def unscored_sentences(metric: str, shown: MeasuredQuantity | None) -> list[str]:
     """That no fit has the score which a study asks about, and which one stands in for it; empty where one has."""
     if shown is None or shown.key == metric:
         return []
@@ -218,13 +218,13 @@ def _silent(effect: Effect) -> str:
     return f"Nothing is known on {listing(effect.silent)}, where one side has no number."
 
 
-def _verb(quantity: Quantity, difference: float) -> str:
+def _verb(quantity: MeasuredQuantity, difference: float) -> str:
     if quantity.better == "none":
         return "adds" if difference > 0 else "saves"
     return "gains" if (difference > 0) == (quantity.better == "higher") else "costs"
 
 
-def _unit(quantity: Quantity) -> str:
+def _unit(quantity: MeasuredQuantity) -> str:
     """Unit of a difference in words; the quantity's label where it has no unit."""
     if quantity.unit == "dB":
         return "dB"

@@ -9,12 +9,12 @@ from invgraphics.report.data.factors import Factor, Observation
 from invgraphics.report.data.variants import setting_words
 from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, over_scenes, over_seeds
 from invgraphics.report.statistics.pairing import Contrast, Sample, sample, settings_of
-from invgraphics.report.wording import Quantity
+from invgraphics.report.wording import MeasuredQuantity
 
 ALPHA = 1 - CONFIDENCE
 """Family-wise error rate of a study."""
 MOST_SETTINGS = 100
-"""Combinations of other factors' levels that an effect is looked at in one by one; of more there are too few fits in each."""
+"""Combinations of other factors' levels in which an effect is examined one by one; of more there are too few fits in each."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def across_scenes(values: Sample, whole: Estimate) -> Estimate | None:
 
 
 def effects_by_setting(
-    contrast: Contrast, quantity: Quantity, observations: Sequence[Observation], factors: Sequence[Factor]
+    contrast: Contrast, quantity: MeasuredQuantity, observations: Sequence[Observation], factors: Sequence[Factor]
 ) -> dict[str, SettingEffect]:
     """A contrast at each combination of other factors' levels, in words, uncorrected; empty where there is one only."""
     settings = [] if contrast.against is not None else settings_of(contrast, observations)

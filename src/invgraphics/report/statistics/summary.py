@@ -12,7 +12,7 @@ from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.intervals import mean_half_width
 from invgraphics.report.statistics.leaders import leaders
 from invgraphics.report.statistics.values import diverged, value_of
-from invgraphics.report.wording import ABSENT, COSTS, TIMES, Quantity, metric_label, quality_quantity
+from invgraphics.report.wording import ABSENT, COSTS, TIMES, MeasuredQuantity, metric_label, quality_quantity
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.run import Run
 from invgraphics.runs.scores import Score
@@ -68,7 +68,7 @@ class Row:
     disturbed: str = ""
     lost: frozenset[str] = frozenset()
 
-    def ranked_in(self, column: Quantity) -> bool:
+    def ranked_in(self, column: MeasuredQuantity) -> bool:
         """Whether it is ranked in a column: it lacks no seed, none diverged, and for times no clock was disturbed."""
         return self.complete and column.key not in self.lost and not (self.disturbed and column.key in TIMES)
 
@@ -84,7 +84,7 @@ class Summary:
         skipped: why -> labels of the metrics that no run has for that reason.
     """
 
-    columns: tuple[Quantity, ...]
+    columns: tuple[MeasuredQuantity, ...]
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
     skipped: dict[str, list[str]]
@@ -138,7 +138,7 @@ def summarise(comparison: Comparison, tables: int = 1) -> Summary:
     return Summary(columns, _mark_best(comparison, columns, rows, tables), notes, _skipped(comparison))
 
 
-def quality_columns(comparison: Comparison) -> tuple[Quantity, ...]:
+def quality_columns(comparison: Comparison) -> tuple[MeasuredQuantity, ...]:
     """Quality metrics that at least one run or baseline has, in order of first appearance."""
     found: dict[str, Score] = {}
     for quality in [run.scores.quality for run in comparison.runs] + list(comparison.baselines.values()):
@@ -159,7 +159,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def table_columns(comparison: Comparison) -> tuple[Quantity, ...]:
+def table_columns(comparison: Comparison) -> tuple[MeasuredQuantity, ...]:
     """Columns of the summary: quality metrics, then the costs that any run has."""
     budgets = {comparison.budget, *(run.provenance.budget for run in comparison.runs)}
     time_budget = any(budget and "step" not in budget for budget in budgets)
@@ -181,7 +181,7 @@ def _known(values: Sequence[float | None]) -> list[float]:
     return [value for value in values if value is not None and not math.isnan(value)]
 
 
-def _method_cell(column: Quantity, runs: Sequence[Run], absences: dict[str, list[str]]) -> Cell:
+def _method_cell(column: MeasuredQuantity, runs: Sequence[Run], absences: dict[str, list[str]]) -> Cell:
     """A method's cell in a column; why it lacks values is added to ``absences``, reason -> labels of the columns."""
     values = _known([value_of(run, column) for run in runs])
     reasons = [_absence(run, column) for run in runs if value_of(run, column) is None]
@@ -197,7 +197,7 @@ def _method_cell(column: Quantity, runs: Sequence[Run], absences: dict[str, list
     return _cell(column, values, list(absences).index(reason) + 1)
 
 
-def _absence(run: Run, column: Quantity) -> str:
+def _absence(run: Run, column: MeasuredQuantity) -> str:
     if column.group == "cost":
         return ""  # not every method has every cost (primitives, for instance): no footnote
     if column.key in run.scores.quality:
@@ -205,7 +205,7 @@ def _absence(run: Run, column: Quantity) -> str:
     return run.scores.skipped.get(column.key, "the run does not report it")
 
 
-def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
+def _cell(column: MeasuredQuantity, values: Sequence[float], note: int = 0) -> Cell:
     if not values:
         return Cell(None, None, "n/a" if note else ABSENT, "", note=note)
     mean = statistics.fmean(values)
@@ -214,7 +214,9 @@ def _cell(column: Quantity, values: Sequence[float], note: int = 0) -> Cell:
     return Cell(mean, std, column.text(mean), "" if std is None else column.spread(mean, std), note=note, half_width=half)
 
 
-def _mark_best(comparison: Comparison, columns: Sequence[Quantity], rows: Sequence[Row], tables: int) -> tuple[Row, ...]:
+def _mark_best(
+    comparison: Comparison, columns: Sequence[MeasuredQuantity], rows: Sequence[Row], tables: int
+) -> tuple[Row, ...]:
     """Mark the cell of each column's leader, where there is one."""
     means = []
     for index, column in enumerate(columns):

@@ -20,7 +20,7 @@ def seconds_to_reach(run: Run, level: float) -> float | None:
 
 
 def span_to_reach(run: Run, level: float) -> tuple[float, float] | None:
-    """(last look before, first look at which) the monitored PSNR was at least ``level`` dB, seconds; ``None`` if never."""
+    """(last evaluation before, first one at which) the monitored PSNR was at least ``level`` dB, seconds; ``None`` if never."""
     before = 0.0
     for entry in run.history:
         if entry.psnr is None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import statistics
 
-from invgraphics.report.wording import Quantity
+from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.runs.run import Run
 
 PERFECT_DB = 100.0
 """PSNR from which on a picture counts as perfect: errors of 1e-5 of white. Without a limit one equal picture is infinite."""
 
 
-def value_of(run: Run, column: Quantity) -> float | None:
+def value_of(run: Run, column: MeasuredQuantity) -> float | None:
     """A run's value of a quantity, in stored units; a PSNR of equal pictures counts as `PERFECT_DB`."""
     if column.group == "cost":
         return run.scores.cost.get(column.key)
@@ -24,14 +24,14 @@ def value_of(run: Run, column: Quantity) -> float | None:
     return clipped(score.mean, column)
 
 
-def clipped(value: float | None, column: Quantity) -> float:
+def clipped(value: float | None, column: MeasuredQuantity) -> float:
     """A score with perfection at a finite value; NaN for ``None``."""
     if value is None:
         return math.nan
     return min(value, PERFECT_DB) if column.unit == "dB" and column.better == "higher" else value
 
 
-def diverged(run: Run, column: Quantity) -> bool:
+def diverged(run: Run, column: MeasuredQuantity) -> bool:
     """Whether a fit has no finite score because it diverged, rather than because the metric is undefined or was not computed.
 
     Of a picture's metric, one view that is not finite is enough: the others would flatter the fit. Geometry is undefined in

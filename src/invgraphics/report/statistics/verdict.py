@@ -12,7 +12,7 @@ from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.rules import DEAD_SHARE
 from invgraphics.report.statistics.sentences import detectable_words
 from invgraphics.report.statistics.summary import Row, Summary
-from invgraphics.report.wording import Quantity, budget_words, grouped, listing, times
+from invgraphics.report.wording import MeasuredQuantity, budget_words, grouped, listing, times
 from invgraphics.runs.run import Run
 
 EXACT_POINTS = "exact surface points"
@@ -25,7 +25,7 @@ def verdict(comparison: Comparison, summary: Summary) -> list[str]:
     return [sentence for sentence in sentences if sentence]
 
 
-def _ranking(summary: Summary, column: Quantity) -> list[tuple[float, Row]]:
+def _ranking(summary: Summary, column: MeasuredQuantity) -> list[tuple[float, Row]]:
     """(value, row) of the methods that have all their seeds, best first."""
     rows = [row for row in summary.methods if row.ranked_in(column)]
     values = [(cell.mean, row) for row in rows if (cell := summary.cell(row, column.key)) and cell.mean is not None]
@@ -65,7 +65,7 @@ def _quality(comparison: Comparison, summary: Summary) -> list[str]:
     return [sentence, _resolution(comparison, summary, column, ranking), _other_metrics(summary, columns[1:], winner)]
 
 
-def _best_baseline(summary: Summary, column: Quantity) -> tuple[float, Row] | None:
+def _best_baseline(summary: Summary, column: MeasuredQuantity) -> tuple[float, Row] | None:
     found = [(cell.mean, row) for row in summary.baselines if (cell := summary.cell(row, column.key)) and cell.mean is not None]
     return min(found, key=lambda entry: column.sort_key(entry[0])) if found else None
 
@@ -74,7 +74,7 @@ def _one_seed(ranking: list[tuple[float, Row]]) -> bool:
     return max(row.seeds for _, row in ranking) < 2
 
 
-def _resolution(comparison: Comparison, summary: Summary, column: Quantity, ranking: list[tuple[float, Row]]) -> str:
+def _resolution(comparison: Comparison, summary: Summary, column: MeasuredQuantity, ranking: list[tuple[float, Row]]) -> str:
     """Sentence on the interval of the first method's lead over the second, and its significance over seeds."""
     if len(ranking) < 2:
         return ""
@@ -95,7 +95,7 @@ def _resolution(comparison: Comparison, summary: Summary, column: Quantity, rank
     return f"{size} cannot tell that lead from chance: {detectable_words(lead)}."
 
 
-def _other_metrics(summary: Summary, columns: list[Quantity], winner: Row) -> str:
+def _other_metrics(summary: Summary, columns: list[MeasuredQuantity], winner: Row) -> str:
     """Metrics that a method leads by more than chance."""
     agree: list[str] = []
     others: dict[str, list[str]] = {}
@@ -123,13 +123,20 @@ def _costs(summary: Summary) -> list[str]:
         (value, row), (second, _) = ranking[0], ranking[1]
         if not ((cell := summary.cell(row, column.key)) and cell.best):
             continue
-        ratio = second / value if column.better == "lower" and value else value / second if second else math.inf
+        ratio = _lead_ratio(value, second, column)
         if math.isfinite(ratio) and ratio >= 1.05:
             parts.append(
                 f"{row.label} {words[column.key]} ({column.text(value)} {column.unit}, {times(ratio)}× better than the next)"
             )
     text = "; ".join(parts)
     return [f"{text}."] if text else []
+
+
+def _lead_ratio(best: float, second: float, column: MeasuredQuantity) -> float:
+    """Factor by which the best value of a cost is better than the second; infinite beside zero."""
+    if column.better == "lower" and best:
+        return second / best
+    return best / second if second else math.inf
 
 
 def unequal_start(runs: Sequence[Run]) -> list[str]:

@@ -9,7 +9,7 @@ Not all pairs count. Where a scene repeats itself, distant pairs that show diffe
 where the texture is rich. Of each photograph, the two pairs with most matches count, which on a walk are those with the
 photographs before and after it: baselines are short there, and copies are hardly ever confused. One contradicting pair that is
 among the strongest of both its photographs is enough: a fold needs no more. Comparing rotations of two-view geometries with
-the reconstruction, or around triplets, tells less: small planar overlaps leave the rotation of correct pairs ambiguous.
+the reconstruction, or around triplets, is weaker evidence: small planar overlaps leave the rotation of correct pairs ambiguous.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ MODELS: dict[str, str] = {
 """COLMAP's camera models by our names; ``auto`` begins with ``radial``."""
 
 EXHAUSTIVE = 200
-"""Most photographs of which every pair is matched when nothing else is asked for: 20 thousand pairs."""
+"""Most photographs of which every pair is matched by default: 20 thousand pairs."""
 
 
 @dataclass(frozen=True)

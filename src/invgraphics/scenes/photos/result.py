@@ -60,7 +60,7 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
 
 
 def _write_model(model: Any, folder: Path) -> None:
-    """Write a COLMAP model; the library does not say where it could not write all."""
+    """Write a COLMAP model; the library does not report incomplete writes."""
     model.write(str(folder))
     try:
         check_sizes(folder)
@@ -71,8 +71,8 @@ def _write_model(model: Any, folder: Path) -> None:
 def max_distortion(lens: Lens) -> float:
     """Largest displacement in pixels by the lens distortion, on a lattice over the picture.
 
-    Where the lens has no inverse, as in the corners of strong barrel distortion, nothing is measured: it counts as the longest
-    side of the picture if that is everywhere.
+    Where the lens has no inverse, as in the corners of strong barrel distortion, nothing is measured; if that is
+    everywhere, the result is the longest side of the picture.
     """
     if lens.is_pinhole():
         return 0.0

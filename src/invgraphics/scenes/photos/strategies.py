@@ -47,9 +47,11 @@ class Strategy:
 
 
 def strategies(job: PhotoJob, photos: Sequence[Prepared]) -> tuple[Strategy, ...]:
-    """Ordered strategies for a job: as asked for first, then the alternatives that its settings leave open."""
+    """Ordered strategies for a job: the requested one first, then the alternatives that its settings leave open."""
     straight = all(photo.centre is not None for photo in photos)  # a data set's calibrated pinholes
-    lens = "pinhole" if straight else "radial" if job.lens == "auto" else job.lens
+    lens = "radial" if job.lens == "auto" else job.lens
+    if straight:
+        lens = "pinhole"
     others = ["pinhole", "opencv"] if job.lens == "auto" and not straight else [lens, lens]
     tries = [
         Strategy("incremental", lens),

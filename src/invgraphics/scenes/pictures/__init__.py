@@ -1,1 +1,1 @@
-"""Photographs: reading, lens distortion, size, and what of them counts."""
+"""Photographs: reading, lens distortion, size, and masks."""

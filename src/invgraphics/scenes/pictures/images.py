@@ -18,7 +18,7 @@ from invgraphics.scenes.pictures import png
 from invgraphics.scenes.pictures.lens import Lens
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-"""What counts as a photograph, in lower case."""
+"""Suffixes of photographs, in lower case."""
 
 _ORIENTATION = 0x0112  # EXIF tag
 _TURNED = (5, 6, 7, 8)  # orientations that exchange width and height
@@ -34,7 +34,7 @@ class Photo:
         name: what the data set calls it.
         lens: the lens whose distortion has to be removed; replaces the camera's intrinsics.
         alpha: a second file whose brightness is the coverage.
-        mask: a second file that is dark where pixels do not count.
+        mask: a second file that is dark where pixels are masked out.
     """
 
     path: Path
@@ -80,7 +80,7 @@ def stored_size(path: Path) -> tuple[int, int]:
 def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w c"]:
     """Read a photograph as 8-bit colour: upright, or, where its camera is known, as that was calibrated.
 
-    Sixteen-bit greys are rounded, palettes and greys become RGB. Structure from motion looks at pixels as they are stored
+    Sixteen-bit greys are rounded, palettes and greys become RGB. Structure from motion reads pixels as they are stored
     (COLMAP ignores EXIF): with a camera the EXIF orientation is applied only where the stored shape is not the camera's.
 
     Args:

@@ -1,4 +1,4 @@
-"""Masks of photographs: pixels that neither a fit nor a score looks at, such as people who walk past."""
+"""Masks of photographs: pixels that neither a fit nor a score uses, such as people who walk past."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _named_like(photo: Photo, folder: Path) -> Path | None:
 
 
 def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Read a mask as a picture of a size: 255 where pixels count, which is where it is brighter than half of its maximum.
+    """Read a mask as a picture of a size: 255 where pixels are valid, which is where it is brighter than half of its maximum.
 
     Args:
         mask: the file; where its size is not the photograph's, its nearest pixels are taken.
@@ -64,7 +64,7 @@ def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]
 
 
 def brightness(pixels: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w"]:
-    """Brightness of a mask's pixels: its alpha where that alone tells, as of a cut-out; of masks of 0 and 1, 0 and 255."""
+    """Brightness of a mask's pixels: its alpha where only that varies, as of a cut-out; of masks of 0 and 1, 0 and 255."""
     values = pixels[:, :, :3].max(axis=2)
     if pixels.shape[2] == 4 and values.min() == values.max() and pixels[:, :, 3].min() < pixels[:, :, 3].max():
         values = pixels[:, :, 3]

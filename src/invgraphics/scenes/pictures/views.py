@@ -19,7 +19,7 @@ from invgraphics.scenes.pictures.resize import area_resize, wanted_size
 def load_view(photo: Photo, size: int | tuple[int, int] | None = None) -> View:
     """Read, undistort and resize one photograph whose camera fits its file (see `match_sizes`), and its mask.
 
-    A pixel counts if all that it is an average of does.
+    A pixel is valid if all pixels that it averages are.
     """
     view = make_view(photo.camera, _with_alpha(photo), photo.name, size, photo.lens)
     if photo.mask is None:

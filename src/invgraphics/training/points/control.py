@@ -7,7 +7,7 @@ from typing import ClassVar, Protocol, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Context, Field, RayRenderer, Renderer
@@ -18,6 +18,7 @@ from invgraphics.training.hooks import FitState
 from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.prune import trace_random_rays
 from invgraphics.training.requirement import Requirement
+from invgraphics.training.rows import replace_rows
 
 NEIGHBOURS = 4
 """Points whose means a new one starts with."""
@@ -97,16 +98,14 @@ class PointControl(MilestoneHook):
         config, field = self._config, cast(PointParameters, state.field)
         keep = field.confidence_logits.sigmoid() >= config.prune_confidence
         if not bool(keep.any()):
-            keep[field.confidence_logits.argmax()] = True  # a field of nothing could never grow again
+            keep[field.confidence_logits.argmax()] = True  # an empty field could never grow again
         position, weight = strongest_samples(state, state.renderer, config.rays)
         new = self._to_add(field, position, weight, keep)
         rows = keep.nonzero()[:, 0]
         index, squared = near_points(new, field.positions, NEIGHBOURS, float(field.radius))
         old = {name: getattr(field, name).detach() for name in ("features", "raw_rgb", "confidence_logits")}
         tensors = {name: torch.cat([values[rows], _mean_of(values, index, squared)]) for name, values in old.items()}
-        field.replace({"positions": torch.cat([field.positions[rows], new]), **tensors})
-        for name in old:
-            state.optimiser.reindex_rows(f"field.{name}", cast(nn.Parameter, getattr(field, name)), rows, len(new))
+        replace_rows(state, {"positions": torch.cat([field.positions[rows], new]), **tensors}, rows, len(new))
 
     def _to_add(
         self, field: PointParameters, position: Float[Tensor, "k 3"], weight: Float[Tensor, " k"], keep: Bool[Tensor, " n"]
@@ -157,7 +156,7 @@ class ConfidencePenalty:
 
     Attributes:
         weight: factor.
-        least: confidences count as at least this, and as at most 1 less it.
+        least: confidences are clamped to at least this, and to at most 1 less it.
     """
 
     name: ClassVar[str] = "confidence"

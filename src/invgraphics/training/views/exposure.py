@@ -2,7 +2,7 @@
 
 Cameras choose exposure and white balance anew for every photograph. A field that must show all of them as they are explains the
 differences by fog or by colours that change with the view. Scene and maps are known only up to a common map (a gauge): here the
-training views' mean map is the identity, and held-out views, whose exposure nothing tells, are shown under it.
+training views' mean map is the identity, and held-out views, whose exposure is unknown, are shown under it.
 
 Maps may follow other errors too, the more numbers they have. Gaussians, 600 steps at 128 px, one seed, on bricks, fence,
 materials, fox and dtu_scan24, of which each photograph was given an exposure: PSNR rises with a spread of 0.6 stops by 0.6 to

@@ -1,8 +1,8 @@
 """Sparse depth supervision: rays through points of structure from motion end there (Deng et al. 2022, DS-NeRF).
 
-Few photographs can be explained by a fog before each camera that no other photograph shows. Tracks of structure from motion say
-which photographs show a point: the ray from such a camera passes what is before the point, and ends there. Fields that start
-from these points have that built in; ray-marched ones learn it by a penalty.
+Few photographs can be explained by a fog before each camera that no other photograph shows. Tracks of structure from motion
+list the photographs that show a point: the ray from such a camera passes what is before the point, and ends there. Fields that
+start from these points have that built in; ray-marched ones learn it by a penalty.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class SparseDepth:
     """Penalty: the expected relative error of the termination distance of rays through known points, their mean.
 
     A ray terminates in a sample with the probability of its weight. The error is |t - d| / (`SPAN` d), at most 1, for a point
-    at distance d; not to terminate counts 1 too. (DS-NeRF takes a KL divergence from a Gaussian around the point instead.)
+    at distance d; a ray that does not terminate has an error of 1. (DS-NeRF takes a KL divergence from a Gaussian around the
+    point instead.)
 
     Attributes:
         config: settings.
@@ -93,7 +94,7 @@ def make_sparse_depth(
         fixed_poses: whether cameras stay where they are; points were triangulated there.
 
     Raises:
-        InputError: depths are asked for, and cannot be used.
+        InputError: depths are requested, and cannot be used.
     """
     config = SparseDepthConfig() if chosen is None else chosen
     if config.weight == 0 or (chosen is None and scene.bounds.space != "contracted"):
@@ -113,7 +114,7 @@ def make_sparse_depth(
 
 
 def _through_landmarks(scene: Scene) -> tuple[Rays, Float[Tensor, " n"]]:
-    """Rays from training cameras through their landmarks within the bounds and at pixels that count, and the distances."""
+    """Rays from training cameras through their landmarks within the bounds and at valid pixels, and the distances."""
     found, distances = [], []
     for index, view in enumerate(scene.train):
         camera = view.camera
