@@ -80,7 +80,7 @@ def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
 
 def _sample_surface_points(field: Field, rays: Rays, bounds: Bounds) -> Points:
     """Sample at most one point per ray by its rendering weights; rays pass through with probability 1 - alpha."""
-    samples, weights = sample_weights(field, rays, bounds)
+    samples, weights = uniform_rendering_weights(field, rays, bounds)
     # Inverse of the cumulated weight; a draw beyond a ray's alpha goes through.
     cumulated = weights.cumsum(dim=1)
     draw = torch.rand(len(rays), 1).to(cumulated)
@@ -92,7 +92,7 @@ def _sample_surface_points(field: Field, rays: Rays, bounds: Bounds) -> Points:
     return Points(chosen.position + jitter * chosen.direction, radiance)
 
 
-def sample_weights(field: Field, rays: Rays, bounds: Bounds) -> tuple[Samples, Float[Tensor, "n samples"]]:
+def uniform_rendering_weights(field: Field, rays: Rays, bounds: Bounds) -> tuple[Samples, Float[Tensor, "n samples"]]:
     """Rendering weights of `SAMPLES` intervals along each ray, and the samples that they belong to, packed."""
     rays = bounds.clip(rays)
     edges = _edges(rays, bounds)

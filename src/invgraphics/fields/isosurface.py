@@ -100,7 +100,7 @@ def extract_mesh(field: Field, bounds: Bounds, resolution: int, level: float | N
     # Both grow towards the inside, so that one rule tells front from back.
     if distances:
         level = 0.0 if level is None else level
-        volume, level, what = -_distances(field, grid, level), -level, "The signed distance"
+        volume, level, what = -_signed_distances(field, grid, level), -level, "The signed distance"
         outside = float(volume.min()) - grid.step
     else:
         level = default_level(bounds) if level is None else level
@@ -131,7 +131,7 @@ def _densities(field: Field, grid: VoxelGrid) -> Float[Tensor, "x y z"]:
     return torch.cat(parts).view(grid.shape)
 
 
-def _distances(field: Field, grid: VoxelGrid, level: float) -> Float[Tensor, "x y z"]:
+def _signed_distances(field: Field, grid: VoxelGrid, level: float) -> Float[Tensor, "x y z"]:
     """Signed distance at the voxel centres; in blocks that the level cannot cross, that of the block's centre."""
     counts = [math.ceil(count / BLOCK) for count in grid.shape]
     middle = grid.origin + grid.step * (BLOCK - 1) / 2

@@ -111,7 +111,7 @@ class Hybrid(RayRenderer):
         self.volumetric.update(self.density(field, ctx, on_rays=False), ctx)
 
 
-class WeightPruned(Sampler):
+class WeightThresholdSampler(Sampler):
     """Another sampler's samples, in training without those of negligible weight by the densities that it found on the way.
 
     Few samples of a sharp surface weigh anything, and those that do not have no gradient worth its price either: the
@@ -140,21 +140,21 @@ class WeightPruned(Sampler):
             return samples, levels
         with torch.no_grad():
             weights = sample_weights(samples.density, samples, len(rays))
-            seen = torch.nonzero((weights > self.threshold) | heaviest_of_rays(weights, samples.ray, len(rays)))[:, 0]
-        return samples[seen], levels
+            kept = torch.nonzero((weights > self.threshold) | heaviest_of_rays(weights, samples.ray, len(rays)))[:, 0]
+        return samples[kept], levels
 
     @override
     def update(self, field: Field, ctx: Context) -> None:
         self.sampler.update(field, ctx)
 
     @override
-    def untrained(self) -> WeightPruned:
-        return WeightPruned(self.sampler.untrained(), self.threshold)
+    def untrained(self) -> WeightThresholdSampler:
+        return WeightThresholdSampler(self.sampler.untrained(), self.threshold)
 
 
 def make_volumetric(sampler: Sampler, gradient_reach: float, weight_threshold: float) -> Volumetric:
     """Volume renderer with a sampler whose samples weigh more than ``weight_threshold`` in training."""
-    return Volumetric(WeightPruned(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
+    return Volumetric(WeightThresholdSampler(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
 
 
 def check_settings(first: float, last: float, gradient_reach: float, weight_threshold: float) -> None:
