@@ -75,7 +75,7 @@ def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
     for _ in range(-(-most // RAYS)):
         camera = scene.train[int(torch.randint(len(scene.train), ()))].camera
         flat = torch.randint(camera.width * camera.height, (RAYS,))
-        yield camera.rays(torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5)
+        yield camera.rays(camera.pixel_centres_of(flat))
 
 
 def _sample_surface_points(field: Field, rays: Rays, bounds: Bounds) -> Points:

@@ -15,7 +15,7 @@ FEW = 2.0
 """Views that must see a texel for their agreement to count in full."""
 
 
-def weights_to_alphas(weights: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
+def layer_alphas_from_weights(weights: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
     """Opacities, nearest plane first, with which compositing gives each plane the weight ``weights`` (their sum at most 1)."""
     before = weights.cumsum(dim=0) - weights
     return (weights / (1 - before).clamp_min(1e-6)).clamp(0, 1)
@@ -61,7 +61,7 @@ def plane_sweep(
     variance = (total[:, 4] / n - mean.square().mean(dim=1)).clamp_min(0)
     disagreement = variance.sqrt() / agreement + (FEW - seen).clamp_min(0)
     weights = torch.softmax(-disagreement, dim=0) * (total[:, 3] / n)
-    return colour.clamp(0, 1), weights_to_alphas(weights)
+    return colour.clamp(0, 1), layer_alphas_from_weights(weights)
 
 
 def premultiplied(view: View) -> Float[Tensor, "4 h w"]:

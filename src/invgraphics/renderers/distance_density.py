@@ -157,9 +157,8 @@ class LaplaceDensity(DistanceDensity):
             return laplace_density(values.sdf, self.beta)
         delta = samples.delta
         extended = delta > 0
-        mean = laplace_optical_depth(values.sdf, self.slope(values, samples), delta, self.beta) / torch.where(
-            extended, delta, 1.0
-        )
+        optical_depth = laplace_optical_depth(values.sdf, self.slope(values, samples), delta, self.beta)
+        mean = optical_depth / torch.where(extended, delta, 1.0)
         return torch.where(extended, mean, laplace_density(values.sdf, self.beta))
 
 

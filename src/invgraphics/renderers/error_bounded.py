@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.compositing import optical_depth_before, weights_from_optical_depth
 from invgraphics.core.spacing import from_spacing
 from invgraphics.errors import NotComposableError
 from invgraphics.renderers.distance_density import DistanceDensity, laplace_density
@@ -26,7 +27,7 @@ from invgraphics.renderers.samplers import (
     uniform,
     unit_ball_exit,
 )
-from invgraphics.renderers.up_sampling import MAX_ROUNDS, interval_weights, optical_depth_before, signed_distances
+from invgraphics.renderers.up_sampling import MAX_ROUNDS, signed_distances
 
 LARGEST_ERROR = 1e6
 """Error bounds are clamped here: larger ones would overflow, and mean no more than "unbounded"."""
@@ -104,7 +105,7 @@ class ErrorBoundedSampler(Sampler):
         edges = from_spacing(spacing, ctx.bounds, transition)
         with torch.no_grad():
             edges, sdf, beta = self._refined(edges, field, rays, hit, ctx)
-            weights = interval_weights(laplace_density(sdf[:, :-1], beta) * edges.diff(dim=1))
+            weights = weights_from_optical_depth(laplace_density(sdf[:, :-1], beta) * edges.diff(dim=1))
             drawn = sample_pdf(edges, weights + PADDING, quantiles(len(edges), self.config.fine, ctx, like=edges))
             merged = torch.cat([edges[:, :1], drawn, self._extra(edges, ctx), edges[:, -1:]], dim=1).sort(dim=1).values
         level = Trace(pack_intervals(rays, hit, edges), None, weights.flatten(), rays=len(rays))

@@ -68,7 +68,7 @@ class SplattingConfig:
         if self.tile is not None and self.tile < 1:
             raise ValueError(f"tile must be at least 1, not {self.tile}")
         if self.shape == "disc" and (self.antialiased or self.absolute_gradients):
-            raise ValueError("discs know neither 'antialiased' nor 'absolute_gradients'")
+            raise ValueError("'antialiased' and 'absolute_gradients' are not supported for discs")
 
     def build(self, scene: Scene) -> Splatting:
         """The renderer; it needs nothing from the scene."""

@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 from typing_extensions import override
 
 from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.compositing import weights_from_optical_depth
 from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.renderers.distance_density import section_optical_depth
 from invgraphics.renderers.samplers import (
@@ -120,14 +121,4 @@ def section_weights(
     slope = sdf.diff(dim=1) / delta.clamp_min(torch.finfo(delta.dtype).tiny)
     slope = torch.minimum(slope, pad(slope[:, :-1], (1, 0))).clamp(-1, 0)
     optical_depth = section_optical_depth((sdf[:, 1:] + sdf[:, :-1]) / 2, slope, delta, sharpness)
-    return interval_weights(optical_depth)
-
-
-def optical_depth_before(optical_depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
-    """Optical depth before each of a ray's consecutive intervals."""
-    return pad(optical_depth[:, :-1].cumsum(dim=1), (1, 0))
-
-
-def interval_weights(optical_depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
-    """Weights of a ray's consecutive intervals from their optical depths (NeRF, equation 3)."""
-    return torch.exp(-optical_depth_before(optical_depth)) * -torch.expm1(-optical_depth)
+    return weights_from_optical_depth(optical_depth)
