@@ -21,9 +21,9 @@ SAMPLES = 512
 NEAREST = 1e-6
 """Share of a ray's length at which its first interval begins at the earliest, where intervals grow with distance."""
 RAYS = 512
-"""Rays that are looked along at once."""
+"""Rays that are sampled at once."""
 MAX_RAYS_PER_POINT = 64
-"""Rays tried per wanted point before a field counts as empty enough."""
+"""Rays tried per wanted point before a field counts as nearly empty."""
 
 
 @torch.no_grad()

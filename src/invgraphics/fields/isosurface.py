@@ -25,7 +25,7 @@ BLOCK = 4
 LIPSCHITZ = 2.0
 """Bound on the gradient of a fitted distance: blocks with centres farther away than this times their radius are uniform."""
 CHUNK = 1 << 16
-"""Points that are handed to the field at once."""
+"""Points at which the field is queried at once."""
 REMEDY = "Fit it for longer."
 """What to do about a volume without the level; callers with a level of their own to choose say so."""
 

@@ -1,4 +1,4 @@
-"""Plane sweep over training views: the colours that they show at each texel, and how far they agree (Collins 1996)."""
+"""Plane sweep over training views: the colours that they show at each texel, and how well they agree (Collins 1996)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from invgraphics.core import Camera, Scene, View
 from invgraphics.core.planes import homographies, warp
 
 WHOLE = 0.999
-"""Share of the pixels around a texel's image that must count (`View.mask`) for it to be seen."""
+"""Share of the pixels around a texel's image that must be valid (`View.mask`) for it to be seen."""
 FEW = 2.0
 """Views that must see a texel for their agreement to count in full."""
 
@@ -34,8 +34,8 @@ def plane_sweep(
         scene: its training views, in its colour space.
         camera: reference camera, as wide as the planes.
         depths: of the planes.
-        views: most views that are looked at, evenly spaced among the training views.
-        agreement: standard deviation that is as likely 1/e as none.
+        views: most views that are used, evenly spaced among the training views.
+        agreement: standard deviation at which a plane is 1/e as likely as at none.
     """
     count = min(views, len(scene.train))
     chosen = [scene.train[index * len(scene.train) // count] for index in range(count)]

@@ -36,8 +36,8 @@ class ProposalsConfig:
         dilation_bias: the same as a share of the ray.
         blurred: whether weights are widened by mip-NeRF's filter (equation 18) instead.
         padding: added to every weight before it is drawn from (mip-NeRF: 0.01).
-        anneal: slope s of the exponent s p / ((s - 1) p + 1) of weights at a progress p of the fit, which holds samples apart
-            while proposals know little; 0 for none.
+        anneal: slope s of the exponent s p / ((s - 1) p + 1) of weights at a progress p of the fit, which keeps samples
+            spread out while proposals are untrained; 0 for none.
         jitter_per_ray: whether all samples of a ray are moved together in training, and not one by one.
     """
 

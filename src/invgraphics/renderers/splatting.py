@@ -45,7 +45,7 @@ class SplattingConfig:
             half of the light is gone. For evaluation: gradients pass through the expected one only.
         normals: ``shortest`` averages the splats' shortest axes; ``depth`` takes the slope of the depth map.
         absolute_gradients: whether density control sees the sum of absolute gradients over pixels (AbsGS), in which opposite
-            pulls do not cancel.
+            gradients do not cancel.
         max_grad_splats: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
             limited bandwidth uses 10).
         tile: edge of a tile in pixels (Numba takes 32 at most); ``None`` leaves it to the kernel.
