@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from invgraphics.core import Bounds, Rays
-from invgraphics.core.bounds import FAR, Space, contract, contract_jacobian, uncontract
+from invgraphics.core.bounds import CONTRACTED_FAR, Space, contract, contract_jacobian, uncontract
 
 F64 = torch.float64
 
@@ -93,7 +93,7 @@ def test_contracted_rays_end_far_away() -> None:
     region = bounds("contracted", near=0.3)
     clipped = region.clip(Rays.make(torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0, 1.0]], dtype=F64)))
     assert float(clipped.near) == 0.3
-    assert float(clipped.far) == FAR * 2.0
+    assert float(clipped.far) == CONTRACTED_FAR * 2.0
 
 
 @pytest.mark.parametrize("space", ["box", "contracted"])

@@ -41,6 +41,8 @@ def test_the_pixel_of_a_point_is_the_one_whose_ray_meets_it() -> None:
     inside, pixel = view.pixel_of(torch.cat([points, 2 * view.position - points]))
     assert inside.tolist() == [True] * 192 + [False] * 192
     assert pixel.tolist() == [*range(192), *[0] * 192]
+    centres = view.pixel_centres_of(torch.arange(192))
+    assert centres[[0, 15, 16, 191]].tolist() == [[0.5, 0.5], [15.5, 0.5], [0.5, 1.5], [15.5, 11.5]]
     beside = [[e, 6.5] for e in (0.01, -0.01, 15.99, 16.01)] + [[8.5, e] for e in (0.01, -0.01, 11.99, 12.01)]
     edges = torch.tensor(beside)
     inside, pixel = view.pixel_of(view.rays(edges.double()).at(torch.ones(8, dtype=F64)))

@@ -6,8 +6,8 @@ import torch
 
 from invgraphics.core import Bounds, Camera, Context, Gaussians
 from invgraphics.core.transforms import look_at
+from invgraphics.fields.gaussian import FixedGaussians
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
-from invgraphics.tools.export import FixedGaussians
 
 BOUNDS = Bounds(-torch.ones(3), torch.ones(3))
 

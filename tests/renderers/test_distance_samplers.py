@@ -104,5 +104,5 @@ def test_they_ask_for_a_distance_and_say_so() -> None:
     expected = 1 - torch.exp(-ball.optical_depth(scene.bounds.clip(rays)))
     torch.testing.assert_close(rendering.alpha, expected, rtol=0, atol=0.02)
     bounded = VolumetricConfig(ErrorBoundedConfig(16, 8, 4)).build(scene)
-    with pytest.raises(NotComposableError, match="made from a distance, not that of Sphere"):
+    with pytest.raises(NotComposableError, match="derived from a signed distance, not that of Sphere"):
         bounded.render_rays(ball, rays, ctx)

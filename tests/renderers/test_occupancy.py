@@ -12,7 +12,7 @@ from torch import Tensor
 from invgraphics.core import Context, Field, Quantity, Samples, Scene
 from invgraphics.fields.analytic import GaussianBlob, Sphere
 from invgraphics.recipes.recipe import load_method
-from invgraphics.renderers.occupancy import Occupancy, OccupancyConfig
+from invgraphics.renderers.occupancy import OccupancyConfig, OccupancyGridSampler
 from invgraphics.renderers.volumetric import Volumetric
 
 SMALL = OccupancyConfig(resolution=16, steps_per_diagonal=256, warmup=32, every=4, cells=512)
@@ -22,7 +22,7 @@ def context(scene: Scene, training: bool = True) -> Context:
     return Context(scene.bounds, training=training, generator=torch.Generator().manual_seed(1))
 
 
-def learnt(config: OccupancyConfig, scene: Scene, field: Field, updates: int = 33) -> Occupancy:
+def learnt(config: OccupancyConfig, scene: Scene, field: Field, updates: int = 33) -> OccupancyGridSampler:
     sampler, ctx = config.build(scene), context(scene)
     for _ in range(updates):
         sampler.update(field, ctx)

@@ -12,7 +12,7 @@ from invgraphics.fields.encodings.frequency import FrequencyConfig
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
 from invgraphics.renderers.occupancy import OccupancyConfig
-from invgraphics.renderers.volumetric import UNSEEN, Volumetric
+from invgraphics.renderers.volumetric import MAX_SKIPPED_WEIGHT, Volumetric
 
 GRID = HashConfig(levels=4, log2_size=10, base=4, finest=64)
 FIELD = NeuralFieldConfig(
@@ -60,7 +60,7 @@ def test_picture_is_the_composed_one(setting, calls, monkeypatch, direction: str
     assert 0.1 < float(theirs.alpha.mean()) < 0.95
     torch.testing.assert_close(ours.alpha, theirs.alpha, rtol=0, atol=2e-4)
     # Both leave out colours, not the same ones.
-    torch.testing.assert_close(ours.rgb, theirs.rgb, rtol=0, atol=UNSEEN + 2e-4)
+    torch.testing.assert_close(ours.rgb, theirs.rgb, rtol=0, atol=MAX_SKIPPED_WEIGHT + 2e-4)
     clear = (theirs.alpha - 0.5).abs() > 1e-3
     torch.testing.assert_close(ours.depth[clear], theirs.depth[clear], rtol=1e-3, atol=1e-3)
 

@@ -16,7 +16,7 @@ from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
 from invgraphics.renderers.occupancy import OccupancyConfig
-from invgraphics.renderers.volumetric import UNSEEN, Volumetric
+from invgraphics.renderers.volumetric import MAX_SKIPPED_WEIGHT, Volumetric
 
 SAMPLER = OccupancyConfig(resolution=8, steps_per_diagonal=256, transmittance=1e-4)
 NO_NETWORK = {"layers": 0, "skip": -1, "geometry_features": 0, "geometry_head": "none"}
@@ -91,7 +91,9 @@ def test_a_picture_is_the_composed_one(scene, renderer, monkeypatch, name: str, 
     assert float(theirs.rgb.std()) > 0.02
     torch.testing.assert_close(ours.alpha, theirs.alpha, rtol=0, atol=2e-4)
     # Both leave out colours, not the same ones; colours without an upper bound have a factor to go with them.
-    torch.testing.assert_close(ours.rgb, theirs.rgb, rtol=0, atol=(UNSEEN + 2e-4) * max(1.0, float(theirs.rgb.max())))
+    torch.testing.assert_close(
+        ours.rgb, theirs.rgb, rtol=0, atol=(MAX_SKIPPED_WEIGHT + 2e-4) * max(1.0, float(theirs.rgb.max()))
+    )
 
 
 @pytest.mark.parametrize(("name", "cropped"), [("vm", False), ("voxels", False), ("dvgo", True), ("plenoxels", False)])

@@ -14,7 +14,7 @@ from invgraphics.core import Camera, Context, Field, Planes, Quantity, Samples, 
 from invgraphics.core.planes import homographies, inverse_depths, mean_camera, widened, widest_angle
 from invgraphics.core.transforms import look_at, transform_points
 from invgraphics.errors import InputError
-from invgraphics.fields.plane_sweep import plane_sweep, weights_to_alphas
+from invgraphics.fields.plane_sweep import layer_alphas_from_weights, plane_sweep
 from invgraphics.fields.planes import PlaneField, PlanesConfig
 from invgraphics.renderers.planes import PlaneRenderer
 from invgraphics.testing import check_field, check_renderer, toy_cameras, toy_scene
@@ -148,9 +148,9 @@ def test_view_dependence_is_the_basis_at_the_viewing_direction(scene: Scene) -> 
 
 def test_weights_and_alphas_are_inverses() -> None:
     weights = torch.softmax(torch.randn(5, 3, 4), dim=0)
-    light = torch.cumprod(1 - weights_to_alphas(weights), dim=0).roll(1, 0)
+    light = torch.cumprod(1 - layer_alphas_from_weights(weights), dim=0).roll(1, 0)
     light[0] = 1
-    torch.testing.assert_close(light * weights_to_alphas(weights), weights, atol=1e-5, rtol=0)
+    torch.testing.assert_close(light * layer_alphas_from_weights(weights), weights, atol=1e-5, rtol=0)
 
 
 def test_a_sweep_finds_a_textured_plane(scene: Scene) -> None:

@@ -13,7 +13,7 @@ from invgraphics.core import Batch, Context, Rays, Rendering, Samples, Scene, Tr
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.analytic import Sphere
 from invgraphics.renderers.histograms import blur, dilate, resample
-from invgraphics.renderers.proposals import Proposals, ProposalsConfig
+from invgraphics.renderers.proposals import ProposalSampler, ProposalsConfig
 from invgraphics.renderers.volumetric import Volumetric
 from invgraphics.training.interlevel import InterlevelLoss, outer_measure
 
@@ -85,7 +85,7 @@ def rays_of(scene: Scene) -> Rays:
 def test_samples_gather_where_the_proposals_have_weight(make_scene: Callable[..., Scene], space: str) -> None:
     scene, proposal = make_scene(space), Sphere(40.0, 0.3)
     config = ProposalsConfig(counts=(32, 32), count=16, dilation=0.0, dilation_bias=0.0)
-    sampler = Proposals(replace(config, fields=(None, None)), [proposal, proposal])
+    sampler = ProposalSampler(replace(config, fields=(None, None)), [proposal, proposal])
     rays = scene.bounds.clip(scene.train[0].camera.rays())
     closest = rays.origins - (rays.origins * rays.directions).sum(dim=1, keepdim=True) * rays.directions
     hit = torch.nonzero(closest.norm(dim=1) < 0.2)[:, 0]
@@ -115,7 +115,7 @@ def test_samples_reach_as_far_beyond_a_thin_thing_as_weights_are_widened(
     plain = ProposalsConfig(counts=(32,), count=64, fields=(None,), dilation=0.0, dilation_bias=0.0, padding=1e-9)
 
     def reach(config: ProposalsConfig) -> float:
-        samples, _ = Proposals(config, [proposal]).sample(rays, NOTHING, context(scene))
+        samples, _ = ProposalSampler(config, [proposal]).sample(rays, NOTHING, context(scene))
         return float((samples.position.norm(dim=1) / length).max())
 
     # Either setting widens by a tenth of the ray: 3.2 over the 32 intervals.
@@ -127,7 +127,7 @@ def test_samples_reach_as_far_beyond_a_thin_thing_as_weights_are_widened(
 
 def test_proposals_learn_from_the_loss_alone_and_nothing_else_does(make_scene: Callable[..., Scene]) -> None:
     scene, proposal, ball = make_scene(), Sphere(0.2, 0.8), Sphere(9.0, 0.5, colour=(0.2, 0.5, 0.7))
-    sampler = Proposals(ProposalsConfig(counts=(16,), count=12, fields=(None,)), [proposal])
+    sampler = ProposalSampler(ProposalsConfig(counts=(16,), count=12, fields=(None,)), [proposal])
     rays = rays_of(scene)
     rays = replace(rays, origins=rays.origins.requires_grad_())
     rendering, trace = Volumetric(sampler).render_rays(ball, rays, context(scene, True))
@@ -144,14 +144,14 @@ def test_levels_of_the_rendered_field_are_hidden_unless_they_are_trained(make_sc
     scene, ball = make_scene(), Sphere(5.0, 0.8, colour=(0.2, 0.5, 0.7))
     shy = ProposalsConfig(counts=(8,), count=8)
     rays = rays_of(scene)
-    assert Proposals(shy, []).sample(rays, ball, context(scene, True))[1] == ()
-    (level,) = Proposals(replace(shy, train_levels=True), []).sample(rays, ball, context(scene, True))[1]
+    assert ProposalSampler(shy, []).sample(rays, ball, context(scene, True))[1] == ()
+    (level,) = ProposalSampler(replace(shy, train_levels=True), []).sample(rays, ball, context(scene, True))[1]
     assert level.values is not None
     assert level.values.radiance is not None
     assert level.weights is not None
     assert level.weights.requires_grad
-    taught = Proposals(replace(shy, fields=(None,)), [Sphere(1.0, 0.1)])
-    found, expected = (each.sample(rays, ball, context(scene))[0] for each in (taught.untrained(), Proposals(shy, [])))
+    taught = ProposalSampler(replace(shy, fields=(None,)), [Sphere(1.0, 0.1)])
+    found, expected = (each.sample(rays, ball, context(scene))[0] for each in (taught.untrained(), ProposalSampler(shy, [])))
     assert torch.equal(found.t0, expected.t0)
 
 
@@ -219,7 +219,7 @@ def test_refusals() -> None:
         with pytest.raises(InputError, match=words):
             fill(ProposalsConfig, bad)
     with pytest.raises(NotComposableError, match="needs density"):
-        Proposals(ProposalsConfig(counts=(8,), fields=(None,)), [_blind()])
+        ProposalSampler(ProposalsConfig(counts=(8,), fields=(None,)), [_blind()])
 
 
 def _blind() -> Sphere:

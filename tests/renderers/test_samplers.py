@@ -10,7 +10,14 @@ from made_up_fields import NOTHING
 from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Quantity, Rays, Samples, Scene
 from invgraphics.errors import NotComposableError
 from invgraphics.fields.analytic import Sphere
-from invgraphics.renderers.samplers import Hierarchical, HierarchicalConfig, StratifiedConfig, from_spacing, invert, to_spacing
+from invgraphics.renderers.samplers import (
+    HierarchicalConfig,
+    HierarchicalSampler,
+    StratifiedConfig,
+    from_spacing,
+    sample_pdf,
+    to_spacing,
+)
 
 
 def context(scene: Scene, training: bool = False) -> Context:
@@ -75,7 +82,7 @@ def test_contracted_spacing_is_linear_then_disparity(make_scene: Callable[..., S
 def test_inverting_a_histogram_equals_numpy() -> None:
     edges = torch.cumsum(torch.rand(5, 9) + 0.1, dim=1).double()
     mass, u = torch.rand(5, 8).double() + 1e-5, torch.rand(5, 30).double()
-    got = invert(edges, mass, u)
+    got = sample_pdf(edges, mass, u)
     for row in range(5):
         cumulative = np.concatenate([[0], np.cumsum(mass[row].numpy())]) / mass[row].sum().item()
         np.testing.assert_allclose(got[row].numpy(), np.interp(u[row].numpy(), cumulative, edges[row].numpy()))
@@ -107,7 +114,7 @@ class Dark(Field):
 def test_own_proposal_leaves_a_trainable_level(make_scene: Callable[..., Scene]) -> None:
     scene, ball = make_scene(), Sphere(5.0, 0.8, colour=(0.2, 0.5, 0.7))
     rays = clipped(scene)
-    samples, levels = Hierarchical(HierarchicalConfig(16, 16), ball).sample(rays, NOTHING, context(scene))
+    samples, levels = HierarchicalSampler(HierarchicalConfig(16, 16), ball).sample(rays, NOTHING, context(scene))
     (level,) = levels
     assert level.rays == len(rays)
     assert level.weights is not None
@@ -123,7 +130,7 @@ def test_own_proposal_leaves_a_trainable_level(make_scene: Callable[..., Scene])
 
 def test_the_density_itself_stands_in_for_a_proposal(make_scene: Callable[..., Scene]) -> None:
     scene, ball = make_scene(), Sphere(5.0, 0.8)
-    taught = Hierarchical(HierarchicalConfig(16, 16), Sphere(1.0, 0.1))
+    taught = HierarchicalSampler(HierarchicalConfig(16, 16), Sphere(1.0, 0.1))
     plain = HierarchicalConfig(16, 16).build(scene)
     rays = clipped(scene)
     found, expected = (each.sample(rays, ball, context(scene))[0] for each in (taught.untrained(), plain))
@@ -137,4 +144,4 @@ def test_refusals() -> None:
     with pytest.raises(ValueError, match="coarse must be from 1"):
         HierarchicalConfig(coarse=0)
     with pytest.raises(NotComposableError, match="needs density, which Dark"):
-        Hierarchical(HierarchicalConfig(), Dark())
+        HierarchicalSampler(HierarchicalConfig(), Dark())

@@ -14,7 +14,7 @@ from invgraphics.kernels.types import March
 from invgraphics.renderers.occupancy import OccupancyConfig
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.termination import Query, contributing_samples, visible_samples
-from invgraphics.renderers.volumetric import UNSEEN, Volumetric
+from invgraphics.renderers.volumetric import MAX_SKIPPED_WEIGHT, Volumetric
 
 STOPPING = OccupancyConfig(resolution=8, steps_per_diagonal=128, stop="evaluation")
 
@@ -96,7 +96,7 @@ def test_colours_are_asked_of_few_and_the_picture_stays(make_scene: Callable[...
     colours = sum(count for count, want in asked if Quantity.RADIANCE in want)
     assert 0 < colours < 0.3 * len(trace.samples)
     assert all(want == Quantity.DENSITY or Quantity.DENSITY not in want for _, want in asked)
-    bound = UNSEEN + STOPPING.transmittance
+    bound = MAX_SKIPPED_WEIGHT + STOPPING.transmittance
     assert float((quick.rgb - whole.rgb).abs().max()) <= bound
     assert float((quick.alpha - whole.alpha).abs().max()) <= STOPPING.transmittance + 1e-5
     both = (quick.alpha > 0.6) & (whole.alpha > 0.6)
@@ -125,7 +125,7 @@ def test_normals_are_asked_of_few_and_the_picture_stays(make_scene: Callable[...
         quick, _ = renderer.render_rays(field, rays, ctx)
     assert trace.samples is not None
     assert 0 < sum(count for count, want in asked if Quantity.NORMAL in want) < 0.3 * len(trace.samples)
-    assert float((quick.rgb - whole.rgb).detach().abs().max()) <= UNSEEN
+    assert float((quick.rgb - whole.rgb).detach().abs().max()) <= MAX_SKIPPED_WEIGHT
     assert whole.normal is not None
     assert quick.normal is not None
     clear = whole.alpha > 0.6
@@ -157,7 +157,7 @@ def test_a_picture_does_not_depend_on_how_it_is_cut(make_scene: Callable[..., Sc
         parts, _ = renderer.render_image(field, camera, Context(scene.bounds, chunk=128))
     assert sum(sizes) == camera.width * camera.height
     assert len(sizes) > 1
-    torch.testing.assert_close(parts.rgb.reshape(-1, 3), whole.rgb, atol=2 * UNSEEN, rtol=0)
+    torch.testing.assert_close(parts.rgb.reshape(-1, 3), whole.rgb, atol=2 * MAX_SKIPPED_WEIGHT, rtol=0)
 
 
 def test_parts_grow_where_rays_take_few_samples(make_scene: Callable[..., Scene]) -> None:
@@ -208,7 +208,7 @@ def test_features_found_on_the_way_spare_the_second_look(make_scene: Callable[..
     assert trace.samples.features.shape == (len(trace.samples), 4)
     march = sum(asked)
     assert len(trace.samples) <= march < 2 * len(trace.samples)
-    assert float((quick.rgb - whole.rgb).abs().max()) <= UNSEEN + STOPPING.transmittance
+    assert float((quick.rgb - whole.rgb).abs().max()) <= MAX_SKIPPED_WEIGHT + STOPPING.transmittance
     again = field.query(trace.samples, Quantity.DENSITY | Quantity.FEATURES)
     torch.testing.assert_close(trace.samples.density, again.density)
     torch.testing.assert_close(trace.samples.features, again.features)

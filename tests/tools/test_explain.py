@@ -18,9 +18,9 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.fields.analytic import Sphere
 from invgraphics.renderers.gaussians.volume import GaussianExact, GaussianExactConfig, GaussianSorted, GaussianSortedConfig
-from invgraphics.renderers.samplers import Hierarchical, HierarchicalConfig, Stratified, StratifiedConfig
+from invgraphics.renderers.samplers import HierarchicalConfig, HierarchicalSampler, StratifiedConfig, StratifiedSampler
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
-from invgraphics.renderers.volumetric import UNSEEN, Volumetric
+from invgraphics.renderers.volumetric import MAX_SKIPPED_WEIGHT, Volumetric
 from invgraphics.studies.approximations import field_of, isotropic_gaussians
 from invgraphics.tools.explain import ExplainRequest, explain
 
@@ -62,7 +62,7 @@ def test_what_is_listed_adds_up_to_the_rendered_pixel(runs: dict[str, Path], tmp
         rendered = explained.rendered.numpy()
         assert np.abs(shown / 255 - rendered.clip(0, 1)).max() <= 0.5 / 255 + 2e-5
         # The hash grid's kernel may leave out colours of samples whose weights sum to no more than this; others leave out none.
-        assert rendered == pytest.approx(total, abs=UNSEEN if method == "volumetric/hash" else 2e-5)
+        assert rendered == pytest.approx(total, abs=MAX_SKIPPED_WEIGHT if method == "volumetric/hash" else 2e-5)
         if method != "gaussian-volume/exact":  # whose Gaussians share what they overlap in
             assert table["weight"] == pytest.approx(table["transmittance"] * table["alpha"], abs=2e-6)
             left = np.cumprod(1 - table["alpha"])
@@ -131,7 +131,9 @@ def test_a_ball_of_fog_in_closed_form(sampler: str) -> None:
     """Density 3 over a chord of length 1 from distance 1.5: T = exp(-3 (t - 1.5)) inside."""
     ball = Sphere(density=3.0, radius=0.5, centre=(0.0, 0.0, 2.0), colour=(0.2, 0.6, 0.4))
     chosen = (
-        Stratified(StratifiedConfig(400)) if sampler == "stratified" else Hierarchical(HierarchicalConfig(coarse=200, fine=200))
+        StratifiedSampler(StratifiedConfig(400))
+        if sampler == "stratified"
+        else HierarchicalSampler(HierarchicalConfig(coarse=200, fine=200))
     )
     bounds = Bounds(-3 * torch.ones(3), 3 * torch.ones(3))
     found = Volumetric(chosen).contributions(ball, HEAD_ON, (10, 10), Context(bounds))
@@ -189,7 +191,7 @@ def test_a_ray_that_meets_nothing(tmp_path: Path) -> None:
         assert (len(found), found.opacity, found.expected_depth, found.median_depth) == (0, 0, math.inf, math.inf)
         assert found.colour.tolist() == [0, 0, 0]
     away = Bounds(torch.tensor([5.0, 5, 5]), torch.tensor([6.0, 6, 6]))
-    found = Volumetric(Stratified(StratifiedConfig(4))).contributions(Sphere(1.0, 0.5), HEAD_ON, (10, 10), Context(away))
+    found = Volumetric(StratifiedSampler(StratifiedConfig(4))).contributions(Sphere(1.0, 0.5), HEAD_ON, (10, 10), Context(away))
     assert len(found) == 0
     assert found.profile is None
 

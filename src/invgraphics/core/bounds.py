@@ -14,7 +14,7 @@ from invgraphics.core.rays import Rays
 
 Space = Literal["box", "contracted"]
 
-FAR = 1e3
+CONTRACTED_FAR = 1e3
 """Where contracted rays end, in half-extents of the inner box: the remaining shell is 1/1000 of the contracted radius."""
 
 
@@ -103,8 +103,9 @@ class Bounds:
         return x & y & z
 
     def clip(self, rays: Rays) -> Rays:
-        """Give rays their sampling interval: the box's entry and exit, or [near, FAR half-extents] when contracted; less what
-        is outside ``crop``.
+        """Clip rays to the region, and to ``crop``.
+
+        The region is the box; in contracted space, distances from ``near`` to `CONTRACTED_FAR` half-extents.
 
         A ray that misses the box gets ``far = near``.
         """
@@ -113,7 +114,7 @@ class Bounds:
 
     def _clip_to_field(self, rays: Rays) -> Rays:
         if self.space == "contracted":
-            far = FAR * float(self.half.max())
+            far = CONTRACTED_FAR * float(self.half.max())
             return rays.within(rays.near.clamp_min(self.near), rays.far.clamp_max(far))
         return _clip_to_box(rays.within(rays.near.clamp_min(self.near), rays.far), self.lo, self.hi)
 
@@ -156,6 +157,6 @@ def contract_jacobian(x: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3 3"]:
 
 def uncontract(y: Float[Tensor, "*m 3"]) -> Float[Tensor, "*m 3"]:
     """Inverse of `contract`, with radii clamped below 2."""
-    norm = y.norm(dim=-1, keepdim=True).clamp(1.0, 2 - 1 / FAR)
+    norm = y.norm(dim=-1, keepdim=True).clamp(1.0, 2 - 1 / CONTRACTED_FAR)
     unit = y / y.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     return torch.where(y.norm(dim=-1, keepdim=True) > 1, unit / (2 - norm), y)

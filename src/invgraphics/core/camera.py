@@ -49,6 +49,10 @@ class Camera:
         y, x = torch.meshgrid(torch.arange(self.height, **like) + 0.5, torch.arange(self.width, **like) + 0.5, indexing="ij")
         return torch.stack([x, y], dim=-1)
 
+    def pixel_centres_of(self, flat: Int[Tensor, " n"]) -> Float[Tensor, "n 2"]:
+        """Image coordinates (x, y) of the centres of the pixels with these flat indices, row by row; see `pixel_of`."""
+        return torch.stack([flat % self.width, flat // self.width], dim=1) + 0.5
+
     def rays(self, pixels: Float[Tensor, "n 2"] | None = None, view: int = -1) -> Rays:
         """Rays through image points.
 
@@ -57,7 +61,7 @@ class Camera:
             view: training-view index to record in the rays.
         """
         pixels = self.pixel_centres().reshape(-1, 2) if pixels is None else pixels
-        return _rays(pixels, self.cam_to_world, (self.focal, self.centre), view)
+        return _rays(pixels, self.cam_to_world, self.focal, self.centre, view)
 
     def ray(self, pixel: tuple[int, int]) -> Rays:
         """The one ray through the centre of ``pixel``: column and row, from 0."""
@@ -94,7 +98,7 @@ class Camera:
 
 
 def rays_through(cameras: Sequence[Camera], camera: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"], view: Tensor) -> Rays:
-    """Rays of several cameras at once, which costs less than asking each.
+    """Rays of several cameras at once, which is faster than camera by camera.
 
     Args:
         cameras: the cameras.
@@ -102,13 +106,13 @@ def rays_through(cameras: Sequence[Camera], camera: Int[Tensor, " n"], pixels: F
         pixels: image coordinates (x, y).
         view: training-view index to record for each ray.
     """
-    pose, *lens = (torch.stack([getattr(c, name) for c in cameras])[camera] for name in ("cam_to_world", "focal", "centre"))
-    return _rays(pixels, pose, (lens[0], lens[1]), view)
+    names = "cam_to_world", "focal", "centre"
+    pose, focal, centre = (torch.stack([getattr(c, name) for c in cameras])[camera] for name in names)
+    return _rays(pixels, pose, focal, centre, view)
 
 
-def _rays(pixels: Float[Tensor, "n 2"], pose: Tensor, lens: tuple[Tensor, Tensor], view: Tensor | int) -> Rays:
-    """Rays from poses (4, 4) or (n, 4, 4) and lenses: focal lengths and principal points, each (2,) or (n, 2)."""
-    focal, centre = lens
+def _rays(pixels: Float[Tensor, "n 2"], pose: Tensor, focal: Tensor, centre: Tensor, view: Tensor | int) -> Rays:
+    """Rays from poses (4, 4) or (n, 4, 4), focal lengths and principal points, each (2,) or (n, 2)."""
     plane = (pixels - centre) / focal
     in_camera = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
     length = in_camera.norm(dim=1, keepdim=True)

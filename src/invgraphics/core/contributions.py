@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from invgraphics.core.compositing import alphas_from_weights
 from invgraphics.core.field import Field, Quantity
 from invgraphics.core.rays import Rays
 from invgraphics.core.rendering import Context, Trace
@@ -18,8 +19,6 @@ from invgraphics.core.spacing import from_spacing, to_spacing
 
 POINTS = 512
 """Points of a profile."""
-MIN_TRANSMITTANCE = 1e-6
-"""Transmittance below which opacities cannot be told from weights: they are lost in rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +147,7 @@ def sampled_contributions(field: Field, trace: Trace, rays: Rays, ctx: Context) 
     assert weight is not None
     assert values is not None
     assert values.radiance is not None
-    alpha, reached = opacities(weight)
+    alpha, reached = alphas_from_weights(weight)
     rgb, counted = values.radiance, values.radiance.any(dim=1)
     if not bool(counted.all()) and Quantity.RADIANCE in field.provides:
         queried = field.query(samples, Quantity.RADIANCE).radiance
@@ -168,24 +167,16 @@ def sampled_contributions(field: Field, trace: Trace, rays: Rays, ctx: Context) 
         rgb=rgb,
         counted=counted,
         density=values.density,
-        profile=_profile(field, ctx.bounds.clip(rays), (ends, light), ctx),
+        profile=_profile(field, ctx.bounds.clip(rays), ends, light, ctx),
         passes=tuple(Pass(s.t0, s.t1, w) for s, w in levels if s is not None and w is not None),
     )
 
 
-def opacities(weight: Float[Tensor, " k"]) -> tuple[Float[Tensor, " k"], Float[Tensor, " k_plus_1"]]:
-    """Opacities of a ray's samples from their weights; and the transmittance before each and at the end."""
-    reached = 1 - torch.nn.functional.pad(weight.double().cumsum(0), (1, 0))
-    alpha = (weight / reached[:-1].clamp_min(MIN_TRANSMITTANCE)).clamp(0, 1)
-    return alpha.to(weight.dtype), reached.clamp(0, 1).to(weight.dtype)
-
-
-def _profile(field: Field, rays: Rays, light: tuple[Tensor, Tensor], ctx: Context) -> Profile | None:
-    """The field's own density from near to far, and what its samples (interval ends, transmittance there) let through."""
+def _profile(field: Field, rays: Rays, ends: Float[Tensor, " e"], reached: Float[Tensor, " e"], ctx: Context) -> Profile | None:
+    """Density of the field from near to far, and transmittance: ``reached`` at interval ``ends``, interpolated in between."""
     near, far = (to_spacing(limit, ctx.bounds) for limit in (rays.near, rays.far))
     if not bool(rays.far > rays.near):
         return None
-    ends, reached = light
     even = from_spacing(torch.lerp(near, far, torch.linspace(0, 1, POINTS).to(near)), ctx.bounds)
     t = torch.cat([even, ends]).sort().values
     density = None

@@ -1,4 +1,4 @@
-"""A field over lattices, as fields hand it to fused kernels: voxels, tri-planes and factors, with networks or without."""
+"""A field over lattices, as fields pass it to fused kernels: voxels, tri-planes and factors, with networks or without."""
 
 from __future__ import annotations
 
@@ -110,12 +110,12 @@ class FusedLattice:
 
     @property
     def handed(self) -> int:
-        """Number of features that geometry hands on to colour."""
+        """Number of geometry features: those that colour takes from geometry."""
         return (len(self.geometry_net[-1][1]) if self.geometry_net else self.geometry.width) - 1
 
     @property
     def own(self) -> int:
-        """Number of colour's features that come from appearance."""
+        """Number of appearance features: those that colour takes from appearance."""
         if self.appearance is None:
             return 0
         return len(self.basis[-1][1]) if self.basis else self.appearance.width

@@ -91,7 +91,7 @@ class Model:
             pixel: column and row, from 0.
 
         Raises:
-            NotComposableError: the renderer composites nothing along rays that could be listed.
+            NotComposableError: the renderer has no per-ray contributions to list.
         """
         found = self.renderer.contributions(self.field, self._like_model(camera), pixel, self.context())
         return found.to(camera.focal.device)

@@ -1,4 +1,4 @@
-"""A hash grid with two networks, as fields hand it to fused kernels (Instant-NGP, Müller et al. 2022)."""
+"""A hash grid with two networks, as fields pass it to fused kernels (Instant-NGP, Müller et al. 2022)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 MAX_LEVELS = 64
-"""Levels between 1 and 2^20 cells along an edge that are worth telling apart."""
+"""Most levels of a hash grid: between 1 and 2^20 cells along an edge, more would hardly differ."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class FusedNGP:
         table: features of all levels.
         grid: geometry of the levels.
         density_net: weight (outs, ins) and bias of each layer of a ReLU network from grid features to the raw density, followed
-            by the latent features for the colour network.
-        colour_net: weight and bias of each layer of a ReLU network from latent features and direction to raw RGB.
+            by the geometry features for the colour network.
+        colour_net: weight and bias of each layer of a ReLU network from geometry features and direction to raw RGB.
         density_activation: maps raw density + ``density_bias`` to density; ``exp`` is clamped at exp(15).
         density_bias: added to the raw density.
         sh_bands: bands of spherical harmonics that encode the direction, 0 to 4.

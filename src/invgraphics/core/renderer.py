@@ -39,7 +39,7 @@ class Sampler(_StatefulModule, ABC):
 
     @property
     def requires(self) -> Quantity:
-        """Quantities of the field that it asks for besides the density."""
+        """Quantities of the field needed in addition to density."""
         return Quantity.NONE
 
     @abstractmethod
@@ -80,12 +80,12 @@ class Renderer(_StatefulModule, ABC):
 
     @property
     def required(self) -> Quantity:
-        """What `requires` names, and what the parts of this renderer need besides (a sampler's `Sampler.requires`)."""
+        """Quantities of the field that this renderer (`requires`) and its parts (`Sampler.requires`) together need."""
         return self.requires
 
     @property
     def feature_width(self) -> int | None:
-        """Number of features that its networks take from the field; ``None`` where it takes none, or any number."""
+        """Number of features that its networks take from the field; ``None``: none, or any number."""
         return None
 
     @abstractmethod
@@ -105,19 +105,19 @@ class Renderer(_StatefulModule, ABC):
             ctx: of an evaluation, without randomness.
 
         Raises:
-            NotComposableError: this renderer composites nothing along rays that could be listed.
+            NotComposableError: this renderer has no per-ray contributions to list.
         """
-        raise NotComposableError(f"{type(self).__name__} composites nothing along rays that could be listed.")
+        raise NotComposableError(f"{type(self).__name__} has no per-ray contributions to list.")
 
     def for_depth_fusion(self) -> Renderer:
         """The variant of this renderer whose depth maps are fused to a mesh; itself, where there is no sharper one."""
         return self
 
 
-SAMPLES_EXPECTED = 16
-"""Samples per ray that a picture's first rays are counted with, to keep within `Context.chunk`."""
-MORE_RAYS = 16
-"""How many times as many rays a part may have where they take fewer samples than expected."""
+EXPECTED_SAMPLES_PER_RAY = 16
+"""Samples per ray assumed for a picture's first chunk of rays, to keep it within `Context.chunk` samples."""
+MAX_CHUNK_FACTOR = 16
+"""Largest chunk over the first one, for rays that take fewer samples than expected."""
 
 
 class RayRenderer(Renderer):
@@ -128,24 +128,27 @@ class RayRenderer(Renderer):
         """Render n rays; the rendering has shape (n,)."""
 
     def render_whole(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace] | None:
-        """Render a whole picture at once, where that is faster than in parts; ``None`` where it is not."""
+        """Render a whole picture at once where that is faster than in chunks of rays; ``None`` where it is not."""
         return None
 
     @final
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
-        """Render every pixel: by `render_whole`, else in parts, larger where rays take few samples (the last part's trace)."""
+        """Render every pixel: by `render_whole` where it returns a picture, else in chunks of rays.
+
+        The chunks' size adapts to the samples per ray. The trace is the last chunk's.
+        """
         whole = self.render_whole(field, camera, ctx)
         if whole is not None:
             return whole
         rays = camera.rays()
-        least = max(1, ctx.chunk // SAMPLES_EXPECTED)
+        least = max(1, ctx.chunk // EXPECTED_SAMPLES_PER_RAY)
         size = min(least, len(rays))
         rendering, trace = self.render_rays(field, rays[:size], ctx)
         parts, begin = [rendering], size
         while begin < len(rays):
             if trace.samples is not None:
                 fitting = size * ctx.chunk // max(len(trace.samples), 1)
-                size = min(max(fitting, least), 2 * size, MORE_RAYS * least)
+                size = min(max(fitting, least), 2 * size, MAX_CHUNK_FACTOR * least)
             rendering, trace = self.render_rays(field, rays[begin : begin + size], ctx)
             parts.append(rendering)
             begin += size

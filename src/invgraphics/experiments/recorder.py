@@ -69,7 +69,7 @@ class Monitor:
         if isinstance(field, Conditional) and subject is not None and subject in field.subjects:
             field = field.of_subject(subject)
         if isinstance(renderer, RayRenderer):
-            pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
+            pixels = camera.pixel_centres_of(flat)
             rays: Rays = camera.rays(pixels).to(self._device)
             return torch.cat([renderer.render_rays(field, part, ctx)[0].over(background) for part in rays.chunks(4096)])
         picture = renderer.render_image(field, camera.to(self._device), ctx)[0].over(background)

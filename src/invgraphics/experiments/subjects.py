@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from invgraphics.core import Conditional, Field, Model, Renderer, Scene, View
 from invgraphics.errors import InputError
-from invgraphics.renderers.occupancy import Occupancy
+from invgraphics.renderers.occupancy import OccupancyGridSampler
 from invgraphics.scenes.mitsuba.spec import class_names
 from invgraphics.training.codes.inference import CodeInference, infer_codes
 
@@ -34,7 +34,7 @@ def check_subjects(field: Field, renderer: Renderer, scene: Scene, method: str) 
             f"{method} learns a prior over a class of objects, and '{scene.name}' shows one subject.",
             f"Scenes of classes: {', '.join(class_names())}; or an .npz with the key 'subject'.",
         )
-    if conditional and any(isinstance(part, Occupancy) for part in renderer.modules()):
+    if conditional and any(isinstance(part, OccupancyGridSampler) for part in renderer.modules()):
         raise InputError(
             f"{method} shows many subjects, and an occupancy grid knows the empty space of one.",
             "Choose another sampler, such as renderer.sampler.type = 'stratified'.",

@@ -21,9 +21,9 @@ SAMPLES = 512
 NEAREST = 1e-6
 """Share of a ray's length at which its first interval begins at the earliest, where intervals grow with distance."""
 RAYS = 512
-"""Rays that are looked along at once."""
+"""Rays that are sampled at once."""
 MAX_RAYS_PER_POINT = 64
-"""Rays tried per wanted point before a field counts as empty enough."""
+"""Rays tried per wanted point before a field counts as nearly empty."""
 
 
 @torch.no_grad()
@@ -75,12 +75,12 @@ def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
     for _ in range(-(-most // RAYS)):
         camera = scene.train[int(torch.randint(len(scene.train), ()))].camera
         flat = torch.randint(camera.width * camera.height, (RAYS,))
-        yield camera.rays(torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5)
+        yield camera.rays(camera.pixel_centres_of(flat))
 
 
 def _sample_surface_points(field: Field, rays: Rays, bounds: Bounds) -> Points:
     """Sample at most one point per ray by its rendering weights; rays pass through with probability 1 - alpha."""
-    samples, weights = sample_weights(field, rays, bounds)
+    samples, weights = uniform_rendering_weights(field, rays, bounds)
     # Inverse of the cumulated weight; a draw beyond a ray's alpha goes through.
     cumulated = weights.cumsum(dim=1)
     draw = torch.rand(len(rays), 1).to(cumulated)
@@ -92,7 +92,7 @@ def _sample_surface_points(field: Field, rays: Rays, bounds: Bounds) -> Points:
     return Points(chosen.position + jitter * chosen.direction, radiance)
 
 
-def sample_weights(field: Field, rays: Rays, bounds: Bounds) -> tuple[Samples, Float[Tensor, "n samples"]]:
+def uniform_rendering_weights(field: Field, rays: Rays, bounds: Bounds) -> tuple[Samples, Float[Tensor, "n samples"]]:
     """Rendering weights of `SAMPLES` intervals along each ray, and the samples that they belong to, packed."""
     rays = bounds.clip(rays)
     edges = _edges(rays, bounds)

@@ -36,14 +36,14 @@ class DensityActivation:
     interpolation: Interpolation = "post"
 
     def at_vertices(self, raw: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-        """What is interpolated, of raw values at vertices."""
+        """Values to interpolate, from raw values at vertices."""
         if self.interpolation == "post":
             return raw
         density = self._activated(raw)
         return density if self.interpolation == "in" else -torch.expm1(-OPACITY_STEP * density)
 
     def at_points(self, interpolated: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-        """Densities, of values interpolated at points or said by a network."""
+        """Densities, from values interpolated at points or output by a network."""
         if self.interpolation == "post":
             return self._activated(interpolated)
         if self.interpolation == "in":

@@ -13,7 +13,7 @@ from torch import Tensor
 from invgraphics.core import Camera, Context, Field, FieldValues, Quantity, Rays, Samples, Scene, View
 from invgraphics.core.bounds import Bounds
 from invgraphics.errors import InputError, NotComposableError
-from invgraphics.fields.convert import require_density, sample_weights
+from invgraphics.fields.convert import require_density, uniform_rendering_weights
 
 MIN_ALPHA = 0.5
 """Opacity of a ray from which on a fitted field has a depth there (CONVENTIONS.md)."""
@@ -76,7 +76,7 @@ def field_depth(field: Field, camera: Camera, bounds: Bounds) -> Float[Tensor, "
 
 
 def _depth_along(field: Field, rays: Rays, bounds: Bounds) -> Float[Tensor, " n"]:
-    samples, weights = sample_weights(field, rays, bounds)
+    samples, weights = uniform_rendering_weights(field, rays, bounds)
     middle = ((samples.t0 + samples.t1) / 2).view_as(weights)
     alpha = weights.sum(dim=1)
     return torch.where(alpha >= MIN_ALPHA, (weights * middle).sum(dim=1) / alpha.clamp_min(MIN_ALPHA), torch.inf)

@@ -67,8 +67,17 @@ def _hash_parts(field: FieldParts) -> FusedNGP | None:
         return None
     geometry, colour = _layers(field.geometry_net), _layers(field.colour_net)
     bands = config.direction_degree if config.direction == "sh" else 0
-    density = config.density_activation, config.density_bias, bands, field.colour, field.contracted_density
-    return FusedNGP(encoding.table.detach(), encoding.grid, geometry, colour, *density)
+    return FusedNGP(
+        table=encoding.table.detach(),
+        grid=encoding.grid,
+        density_net=geometry,
+        colour_net=colour,
+        density_activation=config.density_activation,
+        density_bias=config.density_bias,
+        sh_bands=bands,
+        colour_space=field.colour,
+        contracted_density=field.contracted_density,
+    )
 
 
 def sdf_parts(config: NeuralSettings, encoding: Encoding, net: Mlp, coordinate_scale: Tensor, scale: float) -> FusedSDF | None:
@@ -84,13 +93,23 @@ def sdf_parts(config: NeuralSettings, encoding: Encoding, net: Mlp, coordinate_s
     if config.skip >= 0 or net.sharpness is None or not config.layers:
         return None
     *hidden, (weight, bias) = net.layers()
-    network = (*hidden, (weight[:1], bias[:1])), net.sharpness, coordinate_scale, scale
     if not isinstance(encoding, HashEncoding | FrequencyEncoding) or encoding.window_alpha is not None:
         return None
     if isinstance(encoding, FrequencyEncoding):
-        octaves = encoding.config.octaves
-        return FusedSDF(weight.new_zeros(0, 2), None, octaves, *network) if encoding.config.include_input else None
-    return FusedSDF(encoding.table.detach(), encoding.grid, 0, *network) if encoding.grid.features == 2 else None
+        supported, table, grid, octaves = encoding.config.include_input, weight.new_zeros(0, 2), None, encoding.config.octaves
+    else:
+        supported, table, grid, octaves = encoding.grid.features == 2, encoding.table.detach(), encoding.grid, 0
+    if not supported:
+        return None
+    return FusedSDF(
+        table=table,
+        grid=grid,
+        octaves=octaves,
+        net=(*hidden, (weight[:1], bias[:1])),
+        sharpness=net.sharpness,
+        coordinate_scale=coordinate_scale,
+        scale=scale,
+    )
 
 
 def _lattice_parts(field: FieldParts) -> FusedLattice | None:

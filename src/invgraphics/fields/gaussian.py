@@ -172,7 +172,7 @@ class GaussianField(Field):
         self.sh_active.fill_(degree)
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
-        """The Gaussians as one density in space, by the ``physical`` reading of their opacities (`query_density`).
+        """The Gaussians as one density in space, by the ``physical`` convention for their opacities (`query_density`).
 
         Raises:
             NotComposableError: something else than density, radiance and normal is wanted.
@@ -182,10 +182,10 @@ class GaussianField(Field):
         return query_density(self._smoothed(self._gaussians(harmonics.count(self.active_degree))), samples, want)
 
     def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
-        """The activated Gaussians, smoothed, with the active bands of their colour; in training those that are not left out."""
+        """The activated, smoothed Gaussians with the active SH bands; in training, with dropout applied to their opacities."""
         if want != Quantity.GAUSSIANS:
             return super().primitives(want, ctx)
-        return self._thinned(self._smoothed(self._gaussians(harmonics.count(self.active_degree))), ctx)
+        return self._with_dropout(self._smoothed(self._gaussians(harmonics.count(self.active_degree))), ctx)
 
     def primitive_count(self) -> int:
         """Number of Gaussians."""
@@ -193,7 +193,9 @@ class GaussianField(Field):
 
     @torch.no_grad()
     def replace(self, tensors: Mapping[str, Tensor]) -> None:
-        """Replace all parameters by new ones, of any common number of rows, without smoothing. An optimiser must be told.
+        """Replace all parameters by new ones, of any common number of rows, without smoothing.
+
+        The optimiser must be updated too.
 
         Raises:
             ValueError: a name is missing or unknown, the numbers of rows differ, or a row has another shape than before.
@@ -227,7 +229,7 @@ class GaussianField(Field):
         scales = (gaussians.scales.square() + self.smoothing[:, None].square()).sqrt()
         return replace(gaussians, scales=scales, opacities=gaussians.opacities * (gaussians.scales / scales).prod(dim=1))
 
-    def _thinned(self, gaussians: Gaussians, ctx: Context) -> Gaussians:
+    def _with_dropout(self, gaussians: Gaussians, ctx: Context) -> Gaussians:
         """Make a random share of the Gaussians transparent, and the others that much more opaque (DropGaussian, eq. 6)."""
         share = self.dropout * ctx.progress
         if not ctx.training or share <= 0:
@@ -248,3 +250,25 @@ class GaussianField(Field):
         self.smoothing = self.means.new_zeros(len(self.means))
         state_dict.setdefault(prefix + "smoothing", self.smoothing)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+class FixedGaussians(Field):
+    """Field of constant Gaussians, for rendering without fitting."""
+
+    provides = Quantity.GAUSSIANS
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        super().__init__()
+        self._gaussians = gaussians
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        """Refuse pointwise queries: this field has primitives only."""
+        raise NotComposableError(f"FixedGaussians has no {want.words()} at points.", "It provides gaussians.")
+
+    def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
+        """The Gaussians."""
+        return self._gaussians if want == Quantity.GAUSSIANS else super().primitives(want, ctx)
+
+    def primitive_count(self) -> int:
+        """Number of Gaussians."""
+        return len(self._gaussians)

@@ -1,6 +1,6 @@
 """3D Gaussians as one density in space: pointwise density, mixed colour and normal at samples.
 
-The density is the ``physical`` reading of the opacities (`kernels.extinction`), of which `gaussian-volume/exact` with
+The density follows the ``physical`` convention for opacities (`kernels.extinction`), of which `gaussian-volume/exact` with
 ``opacity = "physical"`` has the line integrals: quadrature converges to it as its steps shrink.
 """
 

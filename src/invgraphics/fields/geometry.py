@@ -20,7 +20,7 @@ class Geometry:
 
     Attributes:
         raw: density before its activation, or signed distance in half-extents of the box.
-        features: what geometry hands on to colour; ``None`` where it was not wanted.
+        features: geometry features, which colour takes; ``None`` where they were not wanted.
         gradient: of ``raw`` in the positions; ``None`` where it was not wanted.
     """
 
@@ -41,13 +41,13 @@ def query_geometry(
 
     Args:
         encode: features of positions, all at once: the backward pass makes one gradient of the encoding's size.
-        network: raw geometry of features, and behind it, if asked, the features that are handed on.
+        network: from features to raw geometry, followed by the geometry features if the flag is set.
         position: of m points, local frame.
-        with_features: whether the features that are handed on are wanted.
-        with_gradient: whether the gradient is.
+        with_features: whether the geometry features are wanted.
+        with_gradient: whether the gradient is wanted.
     """
     training = torch.is_grad_enabled()
-    raws, handed, slopes, gradient = [], [], [], None
+    raws, geometry_features, slopes, gradient = [], [], [], None
     with torch.set_grad_enabled(training or with_gradient):
         moving = position
         if with_gradient and not (training and position.requires_grad):
@@ -65,10 +65,10 @@ def query_geometry(
                 slopes += torch.autograd.grad(outputs[:, 0].sum(), chunk, create_graph=training)
             outputs = outputs if training else outputs.detach()
             raws.append(outputs[:, 0])
-            handed.append(outputs[:, 1:])
+            geometry_features.append(outputs[:, 1:])
         if with_gradient:
             (gradient,) = torch.autograd.grad(followed, moving, torch.cat(slopes), create_graph=training)
-    return Geometry(torch.cat(raws), torch.cat(handed) if with_features else None, gradient)
+    return Geometry(torch.cat(raws), torch.cat(geometry_features) if with_features else None, gradient)
 
 
 def chunks(first: Tensor, *others: Tensor | None) -> Iterator[tuple[Any, ...]]:

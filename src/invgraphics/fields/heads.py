@@ -1,4 +1,4 @@
-"""Heads: what makes raw geometry and colour of an encoding's features, by networks or without."""
+"""Heads: from an encoding's features to raw geometry and colour, by networks or without."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ NEUS_SHARPNESS, EG3D_SHARPNESS = 100.0, 1.0
 
 
 def geometry_net(settings: NeuralSettings, inputs: int) -> Mlp:
-    """Network from features to raw geometry and the features that it hands on."""
-    # A distance function also sees the plain coordinates, which its start as a sphere is made of.
+    """Network from the encoding's features to raw geometry, followed by the geometry features."""
+    # A signed distance also takes the plain coordinates, from which its initial sphere is made.
     inputs += 3 if settings.geometry == "sdf" else 0
     return Mlp(
         inputs=inputs,
@@ -55,8 +55,8 @@ def sums_components(encoding: Encoding) -> bool:
     return isinstance(encoding, LatticeFeatures) and encoding.combine in ("vm", "cp")
 
 
-def features_handed_on(settings: NeuralSettings, encoding: Encoding) -> int:
-    """Number of geometry features that colour gets."""
+def geometry_feature_width(settings: NeuralSettings, encoding: Encoding) -> int:
+    """Number of geometry features: those that colour takes from geometry."""
     if settings.geometry_head == "mlp":
         return settings.geometry_features
     return 0 if sums_components(encoding) else encoding.width - 1

@@ -25,7 +25,7 @@ BLOCK = 4
 LIPSCHITZ = 2.0
 """Bound on the gradient of a fitted distance: blocks with centres farther away than this times their radius are uniform."""
 CHUNK = 1 << 16
-"""Points that are handed to the field at once."""
+"""Points at which the field is queried at once."""
 REMEDY = "Fit it for longer."
 """What to do about a volume without the level; callers with a level of their own to choose say so."""
 
@@ -100,7 +100,7 @@ def extract_mesh(field: Field, bounds: Bounds, resolution: int, level: float | N
     # Both grow towards the inside, so that one rule tells front from back.
     if distances:
         level = 0.0 if level is None else level
-        volume, level, what = -_distances(field, grid, level), -level, "The signed distance"
+        volume, level, what = -_signed_distances(field, grid, level), -level, "The signed distance"
         outside = float(volume.min()) - grid.step
     else:
         level = default_level(bounds) if level is None else level
@@ -131,7 +131,7 @@ def _densities(field: Field, grid: VoxelGrid) -> Float[Tensor, "x y z"]:
     return torch.cat(parts).view(grid.shape)
 
 
-def _distances(field: Field, grid: VoxelGrid, level: float) -> Float[Tensor, "x y z"]:
+def _signed_distances(field: Field, grid: VoxelGrid, level: float) -> Float[Tensor, "x y z"]:
     """Signed distance at the voxel centres; in blocks that the level cannot cross, that of the block's centre."""
     counts = [math.ceil(count / BLOCK) for count in grid.shape]
     middle = grid.origin + grid.step * (BLOCK - 1) / 2

@@ -74,7 +74,7 @@ class MeshFieldConfig:
         if Quantity.MESH in source.provides:
             mesh: Mesh = source.primitives(Quantity.MESH, Context(scene.bounds))
         elif (Quantity.SDF | Quantity.DENSITY) & source.provides:
-            remedy = "Say --set field.level=LEVEL, or fit the run that the mesh is made of for longer."
+            remedy = "Use --set field.level=LEVEL, or fit the run that the mesh is made of for longer."
             mesh = extract_mesh(source, scene.bounds, self.resolution, self.level, remedy).mesh
         else:
             remedy = "Export it with `invgraphics export RUN --to mesh` first, and give that file as field.source."

@@ -1,10 +1,10 @@
 """Networks over an encoding of position: NeRF, Instant-NGP, signed distance functions; and grids, factors and planes.
 
-A position goes through `Bounds.to_unit` and the encoding into ``geometry_net``, which says what is there (a density or a signed
-distance) and hands a feature vector to ``colour_net``, which also sees the direction. A method is a choice of settings:
-NeRF is 8 layers of 256 with a skip at 4 over 10 octaves, 256 geometry features and one colour layer of 128; Instant-NGP is one
-layer of 64 over a hash encoding, 15 geometry features, two colour layers of 64, ``exp`` density and SH directions. A grid can
-be the density itself; colour can have an encoding of its own, and a network, spherical harmonics or nothing above it (DVGO).
+A position goes through `Bounds.to_unit` and the encoding into ``geometry_net``, which outputs a density or a signed distance,
+and features for ``colour_net``, which also takes the direction. A method is a choice of settings: NeRF is 8 layers of 256
+with a skip at 4 over 10 octaves, 256 geometry features and one colour layer of 128; Instant-NGP is one layer of 64 over a hash
+encoding, 15 geometry features, two colour layers of 64, ``exp`` density and SH directions. A grid can be the density itself;
+colour can have an encoding of its own, and a network, spherical harmonics or nothing above it (DVGO).
 
 Densities are per local length unit, signed distances in local length units, whatever the size of the box.
 """
@@ -107,19 +107,19 @@ class NeuralField(Field):
         )
         if config.geometry_head == "mlp":
             self.geometry_net = heads.geometry_net(config, self.encoding.width)
-        handed = heads.features_handed_on(config, self.encoding)
+        width = heads.geometry_feature_width(config, self.encoding)
         own = 0 if self.appearance is None else config.appearance_basis or self.appearance.width
-        heads.check_colour_features(config.head, handed + own)
+        heads.check_colour_features(config.head, width + own)
         if config.head == "mlp":
-            self.colour_net = heads.colour_net(config, handed + own + 3 * len(config.colour_inputs))
+            self.colour_net = heads.colour_net(config, width + own + 3 * len(config.colour_inputs))
         self.basis: nn.Linear | None = None
         if self.appearance is not None and config.appearance_basis:
             self.basis = nn.Linear(self.appearance.width, own, bias=False)
-        # Colour with an encoding of its own is looked up where it is asked, not wherever a sampler asks for densities.
+        # A separate appearance encoding is evaluated only where radiance is queried: density queries provide no features.
         without = Quantity.NONE if self.appearance is None else Quantity.FEATURES
         self.provides = _POINTWISE[config.geometry] & ~without
-        self._needs_geometry_for_colour = handed > 0 or self.appearance is None
-        self._features_handed_on = handed
+        self._needs_geometry_for_colour = width > 0 or self.appearance is None
+        self._geometry_feature_width = width
         if config.geometry == "sdf":
             radius = (INTERIOR_RADIUS if interior else INITIAL_RADIUS) * float(bounds.half.min()) / self._half
             self.geometry_net.initialise_as_sphere(radius, inside_out=interior)
@@ -132,7 +132,7 @@ class NeuralField(Field):
     @property
     @override
     def feature_width(self) -> int | None:
-        return self._features_handed_on if Quantity.FEATURES in self.provides else None
+        return self._geometry_feature_width if Quantity.FEATURES in self.provides else None
 
     def lattice_encodings(self) -> dict[Role, LatticeEncoding]:
         """Its encodings that are lattices, by role; one that colour shares is geometry's."""
@@ -152,8 +152,8 @@ class NeuralField(Field):
 
         Gradients and normals can be had inside ``no_grad``. A normal is the normalised gradient: of the signed distance, or of
         minus the density (taken before its activation, which is monotone, so that it is defined where the density saturates).
-        Features are what geometry hands on to colour; samples that bring them along are not looked at again where only their
-        radiance is wanted and colour sees no normal.
+        Features are the geometry features; of samples that hold them, geometry is not evaluated again where only radiance is
+        wanted and colour sees no normal.
         """
         if want == Quantity.SDF and not torch.is_grad_enabled():
             sdf = self._fused_distance(samples.position)
@@ -259,32 +259,32 @@ class NeuralField(Field):
         return encode_samples(self.appearance, self.bounds, samples, self.bounds.to_unit(samples.position))
 
     def _geometry(self, features: Float[Tensor, "m f"], with_features: bool) -> Float[Tensor, "m o"]:
-        """Raw geometry, and behind it the features that are handed on."""
+        """Raw geometry, followed by the geometry features."""
         if self.config.geometry_head == "mlp":
             return self.geometry_net(features, None if with_features else 1)
         return features.sum(dim=1, keepdim=True) if heads.sums_components(self.encoding) else features
 
     def _radiance(
         self,
-        handed: Float[Tensor, "m g"],
+        geometry: Float[Tensor, "m g"],
         appearance: Float[Tensor, "m a"] | None,
         samples: Samples,
         normal: Float[Tensor, "m 3"] | None,
     ) -> Float[Tensor, "m 3"]:
-        """Colour of what geometry hands on, of the appearance's features and of ``colour_inputs``, chunk by chunk."""
+        """Colour from the geometry features, the appearance's and ``colour_inputs``, chunk by chunk."""
         position = None
         if "position" in self.config.colour_inputs:
             position = self._coordinates(self.bounds.to_unit(samples.position))
         seen = normal if "normal" in self.config.colour_inputs else None
-        parts = [self._radiance_of(*chunk) for chunk in chunks(samples.direction, handed, appearance, position, seen)]
+        parts = [self._radiance_of(*chunk) for chunk in chunks(samples.direction, geometry, appearance, position, seen)]
         return torch.cat(parts)
 
     def _radiance_of(
-        self, direction: Float[Tensor, "m 3"], handed: Tensor, appearance: Tensor | None, *surface: Tensor | None
+        self, direction: Float[Tensor, "m 3"], geometry: Tensor, appearance: Tensor | None, *surface: Tensor | None
     ) -> Float[Tensor, "m 3"]:
         parts = [part for part in surface if part is not None]
         if self._needs_geometry_for_colour:
-            parts.append(handed)
+            parts.append(geometry)
         if appearance is not None:
             parts.append(appearance if self.basis is None else self.basis(appearance))
         features = parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)

@@ -1,4 +1,4 @@
-"""Plane sweep over training views: the colours that they show at each texel, and how far they agree (Collins 1996)."""
+"""Plane sweep over training views: the colours that they show at each texel, and how well they agree (Collins 1996)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from invgraphics.core import Camera, Scene, View
 from invgraphics.core.planes import homographies, warp
 
 WHOLE = 0.999
-"""Share of the pixels around a texel's image that must count (`View.mask`) for it to be seen."""
+"""Share of the pixels around a texel's image that must be valid (`View.mask`) for it to be seen."""
 FEW = 2.0
 """Views that must see a texel for their agreement to count in full."""
 
 
-def weights_to_alphas(weights: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
+def layer_alphas_from_weights(weights: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
     """Opacities, nearest plane first, with which compositing gives each plane the weight ``weights`` (their sum at most 1)."""
     before = weights.cumsum(dim=0) - weights
     return (weights / (1 - before).clamp_min(1e-6)).clamp(0, 1)
@@ -34,8 +34,8 @@ def plane_sweep(
         scene: its training views, in its colour space.
         camera: reference camera, as wide as the planes.
         depths: of the planes.
-        views: most views that are looked at, evenly spaced among the training views.
-        agreement: standard deviation that is as likely 1/e as none.
+        views: most views that are used, evenly spaced among the training views.
+        agreement: standard deviation at which a plane is 1/e as likely as at none.
     """
     count = min(views, len(scene.train))
     chosen = [scene.train[index * len(scene.train) // count] for index in range(count)]
@@ -61,7 +61,7 @@ def plane_sweep(
     variance = (total[:, 4] / n - mean.square().mean(dim=1)).clamp_min(0)
     disagreement = variance.sqrt() / agreement + (FEW - seen).clamp_min(0)
     weights = torch.softmax(-disagreement, dim=0) * (total[:, 3] / n)
-    return colour.clamp(0, 1), weights_to_alphas(weights)
+    return colour.clamp(0, 1), layer_alphas_from_weights(weights)
 
 
 def premultiplied(view: View) -> Float[Tensor, "4 h w"]:

@@ -13,7 +13,7 @@ from invgraphics.core import Camera, Context, Field, FieldValues, Planes, Quanti
 from invgraphics.core.planes import WIDEST, inverse_depths, mean_camera, widened, widest_angle
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.mlp import Mlp
-from invgraphics.fields.plane_sweep import plane_sweep, weights_to_alphas
+from invgraphics.fields.plane_sweep import layer_alphas_from_weights, plane_sweep
 
 EPS = 1e-4
 """Colours and opacities are kept this far from 0 and 1 before their logit is taken."""
@@ -77,7 +77,7 @@ class PlanesConfig:
             rgb, alpha = plane_sweep(scene, camera, depths, self.sweep_views, self.agreement)
         else:
             rgb = torch.full((self.count, 3, *shape[1:]), 0.5)
-            alpha = weights_to_alphas(torch.full(shape, 1 / self.count))
+            alpha = layer_alphas_from_weights(torch.full(shape, 1 / self.count))
         return self.from_planes(Planes(camera, depths, rgb, alpha))
 
     def placed(self, scene: Scene) -> tuple[Camera, Float[Tensor, " p"]]:

@@ -21,11 +21,11 @@ class NeuralSettings:
 
     Attributes:
         encoding: position to features.
-        geometry: what the first network says: volume density, or signed distance (started as a sphere).
+        geometry: output of the geometry network: volume density, or signed distance (initialised as a sphere).
         layers: hidden layers of the geometry network.
         width: features of each.
         skip: hidden layer after which the encoding is concatenated once more, counted from 0; -1 for none.
-        geometry_features: features that the geometry network hands to the colour network.
+        geometry_features: features that the colour network takes from the geometry network.
         colour_layers: hidden layers of the colour network.
         colour_width: features of each.
         direction: how the colour network sees the viewing direction; ``none`` makes colour independent of it.
@@ -39,10 +39,10 @@ class NeuralSettings:
             it a density per voxel, as in DVGO.
         density_interpolation: whether raw values of a voxel grid are activated after interpolation, before it (``in``), or made
             opacities before it (``pre``); see `DensityActivation`.
-        appearance: a second encoding, which only colour sees (DVGO, TensoRF); ``None``: colour sees what geometry hands on.
+        appearance: a second encoding, for colour alone (DVGO, TensoRF); ``None``: colour takes the geometry features.
         appearance_basis: features that a linear map without bias makes of the second encoding's (TensoRF: 27); 0 for no map.
         feature_octaves: octaves of sine and cosine of the colour network's features that are appended to them (TensoRF: 2).
-        geometry_head: ``none``: raw geometry is the encoding's first feature, the others are handed on to colour; of products
+        geometry_head: ``none``: raw geometry is the encoding's first feature, the others are geometry features; of products
             (``vm``, ``cp``) it is the sum of all. No geometry network then.
         head: how colour comes from features. ``sh``: they are coefficients of spherical harmonics in the direction, the
             (degree + 1)^2 of red first; ``none``: they are the raw colour, alike from all sides. No colour network then.

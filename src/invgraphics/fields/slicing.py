@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invgraphics import kernels
 from invgraphics.core import Camera, Field, Planes, Quantity, Rays, Samples
-from invgraphics.core.bounds import FAR, Bounds
+from invgraphics.core.bounds import CONTRACTED_FAR, Bounds
 from invgraphics.fields.convert import require_density
 
 SUBSAMPLES = 8
@@ -58,7 +58,7 @@ def slab_edges(depths: Float[Tensor, " p"], bounds: Bounds) -> Float[Tensor, " p
     """Depths of the ends of all intervals, `SUBSAMPLES` in each slab, evenly spaced in inverse depth."""
     inverse = 1 / depths.double()
     middle = (inverse[1:] + inverse[:-1]) / 2
-    last = 1 / (FAR * float(bounds.half.max())) if bounds.space == "contracted" else inverse[-1] * 0.5
+    last = 1 / (CONTRACTED_FAR * float(bounds.half.max())) if bounds.space == "contracted" else inverse[-1] * 0.5
     behind = torch.clamp(2 * inverse[-1:] - middle[-1:], min=last)
     ends = torch.cat([2 * inverse[:1] - middle[:1], middle, behind if bounds.space == "box" else behind.new_tensor([last])])
     share = torch.arange(SUBSAMPLES, dtype=torch.float64) / SUBSAMPLES

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics.core.bounds import Bounds
@@ -95,7 +95,7 @@ def backdrop_points(scene: Scene, count: int) -> Points:
         counts = torch.ones(view.camera.height, view.camera.width) if view.mask is None else view.mask
         flat = counts.reshape(-1).nonzero()[:, 0]
         flat = flat[torch.randperm(len(flat))[:share]]
-        rays = view.camera.rays(_pixels(view, flat))
+        rays = view.camera.rays(view.camera.pixel_centres_of(flat))
         subject = max(float((view.camera.position - scene.bounds.centre).norm()), scene.bounds.radius)
         distance = subject * least * (most / least) ** torch.rand(len(flat), 1)
         positions.append(rays.origins + distance * rays.directions)
@@ -119,7 +119,7 @@ def depth_points(scene: Scene, most: int) -> Points:
 
 
 def _seen_points(view: View, most: int) -> Points:
-    """Unproject a view's depth map to points; pixels that show nothing or do not count are left out."""
+    """Unproject a view's depth map to points; pixels without a hit and masked-out ones are skipped."""
     assert view.depth is not None
     depth = view.depth.reshape(-1)
     hit = torch.isfinite(depth)
@@ -127,13 +127,8 @@ def _seen_points(view: View, most: int) -> Points:
         hit &= view.mask.reshape(-1)
     flat = hit.nonzero()[:, 0]
     flat = flat[torch.randperm(len(flat))[:most]]
-    rays = view.camera.rays(_pixels(view, flat))
+    rays = view.camera.rays(view.camera.pixel_centres_of(flat))
     return Points(rays.origins + depth[flat, None] * rays.directions, view.colour(flat))
-
-
-def _pixels(view: View, flat: Int[Tensor, " n"]) -> Float[Tensor, "n 2"]:
-    """Centres of the pixels with these flat indices."""
-    return torch.stack([flat % view.camera.width, flat // view.camera.width], dim=1) + 0.5
 
 
 def _checked(points: Points, scene: str) -> Points:

@@ -18,7 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.fields.isosurface import Extracted, VoxelGrid, marching_cubes, without_specks
 
 CARVED = 0.02
-"""Coverage below which a voxel is empty for good, and no further view is asked."""
+"""Coverage below which a voxel is empty for good, and is not tested against further views."""
 UNSEEN_GREY = 0.5
 """Colour of vertices that no photograph shows."""
 CHUNK = 1 << 20
@@ -43,7 +43,7 @@ def visual_hull(scene: Scene, resolution: int) -> Extracted:
     if not scene.has_alpha:
         raise InputError(
             f"The photographs of scene '{scene.name}' are opaque: they show no silhouettes from which a mesh could be carved.",
-            "Say --set field.source=RUN, the folder of a run with a density or a signed distance, or a mesh file.",
+            "Use --set field.source=RUN, the folder of a run with a density or a signed distance, or a mesh file.",
         )
     grid = VoxelGrid.across(scene.bounds, resolution)
     coverage = torch.ones(len(grid))
@@ -55,7 +55,7 @@ def visual_hull(scene: Scene, resolution: int) -> Extracted:
             coverage[part] = torch.where(inside, torch.minimum(coverage[part], alpha), coverage[part])
             seen[part] |= inside
     volume = pad(torch.where(seen, coverage, 0.0).view(grid.shape), (1,) * 6)
-    remedy = "Check the photographs' transparency and poses, or say --set field.source=RUN."
+    remedy = "Check the photographs' transparency and poses, or use --set field.source=RUN."
     vertices, faces = marching_cubes(volume, 0.5, "The visual hull of the training views", remedy)
     return without_specks(Mesh(grid.origin + grid.step * (vertices - 1), faces))
 

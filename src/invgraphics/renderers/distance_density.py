@@ -1,6 +1,6 @@
-"""Densities made from a signed distance: Laplace's distribution (VolSDF), the logistic one (NeuS).
+"""Densities derived from a signed distance: Laplace's distribution (VolSDF), the logistic one (NeuS).
 
-Both rise across the surface over a width, and both have closed-form integrals along a line on which the distance is linear.
+Both rise across the surface over a width, and both have closed-form integrals along a line on which the SDF is linear.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from typing_extensions import override
 
 from invgraphics.core import Field, FieldValues, Quantity, Samples
 
-Slopes = Literal["gradient", "neighbours", "steepest"]
-"""Where the derivative of the distance along a ray comes from."""
+Slopes = Literal["gradient", "neighbours", "steepest", "pointwise"]
+"""Where the derivative of the signed distance along a ray comes from; see `DistanceDensity`."""
 
 _SHORT = 1e-3
-"""Change of the distance over an interval, over β, below which the density at its middle is as good as its mean."""
+"""Change of the signed distance over an interval, relative to β, below which the density at its middle stands for its mean."""
 
 
 def laplace_density(sdf: Float[Tensor, "*m"], beta: Float[Tensor, "*#m"]) -> Float[Tensor, "*m"]:
@@ -36,10 +36,10 @@ def laplace_density(sdf: Float[Tensor, "*m"], beta: Float[Tensor, "*#m"]) -> Flo
 def laplace_optical_depth(
     sdf: Float[Tensor, "*m"], slope: Float[Tensor, "*m"], delta: Float[Tensor, "*m"], beta: Float[Tensor, ""]
 ) -> Float[Tensor, "*m"]:
-    """Integral of `laplace_density` over intervals, along which the distance is taken as linear.
+    """Integral of `laplace_density` over intervals along which the SDF is assumed linear.
 
-    A density at one point of an interval much longer than β says nothing of the rest: the surface would move back to the
-    first point inside, by half an interval in the mean.
+    The density at one point of an interval much longer than β does not represent the interval: the surface would move back
+    to the first sample inside, by half an interval on average.
 
     Args:
         sdf: in the middle of each interval.
@@ -55,7 +55,7 @@ def laplace_optical_depth(
 
 
 def _laplace_tail(sdf: Float[Tensor, "*m"], beta: Float[Tensor, ""]) -> Float[Tensor, "*m"]:
-    """Integral of `laplace_density` from a distance to infinity."""
+    """Integral of `laplace_density` from a signed distance to infinity."""
     return 0.5 * torch.exp(-sdf.abs() / beta) + (-sdf).clamp_min(0) / beta
 
 
@@ -64,7 +64,7 @@ def logistic_density(sdf: Float[Tensor, "*m"], slope: Float[Tensor, "*m"], sharp
 
     Args:
         sdf: signed distance.
-        slope: its derivative along the ray, in [-1, 1] for a distance; where it rises the density is 0.
+        slope: its derivative along the ray, in [-1, 1] for a signed distance; where it is positive the density is 0.
         sharpness: s of the logistic distribution, per length.
     """
     return -slope.clamp_max(0) * sharpness * torch.sigmoid(-sharpness * sdf)
@@ -73,10 +73,10 @@ def logistic_density(sdf: Float[Tensor, "*m"], slope: Float[Tensor, "*m"], sharp
 def section_optical_depth(
     sdf: Float[Tensor, "*m"], slope: Float[Tensor, "*m"], delta: Float[Tensor, "*m"], sharpness: Float[Tensor, ""]
 ) -> Float[Tensor, "*m"]:
-    """Integral of `logistic_density` over intervals, along which the distance is taken as linear.
+    """Integral of `logistic_density` over intervals along which the SDF is assumed linear.
 
     It is -log(1 - α) of α = (Φ(f_i) - Φ(f_i+1)) / Φ(f_i) between an interval's section points (NeuS, equation 13), whose
-    distances are extrapolated from its middle: f ∓ slope δ / 2. log Φ(f) = -softplus(-s f), so that nothing is divided.
+    distances are extrapolated from its middle: f ∓ slope δ / 2. log Φ(f) = -softplus(-s f), which needs no division.
 
     Args:
         sdf: in the middle of each interval.
@@ -89,13 +89,15 @@ def section_optical_depth(
 
 
 class DistanceDensity(Field):
-    """A field of signed distances seen as one of densities, for samplers and for quadrature; it lives as long as a rendering.
+    """View of a field of signed distances as one of densities, for samplers and for quadrature; made anew for each rendering.
 
     Args:
         field: with a signed distance.
         beta: width of the density, local units: β of Laplace's distribution, 1 / s of the logistic one.
-        slopes: how the distance changes along a ray: by the field's ``gradient``; outside the graph by differences of
-            ``neighbours``, which cost no gradient, for searches in training; for points on no rays the ``steepest`` there is.
+        slopes: derivative of the signed distance along a ray, for the density's mean over an interval. ``gradient``: from the
+            field's gradient. ``neighbours``: without gradients, from differences between neighbouring samples, which are
+            cheaper, for searches in training; with gradients as ``gradient``. For points that lie on no ray: ``steepest``
+            assumes -1, ``pointwise`` takes the density at the point, which needs no slope (Laplace's only).
     """
 
     def __init__(self, field: Field, beta: Float[Tensor, ""], slopes: Slopes = "gradient") -> None:
@@ -107,12 +109,12 @@ class DistanceDensity(Field):
 
     @property
     def slopes(self) -> Slopes:
-        """Where slopes come from now: in the graph from the gradient."""
+        """Where slopes come from now: with gradients enabled, ``neighbours`` is ``gradient``."""
         return "gradient" if self._slopes == "neighbours" and torch.is_grad_enabled() else self._slopes
 
     @property
     def needs(self) -> Quantity:
-        """What the density is made from."""
+        """Quantities of the field from which the density is computed."""
         return Quantity.SDF | Quantity.GRADIENT if self.slopes == "gradient" else Quantity.SDF
 
     @abstractmethod
@@ -120,7 +122,7 @@ class DistanceDensity(Field):
         """Density from the values of `needs`, per local length unit."""
 
     def slope(self, values: FieldValues, samples: Samples) -> Float[Tensor, " m"]:
-        """Derivative of the distance along the ray at each sample, from the values of `needs`."""
+        """Derivative of the signed distance along the ray at each sample, from the values of `needs`."""
         assert values.sdf is not None
         if self.slopes == "neighbours":
             return neighbour_slopes(values.sdf, samples)
@@ -129,7 +131,7 @@ class DistanceDensity(Field):
 
     @override
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
-        """See `Field.query`; the distance is handed on where a density is wanted."""
+        """See `Field.query`; with a density, the signed distance is returned too."""
         if Quantity.DENSITY not in want:
             return self.field.query(samples, want)
         values = self.field.query(samples, (want & ~Quantity.DENSITY) | self.needs)
@@ -142,21 +144,22 @@ class LaplaceDensity(DistanceDensity):
     Args:
         field: with a signed distance.
         beta: β, local units.
-        slopes: as of `DistanceDensity`; ``None``: the density at the samples.
+        slopes: as of `DistanceDensity`, but not ``steepest``; ``pointwise``: the density at the samples (VolSDF).
     """
 
-    def __init__(self, field: Field, beta: Float[Tensor, ""], slopes: Slopes | None = None) -> None:
-        super().__init__(field, beta, slopes or "steepest")
+    def __init__(self, field: Field, beta: Float[Tensor, ""], slopes: Slopes = "pointwise") -> None:
+        super().__init__(field, beta, slopes)
 
     @override
     def density_of(self, values: FieldValues, samples: Samples) -> Float[Tensor, " m"]:
         assert values.sdf is not None
-        if self.slopes == "steepest":
+        if self.slopes == "pointwise":
             return laplace_density(values.sdf, self.beta)
         delta = samples.delta
-        there = delta > 0
-        mean = laplace_optical_depth(values.sdf, self.slope(values, samples), delta, self.beta) / torch.where(there, delta, 1.0)
-        return torch.where(there, mean, laplace_density(values.sdf, self.beta))
+        extended = delta > 0
+        optical_depth = laplace_optical_depth(values.sdf, self.slope(values, samples), delta, self.beta)
+        mean = optical_depth / torch.where(extended, delta, 1.0)
+        return torch.where(extended, mean, laplace_density(values.sdf, self.beta))
 
 
 class LogisticDensity(DistanceDensity):
@@ -165,9 +168,9 @@ class LogisticDensity(DistanceDensity):
     Args:
         field: with a signed distance.
         beta: 1 / s, local units.
-        slopes: as of `DistanceDensity`.
-        anneal: from 1 on the slope is that along the ray; at 0 it is halved towards -1, so that a ray sees surfaces that it
-            leaves, too (NeuS's ``cos_anneal_ratio``).
+        slopes: as of `DistanceDensity`, but not ``pointwise``.
+        anneal: at 1 the slope is the one along the ray; at 0 it is moved halfway to -1, so that surfaces seen from inside
+            are rendered too (NeuS's ``cos_anneal_ratio``).
     """
 
     def __init__(self, field: Field, beta: Float[Tensor, ""], slopes: Slopes = "gradient", anneal: float = 1.0) -> None:
@@ -184,15 +187,15 @@ class LogisticDensity(DistanceDensity):
         if self.anneal < 1:
             slope = torch.lerp(-(0.5 - slope / 2).clamp_min(0), slope.clamp_max(0), self.anneal)
         delta = samples.delta
-        there = delta > 0
-        mean = section_optical_depth(values.sdf, slope, delta, sharpness) / torch.where(there, delta, 1.0)
-        return torch.where(there, mean, logistic_density(values.sdf, slope, sharpness))
+        extended = delta > 0
+        mean = section_optical_depth(values.sdf, slope, delta, sharpness) / torch.where(extended, delta, 1.0)
+        return torch.where(extended, mean, logistic_density(values.sdf, slope, sharpness))
 
 
 def neighbour_slopes(sdf: Float[Tensor, " m"], samples: Samples) -> Float[Tensor, " m"]:
-    """Differences of the distance to the next sample of the same ray, of its last sample to the one before it, over length.
+    """Slopes of the signed distance to the next sample of the same ray; of the ray's last sample, from the one before it.
 
-    A sample alone on its ray gets the steepest descent, -1.
+    A sample alone on its ray gets the steepest slope, -1.
     """
     if len(sdf) < 2:
         return sdf.new_full(sdf.shape, -1.0)

@@ -6,11 +6,12 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.compositing import optical_depth_before, weights_from_optical_depth
 from invgraphics.core.spacing import from_spacing
 from invgraphics.errors import NotComposableError
 from invgraphics.renderers.distance_density import DistanceDensity, laplace_density
@@ -19,17 +20,17 @@ from invgraphics.renderers.samplers import (
     PADDING,
     check_samples,
     hit_indices,
-    invert,
-    pack,
+    pack_intervals,
     quantiles,
-    strata,
+    sample_pdf,
+    stratified_edges,
     uniform,
     unit_ball_exit,
 )
-from invgraphics.renderers.up_sampling import MAX_ROUNDS, depth_before, distances, interval_weights
+from invgraphics.renderers.up_sampling import MAX_ROUNDS, signed_distances
 
 LARGEST_ERROR = 1e6
-"""Bounds are clamped here: far ones overflow, and only say that there is no bound."""
+"""Error bounds are clamped here: larger ones would overflow, and mean no more than "unbounded"."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class ErrorBoundedConfig:
     Attributes:
         coarse: strata of the first pass, and samples that a round adds.
         fine: samples drawn by the opacity of the last round.
-        extra: samples drawn from the places that were looked at.
+        extra: samples taken from the edges of the last round.
         error: bound on the opacity's error, ε.
         rounds: most rounds.
         bisections: of the search for the least width that keeps the bound.
@@ -66,13 +67,16 @@ class ErrorBoundedConfig:
         """Samples on each ray, those of the first pass included."""
         return self.coarse + self.fine + self.extra
 
-    def build(self, scene: Scene) -> ErrorBounded:
+    def build(self, scene: Scene) -> ErrorBoundedSampler:
         """The sampler; it needs nothing from the scene."""
-        return ErrorBounded(self)
+        return ErrorBoundedSampler(self)
 
 
-class ErrorBounded(Sampler):
-    """Refines each ray until the opacity of the density's own width, or of the least width found for it, is bounded."""
+class ErrorBoundedSampler(Sampler):
+    """VolSDF's sampler (algorithm 1): refine each ray until the opacity error is below ε.
+
+    Where that fails within the rounds, samples follow the density of the smallest β for which the error is bounded.
+    """
 
     def __init__(self, config: ErrorBoundedConfig) -> None:
         super().__init__()
@@ -88,51 +92,54 @@ class ErrorBounded(Sampler):
         """Sample every ray that meets the bounds.
 
         Raises:
-            NotComposableError: the density is not made from a distance, so that it has no width.
+            NotComposableError: the density is not derived from a signed distance, so it has no width.
         """
         if not isinstance(field, DistanceDensity):
             raise NotComposableError(
-                f"ErrorBounded needs a density that is made from a distance, not that of {type(field).__name__}.",
+                f"error_bounded needs a density derived from a signed distance, not that of {type(field).__name__}.",
                 "Use it with the renderers volsdf or neus.",
             )
         hit = hit_indices(rays)
-        knee = unit_ball_exit(rays[hit], ctx.bounds)
-        spacing = strata(rays[hit], self.config.coarse, ctx, knee)
-        edges = from_spacing(spacing, ctx.bounds, knee)
+        transition = unit_ball_exit(rays[hit], ctx.bounds)
+        spacing = stratified_edges(rays[hit], self.config.coarse, ctx, transition)
+        edges = from_spacing(spacing, ctx.bounds, transition)
         with torch.no_grad():
-            edges, sdf, beta = self._refined(edges, field, (rays, hit), ctx)
-            weights = interval_weights(laplace_density(sdf[:, :-1], beta) * edges.diff(dim=1))
-            drawn = invert(edges, weights + PADDING, quantiles(len(edges), self.config.fine, ctx, like=edges))
-            places = torch.cat([edges[:, :1], drawn, self._extra(edges, ctx), edges[:, -1:]], dim=1).sort(dim=1).values
-        level = Trace(pack(rays, hit, edges), None, weights.flatten(), rays=len(rays))
-        return pack(rays, hit, places), () if ctx.training else (level,)
+            edges, sdf, beta = self._refined(edges, field, rays, hit, ctx)
+            weights = weights_from_optical_depth(laplace_density(sdf[:, :-1], beta) * edges.diff(dim=1))
+            drawn = sample_pdf(edges, weights + PADDING, quantiles(len(edges), self.config.fine, ctx, like=edges))
+            merged = torch.cat([edges[:, :1], drawn, self._extra(edges, ctx), edges[:, -1:]], dim=1).sort(dim=1).values
+        level = Trace(pack_intervals(rays, hit, edges), None, weights.flatten(), rays=len(rays))
+        return pack_intervals(rays, hit, merged), () if ctx.training else (level,)
 
     def _refined(
-        self, edges: Float[Tensor, "k edges"], field: DistanceDensity, place: tuple[Rays, Tensor], ctx: Context
+        self, edges: Float[Tensor, "k edges"], field: DistanceDensity, rays: Rays, hit: Int[Tensor, " k"], ctx: Context
     ) -> tuple[Float[Tensor, "k more"], Float[Tensor, "k more"], Float[Tensor, "k 1"]]:
-        """Edges added in rounds where the error may be, their signed distances, and the least width whose error is bounded."""
+        """Edges refined in rounds where the error bound is large, their signed distances, and the least β of bounded error."""
         config, target = self.config, field.beta.detach()
-        rays, hit = place
-        sdf = distances(field, rays, hit, edges)
-        # Wide enough for any distances (lemma 2).
+        sdf = signed_distances(field, rays, hit, edges)
+        # Large enough for any signed distances (lemma 2).
         beta = (edges.diff(dim=1).square().sum(dim=1, keepdim=True) / (4 * math.log1p(config.error))).sqrt().maximum(target)
         for number in range(config.rounds):
             delta = edges.diff(dim=1)
             clear = clear_distance(sdf, delta)
-            beta = self._least_width(target, beta, (delta, sdf, clear))
+            beta = self._least_width(target, beta, delta, sdf, clear)
             if number + 1 == config.rounds or bool((beta <= target).all()):
                 break
-            mass = error_bounds(delta, sdf, clear, beta) + PADDING
-            added = invert(edges, mass, quantiles(len(edges), config.coarse, ctx, like=edges))
+            weights = error_bounds(delta, sdf, clear, beta) + PADDING
+            added = sample_pdf(edges, weights, quantiles(len(edges), config.coarse, ctx, like=edges))
             edges, order = torch.cat([edges, added], dim=1).sort(dim=1)
-            sdf = torch.cat([sdf, distances(field, rays, hit, added)], dim=1).gather(1, order)
+            sdf = torch.cat([sdf, signed_distances(field, rays, hit, added)], dim=1).gather(1, order)
         return edges, sdf, beta
 
     def _least_width(
-        self, target: Float[Tensor, ""], beta: Float[Tensor, "k 1"], line: tuple[Tensor, Tensor, Tensor]
+        self,
+        target: Float[Tensor, ""],
+        beta: Float[Tensor, "k 1"],
+        delta: Float[Tensor, "k bins"],
+        sdf: Float[Tensor, "k edges"],
+        clear: Float[Tensor, "k bins"],
     ) -> Float[Tensor, "k 1"]:
         """Width between ``target`` and ``beta`` at which the error is still bounded, by bisection."""
-        delta, sdf, clear = line
 
         def bounded(width: Tensor) -> Tensor:
             return error_bounds(delta, sdf, clear, width).amax(dim=1, keepdim=True) <= self.config.error
@@ -145,7 +152,7 @@ class ErrorBounded(Sampler):
         return torch.where(bounded(target.expand_as(beta)), target, high)
 
     def _extra(self, edges: Float[Tensor, "k edges"], ctx: Context) -> Float[Tensor, "k extra"]:
-        """Some of the places that were looked at, the same ones of every ray; random in training."""
+        """A subset of the edges, at the same indices on every ray; random in training."""
         count = min(self.config.extra, edges.shape[1])
         if not ctx.training:
             return edges[:, torch.linspace(0, edges.shape[1] - 1, count, device=edges.device).long()]
@@ -176,5 +183,5 @@ def error_bounds(
     (theorem 1).
     """
     error = (delta.square() * torch.exp(-clear / beta) / (4 * beta.square())).cumsum(dim=1)
-    depth = laplace_density(sdf[:, :-1], beta) * delta
-    return torch.expm1(error.clamp_max(math.log(LARGEST_ERROR))) * torch.exp(-depth_before(depth))
+    optical_depth = laplace_density(sdf[:, :-1], beta) * delta
+    return torch.expm1(error.clamp_max(math.log(LARGEST_ERROR))) * torch.exp(-optical_depth_before(optical_depth))

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from invgraphics.core import Context
-from invgraphics.renderers.samplers import invert, quantiles
+from invgraphics.renderers.samplers import quantiles, sample_pdf
 
 
 def blur(weights: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
@@ -36,7 +36,7 @@ def dilate(
     density = weights / (upper - lower).clamp_min(tiny)
     lo, hi = edges[:, :1], edges[:, -1:]
     wide = torch.cat([edges, lower - by, upper + by], dim=1).clamp(lo, hi).sort(dim=1).values
-    # Looked at in the middle of each new interval, within which no interval's reach begins or ends.
+    # Evaluated in the middle of each new interval, within which no interval's reach begins or ends.
     middle = ((wide[:, 1:] + wide[:, :-1]) / 2).contiguous()
     first = torch.searchsorted(upper + by, middle, right=True).clamp_max(lower.shape[1] - 1)
     last = (torch.searchsorted(lower - by, middle, right=True) - 1).clamp_min(0)
@@ -68,7 +68,7 @@ def range_max(values: Float[Tensor, "k n"], first: Tensor, last: Tensor) -> Floa
 
 
 def resample(
-    edges: Float[Tensor, "k edges"], mass: Float[Tensor, "k bins"], count: int, ctx: Context, *, per_ray: bool
+    edges: Float[Tensor, "k edges"], weights: Float[Tensor, "k bins"], count: int, ctx: Context, *, per_ray: bool
 ) -> Float[Tensor, "k count_plus_1"]:
     """Edges of ``count`` intervals around points that are drawn from a histogram (multinerf, ``sample_intervals``).
 
@@ -77,13 +77,13 @@ def resample(
 
     Args:
         edges: of the histogram.
-        mass: unnormalised probability of its bins, > 0.
+        weights: unnormalised probability of its bins, > 0.
         count: number of intervals, at least 2.
         ctx: in training, points are drawn at random.
         per_ray: whether a ray's quantiles are moved together.
     """
     with torch.no_grad():
-        points = invert(edges, mass, quantiles(len(edges), count, ctx, like=mass, per_ray=per_ray))
+        points = sample_pdf(edges, weights, quantiles(len(edges), count, ctx, like=weights, per_ray=per_ray))
         between = (points[:, 1:] + points[:, :-1]) / 2
         first = (2 * points[:, :1] - between[:, :1]).maximum(edges[:, :1])
         last = (2 * points[:, -1:] - between[:, -1:]).minimum(edges[:, -1:])

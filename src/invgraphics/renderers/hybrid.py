@@ -1,4 +1,4 @@
-"""Volume rendering of surfaces: a density is made from a signed distance, and its width found by the fit."""
+"""Volume rendering of surfaces: a density is derived from a signed distance, and its width found by the fit."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from invgraphics.renderers.quadrature import heaviest_of_rays, sample_weights
 from invgraphics.renderers.volumetric import Volumetric
 
 Change = Literal["learnt", "scheduled", "held"]
-"""What becomes of a width during a fit: it follows its gradient, or a log-linear schedule, or stays."""
+"""How the density's width evolves during a fit: learnt by gradient, on a log-linear schedule, or fixed."""
 
 
 class HybridSettings(Protocol):
-    """What all renderers of this family are configured by."""
+    """Settings that all renderers of this family share."""
 
     @property
     def change(self) -> Change:
-        """What becomes of the width."""
+        """How the width evolves during a fit."""
         ...
 
     @property
@@ -54,10 +54,10 @@ class HybridSettings(Protocol):
 
 
 class Hybrid(RayRenderer):
-    """Volume renderer of a density that a signed distance makes; `VolSDF` and `NeuS` say which.
+    """Volume renderer of a density derived from a signed distance; `VolSDF` and `NeuS` choose which.
 
     Args:
-        settings: the width and what becomes of it.
+        settings: the width and how it evolves.
         volumetric: renders the density, with a sampler of its own.
 
     Attributes:
@@ -79,7 +79,7 @@ class Hybrid(RayRenderer):
 
     @abstractmethod
     def density(self, field: Field, ctx: Context, *, on_rays: bool = True) -> DistanceDensity:
-        """The field as one of densities; ``on_rays`` says whether its samples will lie on rays."""
+        """The field as one of densities; ``on_rays`` is false for queries at isolated points (occupancy refresh)."""
 
     @abstractmethod
     def untrained(self) -> Self:
@@ -104,19 +104,19 @@ class Hybrid(RayRenderer):
     @override
     @torch.no_grad()
     def update(self, field: Field, ctx: Context) -> None:
-        """Set a scheduled width, and refresh the sampler's state by the density that it makes."""
+        """Set a scheduled width, and refresh the sampler's state by the density of that width."""
         if self._settings.change == "scheduled":
             first, last = self._settings.widths
             self.width.fill_(self._settings.to_parameter(first * (last / first) ** ctx.progress))
         self.volumetric.update(self.density(field, ctx, on_rays=False), ctx)
 
 
-class WeightPruned(Sampler):
-    """Another sampler's samples, in training without those of negligible weight by the densities that it found on the way.
+class WeightThresholdSampler(Sampler):
+    """Another sampler's samples, in training without those of negligible weight by the densities that it queried anyway.
 
-    Few samples of a sharp surface weigh anything, and those that do not have no gradient worth its price either: the
+    Near a sharp surface few samples have any weight, and the gradients of the others are not worth their cost: the
     derivative of a density's tail is as small as the tail. Each ray keeps its heaviest sample, however light: a ray without
-    samples has no gradient, and could not bring back a surface where a mask asks for one.
+    samples has no gradient, and could not bring back a surface where a mask demands one.
 
     Args:
         sampler: the other; samples that come without densities are all kept.
@@ -140,21 +140,21 @@ class WeightPruned(Sampler):
             return samples, levels
         with torch.no_grad():
             weights = sample_weights(samples.density, samples, len(rays))
-            seen = torch.nonzero((weights > self.threshold) | heaviest_of_rays(weights, samples.ray, len(rays)))[:, 0]
-        return samples[seen], levels
+            kept = torch.nonzero((weights > self.threshold) | heaviest_of_rays(weights, samples.ray, len(rays)))[:, 0]
+        return samples[kept], levels
 
     @override
     def update(self, field: Field, ctx: Context) -> None:
         self.sampler.update(field, ctx)
 
     @override
-    def untrained(self) -> WeightPruned:
-        return WeightPruned(self.sampler.untrained(), self.threshold)
+    def untrained(self) -> WeightThresholdSampler:
+        return WeightThresholdSampler(self.sampler.untrained(), self.threshold)
 
 
 def make_volumetric(sampler: Sampler, gradient_reach: float, weight_threshold: float) -> Volumetric:
     """Volume renderer with a sampler whose samples weigh more than ``weight_threshold`` in training."""
-    return Volumetric(WeightPruned(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
+    return Volumetric(WeightThresholdSampler(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
 
 
 def check_settings(first: float, last: float, gradient_reach: float, weight_threshold: float) -> None:

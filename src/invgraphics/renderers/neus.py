@@ -80,9 +80,10 @@ class NeuS(Hybrid):
 
     @override
     def density(self, field: Field, ctx: Context, *, on_rays: bool = True) -> LogisticDensity:
-        seen = 1.0 if self.config.anneal == 0 else min(1.0, ctx.progress / self.config.anneal)
-        slopes = "steepest" if not on_rays else "neighbours" if ctx.training else "gradient"
-        return LogisticDensity(field, self.beta(ctx), slopes, seen)
+        anneal = 1.0 if self.config.anneal == 0 else min(1.0, ctx.progress / self.config.anneal)
+        if not on_rays:
+            return LogisticDensity(field, self.beta(ctx), "steepest", anneal)
+        return LogisticDensity(field, self.beta(ctx), "neighbours" if ctx.training else "gradient", anneal)
 
     @override
     def untrained(self) -> NeuS:

@@ -35,24 +35,24 @@ class OccupancyConfig:
         steps_per_diagonal: steps that a march across the bounds' diagonal takes.
         evaluation_steps: the same outside training; ``None`` takes as many. In training the steps are shifted at random, so
             that a field fitted with long ones is sharper when it is seen with short ones.
-        early_steps: the same at the start of training; moves to ``steps_per_diagonal`` over the fit's first quarter. In fog few
-            long steps tell as much as many short ones, and more rays can be afforded. ``None``: no change.
+        early_steps: the same at the start of training; moves to ``steps_per_diagonal`` over the fit's first quarter. Early
+            on, density is diffuse: fewer, longer steps suffice and leave time for more rays. ``None``: no change.
         late_steps: the same at the end of training; the number moves there over the second half of the fit. Shorter steps
-            show thin things, once they are all that is left to be learned. ``None``: no change.
+            resolve thin structures, once these are all that is left to be learned. ``None``: no change.
         cone: growth of the step with distance; ``None`` means 0 in a box and steps of equal contracted length in a contracted
             space, where Instant-NGP's is 1/256.
-        grace: training steps before the first refresh. What is thinner than the threshold before it was ever seen would be
-            culled, never be sampled, and never grow.
-        decay: what a cell's memory is multiplied with when the cell is looked at again.
-        early_decay: the same at the start; its distance from 1 falls to that of ``decay`` by half of the fit. Fog must be
-            forgotten quickly, but one look at a random point finds a wire only now and then. ``None``: ``decay`` throughout.
+        grace: training steps before the first refresh. Cells below the threshold before they were ever trained
+            would be culled and never recover.
+        decay: factor of a cell's EMA at each of its updates (nerfacc: ``ema_decay``).
+        early_decay: the same at the start; its distance from 1 falls to that of ``decay`` by half of the fit. Early fog
+            must be forgotten quickly, but random points seldom hit a thin structure. ``None``: ``decay`` throughout.
         threshold: least optical depth of a step that counts as occupied; the grid's mean, where that is smaller.
-        warmup: training steps after ``grace`` in which a refresh looks at all cells, as the first does: others count as empty.
+        warmup: training steps after ``grace`` in which a refresh updates all cells: those never updated count as empty.
         every: training steps between two refreshes.
         points_until: progress of a fit until which only cells within ``point_cells`` cells of one of the scene's points, where
             it has some, are sampled: a start from points for fields without primitives.
-        cells: cells that a refresh looks at after warm-up, half of them drawn from the occupied ones.
-        stop: when to leave out samples behind opaque surfaces, at the price of a density look-up.
+        cells: cells updated per refresh after warm-up, half of them drawn from the occupied ones.
+        stop: when to leave out samples behind opaque surfaces, at the cost of a density query.
         transmittance: a ray stops when less than this is left of its light.
         chunk: samples per ray before the transmittance is tested first; each later chunk is half as long again. A GPU has one.
     """
@@ -116,23 +116,23 @@ class OccupancyConfig:
         share = max(0.0, (progress - LATE_STEPS_START) / (1 - LATE_STEPS_START))
         return early * (usual / early) ** min(1.0, 4 * progress) * (late / usual) ** share
 
-    def build(self, scene: Scene) -> Occupancy:
+    def build(self, scene: Scene) -> OccupancyGridSampler:
         """Build the sampler with every cell occupied, in unbounded space only cells visible in a training view."""
         cameras = [view.camera for view in scene.train] if scene.bounds.space == "contracted" else []
         visible = visible_cells(scene.bounds, self.resolution, cameras) if cameras else None
         points = scene.points.position if scene.points is not None and self.points_until > 0 else None
         near = None if points is None else cells_near_points(scene.bounds, self.resolution, points, self.point_cells)
-        return Occupancy(self, scene.bounds, visible, near)
+        return OccupancyGridSampler(self, scene.bounds, visible, near)
 
 
-class Occupancy(Sampler):
+class OccupancyGridSampler(Sampler):
     """Ray marcher in fixed steps, which keeps samples in occupied cells.
 
     Attributes:
-        ema: fading maximum of the optical depth that one step has in each cell.
-        occupied: cells worth a sample.
-        visible: cells that may be; ``None`` for all. Not part of the state: it follows from the scene.
-        near_points: those that may be early in a fit, likewise.
+        ema: decaying maximum of the optical depth of one step in each cell.
+        occupied: cells that are sampled.
+        visible: cells that may be occupied; ``None`` for all. Not part of the state: it follows from the scene.
+        near_points: those that may be occupied early in a fit, likewise.
         step: number of calls of `update` so far.
     """
 
@@ -152,20 +152,20 @@ class Occupancy(Sampler):
         self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool) if visible is None else visible.clone())
         self.register_buffer("visible", visible, persistent=False)
         self.register_buffer("near_points", near_points, persistent=False)
-        self._leave_out(near_points)
+        self._restrict_occupied(near_points)
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
         self.contracted = bounds.space == "contracted" and config.cone is None
         self.cone = config.cone or 0.0
         self.length = 2 * bounds.radius / config.steps_per_diagonal
 
     @override
-    def untrained(self) -> Occupancy:
+    def untrained(self) -> OccupancyGridSampler:
         """Copy of the sampler with every visible cell occupied, as before training."""
         fresh = copy.deepcopy(self)
         fresh.ema.zero_()
         fresh.step.zero_()
         fresh.occupied.fill_(True)
-        fresh._leave_out(fresh.visible)
+        fresh._restrict_occupied(fresh.visible)
         return fresh
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
@@ -201,7 +201,7 @@ class Occupancy(Sampler):
     def composite_fused(
         self, rays: Rays, width: int, field: Field, ctx: Context, max_error: float
     ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]] | None:
-        """See `Sampler.composite_fused`; fields that hand out the parameters of a hash grid or of lattices have a kernel."""
+        """See `Sampler.composite_fused`; there are kernels for fields over a hash grid or over lattices (`Field.fused`)."""
         parts = field.fused(ctx.bounds)
         render = None if self.config.stop == "never" else fused_kernel("render", parts)
         if render is None:
@@ -241,7 +241,7 @@ class Occupancy(Sampler):
         step = int(self.step)
         self.step += 1
         if step == 0:
-            self._leave_out(field.support(ctx.bounds, self.config.resolution))
+            self._restrict_occupied(field.support(ctx.bounds, self.config.resolution))
         if step >= self.config.grace and step % self.config.every == 0:
             everywhere = step < self.config.grace + max(self.config.warmup, self.config.every)
             cells = torch.arange(self.ema.numel(), device=self.ema.device) if everywhere else self._sampled_cells(ctx)
@@ -273,22 +273,22 @@ class Occupancy(Sampler):
         # The mean of equal float32 numbers must not exceed them, or an even fog would vanish: sum in float64.
         mean = float(self.ema.mean(dtype=torch.float64))
         self.occupied.copy_(self.ema >= min(self.config.threshold, mean))
-        self._leave_out(self.visible)
-        self._leave_out(support)
+        self._restrict_occupied(self.visible)
+        self._restrict_occupied(support)
         if ctx.progress < self.config.points_until:
-            self._leave_out(self.near_points)
+            self._restrict_occupied(self.near_points)
 
-    def _leave_out(self, possible: Cells | None) -> None:
-        """Keep only ``possible`` cells occupied; all, where that is ``None``."""
-        if possible is not None:
-            self.occupied &= possible
+    def _restrict_occupied(self, mask: Cells | None) -> None:
+        """Clear occupied cells outside ``mask``; no change if it is ``None``."""
+        if mask is not None:
+            self.occupied &= mask
 
     def _step_optical_depth(self, cells: Int[Tensor, " k"], field: Field, ctx: Context) -> Float[Tensor, " k"]:
         """Optical depth of one step at a random point of each cell.
 
         Steps of equal contracted length are taken along the radius. With a cone they grow with the distance from the camera,
-        which a cell does not know; the distance from the middle of the bounds stands in for it. Steps that become shorter
-        late in a fit make no cell emptier.
+        which is not known here; the distance from the centre of the bounds replaces it. Steps that become shorter late in a
+        fit do not count as lower optical depth.
         """
         corner = torch.stack(torch.unravel_index(cells, self.ema.shape), dim=1)
         unit = (corner + uniform((len(cells), 3), ctx, like=self.ema)) / self.config.resolution

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invgraphics.core import Camera, Context, Field, Planes, Quantity, Renderer, Rendering, Scene, Trace
+from invgraphics.core.compositing import weights_from_alphas
 from invgraphics.core.planes import warp
 from invgraphics.renderers.base import MIN_SURFACE_ALPHA, normals_from_depth, to_rendering
 
@@ -42,7 +43,7 @@ class PlaneRenderer(Renderer):
         maps = planes.homographies(camera)
         rgba, inside, z = warp(torch.cat([planes.rgb, planes.alpha[:, None]], dim=1), maps, size)
         ahead = (planes.depths > _depth_of(camera, planes)).to(inside.dtype)[:, None, None]
-        weights = composite_weights(rgba[:, 3] * inside * ahead)
+        weights = weights_from_alphas(rgba[:, 3] * inside * ahead)
         rgb = rgba[:, :3]
         if planes.coefficients is not None:
             offsets, _, _ = warp(view_dependence(planes, camera), maps, size, (planes.camera.width, planes.camera.height))
@@ -59,15 +60,6 @@ class PlaneRenderer(Renderer):
             seen = alpha >= MIN_SURFACE_ALPHA
             normal = normals_from_depth(distance / alpha.clamp_min(MIN_SURFACE_ALPHA), seen, directions)
         return to_rendering(colour, alpha, distance, normal, far, directions), Trace(rays=alpha.numel())
-
-
-def composite_weights(alpha: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
-    """Weights T_i α_i of layers, nearest first, with T_i = Π_{j<i} (1 - α_j)."""
-    light, weights = torch.ones_like(alpha[0]), []
-    for layer in alpha.unbind(0):
-        weights.append(light * layer)
-        light = light - weights[-1]
-    return torch.stack(weights)
 
 
 def view_dependence(planes: Planes, camera: Camera) -> Float[Tensor, "p 3 i j"]:

@@ -1,4 +1,4 @@
-"""Sampling by proposals, small densities that say where to look closer (mip-NeRF 360, Barron et al. 2022, §3)."""
+"""Sampling by proposals: small density fields that guide where samples are placed (mip-NeRF 360, Barron et al. 2022, §3)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.errors import NotComposableError
 from invgraphics.renderers.histograms import blur, dilate, resample
 from invgraphics.renderers.quadrature import sample_weights
-from invgraphics.renderers.samplers import hit_indices, pack, unit_ball_exit
+from invgraphics.renderers.samplers import hit_indices, pack_intervals, unit_ball_exit
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class ProposalsConfig:
         dilation_bias: the same as a share of the ray.
         blurred: whether weights are widened by mip-NeRF's filter (equation 18) instead.
         padding: added to every weight before it is drawn from (mip-NeRF: 0.01).
-        anneal: slope s of the exponent s p / ((s - 1) p + 1) of weights at a progress p of the fit, which holds samples apart
-            while proposals know little; 0 for none.
+        anneal: slope s of the exponent s p / ((s - 1) p + 1) of weights at a progress p of the fit, which keeps samples
+            spread out while proposals are untrained; 0 for none.
         jitter_per_ray: whether all samples of a ray are moved together in training, and not one by one.
     """
 
@@ -68,18 +68,18 @@ class ProposalsConfig:
         """Exponent of weights at a progress of the fit in [0, 1], from 0 (even sampling) to 1."""
         return 1.0 if self.anneal == 0 else self.anneal * progress / ((self.anneal - 1) * progress + 1)
 
-    def build(self, scene: Scene) -> Proposals:
+    def build(self, scene: Scene) -> ProposalSampler:
         """The sampler with the fields of its levels."""
-        return Proposals(self, [field.build(scene) for field in self.fields])
+        return ProposalSampler(self, [field.build(scene) for field in self.fields])
 
 
-class Proposals(Sampler):
+class ProposalSampler(Sampler):
     """Sampler of several levels, each drawn from the weights of the one before.
 
     Positions carry no gradient into levels with fields of their own: poses are fitted to the rendered level.
 
     Attributes:
-        fields: densities of the proposal levels; empty where the rendered field is asked.
+        fields: densities of the proposal levels; empty where the rendered field is queried.
     """
 
     def __init__(self, config: ProposalsConfig, fields: list[Field]) -> None:
@@ -91,41 +91,41 @@ class Proposals(Sampler):
         self.fields = nn.ModuleList(fields)
 
     @override
-    def untrained(self) -> Proposals:
+    def untrained(self) -> ProposalSampler:
         """Copy of the sampler with the rendered field's density in place of trained proposals."""
         if not self.config.fields:
             return self
-        return Proposals(replace(self.config, fields=()), [])
+        return ProposalSampler(replace(self.config, fields=()), [])
 
     @override
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Sample every ray that meets the bounds, level by level; outside the graph the last level's density comes along."""
         hit = hit_indices(rays)
-        near, far, knee = self._ends(rays, hit, ctx)
-        place, mass = near.new_tensor([0.0, 1.0]).expand(len(hit), 2), near.new_ones(len(hit), 1)
+        near, far, transition = self._ends(rays, hit, ctx)
+        edges, weights = near.new_tensor([0.0, 1.0]).expand(len(hit), 2), near.new_ones(len(hit), 1)
         exponent = self.config.exponent(ctx.progress if ctx.training else 1.0)
         levels: list[Trace] = []
 
-        def intervals(count: int) -> tuple[Tensor, Samples]:
-            drawn = resample(place, mass, count, ctx, per_ray=self.config.jitter_per_ray)
-            return drawn, pack(rays, hit, from_spacing(torch.lerp(near, far, drawn), ctx.bounds, knee))
+        def at(edges: Float[Tensor, "k edges"]) -> Samples:
+            return pack_intervals(rays, hit, from_spacing(torch.lerp(near, far, edges), ctx.bounds, transition))
 
         for index, count in enumerate(self.config.counts):
-            place, samples = intervals(count)
-            levels.append(self._level(index, samples, len(rays), field, ctx))
-            weights = levels[-1].weights
-            assert weights is not None
-            place, mass = self._widened(place, weights.detach().view(len(hit), count), prod(self.config.counts[: index + 1]))
-            mass = (mass + self.config.padding) ** exponent
-        _, samples = intervals(self.config.count)
+            edges = resample(edges, weights, count, ctx, per_ray=self.config.jitter_per_ray)
+            level = self._level(index, at(edges), len(rays), field, ctx)
+            levels.append(level)
+            assert level.weights is not None
+            level_weights = level.weights.detach().view(len(hit), count)
+            edges, weights = self._widened(edges, level_weights, prod(self.config.counts[: index + 1]))
+            weights = (weights + self.config.padding) ** exponent
+        samples = at(resample(edges, weights, self.config.count, ctx, per_ray=self.config.jitter_per_ray))
         hidden = ctx.training and not self.config.fields and not self.config.train_levels
         return self._with_density(samples, field, ctx), () if hidden else tuple(levels)
 
     def _ends(self, rays: Rays, hit: Int[Tensor, " k"], ctx: Context) -> tuple[Tensor, Tensor, Tensor]:
-        """Both ends of the rays in spacing coordinates, and the knee of the spacing, each (k, 1)."""
-        knee = unit_ball_exit(rays[hit], ctx.bounds)
-        near, far = (to_spacing(end[hit, None], ctx.bounds, knee) for end in (rays.near, rays.far))
-        return near, far, knee
+        """Both ends of the rays in spacing coordinates, and the spacing's transition distance, each (k, 1)."""
+        transition = unit_ball_exit(rays[hit], ctx.bounds)
+        near, far = (to_spacing(end[hit, None], ctx.bounds, transition) for end in (rays.near, rays.far))
+        return near, far, transition
 
     @torch.no_grad()
     def _widened(
@@ -151,7 +151,7 @@ class Proposals(Sampler):
         return Trace(samples, values, sample_weights(values.density, samples, rays), rays=rays)
 
     def _with_density(self, samples: Samples, field: Field, ctx: Context) -> Samples:
-        """Samples with the field's density and features, outside the graph, where colour is queried of few of them only."""
+        """Samples with the field's density and features, in inference, where renderers query radiance at few of them."""
         if ctx.training or torch.is_grad_enabled() or Quantity.DENSITY not in field.provides:
             return samples
         want = Quantity.DENSITY | (field.provides & Quantity.FEATURES)

@@ -31,7 +31,7 @@ from invgraphics.core import (
 from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.ray_normals import normals_from_distances
-from invgraphics.renderers.samplers import hit_indices, pack, strata
+from invgraphics.renderers.samplers import hit_indices, pack_intervals, stratified_edges
 from invgraphics.renderers.srn import pixel_network
 from invgraphics.renderers.volumetric import query
 
@@ -144,8 +144,8 @@ class RayAttention(RayRenderer):
 
     def _tokens(self, field: Field, rays: Rays, hit: Int[Tensor, " k"], ctx: Context) -> tuple[Samples, Float[Tensor, "k s w"]]:
         """Samples of the rays ``hit``, and their tokens after the transformer."""
-        edges = strata(rays[hit], self.config.samples, ctx)
-        samples = pack(rays, hit, from_spacing(edges, ctx.bounds))
+        edges = stratified_edges(rays[hit], self.config.samples, ctx)
+        samples = pack_intervals(rays, hit, from_spacing(edges, ctx.bounds))
         features = query(field, samples, Quantity.FEATURES, ctx.chunk).features
         assert features is not None
         near, far = edges[:, :1], edges[:, -1:]

@@ -53,12 +53,12 @@ class StratifiedConfig:
         """Samples on each ray."""
         return self.count
 
-    def build(self, scene: Scene) -> Stratified:
+    def build(self, scene: Scene) -> StratifiedSampler:
         """The sampler; it needs nothing from the scene."""
-        return Stratified(self)
+        return StratifiedSampler(self)
 
 
-class Stratified(Sampler):
+class StratifiedSampler(Sampler):
     """Stratified sampler: intervals tile each ray from near to far, inner edges jittered in training."""
 
     def __init__(self, config: StratifiedConfig) -> None:
@@ -68,9 +68,9 @@ class Stratified(Sampler):
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Sample every ray that intersects the bounds, without querying the field."""
         hit = hit_indices(rays)
-        knee = unit_ball_exit(rays[hit], ctx.bounds)
-        edges = from_spacing(strata(rays[hit], self.config.count, ctx, knee), ctx.bounds, knee)
-        return pack(rays, hit, edges), ()
+        transition = unit_ball_exit(rays[hit], ctx.bounds)
+        edges = from_spacing(stratified_edges(rays[hit], self.config.count, ctx, transition), ctx.bounds, transition)
+        return pack_intervals(rays, hit, edges), ()
 
 
 @dataclass(frozen=True)
@@ -96,12 +96,12 @@ class HierarchicalConfig:
         """Samples on each ray."""
         return self.coarse + self.fine
 
-    def build(self, scene: Scene) -> Hierarchical:
+    def build(self, scene: Scene) -> HierarchicalSampler:
         """The sampler, with its proposal field if it has one."""
-        return Hierarchical(self, None if self.proposal is None else self.proposal.build(scene))
+        return HierarchicalSampler(self, None if self.proposal is None else self.proposal.build(scene))
 
 
-class Hierarchical(Sampler):
+class HierarchicalSampler(Sampler):
     """Hierarchical sampler: two passes, whose merged edges bound the second pass's intervals."""
 
     def __init__(self, config: HierarchicalConfig, proposal: Field | None = None) -> None:
@@ -112,9 +112,9 @@ class Hierarchical(Sampler):
         self.proposal = proposal
 
     @override
-    def untrained(self) -> Hierarchical:
+    def untrained(self) -> HierarchicalSampler:
         """Copy of the sampler with the rendered field's density in place of a trained proposal, as in NeRF."""
-        return self if self.proposal is None else Hierarchical(replace(self.config, proposal=None))
+        return self if self.proposal is None else HierarchicalSampler(replace(self.config, proposal=None))
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Sample by two passes; returns the first pass's trace too, in training only if its proposal field is trained."""
@@ -123,18 +123,18 @@ class Hierarchical(Sampler):
         assert trace.weights is not None
         with torch.no_grad():
             weights = trace.weights.reshape(len(hit), self.config.coarse)
-            drawn = invert(spacing, weights + PADDING, quantiles(len(hit), self.config.fine, ctx, like=spacing))
+            drawn = sample_pdf(spacing, weights + PADDING, quantiles(len(hit), self.config.fine, ctx, like=spacing))
         both = torch.cat([spacing, drawn], dim=1).sort(dim=1).values
         edges = from_spacing(both, ctx.bounds, unit_ball_exit(rays[hit], ctx.bounds))
         hidden = ctx.training and self.proposal is None
-        return pack(rays, hit, edges), () if hidden else (trace,)
+        return pack_intervals(rays, hit, edges), () if hidden else (trace,)
 
     def _coarse_pass(self, rays: Rays, field: Field, ctx: Context) -> tuple[Float[Tensor, "k edges"], Trace]:
         """Edges of the coarse strata in spacing coordinates, for the rays that meet the bounds, and their weights."""
         hit = hit_indices(rays)
-        knee = unit_ball_exit(rays[hit], ctx.bounds)
-        spacing = strata(rays[hit], self.config.coarse, ctx, knee)
-        coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds, knee))
+        transition = unit_ball_exit(rays[hit], ctx.bounds)
+        spacing = stratified_edges(rays[hit], self.config.coarse, ctx, transition)
+        coarse = pack_intervals(rays, hit, from_spacing(spacing, ctx.bounds, transition))
         if self.proposal is None:
             values, sigma = None, field.density_no_grad(coarse)
         else:
@@ -150,14 +150,16 @@ def hit_indices(rays: Rays) -> Int[Tensor, " k"]:
 
 
 def unit_ball_exit(rays: Rays, bounds: Bounds) -> Float[Tensor, "k 1"]:
-    """Distance beyond which a ray has left the bounds' unit ball, from any origin."""
+    """Distance by which a ray has left the bounds' unit ball, from any origin: the ``transition`` of `to_spacing`."""
     return (rays.origins - bounds.centre).norm(dim=1, keepdim=True) + bounds.half.max()
 
 
-def strata(rays: Rays, count: int, ctx: Context, knee: Float[Tensor, "k 1"] | None = None) -> Float[Tensor, "k edges"]:
+def stratified_edges(
+    rays: Rays, count: int, ctx: Context, transition: Float[Tensor, "k 1"] | None = None
+) -> Float[Tensor, "k edges"]:
     """``count + 1`` edges from near to far in spacing coordinates; in training the inner ones move by up to half a stratum."""
-    bend = None if knee is None else knee[:, 0]
-    near, far = to_spacing(rays.near, ctx.bounds, bend), to_spacing(rays.far, ctx.bounds, bend)
+    of_ray = None if transition is None else transition[:, 0]
+    near, far = to_spacing(rays.near, ctx.bounds, of_ray), to_spacing(rays.far, ctx.bounds, of_ray)
     fraction = torch.arange(count + 1, dtype=near.dtype, device=near.device).expand(len(near), -1)
     if ctx.training and count > 1:
         shift = uniform((len(near), count - 1), ctx, like=near) - 0.5
@@ -181,24 +183,24 @@ def uniform(shape: tuple[int, ...], ctx: Context, like: Tensor) -> Tensor:
     return torch.rand(shape, generator=ctx.generator, dtype=like.dtype, device=device).to(like.device)
 
 
-def invert(
-    edges: Float[Tensor, "k bins_plus_1"], mass: Float[Tensor, "k bins"], u: Float[Tensor, "k c"]
+def sample_pdf(
+    edges: Float[Tensor, "k bins_plus_1"], weights: Float[Tensor, "k bins"], u: Float[Tensor, "k c"]
 ) -> Float[Tensor, "k c"]:
-    """Inverse-CDF sampling of a piecewise constant density at quantiles ``u``.
+    """Sample a piecewise constant density at quantiles ``u`` by inverting its CDF (NeRF's ``sample_pdf``).
 
     Args:
         edges: bin edges, increasing.
-        mass: unnormalised probability of each bin, > 0.
+        weights: unnormalised probability of each bin, > 0.
         u: quantiles in [0, 1].
     """
-    cumulative = torch.nn.functional.pad((mass / mass.sum(dim=1, keepdim=True)).cumsum(dim=1), (1, 0))
-    upper = torch.searchsorted(cumulative, u.contiguous(), right=True).clamp(1, mass.shape[1])
+    cumulative = torch.nn.functional.pad((weights / weights.sum(dim=1, keepdim=True)).cumsum(dim=1), (1, 0))
+    upper = torch.searchsorted(cumulative, u.contiguous(), right=True).clamp(1, weights.shape[1])
     c0, c1 = cumulative.gather(1, upper - 1), cumulative.gather(1, upper)
     e0, e1 = edges.gather(1, upper - 1), edges.gather(1, upper)
     return torch.lerp(e0, e1, ((u - c0) / (c1 - c0)).clamp(0, 1))
 
 
-def pack(rays: Rays, hit: Int[Tensor, " k"], edges: Float[Tensor, "k edges"]) -> Samples:
-    """Pack the intervals between ``edges`` of the rays ``hit`` to samples."""
+def pack_intervals(rays: Rays, hit: Int[Tensor, " k"], edges: Float[Tensor, "k edges"]) -> Samples:
+    """Pack the intervals between ``edges`` of the rays ``hit`` into samples."""
     ray = hit.repeat_interleave(edges.shape[1] - 1)
     return Samples.on(rays, ray, edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1))

@@ -162,7 +162,7 @@ def _picture(rays: Rays, trace: Trace, alpha: Float[Tensor, " n"]) -> Rendering:
 
 
 def _lowest(field: Field, rays: Rays, traced: Tracing, ctx: Context) -> Float[Tensor, " n"]:
-    """Least signed distance on each ray, differentiable in field and rays: its place is stationary, or an end of the ray."""
+    """Least signed distance on each ray, differentiable in field and rays: its distance t is stationary or an end."""
     if not torch.is_grad_enabled():
         return traced.low
     met = torch.nonzero(traced.low.isfinite())[:, 0]

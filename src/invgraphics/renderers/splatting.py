@@ -45,7 +45,7 @@ class SplattingConfig:
             half of the light is gone. For evaluation: gradients pass through the expected one only.
         normals: ``shortest`` averages the splats' shortest axes; ``depth`` takes the slope of the depth map.
         absolute_gradients: whether density control sees the sum of absolute gradients over pixels (AbsGS), in which opposite
-            pulls do not cancel.
+            gradients do not cancel.
         max_grad_splats: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
             limited bandwidth uses 10).
         tile: edge of a tile in pixels (Numba takes 32 at most); ``None`` leaves it to the kernel.
@@ -68,7 +68,7 @@ class SplattingConfig:
         if self.tile is not None and self.tile < 1:
             raise ValueError(f"tile must be at least 1, not {self.tile}")
         if self.shape == "disc" and (self.antialiased or self.absolute_gradients):
-            raise ValueError("discs know neither 'antialiased' nor 'absolute_gradients'")
+            raise ValueError("'antialiased' and 'absolute_gradients' are not supported for discs")
 
     def build(self, scene: Scene) -> Splatting:
         """The renderer; it needs nothing from the scene."""

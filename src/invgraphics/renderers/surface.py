@@ -28,7 +28,7 @@ from invgraphics.core import (
     Trace,
     harmonics,
 )
-from invgraphics.core.contributions import opacities
+from invgraphics.core.compositing import alphas_from_weights
 from invgraphics.core.mesh import face_normals
 from invgraphics.errors import NotComposableError
 from invgraphics.kernels.reference.mesh import hit
@@ -103,7 +103,7 @@ class Surface(Renderer):
         order = depth.argsort(stable=True)[: int(depth.isfinite().sum())]
         t = depth[order]
         weight = torch.full_like(t, 1 / len(depth))
-        alpha, reached = opacities(weight)
+        alpha, reached = alphas_from_weights(weight)
         counted = torch.ones_like(order, dtype=torch.bool)
         return Contributions("surface points", t, t, t, alpha, reached[:-1], weight, colours[order], counted)
 

@@ -1,4 +1,4 @@
-"""Early ray termination: leaves out samples behind opaque surfaces, with few queries of the field."""
+"""Early ray termination: samples behind opaque surfaces are left out, with few queries of the field."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ Query = Callable[[Samples], FieldValues]
 """Values of a field at samples, outside the graph; the density at least."""
 
 
-def visible_samples(rays: Rays, march: March, query: Query, transmittance: float, chunk: int | None) -> Samples:
-    """Samples up to which the transmittance is at least ``transmittance``, with the values queried on the way.
+def visible_samples(rays: Rays, march: March, query: Query, min_transmittance: float, chunk: int | None) -> Samples:
+    """Samples in front of which the transmittance is still at least ``min_transmittance``, with the values queried for it.
 
     Their positions carry the gradients of the rays; the values carry none.
 
@@ -29,57 +29,56 @@ def visible_samples(rays: Rays, march: March, query: Query, transmittance: float
         rays: the n rays marched.
         march: their intervals.
         query: the field's density, and features where they are of use.
-        transmittance: least transmittance, in [0, 1).
+        min_transmittance: in [0, 1).
         chunk: intervals per ray of the first query, >= 1; ``None`` queries all at once, which takes a GPU less time than
             several rounds with less work in each.
     """
-    kept, found = _intervals_before_depth(
-        rays, march, query, -math.log(transmittance) if transmittance > 0 else math.inf, chunk
-    )
+    max_optical_depth = -math.log(min_transmittance) if min_transmittance > 0 else math.inf
+    kept, found = _intervals_before_depth(rays, march, query, max_optical_depth, chunk)
     samples = Samples.on(rays, march.ray[kept], march.t0[kept], march.t1[kept])
     return replace(samples, density=found.density, features=found.features)
 
 
 @torch.no_grad()
 def _intervals_before_depth(
-    rays: Rays, march: March, query: Query, most: float, chunk: int | None
+    rays: Rays, march: March, query: Query, max_optical_depth: float, chunk: int | None
 ) -> tuple[Int[Tensor, " k"], FieldValues]:
-    """Intervals behind an optical depth of ``most`` at most, and their values."""
+    """Indices and field values of the intervals in front of which the optical depth is at most ``max_optical_depth``."""
     counts = torch.bincount(march.ray, minlength=len(rays))
     first = counts.cumsum(0) - counts
     reached = torch.zeros_like(march.t0, dtype=torch.bool)
     found, order = [], []
-    depth = rays.near.new_zeros(len(rays))
-    going, done = torch.nonzero(counts)[:, 0], 0
+    optical_depth = rays.near.new_zeros(len(rays))
+    active, queried = torch.nonzero(counts)[:, 0], 0
     if chunk is None:
-        chunk = int(counts.max()) if len(going) else 1
-    while len(going):
-        left = counts[going] - done
-        # One row per ray that goes on, one column per interval of this chunk; the last rows' ends stay empty.
-        table = rays.near.new_zeros(len(going), chunk)
-        there = torch.arange(chunk, device=left.device) < left[:, None]
-        place = torch.nonzero(there.view(-1))[:, 0]
-        index = (first[going] + done)[place // chunk] + place % chunk
+        chunk = int(counts.max()) if len(active) else 1
+    while len(active):
+        remaining = counts[active] - queried
+        # One row per active ray, one column per interval of this chunk; rows of rays with fewer intervals end in zeros.
+        table = rays.near.new_zeros(len(active), chunk)
+        valid = torch.arange(chunk, device=remaining.device) < remaining[:, None]
+        slot = torch.nonzero(valid.view(-1))[:, 0]
+        index = (first[active] + queried)[slot // chunk] + slot % chunk
         t0, t1 = march.t0[index], march.t1[index]
         values = query(Samples.on(rays, march.ray[index], t0, t1))
         assert values.density is not None
         found.append(values)
         order.append(index)
-        table.view(-1)[place] = values.density * (t1 - t0)
-        sums = torch.nn.functional.pad(table.cumsum(dim=1), (1, 0)) + depth[going, None]
-        reached[index] = sums[:, :-1].reshape(-1)[place] <= most
-        depth[going] = sums[:, -1]
-        going = going[(left > chunk) & (sums[:, -1] <= most)]
-        done, chunk = done + chunk, chunk + (chunk + 1) // 2
+        table.view(-1)[slot] = values.density * (t1 - t0)
+        sums = torch.nn.functional.pad(table.cumsum(dim=1), (1, 0)) + optical_depth[active, None]
+        reached[index] = sums[:, :-1].reshape(-1)[slot] <= max_optical_depth
+        optical_depth[active] = sums[:, -1]
+        active = active[(remaining > chunk) & (sums[:, -1] <= max_optical_depth)]
+        queried, chunk = queried + chunk, chunk + (chunk + 1) // 2
     kept = torch.nonzero(reached)[:, 0]
     if not found:
         return kept, FieldValues(density=march.t0[kept])
-    # Where each kept interval was in the order of the queries.
-    at = torch.empty_like(march.ray).index_copy_(0, torch.cat(order), torch.arange(sum(map(len, order)), device=kept.device))
-    at = at[kept]
+    # Position of each kept interval in the order of the queries.
+    query_order = torch.arange(sum(map(len, order)), device=kept.device)
+    query_position = torch.empty_like(march.ray).index_copy_(0, torch.cat(order), query_order)[kept]
     features = [values.features for values in found if values.features is not None]
-    density = torch.cat([values.density for values in found if values.density is not None])[at]
-    return kept, FieldValues(density=density, features=torch.cat(features)[at] if features else None)
+    density = torch.cat([values.density for values in found if values.density is not None])[query_position]
+    return kept, FieldValues(density=density, features=torch.cat(features)[query_position] if features else None)
 
 
 def contributing_samples(

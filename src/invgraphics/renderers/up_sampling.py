@@ -11,9 +11,19 @@ from torch.nn.functional import pad
 from typing_extensions import override
 
 from invgraphics.core import Context, Field, Quantity, Rays, Sampler, Samples, Scene, Trace
+from invgraphics.core.compositing import weights_from_optical_depth
 from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.renderers.distance_density import section_optical_depth
-from invgraphics.renderers.samplers import PADDING, check_samples, hit_indices, invert, pack, quantiles, strata, unit_ball_exit
+from invgraphics.renderers.samplers import (
+    PADDING,
+    check_samples,
+    hit_indices,
+    pack_intervals,
+    quantiles,
+    sample_pdf,
+    stratified_edges,
+    unit_ball_exit,
+)
 
 MAX_ROUNDS = 64
 """Rounds of up-sampling; the sharpness doubles with each, and ends far beyond float32's resolution of a box."""
@@ -47,13 +57,13 @@ class UpSamplingConfig:
         """Samples on each ray."""
         return self.coarse + self.fine
 
-    def build(self, scene: Scene) -> UpSampling:
+    def build(self, scene: Scene) -> UpSampler:
         """The sampler; it needs nothing from the scene."""
-        return UpSampling(self)
+        return UpSampler(self)
 
 
-class UpSampling(Sampler):
-    """Adds edges of intervals where weights, of distances taken as linear in between, say that a surface is."""
+class UpSampler(Sampler):
+    """NeuS's up-sampling: inserts edges where section weights of a piecewise linear signed distance are large."""
 
     def __init__(self, config: UpSamplingConfig) -> None:
         super().__init__()
@@ -67,30 +77,32 @@ class UpSampling(Sampler):
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         """Sample every ray that meets the bounds; outside training the rounds' weights are returned as well."""
         hit = hit_indices(rays)
-        knee = unit_ball_exit(rays[hit], ctx.bounds)
-        edges = from_spacing(strata(rays[hit], self.config.coarse, ctx, knee), ctx.bounds, knee)
+        transition = unit_ball_exit(rays[hit], ctx.bounds)
+        edges = from_spacing(stratified_edges(rays[hit], self.config.coarse, ctx, transition), ctx.bounds, transition)
         with torch.no_grad():
-            sdf = distances(field, rays, hit, edges)
+            sdf = signed_distances(field, rays, hit, edges)
             sharpness, levels = self.config.sharpness / ctx.bounds.half.mean(), []
             for number in range(self.config.rounds):
                 weights = section_weights(edges, sdf, sharpness * 2**number)
-                levels.append(Trace(pack(rays, hit, edges), None, weights.flatten(), rays=len(rays)))
-                added = self._draw(edges, weights, (ctx, knee))
+                levels.append(Trace(pack_intervals(rays, hit, edges), None, weights.flatten(), rays=len(rays)))
+                added = self._draw(edges, weights, transition, ctx)
                 merged, order = torch.cat([edges, added], dim=1).sort(dim=1)
                 if number + 1 < self.config.rounds:
-                    sdf = torch.cat([sdf, distances(field, rays, hit, added)], dim=1).gather(1, order)
+                    sdf = torch.cat([sdf, signed_distances(field, rays, hit, added)], dim=1).gather(1, order)
                 edges = merged
-        return pack(rays, hit, edges), () if ctx.training else tuple(levels)
+        return pack_intervals(rays, hit, edges), () if ctx.training else tuple(levels)
 
-    def _draw(self, edges: Tensor, weights: Tensor, place: tuple[Context, Tensor]) -> Float[Tensor, "k added"]:
-        ctx, knee = place
-        spacing = to_spacing(edges, ctx.bounds, knee)
+    def _draw(
+        self, edges: Float[Tensor, "k edges"], weights: Float[Tensor, "k bins"], transition: Float[Tensor, "k 1"], ctx: Context
+    ) -> Float[Tensor, "k added"]:
+        """New edges of one round, drawn from ``weights`` in spacing coordinates."""
+        spacing = to_spacing(edges, ctx.bounds, transition)
         u = quantiles(len(edges), self.config.fine // self.config.rounds, ctx, like=edges)
-        return from_spacing(invert(spacing, weights + PADDING, u), ctx.bounds, knee)
+        return from_spacing(sample_pdf(spacing, weights + PADDING, u), ctx.bounds, transition)
 
 
-def distances(field: Field, rays: Rays, hit: Int[Tensor, " k"], t: Float[Tensor, "k c"]) -> Float[Tensor, "k c"]:
-    """Signed distances at distances ``t`` along the rays ``hit``, outside the graph."""
+def signed_distances(field: Field, rays: Rays, hit: Int[Tensor, " k"], t: Float[Tensor, "k c"]) -> Float[Tensor, "k c"]:
+    """Signed distances at distances ``t`` along the rays ``hit``, without gradients."""
     ray, flat = hit.repeat_interleave(t.shape[1]), t.reshape(-1)
     sdf = field.query_no_grad(Samples.on(rays, ray, flat, flat), Quantity.SDF).sdf
     assert sdf is not None
@@ -100,22 +112,13 @@ def distances(field: Field, rays: Rays, hit: Int[Tensor, " k"], t: Float[Tensor,
 def section_weights(
     edges: Float[Tensor, "k edges"], sdf: Float[Tensor, "k edges"], sharpness: Float[Tensor, ""]
 ) -> Float[Tensor, "k bins"]:
-    """Weights of the intervals between edges, whose distances are linear in between, by NeuS's density.
+    """Weights of the intervals between edges by NeuS's density, with the signed distance assumed linear in each.
 
-    An interval falls no faster than the one before it, so that the near side of a thin thing is not taken for deep inside.
+    No interval's slope exceeds that of the interval before it (NeuS): one that spans a thin object, behind which the distance
+    rises again, keeps a falling slope.
     """
     delta = edges.diff(dim=1)
     slope = sdf.diff(dim=1) / delta.clamp_min(torch.finfo(delta.dtype).tiny)
     slope = torch.minimum(slope, pad(slope[:, :-1], (1, 0))).clamp(-1, 0)
-    depth = section_optical_depth((sdf[:, 1:] + sdf[:, :-1]) / 2, slope, delta, sharpness)
-    return interval_weights(depth)
-
-
-def depth_before(depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
-    """Optical depth before each of a ray's consecutive intervals."""
-    return pad(depth[:, :-1].cumsum(dim=1), (1, 0))
-
-
-def interval_weights(depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
-    """Weights of a ray's consecutive intervals from their optical depths (NeRF, equation 3)."""
-    return torch.exp(-depth_before(depth)) * -torch.expm1(-depth)
+    optical_depth = section_optical_depth((sdf[:, 1:] + sdf[:, :-1]) / 2, slope, delta, sharpness)
+    return weights_from_optical_depth(optical_depth)

@@ -27,8 +27,8 @@ class VolSDFConfig:
         beta_final: β at the end where it is scheduled; stands in for a learnt one that the field was not fitted with.
         beta_min: least β (VolSDF: 1e-4).
         change: whether β is ``learnt``, ``scheduled`` log-linearly over the fit, or ``held``.
-        sections: take the density's mean over each interval, along which the distance is linear, instead of the density at its
-            middle (VolSDF): for even steps, which are longer than a small β.
+        sections: take the density's mean over each interval, along which the SDF is assumed linear, instead of the density at
+            its middle (VolSDF): for even steps, which are longer than a small β.
         gradient_reach: as of volume rendering.
         weight_threshold: in training, samples that weigh no more than this by the sampler's own densities, where it
             has some (``occupancy``), are left out; 0 keeps all.
@@ -82,8 +82,9 @@ class VolSDF(Hybrid):
 
     @override
     def density(self, field: Field, ctx: Context, *, on_rays: bool = True) -> LaplaceDensity:
-        slopes = None if not (self.config.sections and on_rays) else "neighbours" if ctx.training else "gradient"
-        return LaplaceDensity(field, self.beta(ctx), slopes)
+        if not (self.config.sections and on_rays):
+            return LaplaceDensity(field, self.beta(ctx), "pointwise")
+        return LaplaceDensity(field, self.beta(ctx), "neighbours" if ctx.training else "gradient")
 
     @override
     def untrained(self) -> VolSDF:

@@ -31,9 +31,9 @@ from invgraphics.renderers.quadrature import integrate, sample_weights
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.termination import contributing_samples
 
-UNSEEN = 1e-3
-"""Outside the graph, what all samples together that are not asked for their colour may contribute to a ray: a quarter of
-the smallest step of an 8-bit picture."""
+MAX_SKIPPED_WEIGHT = 1e-3
+"""Upper bound, in inference, of the summed weight per ray of samples whose radiance is not evaluated: a quarter of an 8-bit
+step."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class VolumetricConfig:
     Attributes:
         sampler: where along the rays to look.
         gradient_reach: gradients of samples nearer to a camera than this are scaled by the square of their distance over it;
-            0 leaves them alone. Few pixels see what is near a camera, and each sees it large (Philip and Deschaintre 2023,
-            Floaters no more). In endless space it is in local units; in a box in halves of its longest edge, and only for
-            rays that begin within it: seen from outside, nothing in it is near.
-        colour_threshold: in training, samples that contribute no more than this to their ray are not asked for their colour,
-            which counts as black (DVGO, TensoRF: 1e-4); 0 asks all.
+            0 leaves them alone. What is near a camera is seen by few pixels, whose gradients would dominate there (Philip
+            and Deschaintre 2023, Floaters no more). In endless space it is in local units; in a box in halves of its longest
+            edge, and only for rays that begin within it: seen from outside, nothing in it is near.
+        colour_threshold: in training, radiance is not evaluated for samples whose weight is at most this; it counts as black
+            (DVGO, TensoRF: 1e-4). 0 evaluates all.
     """
 
     title: ClassVar[str] = "volume rendering"
@@ -88,7 +88,7 @@ class Volumetric(RayRenderer):
         samples, levels = self.sampler.sample(ctx.bounds.clip(rays), field, ctx)
         want = self.requires | (field.provides & Quantity.NORMAL if ctx.geometry else Quantity.NONE)
         if Quantity.NORMAL in want and samples.density is None and not torch.is_grad_enabled():
-            # A normal costs several looks at the density, which few samples deserve.
+            # Normals cost several density queries, so they are evaluated only where samples contribute.
             samples = replace(samples, density=query(field, samples, Quantity.DENSITY, ctx.chunk).density)
         if samples.density is not None and not torch.is_grad_enabled():
             values = _query_contributing(field, samples, len(rays), want, ctx.chunk)
@@ -114,7 +114,7 @@ class Volumetric(RayRenderer):
         if torch.is_grad_enabled() or ctx.training or normals:
             return None
         rays = camera.rays()
-        composited = self.sampler.composite_fused(ctx.bounds.clip(rays), camera.width, field, ctx, UNSEEN)
+        composited = self.sampler.composite_fused(ctx.bounds.clip(rays), camera.width, field, ctx, MAX_SKIPPED_WEIGHT)
         if composited is None:
             return None
         sums, alpha = composited
@@ -159,11 +159,11 @@ def _query_contributing(field: Field, samples: Samples, rays: int, want: Quantit
     """Query samples of known density; radiance of samples with negligible weight is skipped and stays zero."""
     assert samples.density is not None
     weights = sample_weights(samples.density, samples, rays)
-    seen = contributing_samples(weights, samples.ray, rays, UNSEEN)
-    found = query(field, samples[seen], want & ~Quantity.DENSITY, chunk)
+    visible = contributing_samples(weights, samples.ray, rays, MAX_SKIPPED_WEIGHT)
+    found = query(field, samples[visible], want & ~Quantity.DENSITY, chunk)
     values = {entry.name: getattr(found, entry.name) for entry in fields(FieldValues)}
     spread = {
-        name: value.new_zeros(len(samples), *value.shape[1:]).index_copy_(0, seen, value)
+        name: value.new_zeros(len(samples), *value.shape[1:]).index_copy_(0, visible, value)
         for name, value in values.items()
         if value is not None
     }
@@ -176,12 +176,12 @@ def _query_above(threshold: float, field: Field, samples: Samples, rays: int, wa
     values = query(field, samples, (want & ~Quantity.RADIANCE) | features, chunk)
     assert values.density is not None
     with torch.no_grad():
-        seen = torch.nonzero(sample_weights(values.density, samples, rays) > threshold)[:, 0]
-    asked = replace(samples[seen], features=None if values.features is None else values.features[seen])
-    found = query(field, asked, Quantity.RADIANCE, chunk).radiance
-    assert found is not None
-    radiance = found.new_zeros(len(samples), 3).index_copy(0, seen, found)
-    return replace(values, radiance=radiance, features=None)
+        visible = torch.nonzero(sample_weights(values.density, samples, rays) > threshold)[:, 0]
+    with_features = replace(samples[visible], features=None if values.features is None else values.features[visible])
+    radiance = query(field, with_features, Quantity.RADIANCE, chunk).radiance
+    assert radiance is not None
+    everywhere = radiance.new_zeros(len(samples), 3).index_copy(0, visible, radiance)
+    return replace(values, radiance=everywhere, features=None)
 
 
 def query(field: Field, samples: Samples, want: Quantity, chunk: int) -> FieldValues:

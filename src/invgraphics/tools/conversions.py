@@ -122,7 +122,7 @@ def _seen_points(model: Model, index: int, scene: Scene, count: int) -> tuple[Te
         step.narrow(axis, 1, last).copy_(torch.maximum(step.narrow(axis, 1, last), jump))
     usable = (depth.isfinite() & (picture.alpha >= 0.5) & (step <= EDGE * depth)).reshape(-1).nonzero()[:, 0]
     flat = usable[torch.randperm(len(usable))[:count]]
-    rays = camera.rays(torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5)
+    rays = camera.rays(camera.pixel_centres_of(flat))
     rgb = (picture.rgb / picture.alpha[..., None].clamp_min(1e-3)).reshape(-1, 3)[flat]
     normals = torch.zeros_like(rgb) if picture.normal is None else picture.normal.reshape(-1, 3)[flat]
     return rays.origins + depth.reshape(-1)[flat, None] * rays.directions, rgb, normals

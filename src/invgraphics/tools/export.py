@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from invgraphics import plugins
-from invgraphics.core import Camera, Context, Field, Gaussians, Quantity, harmonics
-from invgraphics.core.samples import FieldValues, Samples
-from invgraphics.errors import InputError, NotComposableError
+from invgraphics.core import Camera, Gaussians, Quantity, harmonics
+from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
+from invgraphics.fields.gaussian import FixedGaussians
 from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import ANTIALIASED, Splats, read_gaussians, write_gaussians
 from invgraphics.runs.folder import output_file
@@ -72,28 +72,6 @@ class Exported:
 
     path: Path
     facts: dict[str, str]
-
-
-class FixedGaussians(Field):
-    """Field of constant Gaussians, for rendering without fitting."""
-
-    provides = Quantity.GAUSSIANS
-
-    def __init__(self, gaussians: Gaussians) -> None:
-        super().__init__()
-        self._gaussians = gaussians
-
-    def query(self, samples: Samples, want: Quantity) -> FieldValues:
-        """Refuse pointwise queries: this field has primitives only."""
-        raise NotComposableError(f"FixedGaussians has no {want.words()} at points.", "It provides gaussians.")
-
-    def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
-        """The Gaussians."""
-        return self._gaussians if want == Quantity.GAUSSIANS else super().primitives(want, ctx)
-
-    def primitive_count(self) -> int:
-        """Number of Gaussians."""
-        return len(self._gaussians)
 
 
 def export_run(request: ExportRequest) -> Exported:

@@ -93,7 +93,7 @@ def _predicted_and_true(
     valid = torch.arange(batch.alpha.numel()) if view.mask is None else view.mask.reshape(-1).nonzero()[:, 0]
     if isinstance(model.renderer, RayRenderer):
         flat = valid[torch.randint(len(valid), (min(rays, len(valid)),), generator=generator)]
-        pixels = torch.stack([flat % camera.width, flat // camera.width], dim=1) + 0.5
+        pixels = camera.pixel_centres_of(flat)
         picture, _ = model.renderer.render_rays(model.field, camera.rays(pixels.to(background)), ctx)
         return picture.over(background), batch.target.reshape(-1, 3)[flat].to(background)
     picture, _ = model.renderer.render_image(model.field, camera, ctx)

@@ -184,14 +184,14 @@ class PointField(Field):
             normal = self._normal(position)
         index, _ = self._neighbours(position)
         near = (index[:, 0] >= 0).nonzero()[:, 0]
-        own, handed = self._aggregate(position.index_select(0, near), index.index_select(0, near))
-        density = own.new_zeros(len(position)).index_copy(0, near, own)
+        inner, aggregated = self._aggregate(position.index_select(0, near), index.index_select(0, near))
+        density = inner.new_zeros(len(position)).index_copy(0, near, inner)
         radiance = features = None
         if Quantity.RADIANCE in want:
-            seen = self._radiance(handed, samples.direction.index_select(0, near))
+            seen = self._radiance(aggregated, samples.direction.index_select(0, near))
             radiance = seen.new_zeros(len(position), 3).index_copy(0, near, seen)
         if Quantity.FEATURES in want:
-            features = handed.new_zeros(len(position), handed.shape[1]).index_copy(0, near, handed)
+            features = aggregated.new_zeros(len(position), aggregated.shape[1]).index_copy(0, near, aggregated)
         return FieldValues(
             density=density if Quantity.DENSITY in want else None, radiance=radiance, normal=normal, features=features
         )
@@ -203,9 +203,9 @@ class PointField(Field):
         self, position: Float[Tensor, "m 3"], index: Int[Tensor, "m k"]
     ) -> tuple[Float[Tensor, " m"], Float[Tensor, "m f"]]:
         """Density at positions with neighbours, and their mean features, of which the last three are raw colour."""
-        # Only neighbours that are there pass through the network: two fifths of the places are empty.
-        sample, place = (index >= 0).nonzero(as_tuple=True)
-        point, m = index[sample, place], len(index)
+        # Only existing neighbours pass through the network: two fifths of the slots are empty.
+        sample, slot = (index >= 0).nonzero(as_tuple=True)
+        point, m = index[sample, slot], len(index)
         offset = (position.index_select(0, sample) - self.positions.index_select(0, point)) / self.radius
         weight = 1 / (offset.square().sum(dim=1) + 1e-6).sqrt()
         weight = weight / weight.new_zeros(m).index_add(0, sample, weight).index_select(0, sample)
@@ -217,20 +217,18 @@ class PointField(Field):
         weighted = weight * self.confidence_logits.sigmoid().index_select(0, point)
         density = softplus(self.density_head(hidden) - 1) * (self.config.density_scale / self.radius)
         density = segment_sums(density, weighted, sample, m)[:, 0]
-        features, own = (
-            segment_sums(hidden, weighted, sample, m),
-            segment_sums(self.raw_rgb.index_select(0, point), weight, sample, m),
-        )
-        return density, torch.cat([features, own], dim=1)
+        features = segment_sums(hidden, weighted, sample, m)
+        raw_rgb = segment_sums(self.raw_rgb.index_select(0, point), weight, sample, m)
+        return density, torch.cat([features, raw_rgb], dim=1)
 
-    def _radiance(self, handed: Float[Tensor, "m f"], direction: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        features, own = handed.split([self.config.width, 3], dim=1)
+    def _radiance(self, aggregated: Float[Tensor, "m f"], direction: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        features, raw_rgb = aggregated.split([self.config.width, 3], dim=1)
         seen = torch.cat([features, harmonics.basis(direction, self.config.direction_degree - 1)], dim=1)
-        raw = own + self.colour_net(seen)
+        raw = raw_rgb + self.colour_net(seen)
         return raw.sigmoid() if self.colour == "srgb" else softplus(raw)
 
     def _normal(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        """Unit normals, outside the graph; zero where there is nothing."""
+        """Unit normals, without gradients; zero where there is no density."""
         with torch.enable_grad():
             moving = position.detach().requires_grad_()
             density = self.query(Samples.at(moving), Quantity.DENSITY).density

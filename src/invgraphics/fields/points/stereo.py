@@ -149,7 +149,7 @@ def _consistent_points(pictures: Sequence[_Picture], index: int, depths: dict[in
     """Geometric consistency: points of a view's depth map that `LEAST_CONSISTENT` of the others show too (one of only one)."""
     here, depth = pictures[index], depths[index].flatten()
     flat = torch.isfinite(depth).nonzero()[:, 0]
-    rays = here.camera.rays(torch.stack([flat % here.camera.width, flat // here.camera.width], dim=1) + 0.5)
+    rays = here.camera.rays(here.camera.pixel_centres_of(flat))
     along = (rays.directions @ here.camera.cam_to_world[:3, 2]).abs()
     position = rays.origins + (depth[flat] / along)[:, None] * rays.directions
     votes = torch.zeros(len(flat))

@@ -17,14 +17,14 @@ REACH = 4.0
 
 
 def density_profile(
-    t: Float[Tensor, " k"], sigma: Float[Tensor, " k"], depth: Float[Tensor, " k"], rays: Rays
+    t: Float[Tensor, " k"], sigma: Float[Tensor, " k"], optical_depth: Float[Tensor, " k"], rays: Rays
 ) -> Profile | None:
     """Density and transmittance profile of Gaussians as overlapping densities; ``None`` without any, or where one is flat.
 
     Args:
         t: distance of each one's largest response.
         sigma: standard deviation along the ray.
-        depth: optical depth of the whole line.
+        optical_depth: optical depth of the whole line.
         rays: the one ray.
     """
     if not len(t) or not bool((sigma > 0).all()):
@@ -35,15 +35,15 @@ def density_profile(
     close = (t[:, None] + sigma[:, None] * torch.linspace(-3, 3, 13).to(t)).flatten()
     at = torch.cat([even, close.clamp(low, high)]).sort().values
     bells = torch.exp(-0.5 * ((at[:, None] - t) / sigma).square()) / math.sqrt(2 * math.pi)
-    return Profile(at, (bells * (depth / sigma)).sum(dim=1), transmittance(at, t, sigma, depth, rays))
+    return Profile(at, (bells * (optical_depth / sigma)).sum(dim=1), transmittance(at, t, sigma, optical_depth, rays))
 
 
 def transmittance(
-    at: Float[Tensor, " p"], t: Float[Tensor, " k"], sigma: Float[Tensor, " k"], depth: Float[Tensor, " k"], rays: Rays
+    at: Float[Tensor, " p"], t: Float[Tensor, " k"], sigma: Float[Tensor, " k"], optical_depth: Float[Tensor, " k"], rays: Rays
 ) -> Float[Tensor, " p"]:
     """Transmittance at distances ``at``, 1 before the near plane, through Gaussians of given optical depths."""
     passed = phi((at.maximum(rays.near[0])[:, None] - t) / sigma) - phi((rays.near[0] - t) / sigma)
-    return torch.exp(-(passed * depth).sum(dim=1))
+    return torch.exp(-(passed * optical_depth).sum(dim=1))
 
 
 def mean_distances(

@@ -13,18 +13,12 @@ from typing_extensions import override
 
 from invgraphics import kernels
 from invgraphics.core import Camera, Context, Contributions, Field, Quantity, RayRenderer, Rays, Rendering, Scene, Trace
-from invgraphics.core.contributions import opacities
+from invgraphics.core.compositing import alphas_from_weights
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, Opacity
 from invgraphics.kernels.gaussians import gaussian_composites, gaussian_integrals
 from invgraphics.kernels.reference.gaussian_order import composite_in_order, depth_order
 from invgraphics.kernels.reference.gaussian_quadrature import Weights, integrate_overlapping, weighted_sums
-from invgraphics.kernels.reference.gaussian_rays import (
-    Intersections,
-    Primitives,
-    colours,
-    intersect,
-    precompute,
-)
+from invgraphics.kernels.reference.gaussian_rays import Intersections, Primitives, colours, intersect, precompute
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.gaussians.profile import density_profile, mean_distances, transmittance
 
@@ -206,19 +200,21 @@ class GaussianExact(GaussianRays):
         weight, moment = self.blending_weights(intersections, rays, axis, True)
         order = intersections.t.argsort(stable=True)
         order = order[intersections.depth[order] > 0]
-        t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
+        t, sigma, optical_depth, weight = (
+            x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight)
+        )
         return Contributions(
             kind="Gaussians",
             t=t,
             begin=t - sigma,
             end=t + sigma,
-            alpha=-torch.expm1(-depth),
-            transmittance=transmittance(t, t, sigma, depth, rays),
+            alpha=-torch.expm1(-optical_depth),
+            transmittance=transmittance(t, t, sigma, optical_depth, rays),
             weight=weight,
             rgb=colours(primitives, intersections)[order],
             counted=torch.ones_like(order, dtype=torch.bool),
             distance=mean_distances(moment, order, weight, t),
-            profile=density_profile(t, sigma, depth, rays),
+            profile=density_profile(t, sigma, optical_depth, rays),
         )
 
 
@@ -261,8 +257,10 @@ class GaussianSorted(GaussianRays):
         weight, moment = self.blending_weights(intersections, rays, axis, True)
         order = self.order(intersections, rays, axis)
         order = order[intersections.depth[order] > 0]  # those below the splats' limit are on the ray all the same
-        t, sigma, depth, weight = (x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight))
-        alpha, reached = opacities(weight)
+        t, sigma, optical_depth, weight = (
+            x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight)
+        )
+        alpha, reached = alphas_from_weights(weight)
         return Contributions(
             kind="Gaussians",
             t=t,
@@ -274,7 +272,7 @@ class GaussianSorted(GaussianRays):
             rgb=colours(primitives, intersections)[order],
             counted=torch.ones_like(order, dtype=torch.bool),
             distance=mean_distances(moment, order, weight, t),
-            marched=density_profile(t, sigma, depth, rays),
+            marched=density_profile(t, sigma, optical_depth, rays),
         )
 
 
