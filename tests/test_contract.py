@@ -39,10 +39,10 @@ from invgraphics.renderers.samplers import (
     StratifiedConfig,
     from_spacing,
     hit_indices,
-    invert,
-    pack,
+    pack_intervals,
     quantiles,
-    strata,
+    sample_pdf,
+    stratified_edges,
 )
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.renderers.volumetric import Volumetric
@@ -74,14 +74,14 @@ class ProposalSampler(Sampler):
 
     def sample(self, rays: Rays, field: Field, ctx: Context) -> tuple[Samples, tuple[Trace, ...]]:
         hit = hit_indices(rays)
-        spacing = strata(rays[hit], self.coarse, ctx)
-        coarse = pack(rays, hit, from_spacing(spacing, ctx.bounds))
+        spacing = stratified_edges(rays[hit], self.coarse, ctx)
+        coarse = pack_intervals(rays, hit, from_spacing(spacing, ctx.bounds))
         own = softplus(5 * self.net(2 * ctx.bounds.to_unit(coarse.position) - 1)[:, 0])
         weights, _, _ = kernels.composite(own * coarse.delta, own[:, None], coarse.ray, len(rays))
         drawn = quantiles(len(hit), self.fine + 1, ctx, like=spacing)
-        edges = invert(spacing, weights.detach().view(len(hit), -1) + 1e-3, drawn)
+        edges = sample_pdf(spacing, weights.detach().view(len(hit), -1) + 1e-3, drawn)
         level = Trace(coarse, FieldValues(density=own), weights, rays=len(rays))
-        return pack(rays, hit, from_spacing(edges, ctx.bounds)), (level,)
+        return pack_intervals(rays, hit, from_spacing(edges, ctx.bounds)), (level,)
 
 
 def interlevel(trace: Trace) -> Tensor:
