@@ -118,11 +118,12 @@ def test_cells_that_are_left_out_stay_what_they_were(in_process, gauntlet, toy_f
 
 
 def test_cheap_cells_come_first(in_process, gauntlet) -> None:
-    """Within a method: fewer steps, then smaller pictures."""
+    """Within a method, at one size, whose steps cost the same: fewer steps first."""
     ablate(replace(gauntlet, cells="splatting/* *"), _yes)
     plan = {planned.fit.out: planned for planned in make_plan(read_study(Path(gauntlet.study)), gauntlet)}
     made = [(plan[out].fit.budget, plan[out].fit.size) for out in in_process.made]
-    assert made[-1] == ("4steps", 24) and sorted(made[:2]) == [("2steps", 16), ("2steps", 24)]
+    assert sorted(made) == [("2steps", 16), ("2steps", 24), ("4steps", 24)]
+    assert made.index(("2steps", 24)) < made.index(("4steps", 24))
 
 
 @pytest.fixture
