@@ -96,7 +96,7 @@ def test_wrong_kinds_of_arguments_are_sentences() -> None:
     for call, sentence in (
         (lambda: ig.fit(ONE, "toy.npz", 20), "'20' is not a budget"),
         (lambda: ig.load_method("volumetric/hash", set="field.width=64"), "'set' cannot be 'field.width=64'"),
-        (lambda: ig.load_method("voxels"), r"Did you mean|There is no method 'voxels'"),
+        (lambda: ig.load_method("voxels"), "There is no method 'voxels'"),
     ):
         with pytest.raises(InputError, match=sentence):
             call()

@@ -21,7 +21,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.runs.folder import CHECKPOINT
-from invgraphics.viewer.launch import ViewerConfig, browsable, check_address, is_loopback, open_viewer
+from invgraphics.viewer.launch import ViewerConfig, check_address, is_loopback, open_viewer, url_host
 from invgraphics.viewer.loaded_run import open_run
 
 
@@ -106,7 +106,7 @@ def test_loopback(host: str, answer: bool) -> None:
     ],
 )
 def test_the_address_that_is_printed_is_served(listens: str, opened: str) -> None:
-    assert browsable(listens) == opened
+    assert url_host(listens) == opened
 
 
 def test_the_page_is_opened_where_there_is_a_screen_only(monkeypatch) -> None:

@@ -48,12 +48,12 @@ class View:
         if self.max_size < SMALLEST:
             raise InputError(f"--max-size cannot be {self.max_size}.", f"Expected {SMALLEST} pixels or more.")
 
-        from invgraphics.viewer.launch import ViewerConfig, browsable, is_loopback, open_viewer
+        from invgraphics.viewer.launch import ViewerConfig, is_loopback, open_viewer, url_host
 
         runs = (self.folder,) if self.other is None else (self.folder, self.other)
         config = ViewerConfig(runs, self.live, self.view, self.host, self.port, self.max_size, self.scene)
         with open_viewer(config, _notify) as viewer:
-            url = f"http://{browsable(self.host)}:{viewer.port}"
+            url = f"http://{url_host(self.host)}:{viewer.port}"
             if not is_loopback(self.host):
                 _notify(f"Everyone who can reach port {viewer.port} of this machine can view these runs.")
             print(f"Serving {' and '.join(map(str, runs))}: {url} (Ctrl-C to stop)", flush=True)

@@ -24,7 +24,6 @@ from invgraphics.renderers.samplers import (
     quantiles,
     sample_pdf,
     stratified_edges,
-    uniform,
     unit_ball_exit,
 )
 from invgraphics.renderers.up_sampling import MAX_ROUNDS, signed_distances
@@ -156,7 +155,7 @@ class ErrorBoundedSampler(Sampler):
         count = min(self.config.extra, edges.shape[1])
         if not ctx.training:
             return edges[:, torch.linspace(0, edges.shape[1] - 1, count, device=edges.device).long()]
-        order = uniform((edges.shape[1],), ctx, like=edges).argsort()
+        order = ctx.rand((edges.shape[1],), like=edges).argsort()
         return edges[:, order[:count]]
 
 

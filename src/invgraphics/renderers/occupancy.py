@@ -17,7 +17,7 @@ from invgraphics.core import Bounds, Context, Field, Quantity, Rays, Sampler, Sa
 from invgraphics.kernels.reference.march import step_lengths
 from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.fused_kernels import fused_kernel
-from invgraphics.renderers.samplers import check_samples, uniform
+from invgraphics.renderers.samplers import check_samples
 from invgraphics.renderers.termination import joined, visible_samples
 from invgraphics.renderers.visibility import cells_near_points, visible_cells
 
@@ -219,7 +219,7 @@ class OccupancyGridSampler(Sampler):
         """Start distances of rays; in training each ray's lattice of steps is jittered as a whole."""
         if not ctx.training:
             return rays.near
-        return rays.near + uniform((len(rays),), ctx, like=rays.near) * step_lengths(rays, rays.near, ctx.bounds, steps)
+        return rays.near + ctx.rand((len(rays),), like=rays.near) * step_lengths(rays, rays.near, ctx.bounds, steps)
 
     @torch.no_grad()
     def _march(self, rays: Rays, ctx: Context) -> March:
@@ -291,7 +291,7 @@ class OccupancyGridSampler(Sampler):
         fit do not count as lower optical depth.
         """
         corner = torch.stack(torch.unravel_index(cells, self.ema.shape), dim=1)
-        unit = (corner + uniform((len(cells), 3), ctx, like=self.ema)) / self.config.resolution
+        unit = (corner + ctx.rand((len(cells), 3), like=self.ema)) / self.config.resolution
         position = ctx.bounds.from_unit(unit.to(ctx.bounds.lo.dtype))
         steps = self.steps(replace(ctx, progress=min(ctx.progress, LATE_STEPS_START)))
         if steps.contracted:

@@ -162,7 +162,7 @@ def stratified_edges(
     near, far = to_spacing(rays.near, ctx.bounds, of_ray), to_spacing(rays.far, ctx.bounds, of_ray)
     fraction = torch.arange(count + 1, dtype=near.dtype, device=near.device).expand(len(near), -1)
     if ctx.training and count > 1:
-        shift = uniform((len(near), count - 1), ctx, like=near) - 0.5
+        shift = ctx.rand((len(near), count - 1), like=near) - 0.5
         fraction = fraction + torch.nn.functional.pad(shift, (1, 1))
     return torch.lerp(near[:, None], far[:, None], fraction / count)
 
@@ -173,14 +173,8 @@ def quantiles(rays: int, count: int, ctx: Context, like: Tensor, *, per_ray: boo
     With ``per_ray`` all of a ray's are at the same place in their parts.
     """
     shape = (rays, 1 if per_ray else count)
-    within = uniform(shape, ctx, like) if ctx.training else like.new_full(shape, 0.5)
+    within = ctx.rand(shape, like=like) if ctx.training else like.new_full(shape, 0.5)
     return (torch.arange(count, dtype=like.dtype, device=like.device) + within) / count
-
-
-def uniform(shape: tuple[int, ...], ctx: Context, like: Tensor) -> Tensor:
-    """Uniform random numbers in [0, 1), drawn on the generator's device, so that CPU and GPU get the same."""
-    device = like.device if ctx.generator is None else ctx.generator.device
-    return torch.rand(shape, generator=ctx.generator, dtype=like.dtype, device=device).to(like.device)
 
 
 def sample_pdf(

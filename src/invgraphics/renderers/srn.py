@@ -33,7 +33,7 @@ from invgraphics.core import (
 from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.ray_normals import normals_from_distances
-from invgraphics.renderers.samplers import hit_indices, uniform
+from invgraphics.renderers.samplers import hit_indices
 from invgraphics.renderers.volumetric import query
 
 STATE_GRADIENT = 10.0
@@ -114,7 +114,7 @@ class SRN(RayRenderer):
         near, far = to_spacing(rays.near, ctx.bounds), to_spacing(rays.far, ctx.bounds)
         place, state = near, None
         if ctx.training and self.config.jitter > 0:
-            place = (near + self.config.jitter * unit * uniform((len(rays),), ctx, like=near)).minimum(far)
+            place = (near + self.config.jitter * unit * ctx.rand((len(rays),), like=near)).minimum(far)
         yield from_spacing(place, ctx.bounds)
         index = torch.arange(len(rays), device=near.device)
         for _ in range(self.config.steps):

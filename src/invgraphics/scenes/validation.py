@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -80,29 +80,32 @@ def _check_apart(scene: Scene, split: str) -> None:
 
 def _in_single_precision(scene: Scene) -> Scene:
     """The scene with float32 cameras, pictures, background and bounds, as NumPy does not make them; itself where they are."""
-    tensors = {
-        f"{name} of {what}": values
-        for split in SPLITS
-        for view in getattr(scene, split)
-        for what, part, names in (
-            (f"{split} view '{view.name}' of '{scene.name}'", view, ("image", "alpha", "depth", "normal", "mask")),
-            (f"the camera of {split} view '{view.name}' of '{scene.name}'", view.camera, ("cam_to_world", "focal", "centre")),
-        )
-        for name in names
-        if (values := getattr(part, name)) is not None
-    }
-    tensors |= {f"background of '{scene.name}'": scene.background}
+    tensors = dict(_tensors(scene))
     for what, values in tensors.items():
         if not isinstance(values, Tensor):
-            message = f"The {what} is a {type(values).__name__}, not a tensor."
+            message = f"The {what} of '{scene.name}' is a {type(values).__name__}, not a tensor."
             raise InputError(message, "torch.as_tensor makes one of an array or a list.")
-    if not any(values.dtype == torch.float64 for values in (*tensors.values(), scene.bounds.lo, scene.bounds.hi)):
+    if not any(values.dtype == torch.float64 for values in tensors.values()):
         return scene
-    views = {split: tuple(_single(view) for view in getattr(scene, split)) for split in SPLITS}
+    views = {split: tuple(_view_in_single_precision(view) for view in getattr(scene, split)) for split in SPLITS}
     return replace(scene, **views, background=scene.background.float(), bounds=scene.bounds.to(torch.float32))
 
 
-def _single(view: View) -> View:
+def _tensors(scene: Scene) -> Iterator[tuple[str, Tensor]]:
+    """Names and values of a scene's tensors: pictures, cameras, background and bounds."""
+    for split in SPLITS:
+        for view in getattr(scene, split):
+            for name in ("image", "alpha", "depth", "normal", "mask"):
+                if (values := getattr(view, name)) is not None:
+                    yield f"{name} of {split} view '{view.name}'", values
+            for name in ("cam_to_world", "focal", "centre"):
+                yield f"{name} of the camera of {split} view '{view.name}'", getattr(view.camera, name)
+    yield "background", scene.background
+    yield "lowest corner of the bounds", scene.bounds.lo
+    yield "highest corner of the bounds", scene.bounds.hi
+
+
+def _view_in_single_precision(view: View) -> View:
     parts = {name: getattr(view, name) for name in ("image", "alpha", "depth", "normal")}
     single = {name: values.float() for name, values in parts.items() if values is not None and values.dtype == torch.float64}
     return replace(view, camera=view.camera.to(torch.float32), **single)

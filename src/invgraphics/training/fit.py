@@ -141,7 +141,7 @@ class Fit:
         objective = (*plan.losses, *plan.penalties)
         losses = [loss(composited, trace, batch, ctx) for loss in plan.losses]
         losses += [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties]
-        terms = torch.stack([_single(value, term) for value, term in zip(losses, objective, strict=True)])
+        terms = torch.stack([_checked_term(value, term) for value, term in zip(losses, objective, strict=True)])
         if self.steps == 0:
             idle = (index for index, value in enumerate(losses[: len(plan.losses)]) if not value.requires_grad)
             self.idle_losses = tuple(idle)
@@ -267,7 +267,7 @@ def _mask_rendering(rendering: Rendering, batch: Batch) -> Rendering:
     return replace(rendering, rgb=rgb, alpha=torch.where(batch.mask, rendering.alpha, batch.alpha))
 
 
-def _single(value: Tensor, term: Loss | Penalty) -> Tensor:
+def _checked_term(value: Tensor, term: Loss | Penalty) -> Tensor:
     """Check that a loss or penalty returned one number, as a tensor."""
     if not isinstance(value, Tensor) or value.ndim:
         what = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)

@@ -75,7 +75,7 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def browsable(host: str) -> str:
+def url_host(host: str) -> str:
     """Host of a URL at which this machine's browser finds a server; of all interfaces, "localhost"."""
     try:
         address = ipaddress.ip_address(host)
