@@ -1,5 +1,6 @@
 """Rasterised meshes: against closed forms, finite differences and Mitsuba's primary hits."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -77,6 +78,21 @@ def test_normals_do_not_cancel_along_a_silhouette(ball: Mesh, make_camera: Calla
     where = camera.rays().at(torch.where(hit, seen.depth.reshape(-1), 0.0))
     cosine = (seen.normal.reshape(-1, 3) * torch.nn.functional.normalize(where, dim=1)).sum(dim=1)[hit]
     assert float(cosine.min()) > 0.99
+
+
+@pytest.mark.parametrize("normals", ["vertices", "faces"])
+@pytest.mark.parametrize("height", [-0.6, 0.6])
+def test_a_sheet_has_the_normal_of_the_side_that_is_seen(normals: str, height: float) -> None:
+    """Also aslant: a normal that points away from the camera is that of the other side, by however little it does."""
+    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    sheet = Mesh.coloured(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.full((4, 3), 0.5))
+    pose = look_at(torch.tensor([0.0, -3.0, height]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    seen = picture(sheet, Camera(pose, torch.full((2,), 30.0), torch.full((2,), 16.0), 32, 32), normals=normals)
+    assert seen.normal is not None
+    hit = seen.alpha == 1
+    assert int(hit.sum()) > 20
+    side = torch.tensor([0.0, 0.0, math.copysign(1.0, height)])
+    torch.testing.assert_close(seen.normal[hit], side.expand(int(hit.sum()), 3))
 
 
 def test_flat_normals_are_those_of_the_faces(camera: Camera) -> None:
