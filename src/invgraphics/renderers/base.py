@@ -12,7 +12,11 @@ from invgraphics.core import Rendering
 MIN_SURFACE_ALPHA = 0.5
 """A pixel with less alpha than this has no depth and no normal (CONVENTIONS.md)."""
 BEHIND = 0.5
-"""Cosine between a normal and its ray from which on the surface is seen from behind."""
+"""Cosine between a normal and its ray from which on the surface is seen from behind.
+
+Normal error of NeRF and the hash grid after 400 steps on five scenes, 64 px: 0.5 to 5.2 degrees less than with 0. From 0.25 to
+never, 0.5 is within 0.01 degrees of the best. NeuS and splats have no such normals.
+"""
 
 
 def to_rendering(
