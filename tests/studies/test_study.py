@@ -188,9 +188,9 @@ def test_the_studies_that_come_along_are_whole_and_short(path: Path, tmp_path: P
     Twenty steps are taken for a second. Some take hours: the gauntlet, whose own test says what it covers, integral-or-splat,
     whose question is about up to 100,000 Gaussians, its replication at a 160th, whose steps are short, families, with seven
     methods on seven scenes, lattices, as many on six for a minute, gaussian-ablation and samples-x-table, whose steps are
-    short, and published, whose fits take an hour each.
+    short, and published and published-cones, whose fits take an hour each.
     """
-    hours = {"gauntlet": 10, "integral-or-splat": 15, "integral-or-splat-64px": 3, "published": 5}
+    hours = {"gauntlet": 10, "integral-or-splat": 15, "integral-or-splat-64px": 3, "published": 5, "published-cones": 5}
     hours |= dict.fromkeys(("families", "lattices", "gaussian-ablation", "samples-x-table"), 2)
     study = read_study(path)
     plan = make_plan(study, AblateRequest(study=str(path), out=str(tmp_path)))
