@@ -393,7 +393,7 @@ class DiscSplatting(Renderer):
         turned = quaternion_to_matrix(gaussians.quaternions)
         tangents = turned.gather(2, axis[:, None, :2].expand(-1, 3, 2)) * scales[:, None, :2]
         lens = torch.diag_embed(torch.cat([camera.focal, camera.focal.new_ones(1)]))
-        lens = lens + nn.functional.pad(camera.centre[:, None], (2, 0, 0, 1))
+        lens = lens + nn.functional.pad(camera.principal_point[:, None], (2, 0, 0, 1))
         to_pixel = lens @ camera.cam_to_world[:3, :3].T
         plane = torch.cat([tangents, (gaussians.means - camera.position)[:, :, None]], dim=2)
         footprints, rgb = kernels.splat_project(gaussians, camera)

@@ -191,7 +191,7 @@ def test_a_scene_is_kept_as_it_is(tmp_path: Path) -> None:
         assert torch.equal(getattr(kept, split)[0].depth, getattr(scene, split)[0].depth)
     for a, b in zip((*kept.train, *kept.test), (*scene.train, *scene.test), strict=True):
         torch.testing.assert_close(a.camera.cam_to_world, b.camera.cam_to_world, atol=1e-6, rtol=0)
-        assert torch.equal(a.camera.focal, b.camera.focal) and torch.equal(a.camera.centre, b.camera.centre)
+        assert torch.equal(a.camera.focal, b.camera.focal) and torch.equal(a.camera.principal_point, b.camera.principal_point)
     assert torch.equal(kept.background, scene.background)
     assert torch.equal(kept.bounds.lo, scene.bounds.lo) and kept.bounds.space == "box"
     assert torch.equal(kept.points.position, scene.points.position)

@@ -56,7 +56,7 @@ def test_axes_are_right_down_forward() -> None:
     view = camera()
     x, y, z = view.cam_to_world[:3, :3].unbind(dim=1)
     middle, depth = view.project((view.position + 2 * z)[None])
-    torch.testing.assert_close(middle[0], view.centre)
+    torch.testing.assert_close(middle[0], view.principal_point)
     torch.testing.assert_close(depth, torch.tensor([2.0], dtype=F64))
     right, _ = view.project((view.position + 2 * z + x)[None])
     below, _ = view.project((view.position + 2 * z + y)[None])
@@ -69,7 +69,7 @@ def test_axes_are_right_down_forward() -> None:
 def test_look_at_sees_its_target_with_up_upwards() -> None:
     view = camera()
     pixels, _ = view.project(torch.tensor([[0.1, 0.2, 0.0], [0.1, 0.2, 0.3]], dtype=F64))
-    torch.testing.assert_close(pixels[0], view.centre)
+    torch.testing.assert_close(pixels[0], view.principal_point)
     assert pixels[1, 1] < pixels[0, 1]
 
 
@@ -86,7 +86,7 @@ def test_resizing_scales_pixels() -> None:
     torch.testing.assert_close(small.project(points)[0], view.project(points)[0] * scale)
     back = small.resized(16, 12)
     torch.testing.assert_close(back.focal, view.focal)
-    torch.testing.assert_close(back.centre, view.centre)
+    torch.testing.assert_close(back.principal_point, view.principal_point)
 
 
 def test_footprints_are_as_wide_as_pixels() -> None:

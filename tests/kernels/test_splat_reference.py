@@ -215,7 +215,7 @@ def test_discs_are_hit_where_rays_meet_their_plane() -> None:
     centres, scales = torch.randn(count, 3, dtype=F64) * 0.2, torch.rand(count, 2, dtype=F64) * 0.3 + 0.1
     # Pixel to camera direction K^-1 (x, y, 1); disc plane to camera [u a, v b, centre]; the homography inverts the latter.
     lens = torch.diag(torch.cat([view.focal, torch.ones(1, dtype=F64)]))
-    lens[:2, 2] = view.centre
+    lens[:2, 2] = view.principal_point
     turn = view.cam_to_world[:3, :3].T
     plane = torch.stack([axes[:, :, 0] * scales[:, :1], axes[:, :, 1] * scales[:, 1:], centres - view.position], dim=2)
     homography = torch.linalg.inv(lens @ turn @ plane)

@@ -166,7 +166,7 @@ def project(function, settings, visible: Tensor, opacities: Tensor, *tensors: Te
     """Footprints and colours of the ``visible`` primitives, zeros for what is culled, whose numbers mean nothing."""
     means, quaternions, scales, sh, pose = tensors
     like, camera = means, view_of_cloud()
-    eye = Camera(pose, camera.focal.to(like), camera.centre.to(like), camera.width, camera.height)
+    eye = Camera(pose, camera.focal.to(like), camera.principal_point.to(like), camera.width, camera.height)
     f, rgb = function(Gaussians(means, quaternions, scales, opacities.to(like), sh), eye, *settings)
     parts = (f.means2d, f.conics, f.opacities[:, None], f.depths[:, None], f.depth_planes, rgb)
     return *(torch.where(visible[:, None], part, 0.0) for part in parts), f.radii.detach()

@@ -117,7 +117,7 @@ def test_hidden_surface_does_not_count() -> None:
     assert float((seen == towards).double().mean()) > 0.92
     elsewhere = cameras[0].moved(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])) @ cameras[0].cam_to_world)
     with pytest.raises(ValueError, match="no camera sees the predicted surface"):
-        compare_surfaces(inner, outer, 0.01, [replace(elsewhere, centre=torch.full((2,), 1e4))], 100)
+        compare_surfaces(inner, outer, 0.01, [replace(elsewhere, principal_point=torch.full((2,), 1e4))], 100)
 
 
 def test_scores_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:

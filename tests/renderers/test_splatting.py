@@ -111,7 +111,7 @@ def test_screen_holds_gradients_in_pixels(make_camera: Callable[..., Camera]) ->
     # The principal point shifts the image position and nothing else (far from the Jacobian's clamp).
     losses = []
     for step in (-1e-4, 1e-4):
-        shifted = Camera(view.cam_to_world, view.focal, view.centre + torch.tensor([step, 0.0]), 12, 10)
+        shifted = Camera(view.cam_to_world, view.focal, view.principal_point + torch.tensor([step, 0.0]), 12, 10)
         alpha = Splatting(SplattingConfig()).render_image(Fixed(splats), shifted, Context(BOUNDS, training=True))[0].alpha
         losses.append(float((alpha.detach() * weight).sum()))
     assert float(trace.screen.means2d.grad[0, 0]) == pytest.approx((losses[1] - losses[0]) / 2e-4, rel=1e-4)

@@ -143,7 +143,7 @@ def test_a_floor_of_one_disc_looks_the_same_in_every_crop() -> None:
     renderer = SplattingConfig(shape="disc").build(toy_scene(2, 8))
     whole = renderer.render_image(Fixed(floor), camera, ctx)[0].alpha
     for x, y in ((0, 192), (0, 240), (240, 240)):
-        crop = replace(camera, centre=camera.centre - torch.tensor([float(x), float(y)]), width=16, height=16)
+        crop = replace(camera, principal_point=camera.principal_point - torch.tensor([float(x), float(y)]), width=16, height=16)
         part = renderer.render_image(Fixed(floor), crop, ctx)[0].alpha
         assert float(part.mean()) > 0.5
         torch.testing.assert_close(part, whole[y : y + 16, x : x + 16], atol=1e-3, rtol=0)

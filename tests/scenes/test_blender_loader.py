@@ -65,7 +65,7 @@ def test_an_angle_of_view_holds_for_photographs_of_other_sizes(folder: Path) -> 
     camera = scene.train[1].camera
     assert (camera.width, camera.height) == (320, 240)
     assert camera.focal.tolist() == pytest.approx([2 * FOCAL, 2 * FOCAL], rel=1e-5)
-    assert camera.centre.tolist() == pytest.approx([160.0, 120.0])
+    assert camera.principal_point.tolist() == pytest.approx([160.0, 120.0])
     assert scene.train[0].camera.width == 160
 
 

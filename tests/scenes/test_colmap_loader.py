@@ -216,7 +216,7 @@ def test_beer_points_project_onto_their_observations(data) -> None:
         rgb = np.array([model.points3D[point.point3D_id].color for point in observed]) / 255
         projected, _ = view.camera.project(torch.from_numpy(world @ local[:3, :3].T + local[:3, 3]).float())
         plane = image.camera.cam_from_img(np.array([point.xy for point in observed]))
-        straight = plane * view.camera.focal.numpy() + view.camera.centre.numpy()
+        straight = plane * view.camera.focal.numpy() + view.camera.principal_point.numpy()
         distances.append(np.linalg.norm(projected.numpy() - straight, axis=1))
         x, y = projected.long().T
         inside = (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)

@@ -40,7 +40,7 @@ def plane_view(index: int, texture: np.ndarray) -> View:
     camera = Camera(
         cam_to_world=torch.from_numpy(pose),
         focal=torch.tensor([180.0, 180.0], dtype=torch.float64),
-        centre=torch.tensor([SIZE / 2, SIZE / 2], dtype=torch.float64),
+        principal_point=torch.tensor([SIZE / 2, SIZE / 2], dtype=torch.float64),
         width=SIZE,
         height=SIZE,
     )

@@ -47,7 +47,7 @@ def test_dots_are_where_the_cameras_say(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(scene.world_from_local.numpy(), SPHERE, rtol=1e-6)
     camera = scene.train[0].camera
     np.testing.assert_allclose(camera.focal.numpy(), [150, 155], rtol=1e-5)
-    np.testing.assert_allclose(camera.centre.numpy(), [83, 58], rtol=1e-5)
+    np.testing.assert_allclose(camera.principal_point.numpy(), [83, 58], rtol=1e-5)
     world = SPHERE[:3, :3] @ camera.position.numpy() + SPHERE[:3, 3]
     np.testing.assert_allclose(world, ring(9)[1].cam_to_world[:3, 3], atol=1e-4)
 

@@ -248,7 +248,7 @@ def test_a_fisheye_without_coefficients_is_no_pinhole(model: str, parameters: tu
     assert Lens("OPENCV", (100.0, 100.0, 100.0, 75.0, 0.0, 0.0, 0.0, 0.0), 200, 150).is_pinhole()
     straight = straighten(lens)
     seen = np.array([[150.0, 75.0]])  # what the straight picture shows there comes from where the angle says
-    angle = np.arctan((seen[0, 0] - straight.centre[0]) / straight.focal[0])
+    angle = np.arctan((seen[0, 0] - straight.principal_point[0]) / straight.focal[0])
     place = (straight.grid[75, 150, 0] + straight.grid[74, 150, 0]).item() / 2  # rows on both sides of the axis
     assert (place + 1) * 100 == pytest.approx(100 + 100 * angle, abs=0.6)
 

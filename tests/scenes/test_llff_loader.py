@@ -74,7 +74,7 @@ def test_scaled_pictures_are_enough(tmp_path: Path) -> None:
         save(half.picture(), tmp_path / "images_2" / f"IMG_{index:02}.png")
     scene = Llff().load(tmp_path, SceneOptions())
     assert scene.train[0].camera.focal.tolist() == [75.0, 75.0]
-    assert torch.equal(scene.train[0].camera.centre, torch.tensor([40.0, 30.0]))
+    assert torch.equal(scene.train[0].camera.principal_point, torch.tensor([40.0, 30.0]))
 
 
 def test_bad_input_is_a_sentence(tmp_path: Path) -> None:

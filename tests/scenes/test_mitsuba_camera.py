@@ -65,6 +65,6 @@ def test_coverage_of_a_ball_is_its_exact_area():
 
 def test_pixels_that_are_not_square_are_refused():
     camera = _camera(*CAMERAS[0])
-    stretched = Camera(camera.cam_to_world, torch.tensor([100.0, 90.0]), camera.centre, WIDTH, HEIGHT)
+    stretched = Camera(camera.cam_to_world, torch.tensor([100.0, 90.0]), camera.principal_point, WIDTH, HEIGHT)
     with pytest.raises(ValueError, match="square"):
         stage.sensor(stretched)

@@ -40,7 +40,7 @@ def test_poses_are_rigid_upright_and_nested(kind):
         assert torch.linalg.det(rotation) > 0
         assert rotation[2, 0].abs() < 1e-12  # the image's x axis is horizontal
         assert rotation[2, 1] < 0  # +y points down
-        assert camera.centre.tolist() == [20, 15]
+        assert camera.principal_point.tolist() == [20, 15]
         half_fov = math.atan(15 / float(camera.focal[0]))  # across the shorter side
         assert math.degrees(2 * half_fov) == pytest.approx(rig.fov)
 
@@ -50,7 +50,7 @@ def test_cameras_look_at_the_target(kind):
     rig = make_rig(TABLES[kind])
     for camera in cameras(rig, "test", 20, (40, 30), 0):
         pixel, depth = camera.project(torch.tensor([rig.target], dtype=torch.float64))
-        assert torch.allclose(pixel[0], camera.centre)
+        assert torch.allclose(pixel[0], camera.principal_point)
         assert depth > 0
 
 

@@ -274,7 +274,7 @@ def sampson_distance(first, second) -> float:
 
 
 def intrinsics(view) -> np.ndarray:
-    (fx, fy), (cx, cy) = view.camera.focal.tolist(), view.camera.centre.tolist()
+    (fx, fy), (cx, cy) = view.camera.focal.tolist(), view.camera.principal_point.tolist()
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 

@@ -96,7 +96,7 @@ def test_geometry_moves_into_the_local_frame(tmp_path: Path) -> None:
         assert view.normal is not None
         torch.testing.assert_close(view.normal[60, 80], -view.camera.cam_to_world[:3, 2])
         # Every eye looks at the world's origin along its axis, at the distance that `depth` says.
-        axis = view.camera.rays(view.camera.centre[None]).at(view.depth[60:61, 80])[0]
+        axis = view.camera.rays(view.camera.principal_point[None]).at(view.depth[60:61, 80])[0]
         world = scene.world_from_local[:3, :3] @ axis + scene.world_from_local[:3, 3]
         assert float(world.norm()) < 1e-5
     assert Npz().load(path, SceneOptions(size=80)).train[0].depth is None

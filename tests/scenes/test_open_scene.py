@@ -58,7 +58,7 @@ def _lens(**values: object) -> View:
         ({"train": (view(0), _posed(lambda p: p[:3, :3].mul_(2)))}, "train view 'v1' of 'toy' is not rigid"),
         ({"test": (_posed(lambda p: p[2, 2].fill_(-1)),)}, "test view 'v1' of 'toy' is left-handed"),
         ({"train": (_lens(focal=torch.tensor([0.0, 1.0])),)}, "train view 'v1' .* has focal length"),
-        ({"train": (_lens(centre=torch.tensor([torch.inf, 1.0])),)}, "train view 'v1' .* centre"),
+        ({"train": (_lens(principal_point=torch.tensor([torch.inf, 1.0])),)}, "train view 'v1' .* principal point"),
         ({"train": (_lens(width=9),)}, "image of train view 'v1' of 'toy' has 8x6 pixels, its camera 9x6"),
         ({"val": (replace(view(4), image=torch.full((6, 8, 3), torch.nan)),)}, "image of val view 'v4' .* not finite"),
         ({"val": (replace(view(4), depth=torch.full((6, 8), torch.nan)),)}, "depth of val view 'v4' .* not finite"),
@@ -240,5 +240,5 @@ def test_test_views_are_not_watched_too() -> None:
 def test_a_principal_point_far_outside_is_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
     validate(scene())
     assert capsys.readouterr().err == ""
-    validate(scene().with_views(train=(view(0), _lens(centre=torch.tensor([40.0, 3.0])))))
+    validate(scene().with_views(train=(view(0), _lens(principal_point=torch.tensor([40.0, 3.0])))))
     assert "Warning: 'v1' has its principal point far outside the picture" in capsys.readouterr().err

@@ -45,7 +45,7 @@ def test_orbit_looks_at_the_middle_from_all_around() -> None:
     scene = toy_scene(views=8, size=8)
     path = orbit(scene, 12)
     pixels = torch.stack([camera.project(scene.bounds.centre[None])[0][0] for camera in path])
-    torch.testing.assert_close(pixels, path[0].centre.expand(12, 2), atol=1e-4, rtol=0)
+    torch.testing.assert_close(pixels, path[0].principal_point.expand(12, 2), atol=1e-4, rtol=0)
     positions = torch.stack([camera.position for camera in path])
     # A circle: in one plane, around its own middle, and round the scene's.
     middle = positions.mean(dim=0)
@@ -112,7 +112,7 @@ def test_spiral_stays_in_the_window_and_looks_at_the_subject() -> None:
     assert float(position[:, 0].min()) > 2.5 and float(position[:, 0].max()) < 3.5
     for camera in path:
         pixel, _ = camera.project(torch.zeros(1, 3))
-        torch.testing.assert_close(pixel[0], camera.centre, atol=0.2, rtol=0)
+        torch.testing.assert_close(pixel[0], camera.principal_point, atol=0.2, rtol=0)
         assert float(camera.cam_to_world[2, 1]) < -0.9
     steps = torch.cat([position, position[:1]]).diff(dim=0).norm(dim=1)
     assert float(steps.max()) < 2 * float(steps.mean())
@@ -191,7 +191,7 @@ def test_films_of_another_shape_are_not_stretched(run: Path, size: tuple[int, in
     for camera in seen:
         assert (camera.width, camera.height) == size
         torch.testing.assert_close(camera.focal, own.focal * scale)
-        torch.testing.assert_close(camera.centre - torch.tensor(size) / 2, (own.centre - 12) * scale)
+        torch.testing.assert_close(camera.principal_point - torch.tensor(size) / 2, (own.principal_point - 12) * scale)
     assert len(seen) == 2
 
 

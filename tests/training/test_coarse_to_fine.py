@@ -73,8 +73,8 @@ def test_view_counts_are_those_of_single_projections(scene):
         count = 0
         for camera in cameras:
             x, y, z, _ = (camera.world_to_cam @ torch.cat([point, torch.ones(1)])).tolist()
-            u = float(camera.focal[0]) * x / z + float(camera.centre[0])
-            v = float(camera.focal[1]) * y / z + float(camera.centre[1])
+            u = float(camera.focal[0]) * x / z + float(camera.principal_point[0])
+            v = float(camera.focal[1]) * y / z + float(camera.principal_point[1])
             count += z > 0 and 0 <= u <= camera.width and 0 <= v <= camera.height
         expected.append(count)
     assert view_counts(points, cameras).tolist() == expected

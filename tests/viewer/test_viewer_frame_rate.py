@@ -106,7 +106,7 @@ def test_refinement_over_empty_background_does_not_slow_the_next_movement() -> N
 
     class HalfEmpty(FakeRun):
         def render(self, camera: Camera, geometry: bool, crop: None = None) -> Rendering:
-            below_centre = float(camera.centre[1]) < camera.height / 2  # a strip of the lower half
+            below_centre = float(camera.principal_point[1]) < camera.height / 2  # a strip of the lower half
             self.per_pixel = 1e-9 if below_centre else 1e-5
             return super().render(camera, geometry, crop)
 

@@ -76,8 +76,8 @@ def check_camera(camera: Camera, what: str) -> None:
     width, height = camera.width, camera.height
     _expect(min(width, height) >= 1 and max(width, height) <= LONGEST_SIDE, f"{what} has {width}x{height} pixels.")
     _expect(_finite(camera.cam_to_world), f"The pose of {what} is not finite.")
-    fx, fy, cx, cy = torch.cat([camera.focal, camera.centre]).double().tolist()
-    lens = f"{what} has focal length {fx:.4g}, {fy:.4g} and centre {cx:.4g}, {cy:.4g} for {width}x{height} pixels"
+    fx, fy, cx, cy = torch.cat([camera.focal, camera.principal_point]).double().tolist()
+    lens = f"{what} has focal length {fx:.4g}, {fy:.4g} and principal point {cx:.4g}, {cy:.4g} for {width}x{height} pixels"
     _expect(all(map(math.isfinite, (fx, fy, cx, cy))) and min(fx, fy) > 0, f"{lens}.")
     _expect(max(fx, fy) <= LONGEST_FOCAL, f"{lens}: its field of view is zero.")
     _expect(max(fx, fy) <= MOST_STRETCH * min(fx, fy), f"{lens}: its pixels are {max(fx, fy) / min(fx, fy):.2g} times as long.")
@@ -94,7 +94,7 @@ def check_pose(camera: Camera, what: str) -> None:
     size = camera.width, camera.height
     if not all(isinstance(edge, int) and edge > 0 for edge in size):
         raise InputError(f"The size of {what} is {size[0]}x{size[1]} pixels.", "Expected: positive whole numbers.")
-    if camera.cam_to_world.shape != (4, 4) or camera.focal.shape != (2,) or camera.centre.shape != (2,):
+    if camera.cam_to_world.shape != (4, 4) or camera.focal.shape != (2,) or camera.principal_point.shape != (2,):
         raise InputError(f"The shapes of {what} are not (4, 4) of its pose, (2,) of its focal lengths and principal point.")
     rotation = camera.cam_to_world[:3, :3].detach().double()
     error = float((rotation.T @ rotation - torch.eye(3).to(rotation)).abs().max())
@@ -104,7 +104,7 @@ def check_pose(camera: Camera, what: str) -> None:
 
 def principal_point_far_outside(camera: Camera) -> bool:
     """Whether the principal point lies more than half a picture outside the picture, as of a crop or a forgotten resize."""
-    relative = camera.centre.double().cpu() / torch.tensor([camera.width, camera.height])
+    relative = camera.principal_point.double().cpu() / torch.tensor([camera.width, camera.height])
     return bool(((relative < -0.5) | (relative > 1.5)).any())
 
 

@@ -20,14 +20,14 @@ class Camera:
     Attributes:
         cam_to_world: rigid transform whose columns are the camera's +x (right), +y (down), +z (forward) and position.
         focal: focal lengths (fx, fy) in pixels.
-        centre: principal point (cx, cy) in pixels; the first pixel's centre is (0.5, 0.5).
+        principal_point: (cx, cy) in pixels; the first pixel's centre is (0.5, 0.5).
         width: image width in pixels.
         height: image height in pixels.
     """
 
     cam_to_world: Float[Tensor, "4 4"]
     focal: Float[Tensor, 2]
-    centre: Float[Tensor, 2]
+    principal_point: Float[Tensor, 2]
     width: int
     height: int
 
@@ -61,7 +61,7 @@ class Camera:
             view: training-view index to record in the rays.
         """
         pixels = self.pixel_centres().reshape(-1, 2) if pixels is None else pixels
-        return _rays(pixels, self.cam_to_world, self.focal, self.centre, view)
+        return _rays(pixels, self.cam_to_world, self.focal, self.principal_point, view)
 
     def ray(self, pixel: tuple[int, int]) -> Rays:
         """The one ray through the centre of ``pixel``: column and row, from 0."""
@@ -74,7 +74,7 @@ class Camera:
         """
         in_camera = (points - self.position) @ self.cam_to_world[:3, :3]
         z = in_camera[:, 2]
-        return self.centre + self.focal * in_camera[:, :2] / z[:, None], z
+        return self.principal_point + self.focal * in_camera[:, :2] / z[:, None], z
 
     def pixel_of(self, points: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, " n"], Int[Tensor, " n"]]:
         """Find the pixel into which each point is projected: mask of points in the picture, and flat indices, 0 for others."""
@@ -86,7 +86,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The camera of the same photograph resampled to ``width`` x ``height``."""
         scale = self.focal.new_tensor([width / self.width, height / self.height])
-        return replace(self, focal=self.focal * scale, centre=self.centre * scale, width=width, height=height)
+        return replace(self, focal=self.focal * scale, principal_point=self.principal_point * scale, width=width, height=height)
 
     def moved(self, cam_to_world: Float[Tensor, "4 4"]) -> Camera:
         """The same lens at another pose."""
@@ -94,7 +94,8 @@ class Camera:
 
     def to(self, *args: Any) -> Camera:
         """Move or cast all tensors."""
-        return replace(self, cam_to_world=self.cam_to_world.to(*args), focal=self.focal.to(*args), centre=self.centre.to(*args))
+        pose, focal, principal_point = (values.to(*args) for values in (self.cam_to_world, self.focal, self.principal_point))
+        return replace(self, cam_to_world=pose, focal=focal, principal_point=principal_point)
 
 
 def rays_through(cameras: Sequence[Camera], camera: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"], view: Tensor) -> Rays:
@@ -106,7 +107,7 @@ def rays_through(cameras: Sequence[Camera], camera: Int[Tensor, " n"], pixels: F
         pixels: image coordinates (x, y).
         view: training-view index to record for each ray.
     """
-    names = "cam_to_world", "focal", "centre"
+    names = "cam_to_world", "focal", "principal_point"
     pose, focal, centre = (torch.stack([getattr(c, name) for c in cameras])[camera] for name in names)
     return _rays(pixels, pose, focal, centre, view)
 

@@ -109,12 +109,12 @@ class FusedLattice:
     crop: tuple[Corner, Corner] | None = None
 
     @property
-    def handed(self) -> int:
+    def geometry_features(self) -> int:
         """Number of geometry features: those that colour takes from geometry."""
         return (len(self.geometry_net[-1][1]) if self.geometry_net else self.geometry.width) - 1
 
     @property
-    def own(self) -> int:
+    def appearance_features(self) -> int:
         """Number of appearance features: those that colour takes from appearance."""
         if self.appearance is None:
             return 0

@@ -75,13 +75,13 @@ def homographies(reference: Camera, depths: Float[Tensor, " p"], camera: Camera)
 
 def _intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
     """The calibration matrix K, from camera axes to homogeneous image points."""
-    (fx, fy), (cx, cy) = camera.focal, camera.centre
+    (fx, fy), (cx, cy) = camera.focal, camera.principal_point
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     return torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one]).view(3, 3)
 
 
 def _inverse_intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
-    (fx, fy), (cx, cy) = camera.focal, camera.centre
+    (fx, fy), (cx, cy) = camera.focal, camera.principal_point
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     return torch.stack([1 / fx, zero, -cx / fx, zero, 1 / fy, -cy / fy, zero, zero, one]).view(3, 3)
 
@@ -112,7 +112,7 @@ def mean_camera(cameras: Sequence[Camera]) -> Camera:
     width, height = (round(sum(getattr(camera, edge) for camera in cameras) / len(cameras)) for edge in ("width", "height"))
     scaled = [camera.resized(width, height) for camera in cameras]
     focal, centre = (
-        torch.stack([getattr(camera, name) for camera in scaled]).double().mean(dim=0) for name in ("focal", "centre")
+        torch.stack([getattr(camera, name) for camera in scaled]).double().mean(dim=0) for name in ("focal", "principal_point")
     )
     like = cameras[0].focal
     return Camera(pose.to(like), focal.to(like), centre.to(like), width, height)
@@ -140,7 +140,8 @@ def widened(reference: Camera, cameras: Sequence[Camera], span: tuple[float, flo
             lo, hi = torch.minimum(lo, seen.amin(dim=0)), torch.maximum(hi, seen.amax(dim=0))
     lo, hi = (lo.clamp_min(-most * size)).floor(), (hi.clamp_max((1 + most) * size)).ceil()
     width, height = (int(edge) for edge in (hi - lo).tolist())
-    return replace(reference, centre=reference.centre - lo.to(reference.centre), width=width, height=height)
+    principal_point = reference.principal_point - lo.to(reference.principal_point)
+    return replace(reference, principal_point=principal_point, width=width, height=height)
 
 
 def warp(

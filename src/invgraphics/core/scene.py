@@ -232,7 +232,7 @@ class Scene:
         for split in (self.train, self.val, self.test, *([self.observed] if self.observed else [])):
             for view in split:
                 camera = view.camera
-                for values in (camera.cam_to_world, camera.focal, camera.centre):
+                for values in (camera.cam_to_world, camera.focal, camera.principal_point):
                     sha.update(values.detach().cpu().double().numpy().tobytes())
                 sha.update(f"{camera.width}x{camera.height}".encode())
             sha.update(b"|")

@@ -117,7 +117,7 @@ class DepthMapField(Field):
         everywhere = torch.ones(depth.shape[1:], dtype=torch.bool)
         masks = [everywhere if view.mask is None else view.mask for view in views]
         self.register_buffer("depth", torch.where(depth.isinf() | ~torch.stack(masks), 0.0, depth))
-        for name, values in (("poses", "cam_to_world"), ("focal", "focal"), ("centre", "centre")):
+        for name, values in (("poses", "cam_to_world"), ("focal", "focal"), ("centre", "principal_point")):
             self.register_buffer(name, torch.stack([getattr(view.camera, values) for view in views]).detach().clone())
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:

@@ -188,7 +188,7 @@ class PlaneField(Field):
         self.basis = basis
         self.register_buffer("pose", camera.cam_to_world.detach().clone())
         self.register_buffer("focal", camera.focal.detach().clone())
-        self.register_buffer("centre", camera.centre.detach().clone())
+        self.register_buffer("centre", camera.principal_point.detach().clone())
         self.register_buffer("depths", depths.detach().clone())
 
     @property

@@ -49,7 +49,7 @@ def write_mpi(path: Path, content: PlaneFile) -> None:
     planes = content.planes
     camera = planes.camera
     names = [f"layers/{index:03}.png" for index in range(len(planes))]
-    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
+    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.principal_point.tolist()
     description = {
         "format": FORMAT,
         "version": VERSION,

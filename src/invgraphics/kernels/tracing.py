@@ -9,10 +9,10 @@ from invgraphics.core.bounds import Bounds
 from invgraphics.core.ngp import FusedSDF
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.dispatch import choose
-from invgraphics.kernels.types import Tracing, TracingLimits
+from invgraphics.kernels.types import TracedRays, TracingLimits
 
 
-def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> Tracing:
+def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> TracedRays:
     """Sphere tracing (Hart 1996) of a network over a hash grid or octaves: march, encode, evaluate and refine in one pass.
 
     Args:

@@ -160,7 +160,7 @@ class TracingLimits:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracing:
+class TracedRays:
     """Where n rays met a surface, or came closest to it.
 
     Attributes:

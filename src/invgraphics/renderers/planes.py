@@ -87,6 +87,6 @@ def _depth_of(camera: Camera, planes: Planes) -> Float[Tensor, ""]:
 def _distances(planes: Planes, camera: Camera, z: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
     """Distances along unit rays to the planes, from the homographies' third coordinate d r_z of rays with z = 1."""
     offsets = (planes.depths - _depth_of(camera, planes))[:, None, None]
-    plane = (camera.pixel_centres() - camera.centre) / camera.focal
+    plane = (camera.pixel_centres() - camera.principal_point) / camera.focal
     length = (1 + plane.square().sum(dim=-1)).sqrt()
     return offsets * planes.depths[:, None, None] * length / torch.where(z > 0, z, 1.0)

@@ -28,7 +28,7 @@ from invgraphics.core import (
     Trace,
 )
 from invgraphics.kernels.reference.tracing import sphere_trace
-from invgraphics.kernels.types import Tracing, TracingLimits
+from invgraphics.kernels.types import TracedRays, TracingLimits
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.volumetric import query
 
@@ -133,7 +133,7 @@ def opacity(logit: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     return (logit.clamp(-SATURATION, SATURATION).sigmoid() - low).clamp_min(0) / (high - low)
 
 
-def _trace(field: Field, rays: Rays, limits: TracingLimits, ctx: Context) -> Tracing:
+def _trace(field: Field, rays: Rays, limits: TracingLimits, ctx: Context) -> TracedRays:
     """Trace rays through any field, in one compiled pass where a kernel supports it."""
     fused = field.fused_sdf(ctx.bounds) if ctx.bounds.space == "box" else None
     if fused is not None and kernels.compiled("sdf_trace", rays.origins):
@@ -161,7 +161,7 @@ def _picture(rays: Rays, trace: Trace, alpha: Float[Tensor, " n"]) -> Rendering:
     return to_rendering(spread(values.radiance), alpha, distance, normal, rays.far, rays.directions)
 
 
-def _lowest(field: Field, rays: Rays, traced: Tracing, ctx: Context) -> Float[Tensor, " n"]:
+def _lowest(field: Field, rays: Rays, traced: TracedRays, ctx: Context) -> Float[Tensor, " n"]:
     """Least signed distance on each ray, differentiable in field and rays: its distance t is stationary or an end."""
     if not torch.is_grad_enabled():
         return traced.low
@@ -170,7 +170,9 @@ def _lowest(field: Field, rays: Rays, traced: Tracing, ctx: Context) -> Float[Te
     return traced.low.index_copy(0, met, _sdf(field, Samples.on(rays, met, t, t), ctx))
 
 
-def _surface_distance(field: Field, rays: Rays, traced: Tracing, seen: Int[Tensor, " k"], ctx: Context) -> Float[Tensor, " k"]:
+def _surface_distance(
+    field: Field, rays: Rays, traced: TracedRays, seen: Int[Tensor, " k"], ctx: Context
+) -> Float[Tensor, " k"]:
     """Distance along the rays ``seen`` to their hits, or to their closest approaches.
 
     A hit follows field and ray by the implicit function theorem, ``t - (f(x) - f(x).detach()) / (n . d)`` with the gradient n

@@ -216,18 +216,19 @@ def _interval(rays: Rays, bounds: Bounds, camera: Camera) -> tuple[Float[Tensor,
 
 def _rows(camera: Camera, top: int, count: int) -> Camera:
     """The camera of some rows of a picture."""
-    return replace(camera, centre=camera.centre - camera.centre.new_tensor([0, top]), height=min(count, camera.height - top))
+    above = camera.principal_point.new_tensor([0, top])
+    return replace(camera, principal_point=camera.principal_point - above, height=min(count, camera.height - top))
 
 
 def _pixel(camera: Camera, pixel: tuple[int, int], supersampling: int) -> Camera:
     """The camera of one pixel's rays."""
     fine = camera.resized(supersampling * camera.width, supersampling * camera.height)
-    corner = fine.centre.new_tensor(pixel) * supersampling
-    return replace(fine, centre=fine.centre - corner, width=supersampling, height=supersampling)
+    corner = fine.principal_point.new_tensor(pixel) * supersampling
+    return replace(fine, principal_point=fine.principal_point - corner, width=supersampling, height=supersampling)
 
 
 def _detached(camera: Camera) -> Camera:
-    tensors = {name: getattr(camera, name).detach() for name in ("cam_to_world", "focal", "centre")}
+    tensors = {name: getattr(camera, name).detach() for name in ("cam_to_world", "focal", "principal_point")}
     return replace(camera, **tensors)
 
 

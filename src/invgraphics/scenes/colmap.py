@@ -93,7 +93,7 @@ def _photo(image: Any, folder: Path) -> Photo:
     camera = Camera(
         cam_to_world=pose(colmap_to_opencv(world_to_cam), where),
         focal=torch.tensor([image.camera.focal_length_x, image.camera.focal_length_y], dtype=torch.float64),
-        centre=torch.tensor([image.camera.principal_point_x, image.camera.principal_point_y], dtype=torch.float64),
+        principal_point=torch.tensor([image.camera.principal_point_x, image.camera.principal_point_y], dtype=torch.float64),
         width=lens.width,
         height=lens.height,
     )

@@ -140,7 +140,7 @@ def decompose(projection: Float[np.ndarray, "3 4"], size: tuple[int, int], where
     return Camera(
         cam_to_world=pose(colmap_to_opencv(world_to_cam), where),
         focal=torch.from_numpy(np.diag(intrinsics)[:2].copy()),
-        centre=torch.from_numpy(intrinsics[:2, 2] + 0.5),
+        principal_point=torch.from_numpy(intrinsics[:2, 2] + 0.5),
         width=size[0],
         height=size[1],
     )

@@ -259,7 +259,7 @@ def save_npz(scene: Scene, path: Path) -> None:
         "images": np.stack([view.image.cpu().numpy() for view in views]),
         "cam_to_world": np.stack([view.camera.cam_to_world.cpu().numpy() for view in views]),
         "focal": np.stack([view.camera.focal.cpu().numpy() for view in views]),
-        "centre": np.stack([view.camera.centre.cpu().numpy() for view in views]),
+        "centre": np.stack([view.camera.principal_point.cpu().numpy() for view in views]),
         "test": split == 2,
         "bounds": torch.stack([scene.bounds.lo, scene.bounds.hi]).cpu().numpy(),
         "own_units": np.array(True),

@@ -98,7 +98,7 @@ def _tensors(scene: Scene) -> Iterator[tuple[str, Tensor]]:
             for name in ("image", "alpha", "depth", "normal", "mask"):
                 if (values := getattr(view, name)) is not None:
                     yield f"{name} of {split} view '{view.name}'", values
-            for name in ("cam_to_world", "focal", "centre"):
+            for name in ("cam_to_world", "focal", "principal_point"):
                 yield f"{name} of the camera of {split} view '{view.name}'", getattr(view.camera, name)
     yield "background", scene.background
     yield "lowest corner of the bounds", scene.bounds.lo

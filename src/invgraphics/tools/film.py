@@ -193,8 +193,8 @@ def _sized(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
         return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     new, old = camera.focal.new_tensor(size), camera.focal.new_tensor([camera.width, camera.height])
     scale = (new / old).min()
-    centre = new / 2 + (camera.centre - old / 2) * scale
-    return replace(camera, focal=camera.focal * scale, centre=centre, width=size[0], height=size[1])
+    centre = new / 2 + (camera.principal_point - old / 2) * scale
+    return replace(camera, focal=camera.focal * scale, principal_point=centre, width=size[0], height=size[1])
 
 
 class FilmWriter:

@@ -84,7 +84,8 @@ def pixel_distances(points: Float[Tensor, "n 3"], cameras: Sequence[Camera], mar
     """
     cameras = [camera.to(points.device) for camera in cameras]
     world_to_cam = torch.stack([camera.world_to_cam[:3] for camera in cameras]).to(points)
-    focal, centre = (torch.stack(values).to(points) for values in zip(*((c.focal, c.centre) for c in cameras), strict=True))
+    focal = torch.stack([camera.focal for camera in cameras]).to(points)
+    centre = torch.stack([camera.principal_point for camera in cameras]).to(points)
     size = points.new_tensor([[camera.width, camera.height] for camera in cameras])
     # In units of depth: the tangents of the margins' edges.
     lowest, highest = (-margin * size - centre) / focal, ((1 + margin) * size - centre) / focal

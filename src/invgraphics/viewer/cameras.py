@@ -76,7 +76,7 @@ class LetterboxedView:
     def fit(camera: Camera, aspect: float) -> LetterboxedView:
         """Letterbox a photograph into the smallest window of this aspect (width over height)."""
         square = with_square_pixels(camera)
-        cx, cy = square.centre.tolist()
+        cx, cy = square.principal_point.tolist()
         across, down = 2 * max(cx, square.width - cx), 2 * max(cy, square.height - cy)
         height = math.ceil(max(down, across / aspect))
         width = max(math.ceil(across), round(height * aspect))
@@ -120,8 +120,10 @@ def fov_and_aspect(camera: Camera) -> tuple[float, float]:
 
 def subregion(camera: Camera, columns: tuple[int, int], rows: tuple[int, int]) -> Camera:
     """Camera of a rectangle of the image; half-open pixel ranges."""
-    corner = camera.centre.new_tensor([columns[0], rows[0]])
-    return replace(camera, centre=camera.centre - corner, width=columns[1] - columns[0], height=rows[1] - rows[0])
+    corner = camera.principal_point.new_tensor([columns[0], rows[0]])
+    return replace(
+        camera, principal_point=camera.principal_point - corner, width=columns[1] - columns[0], height=rows[1] - rows[0]
+    )
 
 
 def limit_size(camera: Camera, max_size: int) -> Camera:

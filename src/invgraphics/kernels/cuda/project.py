@@ -34,7 +34,7 @@ class _Project(torch.autograd.Function):
         opacities, camera, dilation, antialiased = constants
         n = len(means)
         gaussians = tuple(tensor.contiguous() for tensor in (means, quaternions, scales, opacities, sh))
-        view = torch.cat([pose[:3, :3].reshape(-1), pose[:3, 3], camera.focal, camera.centre]).to(means)
+        view = torch.cat([pose[:3, :3].reshape(-1), pose[:3, 3], camera.focal, camera.principal_point]).to(means)
         means2d, conics, planes, rgb = (means.new_empty(n, width) for width in (2, 3, 3, 3))
         depths, radii, compensations = (means.new_empty(n) for _ in range(3))
         outputs = (means2d, conics, depths, planes, radii, rgb, compensations)
@@ -84,7 +84,7 @@ def splat_project(
     gaussians: Gaussians, camera: Camera, dilation: float = 0.3, antialiased: bool = False
 ) -> tuple[types.Footprints, Float[Tensor, "n 3"]]:
     """See `invgraphics.kernels.splat_project`; optimised intrinsics are left to the reference."""
-    if camera.focal.requires_grad or camera.centre.requires_grad:
+    if camera.focal.requires_grad or camera.principal_point.requires_grad:
         return reference.splat_project(gaussians, camera, dilation, antialiased)
     g = gaussians
     constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation, antialiased)

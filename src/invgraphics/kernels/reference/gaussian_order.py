@@ -35,7 +35,7 @@ def composite_in_order(
         with_distances: whether weights times distance are returned too.
     """
     near, far = rays.near[intersections.ray], rays.far[intersections.ray]
-    t, sigma, depth = intersections.t, intersections.sigma, intersections.depth
+    t, sigma, depth = intersections.t, intersections.sigma, intersections.optical_depth
     if not splats:
         start, end = (
             ((limit - t) / sigma).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)

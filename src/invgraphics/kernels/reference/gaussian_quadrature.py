@@ -54,7 +54,7 @@ def integrate_overlapping(intersections: Intersections, rays: Rays, steps: int, 
     weights: list[Tensor] = []
     distances: list[Tensor] = []
     for ray, index, there in _in_blocks(intersections, len(rays), steps + 1):
-        t, sigma, depth = (values[index] for values in (intersections.t, intersections.sigma, intersections.depth))
+        t, sigma, depth = (values[index] for values in (intersections.t, intersections.sigma, intersections.optical_depth))
         depth = torch.where(there, depth, 0.0)
         interval = _interval(t, sigma, there, rays.near[ray], rays.far[ray])
         share, distance = _integrate(t, sigma, depth, place_nodes(t, sigma, depth, interval, steps), with_distances)
@@ -62,7 +62,7 @@ def integrate_overlapping(intersections: Intersections, rays: Rays, steps: int, 
         weights.append(share[there])
         distances += [distance[there]] if distance is not None else []
     if not places:
-        return intersections.depth, intersections.depth if with_distances else None
+        return intersections.optical_depth, intersections.optical_depth if with_distances else None
     back = torch.cat(places).argsort()
     return torch.cat(weights)[back], torch.cat(distances)[back] if with_distances else None
 

@@ -67,7 +67,7 @@ class Intersections:
         offset: from the ray's origin to the centre.
         t: distance of the largest response.
         sigma: standard deviation of the response along the ray.
-        depth: optical depth of the whole line; for ``splat`` the one whose alpha is ``a G``.
+        optical_depth: optical depth of the whole line; for ``splat`` the one whose alpha is ``a G``.
     """
 
     ray: Int[Tensor, " p"]
@@ -75,7 +75,7 @@ class Intersections:
     offset: Float[Tensor, "p 3"]
     t: Float[Tensor, " p"]
     sigma: Float[Tensor, " p"]
-    depth: Float[Tensor, " p"]
+    optical_depth: Float[Tensor, " p"]
 
     def __len__(self) -> int:
         return len(self.ray)

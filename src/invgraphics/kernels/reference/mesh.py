@@ -85,7 +85,7 @@ def _in_camera(vertices: Float[Tensor, "v 3"], camera: Camera) -> Float[Tensor, 
 def _directions(camera: Camera) -> Float[Tensor, "pixels 3"]:
     """Directions (x, y, 1) through the pixels' centres in the camera's frame, row by row."""
     camera = camera.to(torch.float64)
-    plane = (camera.pixel_centres().reshape(-1, 2) - camera.centre) / camera.focal
+    plane = (camera.pixel_centres().reshape(-1, 2) - camera.principal_point) / camera.focal
     return torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
 
 
@@ -134,7 +134,7 @@ def _boxes(corners: Float[Tensor, "f 3 3"], camera: Camera, plane: float) -> tup
     crossing[..., 2] = plane
     points = torch.cat([corners, crossing], dim=1)
     counted = torch.cat([ahead, ahead != ahead.roll(-1, dims=1)], dim=1)[..., None]
-    image = camera.centre + camera.focal * points[..., :2] / points[..., 2:]
+    image = camera.principal_point + camera.focal * points[..., :2] / points[..., 2:]
     lowest = torch.where(counted, image, torch.inf).amin(dim=1)
     highest = torch.where(counted, image, -torch.inf).amax(dim=1)
     limit = torch.tensor([camera.width, camera.height], device=corners.device, dtype=corners.dtype)

@@ -30,7 +30,7 @@ def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 
     axes = camera.cam_to_world[:3, :3].T @ quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
     longest = gaussians.scales.argsort(dim=1, descending=True)[:, :2]
     axes = axes.gather(2, longest[:, None, :].expand(-1, 3, 2))
-    means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]
+    means2d = camera.principal_point + camera.focal * mean[:, :2] / mean[:, 2:]
     # The centre's column is written with its screen position, so that the screen-space gradient arrives at it.
     centre = mean[:, 2:] * torch.nn.functional.pad(means2d, (0, 1), value=1.0)
     matrix = torch.cat([homogeneous(axes, camera), centre[:, :, None]], dim=2)
@@ -56,7 +56,7 @@ def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 
 def homogeneous(directions: Float[Tensor, "n 3 k"], camera: Camera) -> Float[Tensor, "n 3 k"]:
     """Directions in camera axes as homogeneous pixels."""
     x, y, z = directions.unbind(dim=1)
-    (fx, fy), (cx, cy) = camera.focal, camera.centre
+    (fx, fy), (cx, cy) = camera.focal, camera.principal_point
     return torch.stack([fx * x + cx * z, fy * y + cy * z, z], dim=1)
 
 

@@ -35,7 +35,7 @@ def splat_project(
     xx, xy, yy, det = _covariance(a, dilation)
     opacities = gaussians.opacities * _compensations(a, det) if antialiased else gaussians.opacities
     conics = torch.stack([yy / det, -xy / det, xx / det], dim=1)
-    means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]
+    means2d = camera.principal_point + camera.focal * mean[:, :2] / mean[:, 2:]
     with torch.no_grad():
         reach = visible_reach(opacities)
         largest = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
@@ -73,8 +73,8 @@ def jacobian(mean: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3 3
     """
     size = camera.focal.new_tensor([camera.width, camera.height])
     margin = MARGIN * 0.5 * size / camera.focal
-    lowest = -camera.centre / camera.focal - margin
-    highest = (size - camera.centre) / camera.focal + margin
+    lowest = -camera.principal_point / camera.focal - margin
+    highest = (size - camera.principal_point) / camera.focal + margin
     z = mean[:, 2]
     slope = torch.minimum(torch.maximum(mean[:, :2] / z[:, None], lowest), highest)
     fx, fy = (camera.focal / z[:, None]).unbind(dim=1)

@@ -17,7 +17,7 @@ from invgraphics.core.bounds import Bounds
 from invgraphics.core.ngp import FusedSDF
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.reference.hash import hash_encode
-from invgraphics.kernels.types import Tracing, TracingLimits
+from invgraphics.kernels.types import TracedRays, TracingLimits
 
 Distance = Callable[[Int[Tensor, " k"], Float[Tensor, " k"]], Float[Tensor, " k"]]
 """Signed distance on the rays of these indices, at these distances from their origins."""
@@ -33,7 +33,7 @@ distances, and where to look next."""
 
 
 @torch.no_grad()
-def sphere_trace(distance: Distance, rays: Rays, limits: TracingLimits) -> Tracing:
+def sphere_trace(distance: Distance, rays: Rays, limits: TracingLimits) -> TracedRays:
     """Trace rays from near to far, or until they are ``limits.depth`` inside.
 
     Marching goes on behind the first hit: a ray that only grazes a surface leaves it again, and how deep it was decides how
@@ -47,14 +47,14 @@ def sphere_trace(distance: Distance, rays: Rays, limits: TracingLimits) -> Traci
 
 def result(
     state: Float[Tensor, "11 n"], steps: Int[Tensor, " n"], ended: Bool[Tensor, " n"], rays: Rays, limits: TracingLimits
-) -> Tracing:
+) -> TracedRays:
     """The result of a trace from the rays' last states; ``ended`` says which were finished before their steps were used up."""
     a, _, b, value = state[_HIT_A : _HIT_FB + 1]
     hit = b.isfinite()
     # A ray that begins inside has no bracket: its hit is where it begins.
     solved = (value.abs() <= limits.tolerance) | (a == b)
     hit_t = torch.where(hit, b, rays.far)
-    return Tracing(hit, hit_t, state[_LOW_T], state[_LOW], steps, torch.where(hit, solved, ended))
+    return TracedRays(hit, hit_t, state[_LOW_T], state[_LOW], steps, torch.where(hit, solved, ended))
 
 
 def _march(
@@ -147,7 +147,7 @@ def _refine_closest(distance: Distance, state: Float[Tensor, "11 n"], limits: Tr
     state[_LOW, going], state[_LOW_T, going] = f, m
 
 
-def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> Tracing:
+def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> TracedRays:
     """See `invgraphics.kernels.sdf_trace`."""
 
     def distance(index: Int[Tensor, " k"], t: Float[Tensor, " k"]) -> Float[Tensor, " k"]:

@@ -42,7 +42,7 @@ def draw_ellipsoids(gaussians: Gaussians, camera: Camera, reach: float = 1.0) ->
     inside_out = torch.linalg.inv(axes)
 
     def paint(near: Int[Tensor, " k"], pixels: Float[Tensor, "p 2"]) -> Float[Tensor, "p 8"]:
-        plane = (pixels - camera.centre) / camera.focal
+        plane = (pixels - camera.principal_point) / camera.focal
         rays = torch.nn.functional.normalize(torch.nn.functional.pad(plane, (0, 1), value=1.0), dim=1)
         return _nearest(rays, mean[near], inside_out[near], rgb[near])
 
@@ -77,7 +77,7 @@ def _nearest(
 def _bounding_squares(mean: Float[Tensor, "n 3"], axes: Float[Tensor, "n 3 3"], camera: Camera) -> Footprints:
     """Screen-space bounding squares of the ellipsoids, for `over_tiles`."""
     n = len(mean)
-    means2d = camera.centre + camera.focal * mean[:, :2] / mean[:, 2:]
+    means2d = camera.principal_point + camera.focal * mean[:, :2] / mean[:, 2:]
     image = homogeneous(torch.cat([axes, mean[:, :, None]], dim=2), camera)
     weights = torch.tensor([1.0, 1.0, 1.0, -1.0]).to(mean).expand(n, 4)
     radii = half_width(image, weights, means2d, camera)

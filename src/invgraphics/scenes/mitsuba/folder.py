@@ -100,7 +100,7 @@ def _camera_table(camera: Camera) -> dict[str, Any]:
     return {
         "cam_to_world": camera.cam_to_world.tolist(),
         "focal": camera.focal.tolist(),
-        "centre": camera.centre.tolist(),
+        "centre": camera.principal_point.tolist(),
         "width": camera.width,
         "height": camera.height,
     }

@@ -73,8 +73,8 @@ def sensor(camera: Camera) -> dict[str, Any]:
         "fov": math.degrees(2 * math.atan(width / (2 * focal))),
         "fov_axis": "x",
         # Mitsuba moves the image, not the principal point: hence the sign.
-        "principal_point_offset_x": 0.5 - float(camera.centre[0]) / width,
-        "principal_point_offset_y": 0.5 - float(camera.centre[1]) / height,
+        "principal_point_offset_x": 0.5 - float(camera.principal_point[0]) / width,
+        "principal_point_offset_y": 0.5 - float(camera.principal_point[1]) / height,
         "near_clip": NEAR,
         "far_clip": FAR,
         "film": {

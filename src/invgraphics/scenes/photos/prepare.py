@@ -224,7 +224,7 @@ def _data_set(folder: Path) -> list[_Source]:
 
 def _calibration(camera: Camera) -> str:
     """Name of a group of cameras of one calibration: focal lengths equal to a thousandth, principal points to a pixel."""
-    return "data set f={:.3g},{:.3g} c={:.0f},{:.0f}".format(*camera.focal.tolist(), *camera.centre.tolist())
+    return "data set f={:.3g},{:.3g} c={:.0f},{:.0f}".format(*camera.focal.tolist(), *camera.principal_point.tolist())
 
 
 def _reduced(pixels: UInt8[np.ndarray, "h w c"], longest: int) -> UInt8[np.ndarray, "h w c"]:
@@ -257,7 +257,7 @@ def _write(work: Path, name: str, source: _Source, pixels: UInt8[np.ndarray, "h 
     if source.camera is not None:
         camera = source.camera.resized(width, height)
         focal = float(camera.focal.mean())
-        centre = (float(camera.centre[0]), float(camera.centre[1]))
+        centre = (float(camera.principal_point[0]), float(camera.principal_point[1]))
     return Prepared(name, source.name, width, height, group, focal, centre, masked, source.mask is not None)
 
 

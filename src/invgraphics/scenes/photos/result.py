@@ -110,7 +110,7 @@ def _move_points(image: Any, camera: Any, straight: Straight) -> None:
     if image.num_points2D() == 0:
         return
     plane = camera.cam_from_img(np.array([point.xy for point in image.points2D]))
-    moved = plane * straight.focal + straight.centre
+    moved = plane * straight.focal + straight.principal_point
     moved[~np.isfinite(moved).all(axis=1)] = -1  # outside: the undistorted picture does not show what has no ray
     for point, xy in zip(image.points2D, moved, strict=True):
         point.xy = xy
@@ -120,6 +120,6 @@ def _make_pinhole(camera: Any, straight: Straight | None) -> None:
     from invgraphics.scenes.colmap_library import pycolmap
 
     focal = (camera.focal_length_x, camera.focal_length_y) if straight is None else straight.focal
-    centre = (camera.principal_point_x, camera.principal_point_y) if straight is None else straight.centre
+    centre = (camera.principal_point_x, camera.principal_point_y) if straight is None else straight.principal_point
     camera.model = pycolmap.CameraModelId.PINHOLE
     camera.params = [*focal, *centre]

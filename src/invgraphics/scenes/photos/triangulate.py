@@ -63,7 +63,7 @@ def triangulated(scene: Scene) -> Triangulated:
     """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else."""
     sha = hashlib.sha256(f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour}".encode())
     for view in scene.train:
-        for values in (view.camera.cam_to_world, view.camera.focal, view.camera.centre):
+        for values in (view.camera.cam_to_world, view.camera.focal, view.camera.principal_point):
             sha.update(values.detach().cpu().double().numpy().tobytes())
     try:
         folder = cache.root().parent / "points"
@@ -140,7 +140,7 @@ def _posed(views: Sequence[View], names: Sequence[str], folder: Path) -> Any:
     extraction.num_threads = max(1, torch.get_num_threads())
     for number, (view, name) in enumerate(zip(views, names, strict=True), 1):
         camera = view.camera
-        params = [*camera.focal.tolist(), *camera.centre.tolist()]
+        params = [*camera.focal.tolist(), *camera.principal_point.tolist()]
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model, reader.camera_params = "PINHOLE", ", ".join(map(repr, params))
         pycolmap.import_images(folder / DATABASE, folder / PHOTOS, pycolmap.CameraMode.PER_IMAGE, [name], reader)

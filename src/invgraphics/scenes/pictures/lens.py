@@ -66,12 +66,12 @@ class Straight:
 
     Attributes:
         focal: focal lengths (fx, fy) of the pinhole, pixels.
-        centre: its principal point, pixels.
+        principal_point: pixels.
         grid: for each pixel of the pinhole picture where to look in the distorted one, in [-1, 1] from border to border.
     """
 
     focal: tuple[float, float]
-    centre: tuple[float, float]
+    principal_point: tuple[float, float]
     grid: Float[torch.Tensor, "h w 2"]
 
 

@@ -53,7 +53,7 @@ def make_view(
             straight = straighten(lens)
             values = undistort(values, straight)
             new = camera.focal.new_tensor
-            camera = replace(camera, focal=new(straight.focal), centre=new(straight.centre))
+            camera = replace(camera, focal=new(straight.focal), principal_point=new(straight.principal_point))
         pixels = _straight(area_resize(values, *final))
         camera = camera.resized(*final)
     image = torch.from_numpy(np.ascontiguousarray(pixels[:, :, :3]))

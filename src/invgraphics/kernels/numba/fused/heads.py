@@ -178,7 +178,7 @@ def pack_layers(layers: Layers) -> tuple[np.ndarray, np.ndarray]:
 
 def pack_head(field: FusedLattice) -> tuple[int, bool, int, int, int, int, int, np.float32]:
     """What `colours` needs to know besides the network."""
-    head, features = field.colour, field.handed + field.own
+    head, features = field.colour, field.geometry_features + field.appearance_features
     sh = head.kind == "sh"
     return (
         KINDS.index(head.kind),

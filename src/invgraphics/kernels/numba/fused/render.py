@@ -81,13 +81,13 @@ def density_scale(settings, points, crop, p):
 
 
 @inlined
-def _enqueue_sample(p, s, raw, points, queue, queued, handed, head, inputs, positions):
+def _enqueue_sample(p, s, raw, points, queue, queued, geometry_features, head, inputs, positions):
     """Append what the colour of batch lane ``p`` needs, whose ray is in slot ``s``, to column ``queued``."""
     features, octaves, direction, degree = head[2], head[3], head[4], head[5]
     n, first = index(queued), features * (1 + 2 * octaves)
     for axis in range(3):
         positions[axis, queued] = points[axis, p]
-    for k in range(handed):
+    for k in range(geometry_features):
         inputs[index(k) * POINTS + n] = raw[index(1 + k) * POINTS + index(p)]
     if direction == FREQUENCY:
         for axis in range(3):
@@ -98,15 +98,15 @@ def _enqueue_sample(p, s, raw, points, queue, queued, handed, head, inputs, posi
 
 
 @inlined
-def _shade_queue(appearance, basis, colour_net, head, handed, batch, room, sums):
+def _shade_queue(appearance, basis, colour_net, head, geometry_features, batch, room, sums):
     """Evaluate the colours of the queued samples and add them, weighted, to their rays."""
     inputs, positions, sample_rays, weights, count = batch
     corners, x, ping, pong = room
     if len(appearance[0]) > 0:
         encode_points(positions, appearance, corners, x)
-        own = apply_network(basis, head[1], x, ping, pong)
-        for number in range((head[2] - handed) * np.int64(POINTS)):
-            inputs[index(handed) * POINTS + index(number)] = own[index(number)]
+        features = apply_network(basis, head[1], x, ping, pong)
+        for number in range((head[2] - geometry_features) * np.int64(POINTS)):
+            inputs[index(geometry_features) * POINTS + index(number)] = features[index(number)]
     found = colours(inputs, colour_net, head, ping, pong)
     for n in range(count):
         for channel in range(3):
@@ -115,7 +115,7 @@ def _shade_queue(appearance, basis, colour_net, head, handed, batch, room, sums)
 
 @parallel
 def render(
-    rays, setup, geometry, appearance, geometry_net, basis, colour_net, head, handed, crop, sizes, memory, settings, width,
+    rays, setup, geometry, appearance, geometry_net, basis, colour_net, head, geometry_features, crop, sizes, memory, settings, width,
     queues, jobs, sums, alpha,
 ):  # fmt: skip
     """Sums of w * (radiance, distance) and of w for every ray; both outputs hold zeros before.
@@ -129,7 +129,7 @@ def render(
         basis: the same of appearance's features.
         colour_net: the same of colour.
         head: see `heads.pack_head`.
-        handed: number of features that geometry hands on to colour.
+        geometry_features: number of features that geometry hands on to colour.
         crop: see `pack_crop`.
         sizes: see `sizes_of`.
         memory: address of the scratch of all jobs.
@@ -159,14 +159,23 @@ def render(
                     scale = density_scale(settings, points, crop, p)
                     weight = composite_sample(s, raw[p], scale, queue, rays[3], compositing, sums, alpha)
                 if weight > _ZERO:
-                    _enqueue_sample(p, s, raw, points, queue, queued, handed, head, inputs, positions)
+                    _enqueue_sample(p, s, raw, points, queue, queued, geometry_features, head, inputs, positions)
                     sample_rays[queued], weights[queued] = queue.ray_index[s], weight
                     queued += 1
                     if queued == POINTS:
                         batch = inputs, positions, sample_rays, weights, queued
-                        _shade_queue(appearance, basis, colour_net, head, handed, batch, room, sums)
+                        _shade_queue(appearance, basis, colour_net, head, geometry_features, batch, room, sums)
                         queued = 0
-        _shade_queue(appearance, basis, colour_net, head, handed, (inputs, positions, sample_rays, weights, queued), room, sums)
+        _shade_queue(
+            appearance,
+            basis,
+            colour_net,
+            head,
+            geometry_features,
+            (inputs, positions, sample_rays, weights, queued),
+            room,
+            sums,
+        )
 
 
 def pack_crop(field: FusedLattice) -> np.ndarray:
@@ -209,7 +218,7 @@ def lattice_render(
     sizes, jobs = sizes_of(max(rows) + GROUP, points_words(geometry), points_words(appearance)), threads()
     # Zeros: what no sample has written to yet is evaluated, and thrown away.
     memory = np.zeros(jobs * sizes[3], np.float32)
-    model = geometry, appearance, *networks, head, field.handed, pack_crop(field), sizes, memory.ctypes.data
+    model = geometry, appearance, *networks, head, field.geometry_features, pack_crop(field), sizes, memory.ctypes.data
     sums, alpha = torch.zeros(len(rays), 4), torch.zeros(len(rays))
     outputs = sums.numpy(), alpha.numpy()
     # Rays that are no image are scheduled in order, as an image as wide as one block.

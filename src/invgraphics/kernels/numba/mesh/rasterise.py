@@ -117,7 +117,7 @@ def mesh_rasterise(
 ) -> Fragments:
     """See `invgraphics.kernels.mesh_rasterise`."""
     width, height, jobs = camera.width, camera.height, threads()
-    lens = np.concatenate([array(camera.focal.double()), array(camera.centre.double())])
+    lens = np.concatenate([array(camera.focal.double()), array(camera.principal_point.double())])
     near, far = np.zeros((height, width)), np.full((height, width), np.inf)
     plane = NEAREST_PLANE
     if interval is not None:

@@ -19,7 +19,7 @@ from invgraphics.kernels.numba.ngp.distance import coordinates, distances, pack_
 from invgraphics.kernels.numba.ngp.network import encode
 from invgraphics.kernels.numba.runtime import array, index, inlined, parallel, prange, threads
 from invgraphics.kernels.reference.tracing import GOLDEN, ROUNDING, result
-from invgraphics.kernels.types import Tracing, TracingLimits
+from invgraphics.kernels.types import TracedRays, TracingLimits
 
 _T, _F, _LOW, _LOW_T, _LOW_A, _LOW_B, _HIT_A, _HIT_FA, _HIT_B, _HIT_FB, _NEXT = range(11)
 _ROWS = 11
@@ -209,7 +209,7 @@ def trace(rays, box, table, levels, octaves, net, widest, settings, limits, jobs
 
 
 @torch.no_grad()
-def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> Tracing:
+def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> TracedRays:
     """See `invgraphics.kernels.sdf_trace`; other than two features per entry are left to the reference."""
     if field.table.shape[1] != 2:
         return reference.sdf_trace(rays, bounds, field, limits)

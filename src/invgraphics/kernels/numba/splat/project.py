@@ -77,7 +77,7 @@ def _flatten_camera(camera: Camera) -> tuple[np.float32, ...]:
     view = np.empty(VIEW, np.float32)
     pose = array(camera.cam_to_world)
     view[:POSITION], view[POSITION:FOCAL] = pose[:3, :3].reshape(-1), pose[:3, 3]
-    view[FOCAL:CENTRE], view[CENTRE:SIZE] = array(camera.focal), array(camera.centre)
+    view[FOCAL:CENTRE], view[CENTRE:SIZE] = array(camera.focal), array(camera.principal_point)
     view[SIZE:] = camera.width, camera.height
     return tuple(view)
 
@@ -94,7 +94,7 @@ def splat_project(
     gaussians: Gaussians, camera: Camera, dilation: float = 0.3, antialiased: bool = False
 ) -> tuple[Footprints, Float[Tensor, "n 3"]]:
     """See `invgraphics.kernels.splat_project`; optimised intrinsics are left to the reference."""
-    if camera.focal.requires_grad or camera.centre.requires_grad:
+    if camera.focal.requires_grad or camera.principal_point.requires_grad:
         return reference.splat_project(gaussians, camera, dilation, antialiased)
     g = gaussians
     constants = (g.opacities.detach(), replace(camera, cam_to_world=camera.cam_to_world.detach()), dilation, antialiased)
