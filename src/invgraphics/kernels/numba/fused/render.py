@@ -115,8 +115,8 @@ def _shade_queue(appearance, basis, colour_net, head, geometry_features, batch, 
 
 @parallel
 def render(
-    rays, setup, geometry, appearance, geometry_net, basis, colour_net, head, geometry_features, crop, sizes, memory, settings, width,
-    queues, jobs, sums, alpha,
+    rays, setup, geometry, appearance, geometry_net, basis, colour_net, head, geometry_features, crop, sizes, memory, settings,
+    width, queues, jobs, sums, alpha,
 ):  # fmt: skip
     """Sums of w * (radiance, distance) and of w for every ray; both outputs hold zeros before.
 
