@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Bounds, Camera, Context, Scene, Screen, Trace, View
+from invgraphics.core import Bounds, Camera, Context, Quantity, Scene, Screen, Trace, View
 from invgraphics.core.transforms import look_at
 from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.renderers.splatting import SplattingConfig
@@ -47,6 +47,12 @@ def _gradients(state: FitState, hook, pixels: list[float], visible: list[bool] |
     radii = torch.tensor([1.0 if seen else 0.0 for seen in (visible or [True] * len(pixels))])
     state.trace = Trace(screen=Screen(means2d, radii, 32, 32))
     hook.after_backward(state)
+
+
+def _end_step(state: FitState, hook) -> None:
+    """The end of a step and what comes before the next."""
+    hook.after_step(state)
+    hook.before_step(state)
 
 
 def test_small_gaussians_with_large_gradients_are_cloned() -> None:
@@ -146,6 +152,8 @@ def test_reset_lowers_opacities_and_arms_pruning_by_size() -> None:
     hook = DensityControlConfig(every=10, resets=(0.25,), prune_opacity=0.005, prune_pixels=0.5).build()
     _gradients(state, hook, [0.0] * 3)
     hook.after_step(state)
+    assert float(torch.sigmoid(state.field.opacity_logits).max()) == 0.5  # until the next step
+    hook.before_step(state)
     assert float(torch.sigmoid(state.field.opacity_logits).max()) == pytest.approx(0.01, abs=1e-6)
     with torch.no_grad():
         state.field.opacity_logits.fill_(0.0)
@@ -191,16 +199,16 @@ def test_white_scenes_are_reset_when_growth_begins(background: float, lowered: b
     state.scene = replace(state.scene, background=torch.full((3,), background))
     hook = DensityControlConfig(every=1000, start=0.25, white_reset=True).build()
     state.ctx = replace(state.ctx, progress=0.2)
-    hook.after_step(state)
+    _end_step(state, hook)
     assert float(torch.sigmoid(state.field.opacity_logits).min()) == pytest.approx(0.5)
     state.ctx = replace(state.ctx, progress=0.3)
-    hook.after_step(state)
+    _end_step(state, hook)
     assert (float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02) == lowered
     with torch.no_grad():
         state.field.opacity_logits.fill_(0.0)
     again = DensityControlConfig(every=1000, start=0.25, white_reset=True).build()
     again.load_state_dict(hook.state_dict())
-    again.after_step(state)
+    _end_step(state, again)
     assert float(torch.sigmoid(state.field.opacity_logits).min()) == pytest.approx(0.5)  # once only
 
 
@@ -210,7 +218,7 @@ def test_white_scenes_are_not_reset_before_gaussians_can_recover(step: int, lowe
     state = _state(3)
     state.scene = replace(state.scene, background=torch.ones(3))
     state.step, state.ctx = step, replace(state.ctx, progress=0.5)
-    DensityControlConfig(every=1000, start=0.0167, white_reset=True, reset_spacing=3000).build().after_step(state)
+    _end_step(state, DensityControlConfig(every=1000, start=0.0167, white_reset=True, reset_spacing=3000).build())
     assert (float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02) == lowered
 
 
@@ -289,10 +297,11 @@ def test_resets_that_come_too_soon_are_left_out() -> None:
             state.field.opacity_logits.fill_(0.0)
         state.step, state.ctx = step, replace(state.ctx, progress=progress)
         hook.after_step(state)
-        lowered.append(float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02)
         resumed = DensityControlConfig(every=10_000, resets=(0.1, 0.2, 0.3), reset_spacing=300).build()
         resumed.load_state_dict(hook.state_dict())
         hook = resumed
+        hook.before_step(state)
+        lowered.append(float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02)
     assert lowered == [False, True, False, False]
 
 
@@ -307,3 +316,49 @@ def test_large_gaussians_stay_until_a_reset_has_happened() -> None:
             _gradients(state, hook, [0.0] * 3)
             hook.after_step(state)
         assert state.field.primitive_count() == count
+
+
+def test_a_reset_lowers_what_is_seen_through_the_filter() -> None:
+    """A flat Gaussian keeps a quarter of its opacity behind the filter: a reset of what is stored would hide it for good."""
+    state = _state(3)
+    pixel = 4.0 / 40
+    with torch.no_grad():
+        state.field.log_scales[:] = torch.tensor([[2.0, 2.0, 0.1], [1.0, 1.0, 1.0], [2.0, 2.0, 0.1]]).mul(pixel).log()
+        state.field.opacity_logits[2] = math.log(0.002 / 0.998)
+        state.field.smoothing.fill_(0.447 * pixel)
+    before = _integrals(state)
+    hook = DensityControlConfig(every=10, resets=(0.25,)).build()
+    _end_step(state, hook)
+    seen = state.field.primitives(Quantity.GAUSSIANS, Context(state.scene.bounds)).opacities.detach()
+    torch.testing.assert_close(seen[:2], torch.full((2,), 0.01))
+    after = _integrals(state)
+    # What a Gaussian holds in all falls as its peak does, for the filter keeps the integral of what is stored.
+    torch.testing.assert_close(after[2], before[2])
+    torch.testing.assert_close(after[:2] / before[:2], torch.sigmoid(state.field.opacity_logits[:2]).detach() / 0.5)
+
+
+def _integrals(state: FitState) -> torch.Tensor:
+    """Integral of opacity times response over space, by quadrature of the Gaussians that are rendered."""
+    gaussians = state.field.primitives(Quantity.GAUSSIANS, Context(state.scene.bounds))
+    z = torch.linspace(-8, 8, 4001)
+    along_an_axis = torch.trapezoid(torch.exp(-0.5 * z**2), z)
+    return (gaussians.opacities * (gaussians.scales * along_an_axis).prod(dim=1)).detach()
+
+
+def test_cloning_by_ordinary_and_splitting_by_absolute_gradients() -> None:
+    """AbsGS: opposite pulls of a Gaussian's pixels cancel in the one and not in the other; three small, three large ones."""
+    state = _state(6)
+    with torch.no_grad():
+        state.field.log_scales[3:] = math.log(0.5)
+    means2d, absgrad = torch.zeros(6, 2, requires_grad=True), torch.zeros(6, 2, requires_grad=True)
+    ordinary = torch.tensor([0.0, 0.15, 0.05, 0.0, 0.15, 0.0]) / 16
+    absolute = torch.tensor([1.0, 1.0, 1.0, 1.0, 0.15, 0.19]) / 16
+    means2d.grad, absgrad.grad = (torch.stack([values, torch.zeros(6)], dim=1) for values in (ordinary, absolute))
+    state.trace = Trace(screen=Screen(means2d, torch.ones(6), 32, 32, absgrad))
+    hook = DensityControlConfig(every=10, threshold=0.1, split_threshold=0.2).build()
+    hook.after_backward(state)
+    resumed = DensityControlConfig(every=10, threshold=0.1, split_threshold=0.2).build()
+    resumed.load_state_dict(hook.state_dict())
+    resumed.after_step(state)
+    assert resumed.last_round.cloned.tolist() == [False, True, False, False, False, False]
+    assert resumed.last_round.split.tolist() == [False, False, False, True, False, False]

@@ -86,3 +86,14 @@ def test_mip_recipe_smooths_from_the_first_step(make_fit, scene) -> None:
 def test_refusals() -> None:
     with pytest.raises(ValueError, match="variance"):
         SmoothingConfig(variance=0.0)
+
+
+def test_what_a_camera_sees_from_close_by_counts() -> None:
+    """A point at 0.1 in front of a camera, in a scene whose near plane is at 0.05: its pixels there are finer than any other's."""
+    state = _state(1)
+    camera = state.scene.train[0].camera
+    with torch.no_grad():
+        state.field.means[0] = camera.position + 0.1 * camera.cam_to_world[:3, 2]
+    assert state.scene.bounds.near == 0.05
+    SmoothingConfig(variance=1.0).build().before_step(state)
+    torch.testing.assert_close(state.field.smoothing, torch.tensor([0.1 / 40]))

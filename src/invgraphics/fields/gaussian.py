@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics.core import harmonics
@@ -128,7 +129,7 @@ class GaussianField(Field):
     """n Gaussians. Parameters are stored before activation; `primitives` activates them.
 
     The buffer ``smoothing`` holds the standard deviation, in local units, of an isotropic filter that every Gaussian is seen
-    through (Mip-Splatting, §4.1): 0 where there is none. `primitives` has it applied.
+    through (Mip-Splatting, §5.1): 0 where there is none. `primitives` has it applied.
 
     Args:
         tensors: one per name in `PARAMETERS`, all with n rows.
@@ -192,6 +193,12 @@ class GaussianField(Field):
         return len(self.means)
 
     @torch.no_grad()
+    def filter_attenuation(self) -> Float[Tensor, " n"]:
+        """Factor in (0, 1] by which the 3D smoothing filter lowers each opacity; 1 without smoothing."""
+        scales = self._gaussians(1).scales
+        return (scales / self._smoothed_scales(scales)).prod(dim=1)
+
+    @torch.no_grad()
     def replace(self, tensors: Mapping[str, Tensor]) -> None:
         """Replace all parameters by new ones, of any common number of rows, without smoothing.
 
@@ -223,11 +230,14 @@ class GaussianField(Field):
         )
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
-        """Apply the 3D smoothing filter: wider, and fainter such that each keeps its integral (Mip-Splatting, §4.1)."""
+        """Apply the 3D smoothing filter: wider, and fainter such that each keeps its integral (Mip-Splatting, §5.1)."""
         if not bool(self.smoothing.any()):
             return gaussians
-        scales = (gaussians.scales.square() + self.smoothing[:, None].square()).sqrt()
+        scales = self._smoothed_scales(gaussians.scales)
         return replace(gaussians, scales=scales, opacities=gaussians.opacities * (gaussians.scales / scales).prod(dim=1))
+
+    def _smoothed_scales(self, scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        return (scales.square() + self.smoothing[:, None].square()).sqrt()
 
     def _with_dropout(self, gaussians: Gaussians, ctx: Context) -> Gaussians:
         """Make a random share of the Gaussians transparent, and the others that much more opaque (DropGaussian, eq. 6)."""

@@ -228,7 +228,7 @@ def splat_project(
         gaussians: activated primitives.
         camera: pinhole camera, differentiable in its pose.
         dilation: variance in square pixels added to both screen axes (low-pass filter).
-        antialiased: opacity compensation: the filter keeps a footprint's integral, not its peak (Mip-Splatting, §4.2).
+        antialiased: opacity compensation: the filter keeps a footprint's integral, not its peak (Mip-Splatting, §5.2).
 
     Returns:
         Conic footprints, culled where what is opaquer than 1/255 misses the frustum; and rgb = max(0, SH(direction) + 0.5).

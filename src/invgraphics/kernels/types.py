@@ -107,7 +107,7 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.99
 """Alpha is clamped here for numerical stability (3DGS, appendix C)."""
 COMPENSATION_MIN = 0.005
-"""Lower bound of the low-pass filter's opacity compensation (Mip-Splatting; 3DGS, anti-aliased rasteriser)."""
+"""Lower bound of the low-pass filter's opacity compensation (3DGS's anti-aliased rasteriser; Mip-Splatting's is 0.001)."""
 TRANSMITTANCE_MIN = 1e-4
 """Compositing of a pixel stops before transmittance falls below this (3DGS, appendix C)."""
 

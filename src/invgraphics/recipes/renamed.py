@@ -33,7 +33,7 @@ _ADDED_TO_NEURAL = {
 }
 ADDED_KEYS: dict[str, dict[str, Any]] = {
     "field.neural": _ADDED_TO_NEURAL,
-    "hooks.density_control": {"reset_spacing": 0},
+    "hooks.density_control": {"reset_spacing": 0, "split_threshold": 0.0},
     "hooks.upsample": {"min_spacing": 0.0},
     "optimiser": {"muon": 0.0},
     "field.gaussians": {"dropout": 0.0, "dropout_views": 0},

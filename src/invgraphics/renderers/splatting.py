@@ -39,7 +39,8 @@ class SplattingConfig:
     Attributes:
         shape: ``ellipsoid`` projects to an ellipse, to first order (EWA); ``disc`` drops the shortest axis and meets each
             pixel's ray exactly (2DGS).
-        dilation: variance in square pixels added to every footprint (low-pass filter); of the smallest one, for discs.
+        dilation: variance in square pixels added to every footprint (low-pass filter); of the smallest one, for discs
+            (2DGS: 0.5).
         antialiased: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
         depth: ``expected`` averages the distances of a pixel's splats by weight; ``median`` takes that of the splat at which
             half of the light is gone. For evaluation: gradients pass through the expected one only.

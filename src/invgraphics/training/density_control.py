@@ -16,6 +16,8 @@ from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters, cap_at
 from invgraphics.training.hooks import FitState, Hook
 from invgraphics.training.rows import replace_rows
 
+LARGEST_OPACITY = 1 - 1e-6
+"""Opacity to which a reset of a strongly filtered Gaussian is limited."""
 WHITE_RESET_STEP = 500
 """Step of 3DGS's reset against a white background; Gaussians that are reset much sooner do not become opaque again."""
 
@@ -24,7 +26,7 @@ WHITE_RESET_STEP = 500
 class DensityControlConfig:
     """The 3DGS rules, on a schedule of progress so that they fit any budget; ``stop = 0`` leaves the Gaussians as they are.
 
-    With a renderer's ``absolute_gradients`` the gradients are those of AbsGS (Ye et al. 2024), whose threshold is higher: 8e-4.
+    With a renderer's ``absolute_gradients`` those decide (AbsGS, Ye et al. 2024), whose thresholds are higher.
 
     Attributes:
         start: progress at which growth begins (paper: 500 of 30,000 steps).
@@ -32,13 +34,16 @@ class DensityControlConfig:
         stop: progress at which it ends (paper: 15,000 of 30,000).
         every: steps between two rounds of growing and pruning.
         threshold: mean norm of dL/d(NDC xy) above which a Gaussian grows.
+        split_threshold: the same for splitting, of absolute gradients; cloning then goes by ordinary ones, as in AbsGS. 0:
+            ``threshold`` decides both, of absolute gradients where the renderer has them (gsplat).
         dense: share of the scene's extent that divides cloning (smaller) from splitting (larger).
         prune_opacity: opacity below which a Gaussian is pruned.
         prune_extent: share of the scene's extent above which a Gaussian is pruned, after the first reset.
-        prune_pixels: radius in pixels above which a Gaussian is pruned, after the first reset; 0 never.
-        resets: progress values at which opacities are reset to at most twice ``prune_opacity``.
+        prune_pixels: radius in pixels above which a Gaussian is pruned, after the first reset; 0 never. Algorithm 1 of 3DGS
+            has it; its code, and so its scores, do not: it clears the radii before it reads them (its issue 123).
+        resets: progress values at which opacities, as a 3D filter leaves them, are reset to at most twice ``prune_opacity``.
         reset_spacing: least number of steps before the first reset and between two; one that is due sooner is skipped. Within
-            fewer steps Gaussians neither shrink below ``prune_pixels`` nor become opaque again, and most are pruned.
+            fewer steps Gaussians do not become opaque again, and most are pruned.
         white_reset: whether they are also reset at ``start`` where the scene's background is white, before splats of the
             background's colour settle in front of it; skipped before step 500 (3DGS's own) or ``reset_spacing``, if sooner.
         max_primitives: cap on the number of Gaussians; those with the largest gradients grow first.
@@ -55,6 +60,7 @@ class DensityControlConfig:
     stop: float = 0.5
     every: int = 100
     threshold: float = 2e-4
+    split_threshold: float = 0.0
     dense: float = 0.01
     prune_opacity: float = 0.005
     prune_extent: float = 0.1
@@ -71,8 +77,8 @@ class DensityControlConfig:
     def __post_init__(self) -> None:
         if self.every < 1 or self.max_primitives < 1:
             raise ValueError("'every' and 'max_primitives' must be at least 1.")
-        if self.reset_spacing < 0:
-            raise ValueError(f"'reset_spacing' must not be negative, not {self.reset_spacing}.")
+        if self.reset_spacing < 0 or self.split_threshold < 0:
+            raise ValueError("'reset_spacing' and 'split_threshold' must not be negative.")
 
     def capped(self, most: int) -> DensityControlConfig:
         """The same, growing to at most ``most`` Gaussians."""
@@ -114,6 +120,7 @@ class DensityControl(Hook):
     """Accumulates screen-space gradients, then grows, prunes and resets the Gaussians on schedule.
 
     The gradient is 3DGS's: dL/d(NDC xy), the pixel gradient times (W/2, H/2), averaged over the views that see the Gaussian.
+    Opacities are reset before the next step, when the 3D filter is that of the Gaussians after their growth.
 
     Attributes:
         last_round: the latest round in this process; ``None`` before the first.
@@ -127,13 +134,21 @@ class DensityControl(Hook):
     def __init__(self, config: DensityControlConfig) -> None:
         self._config = config
         self._gradient_sum = torch.zeros(0)
+        self._clone_gradient_sum = torch.zeros(0)
         self._views = torch.zeros(0)
         self._max_radius = torch.zeros(0)
         self._resets_due = 0
-        self._last_reset = 0
+        self._last_reset, self._reset_pending = 0, False
         self._started = -1.0
         self._first_count = 0
         self.last_round: GrowthRound | None = None
+
+    @override
+    def before_step(self, state: FitState) -> None:
+        """Reset opacities, if the step before has asked for it."""
+        if self._reset_pending:
+            self._reset_pending = False
+            self._reset_opacities(state)
 
     @override
     def after_backward(self, state: FitState) -> None:
@@ -143,15 +158,17 @@ class DensityControl(Hook):
             return
         if len(self._gradient_sum) != len(screen.radii):
             self._clear_statistics(len(screen.radii), screen.radii)
-        ndc = screen.gradient * screen.means2d.new_tensor([screen.width / 2, screen.height / 2])
+        pixels_per_ndc = screen.means2d.new_tensor([screen.width / 2, screen.height / 2])
         visible = screen.radii > 0
-        self._gradient_sum += torch.where(visible, ndc.norm(dim=1), 0)
+        self._gradient_sum += torch.where(visible, (screen.gradient * pixels_per_ndc).norm(dim=1), 0)
+        if self._config.split_threshold and screen.means2d.grad is not None:
+            self._clone_gradient_sum += torch.where(visible, (screen.means2d.grad * pixels_per_ndc).norm(dim=1), 0)
         self._views += visible
         self._max_radius = torch.maximum(self._max_radius, screen.radii.detach())
 
     @override
     def after_step(self, state: FitState) -> None:
-        """Grow, prune and reset as scheduled."""
+        """Grow and prune as scheduled, and say whether opacities are to be reset."""
         config, progress = self._config, state.ctx.progress
         field = cast(GaussianParameters, state.field)
         starts = self._started < 0 and self._due_to_start(state)
@@ -163,10 +180,8 @@ class DensityControl(Hook):
         if self._resets_due < len(config.resets) and progress >= config.resets[self._resets_due]:
             self._resets_due += 1
             if state.step + 1 - self._last_reset >= config.reset_spacing:
-                self._last_reset = state.step + 1
-                self._reset_opacities(state)
-        if starts and self._resets_at_start(state):
-            self._reset_opacities(state)
+                self._last_reset, self._reset_pending = state.step + 1, True
+        self._reset_pending |= starts and self._resets_at_start(state)
 
     def _due_to_start(self, state: FitState) -> bool:
         """Whether growth may begin: by progress, or by steps in long budgets."""
@@ -181,28 +196,36 @@ class DensityControl(Hook):
 
     @torch.no_grad()
     def _reset_opacities(self, state: FitState) -> None:
-        """Clamp opacities to twice the pruning threshold, and zero their moments."""
-        ceiling = 2 * self._config.prune_opacity
-        cast(GaussianParameters, state.field).opacity_logits.clamp_(max=math.log(ceiling / (1 - ceiling)))
+        """Clamp filtered opacities to twice the pruning threshold, and zero their moments."""
+        field = cast(GaussianParameters, state.field)
+        ceiling = (2 * self._config.prune_opacity / field.filter_attenuation()).clamp_max(LARGEST_OPACITY)
+        torch.minimum(field.opacity_logits, ceiling.logit(), out=field.opacity_logits)
         state.optimiser.reset_moments("field.opacity_logits")
 
     @torch.no_grad()
     def _grow_and_prune(self, state: FitState) -> None:
         """One round: clone small Gaussians with large gradients, split large ones, prune transparent and oversized ones."""
         config, field = self._config, cast(GaussianParameters, state.field)
-        gradient = self._gradient_sum / self._views.clamp_min(1)
         largest = field.log_scales.exp().amax(dim=1)
         keep = ~self._to_prune(field, largest, state.scene.extent)
         small = largest <= config.dense * state.scene.extent
         may_grow = keep & torch.where(small, config.clone, config.split)
         room = self._cap(state.ctx.progress, len(keep)) - int(keep.sum())
-        grows = self._to_grow(torch.where(may_grow, gradient, 0.0), room)
+        grows = self._to_grow(torch.where(may_grow, self._gradient(small), 0.0), room)
         to_clone, to_split = grows & small, grows & ~small
         keep &= ~to_split
         if not bool((keep | to_split).any()):
             keep[torch.argmax(field.opacity_logits)] = True  # an empty field could never grow again
         self.last_round = GrowthRound(state.step + 1, to_clone, to_split, ~(keep | to_split))
         self._rebuild(state, *(mask.nonzero()[:, 0] for mask in (keep, to_clone, to_split)))
+
+    def _gradient(self, small: Bool[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """Mean gradients, to be compared with ``threshold``: that of splitting is brought to it."""
+        config, views = self._config, self._views.clamp_min(1)
+        if not config.split_threshold:
+            return self._gradient_sum / views
+        to_split = self._gradient_sum * (config.threshold / config.split_threshold)
+        return torch.where(small, self._clone_gradient_sum, to_split) / views
 
     def _cap(self, progress: float, count: int) -> int:
         """Most Gaussians at this point of the fit."""
@@ -249,16 +272,19 @@ class DensityControl(Hook):
         self._clear_statistics(len(rows), new["means"])
 
     def _clear_statistics(self, count: int, like: Tensor) -> None:
-        self._gradient_sum, self._views, self._max_radius = (torch.zeros(count, device=like.device) for _ in range(3))
+        zeros = [torch.zeros(count, device=like.device) for _ in range(4)]
+        self._gradient_sum, self._clone_gradient_sum, self._views, self._max_radius = zeros
 
     @override
     def state_dict(self) -> dict[str, Tensor]:
         return {
             "gradient_sum": self._gradient_sum,
+            "clone_gradient_sum": self._clone_gradient_sum,
             "views": self._views,
             "max_radius": self._max_radius,
             "resets_due": torch.tensor(self._resets_due),
             "last_reset": torch.tensor(self._last_reset),
+            "reset_pending": torch.tensor(self._reset_pending),
             "started": torch.tensor(self._started, dtype=torch.float64),
             "first_count": torch.tensor(self._first_count),
         }
@@ -267,6 +293,8 @@ class DensityControl(Hook):
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         state = {name: state[first] for name, first in _FIRST_NAMES.items() if first in state} | state
         self._gradient_sum, self._views, self._max_radius = state["gradient_sum"], state["views"], state["max_radius"]
+        self._clone_gradient_sum = state.get("clone_gradient_sum", torch.zeros_like(self._gradient_sum))
+        self._reset_pending = bool(state.get("reset_pending", False))
         self._resets_due, self._started = int(state["resets_due"]), float(state["started"])
         self._last_reset = int(state.get("last_reset", state["resets_due"]))
         self._first_count = int(state["first_count"])

@@ -18,6 +18,10 @@ class GaussianParameters(Protocol):
     quaternions: Float[Tensor, "n 4"]
     opacity_logits: Float[Tensor, " n"]
 
+    def filter_attenuation(self) -> Float[Tensor, " n"]:
+        """Factor in (0, 1] by which a 3D filter lowers each opacity; 1 without one."""
+        ...
+
     def replace(self, tensors: dict[str, Tensor]) -> None:
         """Replace all parameters by new ones, of any common number of rows."""
         ...

@@ -36,8 +36,8 @@ class LimitsConfig:
     filter hides them; density control then copies what can no longer change.
 
     Attributes:
-        min_opacity: lowest opacity; the default lies between what the rasteriser still draws (1/255) and what density control
-            and relocation take for transparent (0.005).
+        min_opacity: lowest opacity before any 3D filter; the default lies between what the rasteriser still draws (1/255) and
+            what density control and relocation take for transparent (0.005).
         max_opacity: highest opacity. The rasteriser clamps alpha at 0.99.
         min_scale: lowest standard deviation along any axis, in pixels of the nearest training camera.
         every: steps between two computations of the scale limits; there is one more after each change in number.
@@ -120,7 +120,7 @@ class DeadGaussians:
 
     Attributes:
         saturated: opacities whose sigmoid has no slope in float32.
-        faded: opacities below what the rasteriser draws.
+        faded: opacities, behind the 3D filter, below what the rasteriser draws.
         collapsed: all three standard deviations vanish beside the low-pass filter.
     """
 
@@ -160,6 +160,6 @@ def dead_gaussians(field: Field, cameras: Sequence[Camera]) -> DeadGaussians | N
     largest = gaussians.log_scales.amax(dim=1).exp()
     return DeadGaussians(
         saturated=(opacity * (1 - opacity) < VANISHING_SLOPE) & (opacity > 0.5),
-        faded=opacity < ALPHA_MIN,
+        faded=opacity * gaussians.filter_attenuation() < ALPHA_MIN,
         collapsed=largest < COLLAPSED * pixel_sizes(gaussians.means, cameras),
     )

@@ -16,7 +16,7 @@ from invgraphics.training.hooks import FitState, Hook
 from invgraphics.training.rows import replace_rows
 
 MOST_COPIES = 51
-"""Most Gaussians that take the place of one at once (the authors' code)."""
+"""Most Gaussians that take the place of one at once (gsplat's; the authors' code has 50)."""
 LARGEST_OPACITY = 1 - 1e-6
 GATE_SLOPE = 100.0
 """Steepness of the sigmoid in opacity that keeps noise to transparent Gaussians."""

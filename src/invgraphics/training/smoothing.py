@@ -1,4 +1,4 @@
-"""The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, §4.1): a low-pass filter at the training views' sampling rate."""
+"""The 3D smoothing filter of Mip-Splatting (Yu et al. 2024, §5.1): a low-pass filter at the training views' sampling rate."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class SmoothingConfig:
         every: steps between two computations; there is one more after each change in number.
         variance: of the filter, in squares of the pixel distance at the Gaussian.
         margin: part of the image by which a Gaussian may lie outside it and still be in view.
-        near: Gaussians nearer than this along the optical axis are ignored, local units.
+        near: cameras nearer to a Gaussian than this along their axis, or than the scene's near plane where that is less, do not
+            count for it; local units.
     """
 
     every: int = 100
@@ -73,7 +74,8 @@ class Smoothing(Hook):
         field, config = cast(SmoothedGaussians, state.field), self._config
         # A filter is positive everywhere; zeros are what a change in number leaves behind.
         if due or not bool(field.smoothing.any()):
-            spacing = pixel_distances(field.means, state.cameras(), config.margin, config.near)
+            near = min(config.near, state.scene.bounds.near)
+            spacing = pixel_distances(field.means, state.cameras(), config.margin, near)
             field.smoothing.copy_(config.variance**0.5 * spacing)
 
 

@@ -24,7 +24,7 @@ of 4,000 random Gaussians, is as far from that of 600, within 10 %. They are wid
 gap between two Gaussians, is below 1e-6.
 """
 MAX_OPTICAL_DEPTH = 9.2
-"""Optical depth behind which less than 1/10000 of the light comes from: nothing there is worth a short interval."""
+"""Optical depth behind which about 1/10000 of the light comes from: nothing there is worth a short interval."""
 MOST_AT_ONCE = 1 << 18
 """Error functions that are in memory at once."""
 

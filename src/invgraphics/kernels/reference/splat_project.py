@@ -26,7 +26,8 @@ def splat_project(
     """See `invgraphics.kernels.splat_project`.
 
     The map from camera axes to (x pixels, y pixels, distance) is replaced by its derivative J at the mean, under which
-    the covariance becomes ``J V J^T`` (Zwicker et al. 2001, equation 29). With ``V = L L^T`` this is ``A A^T``, A = J L.
+    the covariance becomes ``J V J^T`` (Zwicker et al. 2002, EWA splatting, equations 29 and 31, by 3DGS's code). With
+    ``V = L L^T`` this is ``A A^T``, A = J L.
     """
     mean, in_front = in_camera(gaussians, camera)
     factor = camera.cam_to_world[:3, :3].T @ quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]

@@ -158,7 +158,7 @@ def covariance(x, y, dilation):
 
 @inlined
 def compensation_of(x, y, dilation):
-    """Opacity compensation of the low-pass filter (Mip-Splatting, §4.2), and the unfiltered covariance."""
+    """Opacity compensation of the low-pass filter (Mip-Splatting, §5.2), and the unfiltered covariance."""
     xx, xy, yy, area = covariance(x, y, _ZERO)
     _, _, _, det = covariance(x, y, dilation)
     return max(np.sqrt(area / det), _COMPENSATION_MIN), xx, xy, yy, area
