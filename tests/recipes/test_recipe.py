@@ -10,6 +10,7 @@ import torch
 
 from invgraphics.cli.arguments import parse_list
 from invgraphics.core import Conditional
+from invgraphics.data import find
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.recipes.recipe import load_method, methods, presets, resolve, split_name
@@ -177,3 +178,31 @@ def test_a_name_may_carry_changes() -> None:
     assert slug(name) == "volumetric-nerf-preset=paper-field.width=96-batches.rays=77"
     listed = "splatting/gaussians:batches.resolution=[0.5,1.0],volumetric/hash"
     assert parse_list(listed, "--methods") == tuple(listed.replace("],", "]|").split("|"))
+
+
+@pytest.mark.parametrize("name", [name for name in methods() if "paper" in presets(name)])
+def test_a_recipe_with_published_values_says_what_differs_from_the_paper(name: str) -> None:
+    assert "what differs" in (find("renderers") / f"{name}.toml").read_text().lower().replace("\n# ", " ")
+
+
+def test_colours_weigh_as_much_beside_the_mask_in_both_recipes_of_idr() -> None:
+    """Its loss sums a pixel's three channels and divides by the pixels; a photometric loss is a mean over channels, too."""
+    for name in ("sphere-tracing/mlp", "sphere-tracing/hash"):
+        photometric, mask = load_method(name, "paper").recipe.losses[:2]
+        assert (photometric.weight, mask.weight) == (3.0, 100.0), name
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "layer"),
+    [
+        ("hybrid/neus", 256 + 39, 4),
+        ("hybrid/volsdf", 256 + 39, 4),
+        ("sphere-tracing/mlp", 512 + 39, 4),
+        ("volumetric/nerf", 256 + 63, 5),
+    ],
+)
+def test_the_skip_enters_the_layer_that_the_papers_have_it_in(name: str, width: int, layer: int) -> None:
+    """Counted from 0: ``lin4`` of IDR, NeuS and VolSDF; ``pts_linears[5]`` of NeRF."""
+    field = load_method(name, "paper").recipe.field.build(toy_scene(views=2, size=8))
+    inputs = [module.in_features for module in field.modules() if isinstance(module, torch.nn.Linear)]
+    assert inputs.index(width) == layer

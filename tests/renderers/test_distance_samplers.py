@@ -49,6 +49,16 @@ def test_clear_distance_is_a_lower_bound() -> None:
     assert float((clear / nearest)[nearest > 0.2].mean()) > 0.8
 
 
+def test_no_distance_is_clear_where_a_surface_is_crossed() -> None:
+    """A network's slope may exceed 1: at 3 the balls around both ends overlap although the surface lies between them."""
+    edges = torch.linspace(0, 1, 9)[None]
+    sdf = 3 * (0.55 - edges)
+    clear = clear_distance(sdf, edges.diff(dim=1))
+    crossing = (edges[:, :-1] < 0.55) & (edges[:, 1:] > 0.55)
+    assert int(crossing.sum()) == 1 and float(clear[crossing]) == 0
+    assert bool((clear[~crossing] > 0).all())
+
+
 @pytest.mark.parametrize("beta", [0.02, 0.1, 0.3])
 def test_error_bounds_hold(beta: float) -> None:
     """Theorem 1: the opacity of a left Riemann sum errs by no more than the bound, at every edge."""

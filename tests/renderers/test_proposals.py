@@ -12,6 +12,7 @@ from invgraphics.config import fill
 from invgraphics.core import Batch, Context, Rays, Rendering, Samples, Scene, Trace
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.analytic import Sphere
+from invgraphics.fields.density_field import DensityFieldConfig
 from invgraphics.renderers.histograms import blur, dilate, resample
 from invgraphics.renderers.proposals import ProposalSampler, ProposalsConfig
 from invgraphics.renderers.volumetric import Volumetric
@@ -226,3 +227,38 @@ def _blind() -> Sphere:
     field = Sphere(1.0, 0.1)
     field.provides = field.provides & ~field.provides
     return field
+
+
+def test_weights_may_be_annealed_for_a_part_of_the_fit_only() -> None:
+    """Nerfacto: the exponent of its ``bias`` reaches 1 after 1,000 of 30,000 steps."""
+    config = ProposalsConfig(anneal_until=1000 / 30000)
+    assert config.exponent(1000 / 30000) == pytest.approx(1.0) and config.exponent(0.5) == 1.0
+    assert config.exponent(100 / 30000) == pytest.approx(10 * 0.1 / (9 * 0.1 + 1))
+
+
+def test_one_proposal_network_may_serve_all_levels(make_scene: Callable[..., Scene]) -> None:
+    """As two with the same parameters: the same samples, and the sum of their gradients."""
+    scene = make_scene()
+    one = ProposalsConfig(counts=(8, 8), count=4, fields=(DensityFieldConfig(),)).build(scene)
+    two = ProposalsConfig(counts=(8, 8), count=4, fields=(DensityFieldConfig(), DensityFieldConfig())).build(scene)
+    for field in two.fields:
+        field.load_state_dict(one.fields[0].state_dict())
+    levels = []
+    for sampler in (one, two):
+        _, traces = sampler.sample(rays_of(scene), Sphere(5.0, 0.5), context(scene, True, 0.5))
+        sum((trace.weights.square().sum() for trace in traces), torch.zeros(())).backward()
+        levels.append(traces)
+    for a, b in zip(*levels, strict=True):
+        assert torch.equal(a.weights, b.weights)
+    pairs = zip(*(field.parameters() for field in two.fields), strict=True)
+    for shared, (first, second) in zip(one.fields[0].parameters(), pairs, strict=True):
+        if shared.grad is not None:
+            torch.testing.assert_close(shared.grad, first.grad + second.grad)
+
+
+def test_no_sample_is_drawn_from_an_interval_without_length(make_scene: Callable[..., Scene]) -> None:
+    """Dilation leaves some at both ends of a ray. At the start of a fit, when all weights count alike, they count nothing."""
+    scene = make_scene()
+    sampler = ProposalsConfig(counts=(64,), count=64, fields=(DensityFieldConfig(),)).build(scene)
+    samples, _ = sampler.sample(rays_of(scene), Sphere(5.0, 0.5), context(scene, True, 0.0))
+    assert float((samples.t1 - samples.t0).min()) > 0

@@ -31,7 +31,7 @@ class Planes:
         depths: distances along its optical axis, local units, ascending: nearest first.
         rgb: straight colour in the scene's colour space.
         alpha: opacity in [0, 1] of a ray through the texel.
-        coefficients: of the view-dependent colour added to ``rgb``, one for each basis function (NeX, equation 2); over the
+        coefficients: of the view-dependent colour added to ``rgb``, one for each basis function (NeX, equation 3); over the
             same area as ``rgb``, in texels of their own size. ``None`` for none.
         basis: the basis functions; ``None`` exactly where there are no coefficients.
     """

@@ -22,7 +22,7 @@ _MOST_OPACITY = 1 - 1e-6
 
 @dataclass(frozen=True)
 class DensityActivation:
-    """Raw values to densities in [0, inf), around the interpolation of a voxel grid (DVGO, Sun et al. 2022, §4.1, figure 4).
+    """Raw values to densities in [0, inf), around the interpolation of a voxel grid (DVGO, Sun et al. 2022, "post-activation").
 
     Attributes:
         kind: ``exp`` stops growing at exp(15).

@@ -63,7 +63,8 @@ class Mlp(nn.Module):
         """Make the first output about ``|x| - radius`` of the first three inputs x in [-1, 1]; ``inside_out`` negates it.
 
         Atzmon and Lipman 2020 (SAL), theorem 1: wide layers with weights N(0, 2 / width) keep the norm, and the output layer
-        averages. Inputs beyond the first three, and those that come in by the skip, start with weight zero, as in IDR.
+        averages. Inputs beyond the first three, and those that come in by the skip, start with weight zero (IDR keeps the three
+        coordinates of the skip).
         Layers of a practical width are some 15% off, so the averaging weights are then corrected by ridge regression.
         """
         hidden = [layer for layer in self.hidden if isinstance(layer, nn.Linear)]

@@ -38,6 +38,7 @@ ADDED_KEYS: dict[str, dict[str, Any]] = {
     "optimiser": {"muon": 0.0},
     "field.gaussians": {"dropout": 0.0, "dropout_views": 0},
     "renderer.sampler.proposal.neural": _ADDED_TO_NEURAL,
+    "renderer.sampler.proposals": {"anneal_until": 1.0},
     "renderer.volumetric": {"colour_threshold": 0.0},
     "batches": {"foreground_until": 1.0, "foreground_least": 0.0, "start_size": 0, "start_until": 0.5},
 }

@@ -163,14 +163,16 @@ def clear_distance(sdf: Float[Tensor, "k edges"], delta: Float[Tensor, "k bins"]
     """Lower bound of the distance to the surface along each interval, from that at its ends (equation 14, d*).
 
     No surface lies in the balls around both ends. Where they overlap, the bound is the height of the triangle of the two
-    distances over the interval, or the smaller distance if the triangle is obtuse there; otherwise 0.
+    distances over the interval, or the smaller distance if the triangle is obtuse there; otherwise 0. It is 0, too, where the
+    distance changes its sign, whose balls overlap only where it is none (a slope above 1).
     """
     a, b = sdf[:, :-1].abs(), sdf[:, 1:].abs()
     half = (a + b + delta) / 2
     area = (half * (half - a) * (half - b) * (half - delta)).clamp_min(0).sqrt()
     height = 2 * area / delta.clamp_min(torch.finfo(delta.dtype).tiny)
     obtuse = (a.square() - b.square()).abs() >= delta.square()
-    return torch.where(obtuse, torch.minimum(a, b), torch.where(a + b > delta, height, 0.0))
+    apart = torch.where(obtuse, torch.minimum(a, b), torch.where(a + b > delta, height, 0.0))
+    return torch.where(sdf[:, :-1] * sdf[:, 1:] > 0, apart, 0.0)
 
 
 def error_bounds(

@@ -1,4 +1,4 @@
-"""Weights along rays as step functions: dilation, blur, and resampling in intervals (mip-NeRF 360, §3 and appendix)."""
+"""Weights along rays as step functions: dilation, blur, and resampling in intervals (mip-NeRF 360, §3 and supplement)."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def blur(weights: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
 def dilate(
     edges: Float[Tensor, "k edges"], weights: Float[Tensor, "k bins"], by: float
 ) -> tuple[Float[Tensor, "k wide"], Float[Tensor, "k wider_bins"]]:
-    """Largest density within ``by`` of each place, as weights of new intervals (mip-NeRF 360, equations 17 to 19).
+    """Largest density within ``by`` of each place, as weights of new intervals (mip-NeRF 360, supplement).
 
-    Every interval is widened by ``by`` on both sides, within the ends of the ray; each point takes the largest density of the
-    intervals that reach it. Weights keep their sum.
+    Every interval is widened by ``by`` on both sides, between the first and last edge; each point takes the largest density of
+    the intervals that reach it. Weights keep their sum.
 
     Args:
         edges: of adjoining intervals, increasing along each row.
@@ -77,7 +77,7 @@ def resample(
 
     Args:
         edges: of the histogram.
-        weights: unnormalised probability of its bins, > 0.
+        weights: unnormalised probability of its bins, >= 0, and > 0 for some of each ray.
         count: number of intervals, at least 2.
         ctx: in training, points are drawn at random.
         per_ray: whether a ray's quantiles are moved together.

@@ -28,7 +28,7 @@ LATE_STEPS_START = 0.5
 
 @dataclass(frozen=True)
 class OccupancyConfig:
-    """Settings of occupancy-grid ray marching; the defaults are Instant-NGP's unless noted.
+    """Settings of occupancy-grid ray marching, after Instant-NGP, where all cells decay at every refresh.
 
     Attributes:
         resolution: cells along each edge of the unit cube.
@@ -51,7 +51,7 @@ class OccupancyConfig:
         every: training steps between two refreshes.
         points_until: progress of a fit until which only cells within ``point_cells`` cells of one of the scene's points, where
             it has some, are sampled: a start from points for fields without primitives.
-        cells: cells updated per refresh after warm-up, half of them drawn from the occupied ones.
+        cells: cells updated per refresh after warm-up, half of them drawn from the occupied ones (Instant-NGP: 2^20).
         stop: when to leave out samples behind opaque surfaces, at the cost of a density query.
         transmittance: a ray stops when less than this is left of its light.
         chunk: samples per ray before the transmittance is tested first; each later chunk is half as long again. A GPU has one.

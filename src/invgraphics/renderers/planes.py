@@ -63,7 +63,7 @@ class PlaneRenderer(Renderer):
 
 
 def view_dependence(planes: Planes, camera: Camera) -> Float[Tensor, "p 3 i j"]:
-    """Colour added at the texels of the coefficients: Σ_k coefficient_k H_k(v) (NeX, Wizadwongsa et al. 2021, equation 2).
+    """Colour added at the texels of the coefficients: Σ_k coefficient_k H_k(v) (NeX, Wizadwongsa et al. 2021, equation 3).
 
     ``v`` is the unit direction from ``camera`` to the texel, in the axes of the reference camera. NeX evaluates it at every
     pixel of every plane; here the sum is taken at the coefficients' own texels and interpolated.

@@ -27,17 +27,18 @@ class ProposalsConfig:
     Attributes:
         counts: intervals per ray of each proposal level.
         count: intervals per ray of the last level, which is rendered.
-        fields: densities of the proposal levels, one each, trained by the loss ``interlevel`` alone. None at all: each level
-            queries the rendered field, as in NeRF and mip-NeRF.
+        fields: densities of the proposal levels, one for each or one for all (mip-NeRF 360), trained by the loss
+            ``interlevel`` alone. None at all: each level queries the rendered field, as in NeRF and mip-NeRF.
         train_levels: whether levels that query the rendered field are rendered in colour in training, with gradients, for the
             loss ``coarse`` (mip-NeRF).
         dilation: widening of a level's intervals before the next one is drawn, in the longest interval of the spacing's [0, 1]
             over the product of the numbers of intervals so far; thin things then survive between two rays.
         dilation_bias: the same as a share of the ray.
         blurred: whether weights are widened by mip-NeRF's filter (equation 18) instead.
-        padding: added to every weight before it is drawn from (mip-NeRF: 0.01).
+        padding: added to every weight before it is drawn from (mip-NeRF: 0.01; mip-NeRF 360: 0).
         anneal: slope s of the exponent s p / ((s - 1) p + 1) of weights at a progress p of the fit, which keeps samples
             spread out while proposals are untrained; 0 for none.
+        anneal_until: progress of the fit at which the exponent has reached 1 (nerfacto: 1,000 of 30,000 steps).
         jitter_per_ray: whether all samples of a ray are moved together in training, and not one by one.
     """
 
@@ -50,15 +51,18 @@ class ProposalsConfig:
     blurred: bool = False
     padding: float = 1e-5
     anneal: float = 10.0
+    anneal_until: float = 1.0
     jitter_per_ray: bool = True
 
     def __post_init__(self) -> None:
         if not self.counts or min(*self.counts, self.count) < 2:
             raise ValueError("counts must name one level at least, and every level needs 2 intervals or more.")
-        if self.fields and len(self.fields) != len(self.counts):
-            raise ValueError(f"fields must be one for each of the {len(self.counts)} counts, or none, not {len(self.fields)}.")
+        if len(self.fields) not in (0, 1, len(self.counts)):
+            raise ValueError(f"fields must be one for each of the {len(self.counts)} counts, one, or none: {len(self.fields)}.")
         if min(self.dilation, self.dilation_bias, self.anneal) < 0 or self.padding <= 0:
             raise ValueError("dilation, dilation_bias and anneal must not be negative, padding must be above 0.")
+        if not 0 < self.anneal_until <= 1:
+            raise ValueError(f"anneal_until must be above 0 and at most 1, not {self.anneal_until}.")
         if self.fields and self.train_levels:
             raise ValueError("train_levels is for levels without fields of their own.")
         if self.blurred and (self.dilation or self.dilation_bias):
@@ -66,7 +70,8 @@ class ProposalsConfig:
 
     def exponent(self, progress: float) -> float:
         """Exponent of weights at a progress of the fit in [0, 1], from 0 (even sampling) to 1."""
-        return 1.0 if self.anneal == 0 else self.anneal * progress / ((self.anneal - 1) * progress + 1)
+        passed = min(1.0, progress / self.anneal_until)
+        return 1.0 if self.anneal == 0 else self.anneal * passed / ((self.anneal - 1) * passed + 1)
 
     def build(self, scene: Scene) -> ProposalSampler:
         """The sampler with the fields of its levels."""
@@ -79,7 +84,7 @@ class ProposalSampler(Sampler):
     Positions carry no gradient into levels with fields of their own: poses are fitted to the rendered level.
 
     Attributes:
-        fields: densities of the proposal levels; empty where the rendered field is queried.
+        fields: densities of the proposal levels, or one for all; empty where the rendered field is queried.
     """
 
     def __init__(self, config: ProposalsConfig, fields: list[Field]) -> None:
@@ -116,7 +121,8 @@ class ProposalSampler(Sampler):
             assert level.weights is not None
             level_weights = level.weights.detach().view(len(hit), count)
             edges, weights = self._widened(edges, level_weights, prod(self.config.counts[: index + 1]))
-            weights = (weights + self.config.padding) ** exponent
+            # Dilation leaves intervals without length at a ray's ends: they are never drawn, whatever the exponent.
+            weights = torch.where(edges.diff(dim=1) > 0, (weights + self.config.padding) ** exponent, 0.0)
         samples = at(resample(edges, weights, self.config.count, ctx, per_ray=self.config.jitter_per_ray))
         hidden = ctx.training and not self.config.fields and not self.config.train_levels
         return self._with_density(samples, field, ctx), () if hidden else tuple(levels)
@@ -142,7 +148,7 @@ class ProposalSampler(Sampler):
         if self.config.fields:
             still = {name: getattr(samples, name).detach() for name in ("t0", "t1", "position", "direction")}
             samples = replace(samples, **still)
-            values = self.fields[index].query(samples, Quantity.DENSITY)  # type: ignore[operator]
+            values = self.fields[min(index, len(self.fields) - 1)].query(samples, Quantity.DENSITY)  # type: ignore[operator]
         elif self.config.train_levels and ctx.training:
             values = field.query(samples, Quantity.DENSITY | (field.provides & Quantity.RADIANCE))
         else:

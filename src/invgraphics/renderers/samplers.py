@@ -157,7 +157,11 @@ def unit_ball_exit(rays: Rays, bounds: Bounds) -> Float[Tensor, "k 1"]:
 def stratified_edges(
     rays: Rays, count: int, ctx: Context, transition: Float[Tensor, "k 1"] | None = None
 ) -> Float[Tensor, "k edges"]:
-    """``count + 1`` edges from near to far in spacing coordinates; in training the inner ones move by up to half a stratum."""
+    """``count + 1`` edges from near to far in spacing coordinates; in training the inner ones move by up to half a stratum.
+
+    Fields are asked in the middle of two edges, which lies in the stratum's own middle more often than at its ends; NeRF's
+    points (equation 2) are uniform in it.
+    """
     of_ray = None if transition is None else transition[:, 0]
     near, far = to_spacing(rays.near, ctx.bounds, of_ray), to_spacing(rays.far, ctx.bounds, of_ray)
     fraction = torch.arange(count + 1, dtype=near.dtype, device=near.device).expand(len(near), -1)
@@ -184,14 +188,15 @@ def sample_pdf(
 
     Args:
         edges: bin edges, increasing.
-        weights: unnormalised probability of each bin, > 0.
+        weights: unnormalised probability of each bin, >= 0, and > 0 for some of each row.
         u: quantiles in [0, 1].
     """
     cumulative = torch.nn.functional.pad((weights / weights.sum(dim=1, keepdim=True)).cumsum(dim=1), (1, 0))
     upper = torch.searchsorted(cumulative, u.contiguous(), right=True).clamp(1, weights.shape[1])
     c0, c1 = cumulative.gather(1, upper - 1), cumulative.gather(1, upper)
     e0, e1 = edges.gather(1, upper - 1), edges.gather(1, upper)
-    return torch.lerp(e0, e1, ((u - c0) / (c1 - c0)).clamp(0, 1))
+    # A bin without weight is met only by a quantile that was rounded to 1.
+    return torch.lerp(e0, e1, ((u - c0) / (c1 - c0).clamp_min(torch.finfo(c0.dtype).tiny)).clamp(0, 1))
 
 
 def pack_intervals(rays: Rays, hit: Int[Tensor, " k"], edges: Float[Tensor, "k edges"]) -> Samples:

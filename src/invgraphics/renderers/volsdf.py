@@ -28,7 +28,7 @@ class VolSDFConfig:
         beta_min: least β (VolSDF: 1e-4).
         change: whether β is ``learnt``, ``scheduled`` log-linearly over the fit, or ``held``.
         sections: take the density's mean over each interval, along which the SDF is assumed linear, instead of the density at
-            its middle (VolSDF): for even steps, which are longer than a small β.
+            its middle (VolSDF: at its start): for even steps, which are longer than a small β.
         gradient_reach: as of volume rendering.
         weight_threshold: in training, samples that weigh no more than this by the sampler's own densities, where it
             has some (``occupancy``), are left out; 0 keeps all.

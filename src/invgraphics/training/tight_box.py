@@ -21,7 +21,7 @@ from invgraphics.training.upsample import Moments, change_lattices
 
 @dataclass(frozen=True)
 class TightBoxConfig:
-    """One move of a field's region to the bounding box of all voxels that are not empty (DVGO, §4.2).
+    """One move of a field's region to the bounding box of all voxels that are not empty (DVGO, Sun et al. 2022).
 
     Attributes:
         at: progress at which it happens.

@@ -1,4 +1,4 @@
-"""Learning rates of voxels by the number of training views that see them (DVGO, Sun et al. 2022, §4.2)."""
+"""Learning rates of voxels by the number of training views that see them (DVGO, Sun et al. 2022)."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ COLOUR_MARGIN = 0.02
 
 @dataclass(frozen=True)
 class PointFieldConfig:
-    """Settings of a neural point cloud and its initialisation; defaults are Point-NeRF's unless noted.
+    """Settings of a neural point cloud and its initialisation; sizes are Point-NeRF's.
 
     Attributes:
         features: learnt features of each point.
