@@ -212,7 +212,8 @@ def test_the_interlevel_loss_is_exactly_zero_where_the_envelope_holds() -> None:
 def test_refusals() -> None:
     for bad, words in (
         ({"counts": []}, "at least"),
-        ({"counts": [8, 8], "fields": [{"type": "density"}]}, "one for each of the 2 counts"),
+        ({"counts": [8, 8, 8], "fields": [{"type": "density"}] * 2}, "one for each of the 3 counts"),
+        ({"anneal_until": 0.0}, "anneal_until"),
         ({"counts": [8], "fields": [{"type": "density"}], "train_levels": True}, "without fields of their own"),
         ({"blurred": True}, "either blurred or dilated"),
         ({"padding": 0.0}, "padding"),

@@ -142,6 +142,6 @@ def test_causes_are_told_apart() -> None:
     assert dead.faded.tolist() == [False, False, True, False]
     assert dead.collapsed.tolist() == [False, False, False, True]
     assert dead.share == 0.75
-    field.smoothing.fill_(1.0)  # far wider than the first: what is left of its peak is not drawn
+    field.smoothing.fill_(100.0)  # far wider than they are: what is left of their peaks is not drawn
     assert dead_gaussians(field, cameras).faded.tolist() == [True, True, True, True]
     assert "75 % of 4 Gaussians" in dead.sentence()
