@@ -199,4 +199,4 @@ def test_the_skip_enters_the_layer_that_the_papers_have_it_in(name: str, layer: 
     """Counted from 0: ``lin4`` of IDR, NeuS and VolSDF; ``pts_linears[5]`` of NeRF."""
     field = load_method(name, "paper").recipe.field.build(toy_scene(views=2, size=8))
     shapes = [tensor.shape for key, tensor in field.named_parameters() if "geometry" in key and tensor.dim() == 2]
-    assert [index for index, (width, inputs) in enumerate(shapes) if index and inputs > max(width, 256)] == [layer]
+    assert [index for index, (_, inputs) in enumerate(shapes) if index and inputs > shapes[0][0]] == [layer]
