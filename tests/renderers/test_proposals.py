@@ -260,6 +260,6 @@ def test_one_proposal_network_may_serve_all_levels(make_scene: Callable[..., Sce
 def test_no_sample_is_drawn_from_an_interval_without_length(make_scene: Callable[..., Scene]) -> None:
     """Dilation leaves some at both ends of a ray. At the start of a fit, when all weights count alike, they count nothing."""
     scene = make_scene()
-    sampler = ProposalsConfig(counts=(64,), count=64, fields=(DensityFieldConfig(),)).build(scene)
+    sampler = ProposalsConfig(counts=(64,), count=512, fields=(DensityFieldConfig(),)).build(scene)
     samples, _ = sampler.sample(rays_of(scene), Sphere(5.0, 0.5), context(scene, True, 0.0))
     assert float((samples.t1 - samples.t0).min()) > 0
