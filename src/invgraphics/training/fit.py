@@ -84,6 +84,7 @@ class Fit:
             if not isinstance(hook, Hook):
                 raise InputError(f"The hook {_name(hook)} is no training.hooks.Hook.", "Derive it from that class.")
             hook.check(plan.model.field)
+            hook.check_fit(plan.model.field, plan.model.renderer)
         for penalty in plan.penalties:
             check_penalty(penalty, plan.model.field)
         keep_freed_memory()
