@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
@@ -16,7 +16,7 @@ from PIL import Image
 
 from invgraphics import locks
 from invgraphics.config import fill
-from invgraphics.core import Camera, Model, Rendering, Scene, View
+from invgraphics.core import Camera, Model, Quantity, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
@@ -89,7 +89,7 @@ def evaluate(
         method.name,
         poses,
         on_picture=lambda index, picture: _save_view(folder, index, picture, scene),
-        training_scene=_scene_as_trained(scene, provenance),
+        training_scene=scene_as_trained(scene, provenance.data, provenance.data_seed),
     )
     quality, skipped = scaled_scores(model, scene, protocol, provenance.data, refined=poses is not None)
     result = replace(
@@ -108,13 +108,19 @@ def evaluate(
     return result
 
 
-def _scene_as_trained(scene: Scene, provenance: Provenance) -> Scene:
-    """The scene with the photographs of the fit, over its own background; unchanged where this copy cannot give them."""
-    data = replace(fill(TrainingData, provenance.data), init="random", background=KEEP)  # without points, which take minutes
+def scene_as_trained(scene: Scene, changes: Mapping[str, object], seed: int) -> Scene:
+    """The scene with the photographs of a fit, over its own background; unchanged where this copy cannot give them.
+
+    Args:
+        scene: as loaded.
+        changes: of the training data, as a run's record holds them.
+        seed: of these.
+    """
+    data = replace(fill(TrainingData, changes), init="random", background=KEEP)  # without points, which take minutes
     if not data.changes_photographs:
         return scene
     try:
-        return degrade(scene, data, provenance.data_seed)
+        return degrade(scene, data, seed)
     except InputError:
         return scene
 
@@ -175,7 +181,14 @@ def score_model(
         cost=_model_costs(model, scene, statistics.median(seconds)),
         quality=quality | surface | ({} if posed is None else posed.quality()),
         skipped=skipped | surface_skipped,
-        below_baseline=below_baseline(title, quality, statistics_of_views, training_scene or scene, rules),
+        below_baseline=below_baseline(
+            title,
+            quality,
+            statistics_of_views,
+            training_scene or scene,
+            rules,
+            gaussians=Quantity.GAUSSIANS in model.field.provides,
+        ),
     )
 
 
