@@ -30,7 +30,7 @@ from invgraphics.experiments.subjects import UnseenInstances
 from invgraphics.experiments.surface_scores import surface_scores
 from invgraphics.files import write_arrays, write_picture
 from invgraphics.metrics.cost import model_bytes, parameter_count
-from invgraphics.metrics.protocols import non_finite_pixels, protocol_named, score, summarise
+from invgraphics.metrics.protocols import describe_non_finite_pixels, protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
@@ -151,7 +151,7 @@ def score_model(
         NumericalError: a value of the model is not finite.
     """
     rules = protocol_named(protocol)
-    if found := model.non_finite_values():
+    if found := model.describe_non_finite():
         raise NumericalError(f"{title} cannot be scored: {found}.")
     scores, seconds, statistics_of_views = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
@@ -167,11 +167,12 @@ def score_model(
             picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
             on_picture(index, picture)
             scores.append(score(picture, view, scene, rules))
-            if sentence := non_finite_pixels(picture):
+            if sentence := describe_non_finite_pixels(picture):
                 warn(f"Warning: view {view.name}: {sentence}.")
             statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
+    splats = Quantity.GAUSSIANS in model.field.provides
     surface, surface_skipped = surface_scores(model, scene if poses is None else scene_in_fit_frame(poses, scene))
     return Scores(
         method=title,
@@ -181,14 +182,7 @@ def score_model(
         cost=_model_costs(model, scene, statistics.median(seconds)),
         quality=quality | surface | ({} if posed is None else posed.quality()),
         skipped=skipped | surface_skipped,
-        below_baseline=below_baseline(
-            title,
-            quality,
-            statistics_of_views,
-            training_scene or scene,
-            rules,
-            gaussians=Quantity.GAUSSIANS in model.field.provides,
-        ),
+        below_baseline=below_baseline(title, quality, statistics_of_views, training_scene or scene, rules, gaussians=splats),
     )
 
 

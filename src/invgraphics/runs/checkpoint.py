@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from invgraphics.core.finite import non_finite_values
+from invgraphics.core.finite import describe_non_finite
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.files import replacing
 
@@ -23,7 +23,7 @@ def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
     Raises:
         NumericalError: a value is not finite; the old file stays.
     """
-    if found := non_finite_values(parts):
+    if found := describe_non_finite(parts):
         raise NumericalError(f"{path} is not written: {found}.")
     flat = _flat(parts)
     with replacing(path) as temporary:
@@ -67,6 +67,6 @@ def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, 
         if not bar:
             raise InputError(f"{path} was not written by invgraphics: it holds '{key}'.")
         parts.setdefault(section, {})[name] = value
-    if found := non_finite_values(parts):
+    if found := describe_non_finite(parts):
         raise InputError(f"{path} cannot be used: {found}.", "The fit diverged, or the file was damaged: fit again.")
     return parts
