@@ -62,7 +62,9 @@ def test_a_distance_that_is_nowhere_is_told_with_its_sign() -> None:
         extract_mesh(Sphere(50.0, 0.6), BOX, 16, -5.0)
     level, least, most = (float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", caught.value.sentence))
     assert level == -5
-    assert least == pytest.approx(-0.6, abs=0.3) and most == pytest.approx(3**0.5 - 0.6, abs=0.3)  # blocks of 4 voxels of 1/8
+    # Where no surface can be, a block of 4 voxels has the distance of its centre; around the box is one voxel of 1/8 more.
+    assert least == pytest.approx(0.25 * 3**0.5 - 0.6, abs=1e-3)
+    assert most == pytest.approx(0.75 * 3**0.5 - 0.6 + 0.125, abs=1e-3)
 
 
 def test_the_level_of_a_density_is_where_the_surface_is() -> None:
