@@ -21,9 +21,12 @@ from PIL import Image
 from training_fixtures import SMALL
 
 import invgraphics as ig
+from invgraphics.api.loading import reopenable_scene
+from invgraphics.core import Scene, View
 from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.experiments import compare as comparing
+from invgraphics.experiments.request import AblateRequest
 from invgraphics.experiments.session import ScoreTable
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
@@ -142,6 +145,51 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(capsys: pytest.CaptureFixture[st
     ig.fit(SPLATS, toy_scene(views=8, size=24), budget="2steps", out="own")
     with pytest.raises(InputError, match="holds another scene"):
         ig.fit(SPLATS, toy_scene(views=9, size=24), budget="2steps", out="own")
+
+
+def _of_views(scene: Scene, **parts: Callable[[View], object]) -> Scene:
+    """The scene with parts of its training views made anew."""
+    return scene.with_views(train=tuple(replace(v, **{name: make(v) for name, make in parts.items()}) for v in scene.train))
+
+
+OTHER_SCENES: dict[str, Callable[[Scene], Scene]] = {
+    "views": lambda scene: scene.with_views(train=scene.train[:-1]),
+    "val": lambda scene: scene.with_views(val=scene.train[:1]),
+    "pixels": lambda scene: _of_views(scene, image=lambda v: v.image.bitwise_xor(1)),
+    "focal": lambda scene: _of_views(scene, camera=lambda v: replace(v.camera, focal=v.camera.focal + 0.01)),
+    "middle": lambda scene: _of_views(
+        scene, camera=lambda v: replace(v.camera, principal_point=v.camera.principal_point + 0.01)
+    ),
+    "pose": lambda scene: _of_views(scene, camera=lambda v: v.camera.moved(look_at(v.camera.position, *torch.eye(3)[1:]))),
+    "bounds": lambda scene: replace(scene, bounds=replace(scene.bounds, hi=scene.bounds.hi + 0.01)),
+    "near": lambda scene: replace(scene, bounds=replace(scene.bounds, near=0.5)),
+    "background": lambda scene: replace(scene, background=torch.tensor([0.2, 0.4, 0.6])),
+    "colour": lambda scene: replace(scene, colour="linear"),
+    "points": lambda scene: replace(scene, points=replace(scene.points, position=scene.points.position + 0.01)),
+    "colours of points": lambda scene: replace(scene, points=replace(scene.points, rgb=1 - scene.points.rgb)),
+    "no points": lambda scene: replace(scene, points=None),
+    "depth": lambda scene: _of_views(scene, depth=lambda v: v.depth + 0.01),
+    "no depth": lambda scene: replace(
+        _of_views(scene, depth=lambda v: None), test=tuple(replace(v, depth=None) for v in scene.test)
+    ),
+    "mask": lambda scene: _of_views(scene, mask=lambda v: v.opacity() > 0.5),
+}
+
+
+def test_a_scene_made_in_python_is_known_again(tmp_path: Path) -> None:
+    reopenable_scene(toy_scene(views=6, size=16), tmp_path / "kept")
+    kept, place = reopenable_scene(toy_scene(views=6, size=16), tmp_path / "kept")
+    assert place["scene"] == str(tmp_path / "kept" / "scene.npz")
+    reopenable_scene(replace(kept, notes={}), tmp_path / "kept")  # as read from there, poses re-orthonormalised
+
+
+@pytest.mark.parametrize("change", OTHER_SCENES.values(), ids=OTHER_SCENES)
+def test_another_scene_is_told_from_the_one_that_a_folder_keeps(change: Callable[[Scene], Scene], tmp_path: Path) -> None:
+    """Else a run of the other scene would be opened as this one's, finished."""
+    scene = toy_scene(views=6, size=16)
+    reopenable_scene(scene, tmp_path / "kept")
+    with pytest.raises(InputError, match="holds another scene"):
+        reopenable_scene(change(scene), tmp_path / "kept")
 
 
 def test_steps_can_be_watched() -> None:
@@ -333,6 +381,18 @@ def test_a_lone_method_renderer_or_seed_needs_no_list(in_process) -> None:
     assert "--seeds 2 " in report.record.command and "--render-with gaussian-volume/exact:steps=4 " in report.record.command
     again = ig.compare("toy.npz", SPLATS, "2steps", seeds=np.arange(1), out="loaded")
     assert again.run(SPLATS.name, 0).finished
+
+
+def test_numpys_numbers_make_the_same_run_and_command() -> None:
+    """A size of ``np.int64`` used to end in a TypeError once the folder's command was written."""
+    options = {"size": np.int64(16), "test_views": np.int16(2)}
+    ig.fit(SPLATS, ig.load_scene("toy.npz", **options), "2steps", seed=np.uint8(3), out="numpy", snapshots=np.int64(1))
+    ig.fit(SPLATS, ig.load_scene("toy.npz", size=16, test_views=2), "2steps", seed=3, out="python", snapshots=1)
+    numpys, pythons = (json.loads(Path(out, "provenance.json").read_text()) for out in ("numpy", "python"))
+    assert numpys["command"] == pythons["command"].replace("python", "numpy") and "--size 16 " in numpys["command"]
+    assert (numpys["options"], numpys["cell_sha256"]) == (pythons["options"], pythons["cell_sha256"])
+    study = AblateRequest(study="s", out="o", size=(np.int64(8), np.int64(9)), seeds=(np.int64(1),))
+    assert json.dumps([study.size, study.seeds]) == "[[8, 9], [1]]"
 
 
 @pytest.mark.parametrize(

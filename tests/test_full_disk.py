@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_up_runs import made_up_provenance
 from PIL import Image
 from training_fixtures import SMALL
 
@@ -21,6 +22,8 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.formats.base import read_gaussians
 from invgraphics.runs import checkpoint
+from invgraphics.runs.fit import FitRecord
+from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import read_history
 
 METHOD = "splatting/gaussians"
@@ -174,6 +177,22 @@ def test_what_was_there_stays(tmp_path: Path, error: Exception) -> None:
     with pytest.raises(InputError, match=f"'{path}' cannot be written: the disk is full"):
         fail()
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_records_are_on_the_disk_before_they_replace_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As checkpoints are: else a loss of power could leave a checkpoint without the steps that it belongs to."""
+    order: list[tuple[str, int]] = []
+    synchronise, rename = os.fsync, Path.replace
+    monkeypatch.setattr(os, "fsync", lambda file: (order.append(("synchronised", os.fstat(file).st_size)), synchronise(file)))
+    monkeypatch.setattr(
+        Path, "replace", lambda path, target: (order.append(("replaced", path.stat().st_size)), rename(path, target))
+    )
+    folder = RunFolder(tmp_path)
+    folder.write(FitRecord(steps=3, seconds=1.0))
+    folder.write(made_up_provenance())
+    folder.write_recipe({"summary": "s"})
+    sizes = [(tmp_path / name).stat().st_size for name in ("fit.json", "provenance.json", "recipe.toml")]
+    assert order == [(what, size) for size in sizes for what in ("synchronised", "replaced")] and min(sizes) > 10
 
 
 def test_other_errors_pass_and_leave_nothing(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import io
+import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping
@@ -115,10 +116,19 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[IO[bytes]]:
-    """Yield a binary file that replaces ``path`` at the end; an exception removes it. Arguments and errors as `replacing`."""
+def writing(path: Path, *, durable: bool = False) -> Iterator[IO[bytes]]:
+    """Yield a binary file that replaces ``path`` at the end; an exception removes it. Errors as `replacing`.
+
+    Args:
+        path: the file.
+        durable: whether the content is on the disk before it replaces the file: else a loss of power soon afterwards can leave
+            an empty one.
+    """
     with replacing(path) as temporary, temporary.open("wb") as file:
         yield file
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
 
 
 @contextmanager
@@ -128,15 +138,15 @@ def writing_text(path: Path) -> Iterator[IO[str]]:
         yield file
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically."""
-    with writing(path) as file:
+def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
+    """Write a file atomically; ``durable`` as of `writing`."""
+    with writing(path, durable=durable) as file:
         file.write(content)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file atomically."""
-    write_bytes(path, text.encode("utf-8"))
+def write_text(path: Path, text: str, *, durable: bool = False) -> None:
+    """Write a UTF-8 text file atomically; ``durable`` as of `writing`."""
+    write_bytes(path, text.encode("utf-8"), durable=durable)
 
 
 def append_text(path: Path, text: str) -> None:

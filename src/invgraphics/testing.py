@@ -17,33 +17,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from invgraphics.core import (
-    Bounds,
-    Camera,
-    Context,
-    Field,
-    FieldValues,
-    Points,
-    Quantity,
-    Renderer,
-    Samples,
-    Scene,
-    View,
-    check,
-)
+from invgraphics.conformance import check_field, check_renderer, perturb
+from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Points, Quantity, Samples, Scene, View
 from invgraphics.core.colour import quantise
 from invgraphics.core.transforms import look_at
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
 
-_POINTWISE = {
-    Quantity.DENSITY: "density",
-    Quantity.SDF: "sdf",
-    Quantity.GRADIENT: "gradient",
-    Quantity.RADIANCE: "radiance",
-    Quantity.NORMAL: "normal",
-    Quantity.FEATURES: "features",
-}
+__all__ = ["Facing", "TwoBalls", "as_class", "check_field", "check_renderer", "perturb", "toy_cameras", "toy_scene"]
 
 
 class TwoBalls(Field):
@@ -73,7 +54,10 @@ class TwoBalls(Field):
         # Odd cells of a checkerboard are half as bright; without checks every position is in cell 0.
         odd = (samples.position * self.checks).floor().sum(dim=1, keepdim=True) % 2
         shade = shade * (1 - 0.5 * odd)
-        return FieldValues(density=30.0 * (distance.amin(dim=1) < 0), radiance=self.colours[nearest] * shade)
+        return FieldValues(
+            density=30.0 * (distance.amin(dim=1) < 0) if Quantity.DENSITY in want else None,
+            radiance=self.colours[nearest] * shade if Quantity.RADIANCE in want else None,
+        )
 
 
 Facing = Literal["around", "forward"]
@@ -147,99 +131,3 @@ def as_class(scene: Scene) -> Scene:
 
     train, last = of(scene.train, 0, -(-len(scene.train) // 2)), len(scene.test) - 1
     return replace(scene, train=train, test=of(scene.test[:1], 2, 1), observed=of(scene.test[last:], 2, 1))
-
-
-def perturb(field: Field, amount: float = 0.01) -> None:
-    """Add normal noise to a field's parameters: a new lattice is constant, where no normal is defined.
-
-    Args:
-        field: it is changed in place, by torch's global generator.
-        amount: standard deviation.
-    """
-    with torch.no_grad():
-        for parameter in field.parameters():
-            parameter.add_(amount * torch.randn_like(parameter))
-
-
-def check_field(field: Field, scene: Scene) -> None:
-    """Assert the contract of a field: shapes, finiteness, only requested quantities, gradients, a state that reloads.
-
-    Its parameters are perturbed before (see `perturb`) and put back afterwards.
-    """
-    new = {name: value.clone() for name, value in field.state_dict().items()}
-    unfit = [name for name, value in new.items() if not bool(value.isfinite().all())]
-    assert not unfit, f"not finite in a new field, which stops every fit: {unfit}"
-    perturb(field)
-    pointwise = [quantity for quantity in _POINTWISE if quantity in field.provides]
-    position = scene.bounds.from_unit(torch.rand(37, 3)).requires_grad_(True)
-    direction = torch.nn.functional.normalize(torch.randn(37, 3), dim=1)
-    for quantity in pointwise:
-        values = field.query(Samples.at(position, direction), quantity)
-        value = getattr(values, _POINTWISE[quantity])
-        assert value is not None, f"asked for {quantity.words()}, got nothing"
-        shape = (37,) if quantity in (Quantity.DENSITY, Quantity.SDF) else (37, value.shape[-1])
-        assert tuple(value.shape) == shape, f"the shape of {quantity.words()} of 37 samples is {tuple(value.shape)}"
-        assert bool(value.isfinite().all()), f"{quantity.words()} is not finite"
-        if quantity in (Quantity.RADIANCE, Quantity.NORMAL):
-            assert value.shape[1] == 3, f"{quantity.words()} has {value.shape[1]} components"
-        if quantity is Quantity.DENSITY:
-            assert bool((value >= 0).all()), "a density is negative"
-        if quantity is Quantity.FEATURES:
-            assert value.shape[1] == field.feature_width, "feature_width is not the number of features"
-        if quantity is Quantity.NORMAL:
-            empty = torch.zeros(37, dtype=torch.bool)
-            if Quantity.DENSITY in field.provides:
-                density = field.query(Samples.at(position, direction), Quantity.DENSITY).density
-                empty = torch.zeros_like(empty) if density is None else density == 0
-            length = value.norm(dim=1)
-            assert bool((((length - 1).abs() < 1e-3) | empty).all()), "a normal is not of unit length"
-        empty = field.query(Samples.at(position[:0], direction[:0]), quantity)
-        assert len(getattr(empty, _POINTWISE[quantity])) == 0, "no samples must give no values"
-    if Quantity.GRADIENT in field.provides:
-        _check_gradient(field, Samples.at(position, direction))
-    assert pointwise or field.provides, "a field must provide something"
-    state = {name: value.clone() for name, value in field.state_dict().items()}
-    field.load_state_dict(state)
-    field.load_state_dict(new)
-
-
-def _check_gradient(field: Field, samples: Samples) -> None:
-    """Assert that a raw gradient can be had outside the graph, is in it when training, and is what normals are made of."""
-    assert Quantity.SDF in field.provides, "a gradient is that of a signed distance, which the field does not provide"
-    gradient = field.query(samples, Quantity.SDF | Quantity.GRADIENT).gradient
-    outside = field.query_no_grad(samples, Quantity.GRADIENT | (field.provides & Quantity.NORMAL))
-    assert gradient is not None and outside.gradient is not None, "asked for a gradient, got nothing"
-    assert torch.allclose(gradient, outside.gradient, atol=1e-4), "the gradient is another one inside no_grad"
-    assert not outside.gradient.requires_grad, "a gradient inside no_grad is in the graph"
-    assert gradient.requires_grad, "the gradient at positions that are in the graph is not in it"
-    if outside.normal is not None:
-        assert torch.allclose(outside.normal, torch.nn.functional.normalize(outside.gradient, dim=1), atol=1e-4), (
-            "a normal is not the normalised gradient"
-        )
-
-
-def check_renderer(renderer: Renderer, field: Field, scene: Scene) -> None:
-    """Assert the contract of a renderer: shapes, ranges, repeatability, gradients to the field and the pose."""
-    check(field, renderer)
-    camera = scene.test[0].camera.resized(12, 9)
-    ctx = Context(scene.bounds, geometry=True)
-    first, _ = renderer.render_image(field, camera, ctx)
-    again, _ = renderer.render_image(field, camera, ctx)
-    assert first.rgb.shape == (9, 12, 3) and first.alpha.shape == (9, 12) and first.depth.shape == (9, 12)
-    assert torch.equal(first.rgb, again.rgb), "evaluation must be deterministic"
-    assert bool(first.rgb.isfinite().all()) and bool((first.alpha >= 0).all()) and bool((first.alpha <= 1 + 1e-4).all())
-    assert bool((first.depth[first.alpha >= 0.5] > 0).all()), "depth must be positive where something is"
-    turned = camera.cam_to_world @ torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
-    away, _ = renderer.render_image(field, camera.moved(turned), ctx)
-    assert away.rgb.shape == (9, 12, 3) and bool(away.rgb.isfinite().all()) and bool(away.alpha.isfinite().all()), (
-        "a camera that looks away from the scene must get a picture"
-    )
-    pose = camera.cam_to_world.clone().requires_grad_(True)
-    training = Context(scene.bounds, training=True, generator=torch.Generator().manual_seed(0))
-    picture, _ = renderer.render_image(field, camera.moved(pose), training)
-    picture.over(torch.ones(3)).square().mean().backward()
-    assert pose.grad is not None and bool(pose.grad.isfinite().all()), "no gradient reaches the pose"
-    gradients = [parameter.grad for parameter in field.parameters() if parameter.requires_grad]
-    assert not gradients or any(grad is not None and bool((grad != 0).any()) for grad in gradients), (
-        "no gradient reaches the field"
-    )

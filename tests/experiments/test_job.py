@@ -8,7 +8,7 @@ from training_fixtures import SMALL
 
 from invgraphics.errors import InputError
 from invgraphics.experiments.compare import compare
-from invgraphics.experiments.identity import define
+from invgraphics.experiments.identity import cell_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import CompareRequest, FitRequest
 from invgraphics.recipes import recipe
@@ -70,8 +70,8 @@ def test_checkpoints_come_at_any_unit_of_a_budget(text: str, seconds: float) -> 
 
 
 def test_a_budget_counts_and_not_its_spelling() -> None:
-    assert define(Job.of(_request(budget="120s"))) == define(Job.of(_request(budget="2m")))
-    assert define(Job.of(_request(budget="120s"))) != define(Job.of(_request(budget="121s")))
+    assert cell_digest(Job.of(_request(budget="120s"))) == cell_digest(Job.of(_request(budget="2m")))
+    assert cell_digest(Job.of(_request(budget="120s"))) != cell_digest(Job.of(_request(budget="121s")))
 
 
 def test_a_comparison_reads_each_recipe_once(toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

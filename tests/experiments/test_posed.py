@@ -18,10 +18,11 @@ def test_a_scene_follows_its_fit(scene: Scene) -> None:
     depth, normal = torch.full(first.image.shape[:2], 2.0), torch.zeros_like(first.image, dtype=torch.float32)
     normal[..., 2] = 1.0
     scene = replace(scene, test=(replace(first, depth=depth, normal=normal), *scene.test[1:]))
+    scene = replace(scene, val=scene.test[:1], observed=scene.test[1:])
     poses = Poses.of(PosesConfig(), scene)
     poses.given.copy_(drift.poses(poses.reference))
     seen = scene_in_fit_frame(poses, scene)
-    for split in ("train", "test"):
+    for split in ("train", "val", "test", "observed"):
         for before, after in zip(getattr(scene, split), getattr(seen, split), strict=True):
             expected = drift.poses(before.camera.cam_to_world).float()
             torch.testing.assert_close(after.camera.cam_to_world.float(), expected, atol=1e-4, rtol=0)

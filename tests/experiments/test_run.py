@@ -23,7 +23,7 @@ from invgraphics.experiments import evaluate
 from invgraphics.experiments import run as module
 from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.fitted import open_fitted
-from invgraphics.experiments.identity import check_replaceable, identify, truth_digest
+from invgraphics.experiments.identity import check_replaceable, run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
@@ -179,7 +179,7 @@ def test_a_field_that_starts_from_a_changed_file_is_another_fit(toy_folder: Path
     found = []
     for content in (b"one", b"two", b"one"):
         source.write_bytes(content)
-        found.append(identify(Job.of(request), "truth", 1))
+        found.append(run_digest(Job.of(request), "truth", 1))
     assert found[0] == found[2] != found[1]
 
 
@@ -207,7 +207,7 @@ def test_spelling_makes_no_other_run(run: Path, toy_folder: Path) -> None:
     request = _request(toy_folder, run)
     spelt = replace(request, device="cpu", budget=f" {request.budget.replace('steps', ' steps')}")
     assert spelt.budget != request.budget
-    assert identify(Job.of(spelt), "truth", 1) == identify(Job.of(request), "truth", 1)
+    assert run_digest(Job.of(spelt), "truth", 1) == run_digest(Job.of(request), "truth", 1)
     check_replaceable(Job.of(spelt))
 
 

@@ -267,9 +267,17 @@ def test_one_distance_has_the_depths_of_volume_rendering_as_its_density_sharpens
     assert gaps[2] < 5e-3
 
 
+class Painted(Sphere):
+    """A ball whose colour is that of the place: of an even one no pixel would have a gradient to the pose."""
+
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        values = super().query(samples, want)
+        return values if values.radiance is None else replace(values, radiance=samples.position.sigmoid() * self.colour)
+
+
 def test_the_contract() -> None:
     scene = toy_scene(views=2, size=8)
-    check_renderer(tracing(), Sphere(1.0, 0.6, colour=(0.2, 0.5, 0.8)), scene)
+    check_renderer(tracing(), Painted(1.0, 0.6), scene)
     with pytest.raises(NotComposableError, match="sdf, gradient"):
         check_renderer(tracing(), GaussianBlob(1.0, 1.0), scene)
 

@@ -12,6 +12,7 @@ from PIL import Image
 
 from invgraphics.errors import InputError
 from invgraphics.runs import checkpoint
+from invgraphics.runs.collection import runs_of
 from invgraphics.runs.folder import CHECKPOINT, RunFolder
 from invgraphics.runs.history import Moment
 from invgraphics.runs.inside import inside
@@ -129,3 +130,25 @@ def test_the_viewer_opens_no_checkpoint_elsewhere(tmp_path: Path) -> None:
     (run / CHECKPOINT).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(InputError, match="leads outside"):
         missing_file(run)
+
+
+CELL = {"id": "c", "scene": "s", "method": "m", "seed": 0, "status": "done"}
+
+
+@pytest.mark.parametrize("outside", ["/etc", "../b", "runs/../../b"])
+@pytest.mark.parametrize(
+    ("record", "runs"),
+    [
+        ("compare.json", lambda name: {"scene": "s", "methods": ["m"], "runs": [name]}),
+        (
+            "study.json",
+            lambda name: {"name": "n", "scenes": ["s"], "methods": ["m"], "cells": [CELL | {"run": name}]},
+        ),
+    ],
+)
+def test_runs_that_a_record_names_outside_its_folder_are_refused(tmp_path: Path, record: str, runs, outside: str) -> None:
+    """A damaged or foreign record; an absolute path used to end as a fault of invgraphics."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / record).write_text(json.dumps({"schema": 1} | runs(outside)))
+    with pytest.raises(InputError, match="leads outside"):
+        runs_of(tmp_path / "a")

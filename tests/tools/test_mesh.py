@@ -1,6 +1,7 @@
 """Meshes of fields: a ball keeps its radius, Gaussians fuse to a closed surface, files open elsewhere."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,6 +55,16 @@ def test_a_ball_keeps_its_radius(kind: type[Sphere]) -> None:
     assert _volume(surface) == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.05)
     assert surface.open_edges() == 0
     assert surface.rgb.unique(dim=0).flatten().tolist() == pytest.approx([0.2, 0.6, 0.4])
+
+
+def test_a_distance_that_is_nowhere_is_told_with_its_sign() -> None:
+    with pytest.raises(InputError, match="The signed distance has no level") as caught:
+        extract_mesh(Sphere(50.0, 0.6), BOX, 16, -5.0)
+    level, least, most = (float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", caught.value.sentence))
+    assert level == -5
+    # Where no surface can be, a block of 4 voxels has the distance of its centre; around the box is one voxel of 1/8 more.
+    assert least == pytest.approx(0.25 * 3**0.5 - 0.6, abs=1e-3)
+    assert most == pytest.approx(0.75 * 3**0.5 - 0.6 + 0.125, abs=1e-3)
 
 
 def test_the_level_of_a_density_is_where_the_surface_is() -> None:

@@ -76,6 +76,24 @@ def test_keys_without_effect_at_the_size_of_a_run_are_no_difference(
     assert not check_recipes(tmp_path).current
 
 
+def test_runs_of_scenes_of_two_sizes_are_judged_apart(tmp_path: Path) -> None:
+    """``start_size`` has no effect on ``bricks``, of 128 px, and may have one on a scene that is not here."""
+    method = "splatting/gaussians"
+    before = load_method(method, "laptop", ["batches.start_size=0"], Budget.parse("60s"))
+    command = f"invgraphics fit {method} x --budget 60s --out x"
+    for name, scene in (("0", "bricks"), ("1", "anything")):
+        write(tmp_path / name, method=method, recipe_sha256=before.digest, command=command, scene=scene)
+    assert check_recipes(tmp_path / "0").current
+    assert check_recipes(tmp_path).stale == {method: "differs"}
+
+
+def test_a_reason_as_long_as_a_digest_is_a_reason(tmp_path: Path) -> None:
+    reason = f"{'x' * 44}.toml does not exist"
+    assert len(reason) == len(current()["recipe_sha256"])
+    write(tmp_path / "runs" / "0", **(current() | {"method": f"{'x' * 44}.toml"}))
+    assert check_recipes(tmp_path).stale == {f"{'x' * 44}.toml": reason}
+
+
 def test_the_commit_of_a_working_copy(tmp_path: Path) -> None:
     assert commit(tmp_path / "nowhere") == ""
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]

@@ -38,6 +38,24 @@ class Blob(Field):
 BOUNDS = Bounds(torch.tensor([-1.0, -2.0, 0.0]), torch.tensor([1.0, 2.0, 1.0]))
 
 
+class Distance(Blob):
+    """A field of a signed distance on a lattice."""
+
+    provides = Quantity.SDF | Quantity.GRADIENT
+
+    def lattice_encodings(self):
+        return {"geometry": None}
+
+
+def test_a_tight_box_of_what_has_no_grid_or_no_density_is_refused_before_the_first_step(scene):
+    table = load_method("volumetric/hash").table | {"hooks": [{"type": "tight_box", "at": 0.5}]}
+    plan = build_plan(resolve("mine", "", table), scene, Budget(steps=9), 0, torch.device("cpu"))
+    with pytest.raises(InputError, match="needs a geometry made of lattices"):
+        Fit(plan)
+    with pytest.raises(InputError, match="needs a density, which Distance does not have"):
+        TightBoxConfig(at=0.5).build().check_fit(Distance(0, 1), plan.model.renderer)
+
+
 def test_vertices_of_a_grid_lie_in_the_order_of_memory():
     found = BOUNDS.vertices((3, 2, 5)).reshape(3, 2, 5, 3)
     torch.testing.assert_close(found[1, 0, 3], torch.tensor([0.0, -2.0, 0.75]))

@@ -9,12 +9,16 @@ from typing_extensions import override
 
 from invgraphics.core import Context, Field, FieldValues, Quantity, Samples
 from invgraphics.errors import InputError
+from invgraphics.experiments.build import build_plan
 from invgraphics.fields.analytic import Box, GaussianBlob, Sphere
+from invgraphics.recipes.recipe import load_method, resolve
 from invgraphics.renderers.neus import NeuSConfig
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.testing import toy_scene
+from invgraphics.training.budget import Budget
 from invgraphics.training.eikonal import CurvaturePenalty, EikonalLoss, EikonalPenalty, foot_points, laplacian
+from invgraphics.training.fit import Fit
 
 
 class Stretched(Field):
@@ -109,7 +113,14 @@ def test_loss_is_that_of_the_samples() -> None:
         EikonalLoss()(dense, plain, None, ctx)  # type: ignore[arg-type]
 
 
-def test_a_field_without_a_distance_is_refused() -> None:
-    renderer = VolumetricConfig(StratifiedConfig(4)).build(toy_scene(views=2, size=4))
-    with pytest.raises(InputError, match="needs a signed distance, which GaussianBlob does not have"):
-        EikonalPenalty()(GaussianBlob(1.0, 0.1), renderer, context())
+@pytest.mark.parametrize("name", ["eikonal", "curvature"])
+def test_a_field_without_a_distance_is_refused_before_anything_is_built(name: str) -> None:
+    """A neural field provides one or none: that is seen once it is built."""
+    splats, hashed = (
+        load_method(method).table | {"penalties": [{"type": name}]} for method in ("splatting/gaussians", "volumetric/hash")
+    )
+    with pytest.raises(InputError, match=f"The penalty '{name}' needs a signed distance, which GaussianField does not have"):
+        resolve("splatting/gaussians", "", splats)
+    plan = build_plan(resolve("mine", "", hashed), toy_scene(views=2, size=4), Budget(steps=1), 0, torch.device("cpu"))
+    with pytest.raises(InputError, match=f"The penalty '{name}' needs a signed distance, which NeuralField does not have"):
+        Fit(plan)

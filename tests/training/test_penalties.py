@@ -170,6 +170,12 @@ def test_a_recipe_keeps_its_table_without_penalties_and_gives_them_back():
     assert again.digest == method.digest != plain.digest
 
 
+def test_a_field_without_a_density_is_refused_before_anything_is_built():
+    table = load_method("planes/mpi").table | {"penalties": [{"type": "sparsity"}]}
+    with pytest.raises(InputError, match="The penalty 'sparsity' needs a density, which PlaneField does not have"):
+        resolve("planes/mpi", "", table)
+
+
 def test_fields_without_lattices_are_refused(scene):
     table = load_method("splatting/gaussians").table | {"penalties": [{"type": "total_variation"}]}
     with pytest.raises(InputError, match="The penalty 'total_variation' needs encodings made of lattices, which GaussianField"):

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from invgraphics.core import Context
+from invgraphics.errors import InputError
 from invgraphics.kernels.near import near_points
+from invgraphics.renderers.splatting import SplattingConfig
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.testing import toy_scene
@@ -125,3 +127,10 @@ def test_confidence_penalty_is_least_at_zero_and_one(small_scene, make_fit) -> N
     with torch.no_grad():
         field.confidence_logits.fill_(0.0)
     assert float(penalty(field, None, ctx).detach()) > value
+
+
+def test_growth_of_what_is_not_seen_along_rays_is_refused_before_the_first_step(small_scene, make_fit) -> None:
+    plan = make_fit("volumetric/point-nerf", small_scene, 10, 0, *SHRUNK).plan
+    plan.hooks[0].check_fit(plan.model.field, plan.model.renderer)
+    with pytest.raises(InputError, match="The hook 'point_control' needs a renderer of rays"):
+        plan.hooks[0].check_fit(plan.model.field, SplattingConfig().build(small_scene))

@@ -154,6 +154,18 @@ def test_volume_rendering_of_photographs_with_tracks_is_supervised(tmp_path: Pat
         load_method("volumetric/hash", overrides=["training.sparse_depth.rays=0"])
 
 
+class Ending(Fixed):
+    """A renderer of another package that says what its traces mean."""
+
+    ends_in_samples = True
+
+
+def test_a_renderer_of_another_package_is_supervised_where_it_says_that_rays_end_in_samples(tmp_path: Path) -> None:
+    scene = open_scene(str(workspace(tmp_path / "plane", [1.0] * 10)), SceneOptions())
+    assert make_sparse_depth(None, scene, Ending()) is not None
+    assert make_sparse_depth(None, scene, Fixed()) is None
+
+
 def test_points_mend_the_depth_of_a_plane_in_few_photographs(tmp_path: Path) -> None:
     """Four photographs of a plane at a known depth, fitted with and without the points on it."""
     scene = open_scene(str(workspace(tmp_path / "plane", [1.0] * 10)), SceneOptions())

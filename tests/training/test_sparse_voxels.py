@@ -192,7 +192,7 @@ def test_bad_settings_are_refused(scene):
     with pytest.raises(ValueError, match="resolution"):
         SparseVoxelsConfig(resolution=1)
     with pytest.raises(InputError, match="Moments of sparse lattices"):
-        fit_of(scene, 2, "hooks.1.at=[0.5]", "hooks.0.at=[0.9]", "hooks.1.moments=keep").run(lambda loss: False)
+        fit_of(scene, 2, "hooks.1.at=[0.5]", "hooks.0.at=[0.9]", "hooks.1.moments=keep")
     dense_colour = load_method(
         "volumetric/plenoxels",
         None,
@@ -206,5 +206,6 @@ def test_bad_settings_are_refused(scene):
             "field.appearance.resolution=16",
         ],
     )
+    plan = build_plan(dense_colour, scene, Budget(steps=3), 0, torch.device("cpu"))
     with pytest.raises(InputError, match="needs sparse voxel grids"):
-        Fit(build_plan(dense_colour, scene, Budget(steps=3), 0, torch.device("cpu"))).run(lambda loss: False)
+        Fit(plan)

@@ -152,11 +152,13 @@ def evaluate(model: Model | FittedRun, scene: Scene | str, protocol: str = "defa
     """
     scene = as_scene(scene)
     if isinstance(model, FittedRun):
-        if model.poses is not None and scene.digest("train") != model.scene.digest("train"):
+        same = scene.digest("train") == model.scene.digest("train")
+        if model.poses is not None and not same:
             raise InputError(
                 f"{model.method.name} has refined poses of other photographs.", "Give the scene that it was fitted to."
             )
-        return ScoreTable(score_model(model.model, scene, protocol, model.method.name, model.poses))
+        seen = model.as_trained(scene) if same else None
+        return ScoreTable(score_model(model.model, scene, protocol, model.method.name, model.poses, training_scene=seen))
     if not isinstance(model, Model):
         raise InputError(
             f"A {type(model).__name__} cannot be scored.", "Expected: a model, a fit, or what ig.load_run returns."

@@ -6,24 +6,24 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import tomlkit
 import torch
+from torch import Tensor
 
-from invgraphics.core import Scene
+from invgraphics.core import Scene, View
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.fitted import load_fitted, open_fitted
-from invgraphics.experiments.request import DATA, check_size
+from invgraphics.experiments.request import DATA, check_size, python_ints
 from invgraphics.experiments.session import FolderRun
 from invgraphics.files import write_text
 from invgraphics.recipes import recipe
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder, check_run
-from invgraphics.scenes.npz import save_npz
+from invgraphics.scenes.npz import save_npz, unsupported_parts
 from invgraphics.scenes.open import SceneOptions, open_scene, source_of, validate
 from invgraphics.studies.factors import override
 from invgraphics.tables import plain
@@ -31,6 +31,9 @@ from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
 T = TypeVar("T")
+
+CAMERA = ("cam_to_world", "focal", "principal_point")
+"""Tensors of a camera; its size is that of the picture."""
 
 MethodLike: TypeAlias = str | os.PathLike[str] | Mapping[str, Any] | Method
 """A method's name, the path of a recipe, a recipe as a table, or a method that `load_method` returned."""
@@ -63,7 +66,7 @@ def load_scene(
     """
     check_size(size)
     views = None if test_views == "all" else test_views
-    return open_with_progress(os.fspath(spec), SceneOptions(size=size, test_views=views, spp=spp))
+    return open_with_progress(os.fspath(spec), SceneOptions(*python_ints((size, views)), spp=python_ints(spp)))
 
 
 def save_scene(scene: Scene, path: str | os.PathLike[str]) -> Path:
@@ -185,7 +188,7 @@ def listed(items: T | Iterable[T], lone: type | tuple[type, ...]) -> list[T]:
 
 def whole_seeds(seeds: Sequence[int] | int) -> tuple[int, ...]:
     """Seeds, or a lone one, with numpy's whole numbers as plain ones; what is no number stays, for the request to refuse."""
-    return tuple(int(seed) if isinstance(seed, Integral) else seed for seed in listed(seeds, str))
+    return python_ints(tuple(listed(seeds, str)))
 
 
 def resolved(method: MethodLike, budget: str, name: str = "recipe") -> tuple[str, Method | None]:
@@ -245,6 +248,8 @@ def reopenable_scene(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]
     path, present = folder / "scene.npz", (folder / "scene.npz").is_file()
     if not present:
         save_npz(scene, path)
+    elif beyond := unsupported_parts(scene):
+        raise InputError(f"{path} holds another scene: this one has {beyond}.", "Choose another out.")
     kept = open_scene(str(path), SceneOptions(test_views=None))
     if present and not _same(scene, kept):
         raise InputError(f"{path} holds another scene.", "Choose another out.")
@@ -252,8 +257,36 @@ def reopenable_scene(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]
 
 
 def _same(one: Scene, other: Scene) -> bool:
-    """Whether two scenes are equal; poses read from a file are re-orthonormalised, and may differ by rounding."""
-    if any(one.digest(split) != other.digest(split) for split in ("train", "test")):
+    """Whether two scenes are equal in all that a file keeps.
+
+    What is read may differ by rounding: poses are re-orthonormalised, colours of points have 8 bits.
+    """
+    for split in ("train", "val", "test", "observed"):
+        views, others = getattr(one, split), getattr(other, split)
+        if len(views) != len(others) or not all(_same_view(a, b) for a, b in zip(views, others, strict=True)):
+            return False
+    box = all(_close(getattr(one.bounds, corner), getattr(other.bounds, corner)) for corner in ("lo", "hi"))
+    if (one.points is None) != (other.points is None) or not box:
         return False
-    pairs = zip((*one.train, *one.test), (*other.train, *other.test), strict=True)
-    return all(torch.allclose(a.camera.cam_to_world, b.camera.cam_to_world, atol=1e-5) for a, b in pairs)
+    if one.points is None or other.points is None:
+        return True
+    return _close(one.points.position, other.points.position) and _close(one.points.rgb.clamp(0, 1), other.points.rgb, 1 / 255)
+
+
+def _same_view(one: View, other: View) -> bool:
+    exact = all(_close(getattr(one, part), getattr(other, part), 0.0) for part in ("image", "alpha"))
+    cameras = all(_close(getattr(one.camera, part), getattr(other.camera, part)) for part in CAMERA)
+    return (
+        exact
+        and cameras
+        and one.subject == other.subject
+        and _close(one.depth, other.depth)
+        and _close(one.normal, other.normal)
+    )
+
+
+def _close(one: Tensor | None, other: Tensor | None, most: float = 1e-5) -> bool:
+    """Whether two tensors have equal shapes and differ by at most ``most``; ``None`` equals itself alone."""
+    if one is None or other is None:
+        return one is other
+    return one.shape == other.shape and torch.allclose(one.double(), other.double(), rtol=1e-6, atol=most)

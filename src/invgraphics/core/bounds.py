@@ -126,7 +126,7 @@ class Bounds:
 
 def _clip_to_box(rays: Rays, lo: Float[Tensor, 3], hi: Float[Tensor, 3]) -> Rays:
     """Intersect the rays' intervals with a box."""
-    # Slab test; an axis-parallel ray divides by zero, and the infinities then sort themselves out.
+    # Slab test. An axis-parallel ray gets a tiny slope instead of 0: on a face of the box, 0 / 0 would be NaN.
     direction = torch.where(rays.directions == 0, torch.full_like(rays.directions, 1e-20), rays.directions)
     a, b = (lo - rays.origins) / direction, (hi - rays.origins) / direction
     near = torch.minimum(a, b).amax(dim=1).maximum(rays.near)

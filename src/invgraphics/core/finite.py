@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 
-def non_finite_values(parts: Mapping[str, Mapping[str, Tensor]]) -> str:
+def describe_non_finite(parts: Mapping[str, Mapping[str, Tensor]]) -> str:
     """Describe the first tensor with NaN or infinite values, how many it has, and how many more tensors have some.
 
     Kernels cannot be relied on to show them: splatting culls a Gaussian at NaN, and hash grids clamp positions.

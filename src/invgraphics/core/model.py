@@ -14,7 +14,7 @@ from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.contributions import Contributions
 from invgraphics.core.field import Field, Gaussians, Quantity
-from invgraphics.core.finite import non_finite_values
+from invgraphics.core.finite import describe_non_finite
 from invgraphics.core.renderer import Renderer, check
 from invgraphics.core.rendering import Context, Rendering
 
@@ -109,12 +109,12 @@ class Model:
         """The circumstances of an evaluation; ``normals`` as for `render`."""
         return Context(self.bounds, training=False, geometry=normals)
 
-    def non_finite_values(self) -> str:
+    def describe_non_finite(self) -> str:
         """Describe parameters, buffers and activated Gaussians that are NaN or infinite; empty if all are finite."""
         parts = self.state_dict()
         if Quantity.GAUSSIANS in self.field.provides:
             parts["gaussians"] = {name: value for name, value in vars(self.gaussians()).items() if isinstance(value, Tensor)}
-        return non_finite_values(parts)
+        return describe_non_finite(parts)
 
     def to(self, device: torch.device | str) -> Model:
         """Move the model's tensors; modules move in place, as torch's do."""

@@ -121,7 +121,14 @@ MAX_CHUNK_FACTOR = 16
 
 
 class RayRenderer(Renderer):
-    """A renderer whose pixels are independent, so that it can train on any set of rays."""
+    """A renderer whose pixels are independent, so that it can train on any set of rays.
+
+    Attributes:
+        ends_in_samples: whether a ray ends in each sample of its trace with the probability of that sample's weight, so that
+            losses can say where: volume rendering.
+    """
+
+    ends_in_samples: ClassVar[bool] = False
 
     @abstractmethod
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:

@@ -49,7 +49,7 @@ class View:
     alpha: UInt8[Tensor, "h w"] | Float[Tensor, "h w"] | None = None
     depth: Float[Tensor, "h w"] | None = None
     normal: Float[Tensor, "h w 3"] | None = None
-    mask: Tensor | None = None
+    mask: Bool[Tensor, "h w"] | None = None
     ground_truth_pose: Float[Tensor, "4 4"] | None = None
     subject: int | None = None
     landmarks: Float[Tensor, "k 3"] | None = None
@@ -227,7 +227,7 @@ class Scene:
         return figure_html(contact_sheet(shown), facts)
 
     def camera_digest(self) -> str:
-        """SHA-256 of all cameras of all splits, in world order of the views."""
+        """SHA-256 of all cameras, split by split, views in their order."""
         sha = hashlib.sha256()
         for split in (self.train, self.val, self.test, *([self.observed] if self.observed else [])):
             for view in split:
@@ -253,7 +253,7 @@ class Batch:
 
     target: Float[Tensor, "*p 3"]
     alpha: Float[Tensor, "*p"]
-    background: Tensor
+    background: Float[Tensor, 3] | Float[Tensor, "*p 3"]
     view: int = -1
     mask: Bool[Tensor, "*p"] | None = None
 

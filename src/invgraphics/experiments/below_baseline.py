@@ -18,6 +18,8 @@ SPARSE_ALPHA = 0.6
 """Mean alpha below which renderings of opaque photographs are mostly background."""
 EMPTY_ALPHA = 0.1
 """Mean alpha, over that of photographs with alpha, below which renderings are empty."""
+GAPS = "its Gaussians do not cover the views yet, or overfit few photographs", "a longer --budget or more photographs"
+"""Cause and remedy for Gaussians."""
 
 
 def coverage_and_depth(picture: Rendering, camera: Camera, scene: Scene) -> dict[str, float]:
@@ -29,7 +31,13 @@ def coverage_and_depth(picture: Rendering, camera: Camera, scene: Scene) -> dict
 
 
 def below_baseline(
-    method: str, quality: Mapping[str, Score], statistics: Sequence[Mapping[str, float]], scene: Scene, protocol: Protocol
+    method: str,
+    quality: Mapping[str, Score],
+    statistics: Sequence[Mapping[str, float]],
+    scene: Scene,
+    protocol: Protocol,
+    *,
+    gaussians: bool = False,
 ) -> str:
     """Diagnose a mean PSNR below that of the mean training image in a sentence; empty otherwise.
 
@@ -39,6 +47,7 @@ def below_baseline(
         statistics: `coverage_and_depth` of each test view.
         scene: with its training views.
         protocol: of the scores.
+        gaussians: whether the field is made of Gaussians, which leave gaps rather than fog.
     """
     psnr = quality["psnr"].mean if "psnr" in quality else None
     if psnr is None or not scene.train:
@@ -50,15 +59,13 @@ def below_baseline(
     if not known or psnr >= (baseline := sum(known) / len(known)):
         return ""
     means = {key: sum(view[key] for view in statistics) / len(statistics) for key in ("alpha", "relative_depth")}
-    cause, remedy = _diagnose(method, means, scene)
+    cause, remedy = GAPS if gaussians else _diagnose(method, means, scene)
     lost = f"{method} reaches {psnr:.1f} dB, below the mean training image ({baseline:.1f} dB)"
     return f"{lost}: {cause}. Try {remedy}."
 
 
 def _diagnose(method: str, means: Mapping[str, float], scene: Scene) -> tuple[str, str]:
-    """Select cause and remedy by the family of the method, the kind of scene and the statistics of its renderings."""
-    if method.startswith("splatting/"):
-        return "its Gaussians do not cover the views yet, or overfit few photographs", "a longer --budget or more photographs"
+    """Select cause and remedy of fog by the family of the method, the kind of scene and the statistics of its renderings."""
     others = ["splatting/gaussians, which starts from known points"]
     if is_open_space(scene):
         suited = method.startswith(OPEN)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
@@ -16,7 +16,7 @@ from PIL import Image
 
 from invgraphics import locks
 from invgraphics.config import fill
-from invgraphics.core import Camera, Model, Rendering, Scene, View
+from invgraphics.core import Camera, Model, Quantity, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
@@ -30,7 +30,7 @@ from invgraphics.experiments.subjects import UnseenInstances
 from invgraphics.experiments.surface_scores import surface_scores
 from invgraphics.files import write_arrays, write_picture
 from invgraphics.metrics.cost import model_bytes, parameter_count
-from invgraphics.metrics.protocols import non_finite_pixels, protocol_named, score, summarise
+from invgraphics.metrics.protocols import describe_non_finite_pixels, protocol_named, score, summarise
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
@@ -89,7 +89,7 @@ def evaluate(
         method.name,
         poses,
         on_picture=lambda index, picture: _save_view(folder, index, picture, scene),
-        training_scene=_scene_as_trained(scene, provenance),
+        training_scene=scene_as_trained(scene, provenance.data, provenance.data_seed),
     )
     quality, skipped = scaled_scores(model, scene, protocol, provenance.data, refined=poses is not None)
     result = replace(
@@ -108,13 +108,19 @@ def evaluate(
     return result
 
 
-def _scene_as_trained(scene: Scene, provenance: Provenance) -> Scene:
-    """The scene with the photographs of the fit, over its own background; unchanged where this copy cannot give them."""
-    data = replace(fill(TrainingData, provenance.data), init="random", background=KEEP)  # without points, which take minutes
+def scene_as_trained(scene: Scene, changes: Mapping[str, object], seed: int) -> Scene:
+    """The scene with the photographs of a fit, over its own background; unchanged where this copy cannot give them.
+
+    Args:
+        scene: as loaded.
+        changes: of the training data, as a run's record holds them.
+        seed: of these.
+    """
+    data = replace(fill(TrainingData, changes), init="random", background=KEEP)  # without points, which take minutes
     if not data.changes_photographs:
         return scene
     try:
-        return degrade(scene, data, provenance.data_seed)
+        return degrade(scene, data, seed)
     except InputError:
         return scene
 
@@ -145,7 +151,7 @@ def score_model(
         NumericalError: a value of the model is not finite.
     """
     rules = protocol_named(protocol)
-    if found := model.non_finite_values():
+    if found := model.describe_non_finite():
         raise NumericalError(f"{title} cannot be scored: {found}.")
     scores, seconds, statistics_of_views = [], [], []
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
@@ -161,11 +167,12 @@ def score_model(
             picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
             on_picture(index, picture)
             scores.append(score(picture, view, scene, rules))
-            if sentence := non_finite_pixels(picture):
+            if sentence := describe_non_finite_pixels(picture):
                 warn(f"Warning: view {view.name}: {sentence}.")
             statistics_of_views.append(coverage_and_depth(picture, view.camera, scene))
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
+    splats = Quantity.GAUSSIANS in model.field.provides
     surface, surface_skipped = surface_scores(model, scene if poses is None else scene_in_fit_frame(poses, scene))
     return Scores(
         method=title,
@@ -175,7 +182,7 @@ def score_model(
         cost=_model_costs(model, scene, statistics.median(seconds)),
         quality=quality | surface | ({} if posed is None else posed.quality()),
         skipped=skipped | surface_skipped,
-        below_baseline=below_baseline(title, quality, statistics_of_views, training_scene or scene, rules),
+        below_baseline=below_baseline(title, quality, statistics_of_views, training_scene or scene, rules, gaussians=splats),
     )
 
 

@@ -49,7 +49,7 @@ def _update(sha: hashlib._Hash, value: object) -> None:
         sha.update(f"{value!r};".encode())
 
 
-def identify(job: Job, truth: str, threads: int) -> str:
+def run_digest(job: Job, truth: str, threads: int) -> str:
     """Hash everything that determines a run's fit; equal identities mean equal bits on one machine.
 
     The protocol is no part of it: a finished fit is scored by another one from its checkpoint.
@@ -167,7 +167,7 @@ def check_truth(folder: RunFolder, scene: Scene, spec: str | None) -> None:
     )
 
 
-def define(job: Job) -> str:
+def cell_digest(job: Job) -> str:
     """Hash the settings of a study's cell, independent of machine and code version."""
     request = job.request
     scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}

@@ -71,9 +71,9 @@ def transform_camera(camera: Camera, similarity: Similarity) -> Camera:
 def scene_in_fit_frame(poses: Poses, scene: Scene) -> Scene:
     """Transform the scene to the fit's drifted frame: refined training cameras, all else transformed by `world_to_fit`.
 
-    Training cameras are transformed too where the fit has seen only some of them.
-
-    Its ``world_from_local`` leads to the same world as before."""
+    Training cameras are transformed too where the fit has seen only some of them. The scene's ``world_from_local`` leads to the
+    same world as before.
+    """
     errors = training_errors(poses, scene)
     similarity = errors.similarity.inverse()
 
@@ -93,8 +93,10 @@ def scene_in_fit_frame(poses: Poses, scene: Scene) -> Scene:
     return replace(
         scene,
         train=tuple(moved(view, camera) for view, camera in zip(scene.train, cameras, strict=True)),
-        val=tuple(moved(view, transform_camera(view.camera, similarity)) for view in scene.val),
-        test=tuple(moved(view, transform_camera(view.camera, similarity)) for view in scene.test),
+        **{
+            split: tuple(moved(view, transform_camera(view.camera, similarity)) for view in getattr(scene, split))
+            for split in ("val", "test", "observed")
+        },
         points=None if points is None else replace(points, position=similarity.points(points.position).to(points.position)),
         mesh=None if mesh is None else mesh.transformed(similarity.matrix),
         world_from_local=(scene.world_from_local.double() @ back).to(scene.world_from_local),

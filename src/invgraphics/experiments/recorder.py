@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from invgraphics.core import Camera, Conditional, Context, RayRenderer, Rays, Scene, View
-from invgraphics.core.finite import non_finite_values
+from invgraphics.core.finite import describe_non_finite
 from invgraphics.errors import NumericalError
 from invgraphics.experiments.clocks import fit_record
 from invgraphics.experiments.posed import transform_camera, world_to_fit
@@ -180,7 +180,7 @@ class Recorder:
         Raises:
             NumericalError: a value is not finite; the sentence names the steps between which that happened.
         """
-        if found := non_finite_values(self._fit.state()):
+        if found := describe_non_finite(self._fit.state()):
             since = f" (all were at step {self._finite_at})" if self._finite_at < self._fit.steps else ""
             raise NumericalError(f"Step {self._fit.steps}: {found}{since}; the fit stops here.")
         self._finite_at = self._fit.steps

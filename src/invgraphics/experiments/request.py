@@ -46,6 +46,19 @@ def check_seeds(seeds: Sequence[object]) -> None:
             raise InputError(f"A seed cannot be {seed!r}.", expected)
 
 
+def python_ints(value: Any) -> Any:
+    """Convert NumPy's whole numbers, alone or in tuples, to Python's, which JSON and messages spell; all else stays."""
+    if isinstance(value, tuple):
+        return tuple(python_ints(item) for item in value)
+    return int(value) if _is_whole(value) else value
+
+
+def _make_ints_plain(request: Settings | AblateRequest) -> None:
+    """Convert all numbers of a request in place, while it is made."""
+    for field in fields(request):
+        object.__setattr__(request, field.name, python_ints(getattr(request, field.name)))
+
+
 def _is_whole(value: object) -> TypeGuard[int]:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
@@ -86,6 +99,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_size(self.size)
+        _make_ints_plain(self)
 
     @property
     def recipe_overrides(self) -> tuple[str, ...]:
@@ -245,6 +259,7 @@ class AblateRequest:
         check_size(self.size)
         if self.seeds is not None:
             check_seeds(self.seeds)
+        _make_ints_plain(self)
 
     def shell(self) -> str:
         """Shell command that repeats this study."""

@@ -25,7 +25,7 @@ from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, l
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
-from invgraphics.experiments.identity import check_existing, identify, truth_digest
+from invgraphics.experiments.identity import check_existing, run_digest, truth_digest
 from invgraphics.experiments.job import Job, make_training_scene, region_of
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
@@ -93,7 +93,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
         training_scene = make_training_scene(job, scene)
-        identity = identify(job, truth_digest(scene), torch.get_num_threads())
+        identity = run_digest(job, truth_digest(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
             raise InputError(
@@ -117,7 +117,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            described = describe(job, scene, training_scene, identity, fit.plan)
+            described = write_description(job, scene, training_scene, identity, fit.plan)
             folder.write(replace(described, memory_forecast_bytes=forecast.bytes))
             if "inconsistent_poses" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
@@ -213,7 +213,7 @@ def _evaluate(job: Job, scene: Scene, fit: Fit, spent: FitRecord) -> None:
         evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
 
 
-def describe(job: Job, scene: Scene, training_scene: Scene, identity: str, plan: Plan | None = None) -> Provenance:
+def write_description(job: Job, scene: Scene, training_scene: Scene, identity: str, plan: Plan | None = None) -> Provenance:
     """Write the run's recipe, environment and truth; return its provenance as known before the fit.
 
     Args:

@@ -14,7 +14,7 @@ from invgraphics.core import Model, Scene
 from invgraphics.experiments.build import configure_torch, use_kernels
 from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.display import curve_svg, table_html
-from invgraphics.experiments.evaluate import score_model
+from invgraphics.experiments.evaluate import scene_as_trained, score_model
 from invgraphics.experiments.fitted import Fitted
 from invgraphics.experiments.job import Job, in_region, make_training_scene, region_of
 from invgraphics.experiments.recorder import Recorder
@@ -98,7 +98,7 @@ class FittedRun(ABC):
 
     method: Method
     scene: Scene
-    _data_changes: Mapping[str, object]
+    _data: tuple[Mapping[str, object], int]  # changes of the training data, and their seed
 
     @property
     @abstractmethod
@@ -134,10 +134,15 @@ class FittedRun(ABC):
         Raises:
             InputError: there is no such protocol.
         """
-        found = score_model(self.model, self.scene, protocol, self.method.name, self.poses)
+        seen = self.as_trained(self.scene)
+        found = score_model(self.model, self.scene, protocol, self.method.name, self.poses, training_scene=seen)
         refined = self.poses is not None
-        quality, skipped = scaled_scores(self.model, self.scene, protocol, self._data_changes, refined=refined)
+        quality, skipped = scaled_scores(self.model, self.scene, protocol, self._data[0], refined=refined)
         return ScoreTable(replace(found, quality=found.quality | quality, skipped=found.skipped | skipped))
+
+    def as_trained(self, scene: Scene) -> Scene:
+        """A copy of the run's scene with the photographs that the fit saw, of which the mean training image is."""
+        return scene_as_trained(scene, *self._data)
 
     def through(self, renderer: str) -> Model:
         """Model of the fitted field with the renderer of another method; with its own, as it was fitted.
@@ -185,7 +190,7 @@ class MemoryRun(FittedRun):
 
     def __init__(self, job: Job, scene: Scene, on_step: OnStep | None = None) -> None:
         self.method = job.method
-        self._job, self._on_step, self._data_changes = job, on_step, job.data.changes()
+        self._job, self._on_step, self._data = job, on_step, (job.data.changes(), job.request.seed)
         self._history: list[Moment] = []
         self._scores: ScoreTable | None = None
         configure_torch(job.device)
@@ -267,7 +272,7 @@ class FolderRun(FittedRun):
     def __init__(self, fitted: Fitted) -> None:
         self.method, self.scene, self._fitted = fitted.method, fitted.scene, fitted
         self.folder: Path = fitted.folder.root
-        self._data_changes = fitted.source.read(Provenance).data
+        self._data = (record := fitted.source.read(Provenance)).data, record.data_seed
 
     @property
     def model(self) -> Model:

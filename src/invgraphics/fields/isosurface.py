@@ -106,7 +106,7 @@ def extract_mesh(field: Field, bounds: Bounds, resolution: int, level: float | N
         level = default_level(bounds) if level is None else level
         volume, what, outside = _densities(field, grid), "The density", 0.0
     volume = torch.nn.functional.pad(volume, (1,) * 6, value=outside)
-    vertices, faces = marching_cubes(volume, level, what, remedy)
+    vertices, faces = marching_cubes(volume, level, what, remedy, negated=distances)
     extracted = without_specks(Mesh(grid.origin + grid.step * (vertices.to(grid.origin) - 1), faces.to(grid.origin.device)))
     return replace(extracted, mesh=with_attributes(extracted.mesh, field))
 
@@ -156,7 +156,7 @@ def _sdf(field: Field, grid: VoxelGrid, flat: Int[Tensor, " n"]) -> Float[Tensor
 
 
 def marching_cubes(
-    volume: Float[Tensor, "x y z"], level: float, what: str, remedy: str = REMEDY
+    volume: Float[Tensor, "x y z"], level: float, what: str, remedy: str = REMEDY, *, negated: bool = False
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     """Marching cubes (Lewiner et al. 2003): isosurface around values above the level.
 
@@ -165,6 +165,7 @@ def marching_cubes(
         level: of the surface.
         what: the volume's name, for the sentence of an error.
         remedy: what the user can do, for its second line.
+        negated: whether values and level are the negatives of what ``what`` names, as the sentence gives them.
 
     Returns:
         Vertices, in voxels, and outward faces.
@@ -176,10 +177,10 @@ def marching_cubes(
 
     values = volume.cpu().numpy().astype(np.float32)
     if min(values.shape) < 2 or not values.min() < level < values.max():
-        raise InputError(
-            f"{what} has no level {abs(level):.4g}: it runs from {abs(values).min():.4g} to {abs(values).max():.4g}.",
-            remedy,
-        )
+        sign = -1 if negated else 1
+        least, most = sorted((sign * float(values.min()), sign * float(values.max())))
+        # Adding zero makes a zero of -0.
+        raise InputError(f"{what} has no level {sign * level + 0:.4g}: it runs from {least + 0:.4g} to {most + 0:.4g}.", remedy)
     # "ascent" turns its triangles outwards for objects that are higher than what is around them.
     vertices, faces, *_ = march(values, level, gradient_direction="ascent", allow_degenerate=False)
     return torch.from_numpy(vertices.copy()), torch.from_numpy(faces.astype(np.int64))

@@ -75,7 +75,7 @@ def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) 
     if 2 * protocol.crop >= min(height, width):
         raise InputError(f"Protocol '{protocol.name}' crops {protocol.crop} pixels of every side; '{view.name}' has no more.")
     rendering = rendering.detach()
-    if sentence := non_finite_pixels(rendering):
+    if sentence := describe_non_finite_pixels(rendering):
         raise Skip(sentence)
     image, truth, mask = _masked(*_composited(rendering, view, scene, protocol), view, protocol)
     pair = Pair(
@@ -92,7 +92,7 @@ def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) 
     return pair.cropped(protocol.crop) if protocol.crop else pair
 
 
-def non_finite_pixels(rendering: Rendering) -> str:
+def describe_non_finite_pixels(rendering: Rendering) -> str:
     """Describe how many pixels have a NaN or infinite colour or alpha; empty if none has."""
     broken = ~(rendering.rgb.isfinite().all(dim=-1) & rendering.alpha.isfinite())
     count = int(broken.sum())

@@ -65,6 +65,7 @@ class Hybrid(RayRenderer):
     """
 
     requires: ClassVar[Quantity] = Quantity.SDF | Quantity.RADIANCE
+    ends_in_samples: ClassVar[bool] = True
 
     def __init__(self, settings: HybridSettings, volumetric: Volumetric) -> None:
         super().__init__()

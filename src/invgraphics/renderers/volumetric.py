@@ -71,6 +71,7 @@ class Volumetric(RayRenderer):
     """Volume renderer: integrates density and radiance along rays clipped to the scene's bounds."""
 
     requires: ClassVar[Quantity] = Quantity.DENSITY | Quantity.RADIANCE
+    ends_in_samples: ClassVar[bool] = True
 
     def __init__(self, sampler: Sampler, gradient_reach: float = 0.0, colour_threshold: float = 0.0) -> None:
         super().__init__()

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from invgraphics.core.finite import non_finite_values
+from invgraphics.core.finite import describe_non_finite
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.files import replacing
 
@@ -23,13 +23,9 @@ def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
     Raises:
         NumericalError: a value is not finite; the old file stays.
     """
-    if found := non_finite_values(parts):
+    if found := describe_non_finite(parts):
         raise NumericalError(f"{path} is not written: {found}.")
-    flat = {
-        f"{section}|{name}": value.detach().cpu().contiguous().clone()
-        for section, part in parts.items()
-        for name, value in part.items()
-    }
+    flat = _flat(parts)
     with replacing(path) as temporary:
         try:
             save_file(flat, temporary)
@@ -39,6 +35,18 @@ def save(path: Path, parts: dict[str, dict[str, Tensor]]) -> None:
             raise OSError(code, os.strerror(code), str(path)) from error
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
+
+
+def _flat(parts: dict[str, dict[str, Tensor]]) -> dict[str, Tensor]:
+    """All tensors as the format takes them, contiguous on the CPU; of those that share memory, all but one are copies."""
+    flat, seen = {}, set()
+    for section, part in parts.items():
+        for name, value in part.items():
+            plain = value.detach().cpu().contiguous()
+            place = plain.untyped_storage().data_ptr()
+            flat[f"{section}|{name}"] = plain.clone() if place in seen else plain
+            seen.add(place)
+    return flat
 
 
 def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, Tensor]]:
@@ -59,6 +67,6 @@ def load(path: Path, device: torch.device | None = None) -> dict[str, dict[str, 
         if not bar:
             raise InputError(f"{path} was not written by invgraphics: it holds '{key}'.")
         parts.setdefault(section, {})[name] = value
-    if found := non_finite_values(parts):
+    if found := describe_non_finite(parts):
         raise InputError(f"{path} cannot be used: {found}.", "The fit diverged, or the file was damaged: fit again.")
     return parts

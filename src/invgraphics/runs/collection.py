@@ -25,10 +25,9 @@ def runs_of(folder: Path) -> list[Path]:
     else:
         check_run(folder)
         return [folder]
-    found = [folder / name for name in dict.fromkeys(names)]
+    found = [inside(folder, name) for name in dict.fromkeys(names)]
     if not found:
         raise InputError(f"{folder} has no finished run.", "Give its command again, which continues it.")
     for path in found:
-        inside(folder, str(path.relative_to(folder)))
         check_run(path)
     return found

@@ -274,7 +274,7 @@ class RunFolder:
         """Write the resolved recipe, atomically."""
         import tomlkit
 
-        write_text(self.path(RECIPE), tomlkit.dumps(table))
+        write_text(self.path(RECIPE), tomlkit.dumps(table), durable=True)
 
     def read_recipe(self) -> dict[str, Any]:
         """Read the resolved recipe.

@@ -68,8 +68,8 @@ class Record:
         return plain(self)
 
     def write(self, path: Path) -> None:
-        """Write the record atomically: an interruption leaves either the old file or the new one."""
-        write_json(path, self.to_table())
+        """Write the record atomically: an interruption leaves either the old file or the new one, a loss of power included."""
+        write_json(path, self.to_table(), durable=True)
 
 
 def stored_fields(kind: type) -> dict[str, bool]:
@@ -136,9 +136,9 @@ def read_table(path: Path) -> dict[str, Any]:
     return table
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON atomically, see `invgraphics.files`."""
-    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+def write_json(path: Path, content: Any, *, durable: bool = False) -> None:
+    """Write JSON atomically; ``durable`` as of `invgraphics.files.writing`."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n", durable=durable)
 
 
 def _current(kind: type[Record], table: Mapping[str, Any], source: Path, key: str) -> Mapping[str, Any]:

@@ -247,7 +247,7 @@ def save_npz(scene: Scene, path: Path) -> None:
         InputError: it holds what the convention does not: no box, linear or unrounded colours, masks, another
             background, pictures of several sizes; the sentence says what. Nothing is written then.
     """
-    if beyond := _unsupported_parts(scene):
+    if beyond := unsupported_parts(scene):
         raise InputError(
             f"The scene '{scene.name}' cannot be kept as a data set: it has {beyond}.",
             "Write it in a format that `load_scene` reads, and load it from there.",
@@ -277,7 +277,7 @@ def save_npz(scene: Scene, path: Path) -> None:
     write_arrays(path, arrays)
 
 
-def _unsupported_parts(scene: Scene) -> str:
+def unsupported_parts(scene: Scene) -> str:
     """List what a scene has that the format cannot store, in words; empty for nothing."""
     views = [*scene.train, *scene.val, *scene.test, *scene.observed]
     cameras = [view.camera for view in views]

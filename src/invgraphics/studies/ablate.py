@@ -18,7 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.executors.local import cores
-from invgraphics.experiments.identity import identify, truth_digest
+from invgraphics.experiments.identity import run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.renderings import check_variants, is_kept, renderings_complete
@@ -171,7 +171,7 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[Trials, dict[tuple[str, Size]
 
 def _is_finished(planned: Planned, truth: str, threads: int) -> bool:
     run = planned.job.folder
-    same = run.finished and run.identity == identify(planned.job, truth, threads)
+    same = run.finished and run.identity == run_digest(planned.job, truth, threads)
     return same and renderings_complete(planned.job)
 
 

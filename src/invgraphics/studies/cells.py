@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.identity import define
+from invgraphics.experiments.identity import cell_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest, FitRequest
 from invgraphics.recipes.recipe import Method
@@ -75,7 +75,7 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
         except InputError as error:
             raise _in_cell(cell, error) from error
         methods[key] = job.method
-        definition = define(job)
+        definition = cell_digest(job)
         folder = folders.setdefault(definition, Path(fit.out) / "runs" / f"{_readable(cell)}-{definition[:10]}")
         plan.append(Planned(cell, replace(job, request=replace(fit, out=str(folder)))))
     return plan

@@ -19,7 +19,7 @@ from invgraphics.experiments.identity import check_truth
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.request import DATA, FitRequest
-from invgraphics.experiments.run import describe
+from invgraphics.experiments.run import write_description
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import load_method
 from invgraphics.runs.folder import RunFolder
@@ -131,7 +131,7 @@ def convert_run(request: ConvertRequest) -> Converted:
         _check_empty(folder)
         folder.clear()
         origin = _origin(request, fitted, native, converted)
-        provenance = describe(job, fitted.scene, shown, _identity(job, origin), plan)
+        provenance = write_description(job, fitted.scene, shown, _identity(job, origin), plan)
         folder.write(replace(provenance, command=request.shell(), converted=origin, threads=torch.get_num_threads()))
         with PeakMemory(job.device) as memory:
             fit = Fit(plan)

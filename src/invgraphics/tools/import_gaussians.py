@@ -15,7 +15,7 @@ from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
-from invgraphics.experiments.run import describe
+from invgraphics.experiments.run import write_description
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
 from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import SMALLEST_SCALE, Splats, read_gaussians
@@ -87,7 +87,7 @@ def import_run(request: ImportRequest) -> Path:
     with folder.held():
         _check_empty(folder)
         folder.clear()
-        provenance = describe(job, scene, scene, _identity(job.method, scene, origin))
+        provenance = write_description(job, scene, scene, _identity(job.method, scene, origin))
         folder.write(replace(provenance, budget=IMPORTED, command=request.shell(), imported=origin))
         model = build_model(job.method, scene, job.request.seed, job.device)
         assert isinstance(model.field, GaussianField)

@@ -26,13 +26,11 @@ class RecipeCheck:
         folder: of the report.
         runs: runs whose recipes were compared.
         stale: method -> why, for methods with a run that today's recipe would not make.
-        unknown: runs whose records lack what is needed.
     """
 
     folder: Path
     runs: int
     stale: dict[str, str]
-    unknown: int = 0
 
     @property
     def current(self) -> bool:
@@ -61,25 +59,26 @@ def check_recipes(folder: Path) -> RecipeCheck:
         raise InputError(f"'{folder}' is no folder.", "Give the folder of a report.")
     records = [RunFolder(path.parent).read(Provenance) for path in sorted(folder.rglob(Provenance.FILE))]
     stale: dict[str, str] = {}
-    seen: dict[tuple[str, ...], tuple[str, ...]] = {}
+    seen: dict[tuple[str, ...], str | None] = {}
     for record in records:
         overrides = _overrides(record.command)
-        key = record.method, record.preset or "", record.budget, str(record.options.size), *overrides
+        size = str(record.options.size)
+        key = record.method, record.preset or "", record.budget, record.scene, size, record.recipe_sha256, *overrides
         if key not in seen:
-            seen[key] = _todays_digests(record, overrides)
-        if record.recipe_sha256 not in seen[key]:
-            today = seen[key][0]
-            stale[record.method] = "differs" if len(today) == len(record.recipe_sha256) else today
+            seen[key] = _difference(record, overrides)
+        if (why := seen[key]) is not None:
+            stale[record.method] = why
     return RecipeCheck(folder, len(records), stale)
 
 
-def _todays_digests(record: Provenance, overrides: Sequence[str]) -> tuple[str, ...]:
-    """SHA-256 of each recipe that the same request may make today; the reason where it makes none."""
+def _difference(record: Provenance, overrides: Sequence[str]) -> str | None:
+    """Why the same request would not make a run's recipe today: it ``differs``, or none is made; ``None`` where it would."""
     try:
         method = load_method(record.method, record.preset or None, overrides, Budget.parse(record.budget))
     except InputError as error:
-        return (error.sentence.rstrip("."),)
-    return method.equivalent_digests(longest_edge(record.scene, record.options.size))
+        return error.sentence.rstrip(".")
+    same = record.recipe_sha256 in method.equivalent_digests(longest_edge(record.scene, record.options.size))
+    return None if same else "differs"
 
 
 def _overrides(command: str) -> list[str]:

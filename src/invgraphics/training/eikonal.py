@@ -11,6 +11,10 @@ from torch import Tensor
 
 from invgraphics.core import Batch, Context, Field, Quantity, Renderer, Rendering, Samples, Trace
 from invgraphics.errors import InputError
+from invgraphics.training.requirement import Requirement
+
+DISTANCE = Requirement("a signed distance", quantities=Quantity.SDF | Quantity.GRADIENT)
+"""For penalties that need a signed distance."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,7 @@ class EikonalPenalty:
     """
 
     name: ClassVar[str] = "eikonal"
+    requires: ClassVar[Requirement] = DISTANCE
 
     weight: float = 0.1
     points: int = 1024
@@ -41,12 +46,7 @@ class EikonalPenalty:
             raise ValueError("'points' must be at least 1, and 'near' from 0 to 'points'.")
 
     def __call__(self, field: Field, renderer: Renderer, ctx: Context) -> Float[Tensor, ""]:
-        """The weighted mean.
-
-        Raises:
-            InputError: the field has no signed distance.
-        """
-        _check_distance(self.name, field)
+        """The weighted mean."""
         lo, hi = ctx.bounds.lo, ctx.bounds.hi
         position = torch.lerp(lo, hi, ctx.rand((self.points, 3), like=lo))
         values = field.query(Samples.at(position), Quantity.SDF | Quantity.GRADIENT)
@@ -78,6 +78,7 @@ class CurvaturePenalty:
     """
 
     name: ClassVar[str] = "curvature"
+    requires: ClassVar[Requirement] = DISTANCE
 
     weight: float = 5e-4
     points: int = 512
@@ -92,12 +93,7 @@ class CurvaturePenalty:
             raise ValueError("'points' must be at least 1, and 'step' above 0.")
 
     def __call__(self, field: Field, renderer: Renderer, ctx: Context) -> Float[Tensor, ""]:
-        """The weighted mean.
-
-        Raises:
-            InputError: the field has no signed distance.
-        """
-        _check_distance(self.name, field)
+        """The weighted mean."""
         lo, hi, half = ctx.bounds.lo, ctx.bounds.hi, ctx.bounds.half.mean()
         position = torch.lerp(lo, hi, ctx.rand((self.points, 3), like=lo))
         with torch.no_grad():
@@ -164,11 +160,6 @@ def near_surface(
     # Sums of three uniform numbers are as good as normal ones, and come from the context's generator.
     noise = 2 * ctx.rand((3, *position.shape), like=lo).sum(dim=0) - 3
     return (foot_points(position, sdf, gradient) + spread * ctx.bounds.half.mean() * noise).clamp(lo, hi)
-
-
-def _check_distance(name: str, field: Field) -> None:
-    if Quantity.GRADIENT not in field.provides:
-        raise InputError(f"The penalty '{name}' needs a signed distance, which {type(field).__name__} does not have.")
 
 
 def foot_points(

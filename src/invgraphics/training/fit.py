@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from invgraphics.core import Batch, Context, Model, RayRenderer, Rendering, Scene, Trace
-from invgraphics.core.finite import non_finite_values
+from invgraphics.core.finite import describe_non_finite
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.openmp import limit_spinning
@@ -84,6 +84,7 @@ class Fit:
             if not isinstance(hook, Hook):
                 raise InputError(f"The hook {_name(hook)} is no training.hooks.Hook.", "Derive it from that class.")
             hook.check(plan.model.field)
+            hook.check_fit(plan.model.field, plan.model.renderer)
         for penalty in plan.penalties:
             check_penalty(penalty, plan.model.field)
         keep_freed_memory()
@@ -199,7 +200,9 @@ class Fit:
         parts["rendering"] = {"rgb": rendering.rgb, "alpha": rendering.alpha}
         names = [type(term).__name__ for term in (*self.plan.losses, *self.plan.penalties)]
         broken = [name for name, term in zip(names, terms.tolist(), strict=True) if not math.isfinite(term)]
-        where = non_finite_values(parts) or f"the loss is not finite ({', '.join(broken) or 'the sum of ' + ', '.join(names)})"
+        where = (
+            describe_non_finite(parts) or f"the loss is not finite ({', '.join(broken) or 'the sum of ' + ', '.join(names)})"
+        )
         return f"Step {self.steps}: {where}; the fit stops here."
 
     def warmup_step(self) -> None:

@@ -77,6 +77,13 @@ class Hook:
         if cls.requires is not None:
             cls.requires.check(f"hook '{cls.name or cls.__name__}'", field)
 
+    def check_fit(self, field: Field, renderer: Renderer) -> None:
+        """Refuse a field and a renderer that the hook could not act on later; called before the first step of a fit.
+
+        Raises:
+            InputError: names the hook, and what it needs.
+        """
+
     def before_step(self, state: FitState) -> None:
         """Called before the step's rays are drawn."""
 

@@ -163,6 +163,7 @@ class SparsityPenalty:
     """
 
     name: ClassVar[str] = "sparsity"
+    requires: ClassVar[Requirement] = Requirement("a density", quantities=Quantity.DENSITY)
 
     weight: float = 1e-4
     points: int = 4096
@@ -172,13 +173,7 @@ class SparsityPenalty:
             raise ValueError("'weight' must not be negative, and 'points' must be at least 1.")
 
     def __call__(self, field: Field, renderer: Renderer, ctx: Context) -> Float[Tensor, ""]:
-        """The weighted mean.
-
-        Raises:
-            InputError: the field has no density.
-        """
-        if Quantity.DENSITY not in field.provides:
-            raise InputError(f"The penalty '{self.name}' needs a density, which {type(field).__name__} does not have.")
+        """The weighted mean."""
         position = ctx.bounds.from_unit(ctx.rand((self.points, 3), like=ctx.bounds.lo))
         density = field.query(Samples.at(position), Quantity.DENSITY).density
         assert density is not None

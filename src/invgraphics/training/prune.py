@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 from typing_extensions import Protocol, override, runtime_checkable
 
-from invgraphics.core import RayRenderer, Trace
+from invgraphics.core import Field, RayRenderer, Renderer, Trace
 from invgraphics.core.lattice import LatticeEncoding, LatticeField
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
@@ -71,11 +71,14 @@ class Prune(MilestoneHook):
         self._config = config
 
     @override
-    def act(self, state: FitState, due: int) -> None:
-        encodings = list(cast(LatticeField, state.field).lattice_encodings().values())
-        grids = [encoding for encoding in encodings if isinstance(encoding, Prunable)]
-        if not grids or not isinstance(state.renderer, RayRenderer):
+    def check_fit(self, field: Field, renderer: Renderer) -> None:
+        if not _grids(field) or not isinstance(renderer, RayRenderer):
             raise InputError(f"The hook '{self.name}' needs sparse voxel grids and a renderer of rays.")
+
+    @override
+    def act(self, state: FitState, due: int) -> None:
+        assert isinstance(state.renderer, RayRenderer)
+        grids = _grids(state.field)
         bounds, sizes = cast(LatticeField, state.field).bounds, [cast(LatticeEncoding, grid).resolution for grid in grids]
         most = {size: torch.zeros(size, device=bounds.lo.device) for size in sizes}
         for position, weight in ray_weights(state, state.renderer, self._config.rays):
@@ -84,6 +87,11 @@ class Prune(MilestoneHook):
                 torch.maximum(largest, heaviest(unit, weight, size), out=largest)
         for grid, size in zip(grids, sizes, strict=True):
             prune(state, grid, dilated(most[size] >= self._config.weight / size[2], self._config.dilation))
+
+
+def _grids(field: Field) -> list[Prunable]:
+    """Sparse grids of a field with lattices."""
+    return [encoding for encoding in cast(LatticeField, field).lattice_encodings().values() if isinstance(encoding, Prunable)]
 
 
 def trace_random_rays(state: FitState, renderer: RayRenderer, count: int) -> Iterator[Trace]:

@@ -7,29 +7,38 @@ from inspect import get_annotations
 
 from typing_extensions import get_protocol_members
 
+from invgraphics.core import Quantity
 from invgraphics.errors import InputError
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """Members that a field must have.
+    """Members that a field must have, quantities that it must provide, or both.
 
     Attributes:
         words: what they are, for a sentence.
-        protocol: a `typing.Protocol` that lists them.
+        protocol: a `typing.Protocol` that lists the members; ``None`` for none.
+        quantities: that it provides.
     """
 
     words: str
-    protocol: type
+    protocol: type | None = None
+    quantities: Quantity = Quantity.NONE
 
     def met_by(self, field: object) -> bool:
-        """Whether a field, or a class of fields, has every member. Annotations of a class count as its members."""
+        """Whether a field, or a class of fields, has all of them. Annotations of a class count as its members.
+
+        A class whose fields differ in what they provide passes.
+        """
         cls = field if isinstance(field, type) else type(field)
         declared = {name for base in cls.__mro__ for name in get_annotations(base)}
-        return all(hasattr(field, name) or name in declared for name in get_protocol_members(self.protocol))
+        members = () if self.protocol is None else get_protocol_members(self.protocol)
+        provided = getattr(field, "provides", None)
+        enough = self.quantities in provided if isinstance(provided, Quantity) else isinstance(field, type)
+        return enough and all(hasattr(field, name) or name in declared for name in members)
 
     def check(self, part: str, field: object) -> None:
-        """Refuse a field, or a class of fields, that lacks a member.
+        """Refuse a field, or a class of fields, that lacks a member or a quantity.
 
         Raises:
             InputError: names the part of the recipe, what it needs, and the field.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from invgraphics.core import Bounds, Field, Quantity, Samples
+from invgraphics.core import Bounds, Field, Quantity, Renderer, Samples
 from invgraphics.core.lattice import LatticeField
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
@@ -63,12 +63,16 @@ class TightBox(MilestoneHook):
         self._config = config
 
     @override
+    def check_fit(self, field: Field, renderer: Renderer) -> None:
+        if "geometry" not in cast(LatticeField, field).lattice_encodings():
+            raise InputError(f"The hook '{self.name}' needs a geometry made of lattices, which this field does not have.")
+        if Quantity.DENSITY not in field.provides:
+            raise InputError(f"The hook '{self.name}' needs a density, which {type(field).__name__} does not have.")
+
+    @override
     def act(self, state: FitState, due: int) -> None:
         field, config = cast(LatticeField, state.field), self._config
-        encodings = field.lattice_encodings()
-        if "geometry" not in encodings:
-            raise InputError(f"The hook '{self.name}' needs a geometry made of lattices, which this field does not have.")
-        x, y, z = encodings["geometry"].resolution
+        x, y, z = field.lattice_encodings()["geometry"].resolution
         box = occupied_box(state.field, field.bounds, (x, y, z), config.threshold, state.ctx.chunk)
         if box is None:
             return
@@ -97,8 +101,6 @@ def occupied_box(field: Field, bounds: Bounds, resolution: tuple[int, int, int],
     Returns:
         Lowest and highest corner, within ``bounds``; ``None`` where there is no such voxel.
     """
-    if Quantity.DENSITY not in field.provides:
-        raise InputError(f"The hook 'tight_box' needs a density, which {type(field).__name__} does not have.")
     position = bounds.vertices(resolution)
     density = torch.cat([field.density_no_grad(Samples.at(part)) for part in position.split(chunk)])
     cells = torch.tensor([size - 1 for size in resolution], device=position.device)

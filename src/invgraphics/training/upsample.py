@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from typing_extensions import override
 
-from invgraphics.core import Bounds, Camera
+from invgraphics.core import Bounds, Camera, Field, Renderer
 from invgraphics.core.lattice import LatticeEncoding, LatticeField, resampled, vertices_along
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
@@ -74,11 +74,19 @@ class Upsample(MilestoneHook):
         self._config = config
 
     @override
+    def check_fit(self, field: Field, renderer: Renderer) -> None:
+        encodings = cast(LatticeField, field).lattice_encodings().values()
+        if not encodings:
+            raise InputError(f"The hook '{self.name}' needs encodings made of lattices, which this field does not have.")
+        linked = any(lattice.links is not None for encoding in encodings for lattice in encoding.lattices())
+        if linked and self._config.moments == "keep":
+            sentence = "Moments of sparse lattices cannot be kept when these change."
+            raise InputError(sentence, "Set moments = 'drop' in the hook.")
+
+    @override
     def act(self, state: FitState, due: int) -> None:
         config = self._config
         field = cast(LatticeField, state.field)
-        if not field.lattice_encodings():
-            raise InputError(f"The hook '{self.name}' needs encodings made of lattices, which this field does not have.")
         edges = field.bounds.half.tolist()
         limit = pixel_limit(field.bounds, state.cameras()) / config.min_spacing if config.min_spacing else math.inf
         sizes = [(encoding, self._next(encoding, due, limit)) for encoding in field.lattice_encodings().values()]
@@ -119,14 +127,8 @@ def change_lattices(state: FitState, change: Callable[[], None], moments: Moment
     Args:
         state: of the fit.
         change: replaces parameters under their names.
-        moments: what becomes of their moments; kept ones are interpolated over the whole lattice.
-
-    Raises:
-        InputError: moments of linked lattices cannot be kept.
+        moments: what becomes of their moments; kept ones are interpolated over the whole lattice, which must be dense.
     """
-    encodings = cast(LatticeField, state.field).lattice_encodings().values()
-    if moments == "keep" and any(lattice.links is not None for encoding in encodings for lattice in encoding.lattices()):
-        raise InputError("Moments of sparse lattices cannot be kept when these change.", "Set moments = 'drop' in the hook.")
     before = dict(state.field.named_parameters())
     change()
     for name, parameter in state.field.named_parameters():

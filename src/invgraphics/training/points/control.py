@@ -91,10 +91,14 @@ class PointControl(MilestoneHook):
         self._config = config
 
     @override
+    def check_fit(self, field: Field, renderer: Renderer) -> None:
+        if not isinstance(renderer, RayRenderer):
+            raise InputError(f"The hook '{self.name}' needs a renderer of rays.")
+
+    @override
     @torch.no_grad()
     def act(self, state: FitState, due: int) -> None:
-        if not isinstance(state.renderer, RayRenderer):
-            raise InputError(f"The hook '{self.name}' needs a renderer of rays.")
+        assert isinstance(state.renderer, RayRenderer)
         config, field = self._config, cast(PointParameters, state.field)
         keep = field.confidence_logits.sigmoid() >= config.prune_confidence
         if not bool(keep.any()):

@@ -15,8 +15,6 @@ from torch import Tensor
 
 from invgraphics.core import Context, Field, RayRenderer, Rays, Renderer, Scene
 from invgraphics.errors import InputError
-from invgraphics.renderers.hybrid import Hybrid
-from invgraphics.renderers.volumetric import Volumetric
 
 SPAN = 0.5
 """Share of a point's distance at which the error of a termination saturates: some points are wrong."""
@@ -99,7 +97,7 @@ def make_sparse_depth(
     config = SparseDepthConfig() if chosen is None else chosen
     if config.weight == 0 or (chosen is None and scene.bounds.space != "contracted"):
         return None
-    if not isinstance(renderer, Volumetric | Hybrid):
+    if not (isinstance(renderer, RayRenderer) and renderer.ends_in_samples):
         obstacle = "only volume rendering by samples along rays has use for depths"
     elif not fixed_poses:
         obstacle = "poses are optimised, and points were triangulated at the given ones"
