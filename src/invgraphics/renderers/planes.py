@@ -72,7 +72,7 @@ def view_dependence(planes: Planes, camera: Camera) -> Float[Tensor, "p 3 i j"]:
     assert planes.basis is not None
     reference, (rows, columns) = planes.camera, planes.coefficients.shape[3:]
     places = reference.resized(columns, rows)
-    on_plane = (places.pixel_centres() - places.centre) / places.focal
+    on_plane = (places.pixel_centres() - places.principal_point) / places.focal
     points = torch.cat([on_plane, torch.ones_like(on_plane[..., :1])], dim=-1) * planes.depths[:, None, None, None]
     centre = reference.cam_to_world[:3, :3].T @ (camera.position - reference.position)
     basis = planes.basis(normalize(points - centre, dim=-1).reshape(-1, 3)).view(len(planes), rows, columns, -1)
