@@ -129,8 +129,7 @@ def _read(path: Path) -> Arrays:
             raise InputError(f"'{key}' of {path} has shape {arrays[key].shape}, expected {expected}.")
         if key in arrays and arrays[key].dtype.kind not in "fiub":
             raise InputError(f"'{key}' of {path} holds {arrays[key].dtype}, not numbers.")
-    alpha = arrays.get("alpha")
-    if alpha is not None and alpha.dtype == np.uint8 and alpha.max(initial=0) == 1:  # of all views: 0 and 1 are meant
+    if (alpha := arrays.get("alpha")) is not None and alpha.dtype == np.uint8 and alpha.max(initial=0) == 1:  # 0, 1 are meant
         arrays["alpha"] = alpha * np.uint8(255)
     return arrays
 
