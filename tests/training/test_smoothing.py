@@ -89,7 +89,7 @@ def test_refusals() -> None:
 
 
 def test_what_a_camera_sees_from_close_by_counts() -> None:
-    """A point at 0.1 in front of a camera, in a scene whose near plane is at 0.05: its pixels there are finer than any other's."""
+    """A point 0.1 in front of a camera, in a scene whose near plane is at 0.05: its pixels there are finer than any other."""
     state = _state(1)
     camera = state.scene.train[0].camera
     with torch.no_grad():
