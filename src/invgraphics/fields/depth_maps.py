@@ -12,7 +12,6 @@ from torch import Tensor
 
 from invgraphics.core import Camera, Context, Field, FieldValues, Quantity, Rays, Samples, Scene, View
 from invgraphics.core.bounds import Bounds
-from invgraphics.core.colour import quantise
 from invgraphics.core.scene import DepthMaps
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.convert import require_density, uniform_rendering_weights
@@ -112,7 +111,6 @@ class DepthMapField(Field):
         if len(sizes) > 1:
             remedy = "Give one size with --size WIDTHxHEIGHT."
             raise InputError("Warping by depth needs training views of one size; these differ.", remedy)
-        self.names = tuple(view.name for view in views)
         opaque = torch.tensor(255, dtype=torch.uint8).expand(views[0].image.shape[:2])
         self.register_buffer("rgb", _stacked([view.image for view in views]))
         self.register_buffer("alpha", _stacked([opaque if view.alpha is None else view.alpha for view in views]))
@@ -134,16 +132,19 @@ class DepthMapField(Field):
 
         def view(index: int) -> View:
             depth = torch.where(self.depth[index] > 0, self.depth[index], torch.inf)
-            return View(cameras[index], self.rgb[index], self.names[index], alpha=self.alpha[index], depth=depth)
+            return View(cameras[index], self.rgb[index], str(index), alpha=self.alpha[index], depth=depth)
 
         return DepthMaps(cameras, view)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        """Load tensors; checkpoints of earlier versions hold bytes as floats in [0, 1]."""
-        for name in ("rgb", "alpha"):
+        """Load tensors, as many photographs as the checkpoint holds: a fit may have seen only some of the scene's.
+
+        Those of earlier versions are floats.
+        """
+        for name, value in list(self.named_buffers()):
             given = state_dict.get(prefix + name)
-            if given is not None and given.is_floating_point() and not getattr(self, name).is_floating_point():
-                state_dict[prefix + name] = quantise(given)
+            if given is not None and given.ndim == value.ndim:
+                setattr(self, name, torch.empty_like(given, device=value.device))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
