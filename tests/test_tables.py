@@ -74,10 +74,10 @@ def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
     ],
 )
 def test_toml_is_read_within_limits(text: str, sentence: str) -> None:
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(InputError, match=sentence):
         parse_toml(text, "a.toml")
-    assert time.perf_counter() - began < 2
+    assert time.process_time() - began < 2
 
 
 def npy(header: str, body: bytes = b"") -> bytes:

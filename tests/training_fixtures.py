@@ -148,7 +148,7 @@ def toy_scores(fit: Fit) -> ToyScores:
         assert view.alpha is not None and view.depth is not None
         picture = fit.plan.model.render(view.camera, normals=False)
         errors.append((picture.over(scene.background).clamp(0, 1) - view.over(scene.background)).square().mean())
-        ours, true = picture.alpha >= 0.5, view.alpha >= 0.5
+        ours, true = picture.alpha >= 0.5, view.opacity() >= 0.5
         depths.append((picture.depth - view.depth)[ours & true].abs())
         overlaps.append(float((ours & true).sum() / (ours | true).sum()))
     psnr = -10 * math.log10(float(torch.stack(errors).mean()))

@@ -1,5 +1,6 @@
 """What runs fits: processes of their own, which neither outlive their parent nor lose what they did."""
 
+import contextlib
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from training_fixtures import SMALL
@@ -179,3 +181,75 @@ def test_without_ray_a_sentence(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"needs the package ray"):
         plugins.load("executors", "ray")(Resources())
+
+
+class StubRay(ModuleType):
+    """What `RayExecutor` uses of ray, in this process: tasks run when they are got, and again after a named exception."""
+
+    class exceptions:  # noqa: N801  # as in ray
+        class RayError(Exception):
+            pass
+
+    def __init__(self) -> None:
+        super().__init__("ray")
+        self.connected: list[tuple[str, dict]] = []
+        self.asked: dict = {}
+
+    def init(self, address: str, **options) -> None:
+        self.connected.append((address, options))
+
+    def shutdown(self) -> None:
+        self.connected.pop()
+
+    def nodes(self) -> list[dict]:
+        return [{"Alive": True, "Resources": {"CPU": 2.0}}, {"Alive": False, "Resources": {"CPU": 64.0}}]
+
+    def remote(self, function):
+        def options(**asked):
+            self.asked = asked
+            return SimpleNamespace(remote=lambda *arguments: Task(function, arguments, asked))
+
+        return SimpleNamespace(options=options)
+
+    def wait(self, tasks: list, num_returns: int) -> tuple[list, list]:
+        return tasks[-num_returns:], tasks[:-num_returns]
+
+    def get(self, task):
+        return task.result()
+
+
+class Task:
+    def __init__(self, function, arguments: tuple, asked: dict) -> None:
+        self.function, self.arguments, self.asked = function, arguments, asked
+
+    def result(self):
+        if "lost" in self.arguments[0].out:
+            raise StubRay.exceptions.RayError("first\nthe node died")
+        for _ in range(self.asked["max_retries"]):
+            with contextlib.suppress(*self.asked["retry_exceptions"]):
+                return self.function(*self.arguments)
+        return self.function(*self.arguments)
+
+
+def test_ray_runs_fits_and_begins_again_those_that_were_stopped(request_for, tmp_path: Path, monkeypatch) -> None:
+    """Two that end well or badly, one whose node shut down once, and one whose nodes die."""
+    program = tmp_path / "python"
+    program.write_text(
+        f"#!/bin/sh\necho $OMP_NUM_THREADS >> {tmp_path}/log\n"
+        f'case "$*" in *bad*) exit 3;; *stopped*) [ -e {tmp_path}/once ] || {{ touch {tmp_path}/once; exit 130; }};; esac\n'
+    )
+    program.chmod(0o755)
+    ray = StubRay()
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    requests = [request_for(name) for name in ("good", "bad", "stopped", "lost")]
+    executor = plugins.load("executors", "ray")(Resources(threads=2))
+    outcomes = {Path(one.request.out).name: one for one in executor.run(requests, tmp_path / "jobs")}
+    assert {name: one.status for name, one in outcomes.items()} == {"good": 0, "bad": 3, "stopped": 0, "lost": 1}
+    assert "left no message" in outcomes["bad"].error and outcomes["good"].error == ""
+    assert outcomes["lost"].error == "The worker was lost 4 times: the node died"
+    assert (tmp_path / "log").read_text().split() == ["2"] * 4
+    assert ray.asked["num_cpus"] == 2 and ray.connected == []
+    with pytest.raises(InputError, match="requests 3 cores, and the cluster's largest node has 2"):
+        next(plugins.load("executors", "ray")(Resources(threads=3)).run(requests, tmp_path / "jobs"))
+    assert ray.connected == []

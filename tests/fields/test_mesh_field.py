@@ -7,10 +7,11 @@ import torch
 
 from invgraphics.core import Bounds, Context, Mesh, Quantity, Scene, View, harmonics
 from invgraphics.errors import InputError
+from invgraphics.fields import visual_hull as module
 from invgraphics.fields.analytic import Sphere
 from invgraphics.fields.isosurface import extract_mesh
 from invgraphics.fields.mesh import MeshField, MeshFieldConfig
-from invgraphics.fields.visual_hull import photograph_colours
+from invgraphics.fields.visual_hull import photograph_colours, visual_hull
 from invgraphics.testing import toy_cameras
 
 BOX = Bounds(-torch.ones(3), torch.ones(3))
@@ -61,6 +62,14 @@ def test_the_hull_encloses_the_ball_closely(scene: Scene) -> None:
     error = (mesh.rgb.detach() - (mesh.vertices / radii[:, None] + 1) / 2).abs()
     assert float(error.mean()) < 0.03
     assert field.sh_rest.shape[1:] == (3, 3)
+
+
+def test_a_silhouette_is_made_once_for_all_chunks_of_voxels(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, opacity, made = visual_hull(scene, 24).mesh, View.opacity, []
+    monkeypatch.setattr(module, "CHUNK", 1000)
+    monkeypatch.setattr(View, "opacity", lambda view, index=None: made.append(view) or opacity(view, index))
+    assert torch.equal(visual_hull(scene, 24).mesh.vertices, whole.vertices)
+    assert len(made) == len(scene.train)
 
 
 def test_views_that_do_not_see_a_voxel_leave_it_alone(scene: Scene) -> None:

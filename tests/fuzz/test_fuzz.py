@@ -30,6 +30,9 @@ PAGE_SHARE = 20
 CHECKED = {("images", "*"), ("npz", "flip"), ("idr", "flip"), ("old_spz", "flip")}
 """Readers of files with checksums, and mutations: what is accepted after them reads as if nothing had happened."""
 
+WHOLE = {"idr", "llff", "npz", "ply", "compressed_ply", "spz", "old_spz", "colmap_binary", "checkpoint", "images"}
+"""Readers of files that say how long they are: of none is a beginning accepted."""
+
 
 class Drawn:
     """Decisions that Hypothesis makes and shrinks."""
@@ -112,16 +115,30 @@ def test_damaged_inputs_are_refused_or_right(good: tuple[str, Path, str, Reader]
         before = path.read_bytes()
         try:
             change = mutations.mutate(path, choose)
-            outcomes[
-                expect_fine(
-                    reader, spec_of(bad, pattern, name), f"{path.name}, {change}", bool({(name, "*"), (name, change)} & CHECKED)
-                )
-            ] += 1
+            what, unchanged = f"{path.name}, {change}", bool({(name, "*"), (name, change)} & CHECKED)
+            outcome = expect_fine(reader, spec_of(bad, pattern, name), what, unchanged)
+            outcomes[outcome] += 1
         finally:
             path.write_bytes(before)
 
     search()
     print(f"{name}: {outcomes['refused']} refused, {outcomes['accepted']} accepted")
+    assert outcomes["refused"] or name not in WHOLE, "none of the damaged files was refused"
+
+
+def test_beginnings_of_files_are_refused(good: tuple[str, Path, str, Reader]) -> None:
+    name, root, pattern, reader = good
+    if name not in WHOLE:
+        pytest.skip("a shorter file can be a whole one")
+    for path in sorted(root.glob(pattern)):
+        data = path.read_bytes()
+        try:
+            for length in sorted({0, 1, 8, len(data) // 2, len(data) - 1}):
+                path.write_bytes(data[:length])
+                outcome, answer = reader.read(spec_of(root, pattern, name))
+                assert outcome == "refused", f"the first {length} of {len(data)} bytes of {path.name}: {outcome}: {answer}"
+        finally:
+            path.write_bytes(data)
 
 
 def test_harmless_changes_are_accepted_as_the_same(good: tuple[str, Path, str, Reader]) -> None:

@@ -8,7 +8,8 @@ import torch
 from invgraphics.core import Camera, Context, Quantity, Scene, View
 from invgraphics.core.planes import homographies
 from invgraphics.errors import InputError
-from invgraphics.fields.depth_maps import DepthMapField, DepthMapsConfig, field_depth
+from invgraphics.fields import depth_maps as module
+from invgraphics.fields.depth_maps import DepthMapField, DepthMapsConfig, field_depth, stored_bytes
 from invgraphics.renderers.depth_warp import DepthWarp, DepthWarpConfig
 from invgraphics.testing import TwoBalls, check_field, check_renderer, toy_scene
 
@@ -93,7 +94,7 @@ def test_depth_of_a_field_is_the_rendered_one(scene: Scene) -> None:
     assert float((found.isfinite() == view.depth.isfinite()).float().mean()) > 0.98
     assert float((found - view.depth)[both].abs().max()) < 0.03
     field = DepthMapsConfig("field", "somewhere").converted(TwoBalls(), scene)
-    assert torch.equal(field.primitives(Quantity.DEPTH_MAPS, Context(scene.bounds))[0].depth, found)
+    assert torch.equal(field.primitives(Quantity.DEPTH_MAPS, Context(scene.bounds)).view(0).depth, found)
 
 
 def test_contracts(scene: Scene) -> None:
@@ -131,3 +132,42 @@ def test_pixels_that_do_not_count_are_not_warped(scene: Scene) -> None:
     _, opacity, *_ = shown(DepthMapField([replace(view, mask=mask)], [view.depth]), camera, scene)
     assert float(opacity[:, :8].max()) == 0.0
     assert float(opacity[:, 9:].min()) > 0.99
+
+
+def test_photographs_stay_bytes_and_show_what_floats_do(scene: Scene) -> None:
+    """Bytes in the checkpoint too: colour, alpha and a distance in float32, 8 bytes for each pixel."""
+    field = DepthMapsConfig().build(scene)
+    floats = scene.with_views(train=tuple(replace(view, image=view.colour(), alpha=view.opacity()) for view in scene.train))
+    same = DepthMapsConfig().build(floats)
+    camera = scene.test[0].camera
+    for found, expected in zip(shown(field, camera, scene), shown(same, camera, scene), strict=True):
+        torch.testing.assert_close(found, expected)
+    pictures = sum(
+        field.state_dict()[name].numel() * field.state_dict()[name].element_size() for name in ("rgb", "alpha", "depth")
+    )
+    assert pictures == stored_bytes(scene.train) == 8 * 24 * 24 * 5
+    assert stored_bytes(floats.train) == 20 * 24 * 24 * 5
+    opaque = scene.with_views(train=tuple(replace(view, alpha=None) for view in scene.train))
+    assert bool(
+        (DepthMapsConfig().build(opaque).primitives(Quantity.DEPTH_MAPS, Context(scene.bounds)).view(0).opacity() == 1).all()
+    )
+
+
+def test_checkpoints_of_earlier_versions_hold_floats(scene: Scene) -> None:
+    """And a fit to some of the photographs holds those alone."""
+    few = scene.with_views(train=scene.train[1:4])
+    field, again = DepthMapsConfig().build(few), DepthMapsConfig().build(scene)
+    old = {name: value / 255 if value.dtype == torch.uint8 else value for name, value in field.state_dict().items()}
+    again.load_state_dict(old)
+    camera = scene.test[0].camera
+    for found, expected in zip(shown(again, camera, scene), shown(field, camera, scene), strict=True):
+        torch.testing.assert_close(found, expected)
+    with pytest.raises(RuntimeError, match="size mismatch for depth"):
+        again.load_state_dict(old | {"depth": old["depth"][0]})
+
+
+def test_only_the_photographs_that_are_warped_are_made(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    field, made = DepthMapsConfig().build(scene), []
+    monkeypatch.setattr(module, "View", lambda *args, **more: made.append(1) or View(*args, **more))
+    shown(field, scene.test[0].camera, scene, views=2)
+    assert len(made) == 2

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from invgraphics import kernels
 from invgraphics.core import Camera, Context, Field, Planes, Quantity, Samples, Scene, View
+from invgraphics.core.compositing import layer_alphas_from_weights
 from invgraphics.core.planes import homographies, inverse_depths, mean_camera, widened, widest_angle
 from invgraphics.core.transforms import look_at, transform_points
 from invgraphics.errors import InputError
-from invgraphics.fields.plane_sweep import layer_alphas_from_weights, plane_sweep
+from invgraphics.fields.plane_sweep import plane_sweep
 from invgraphics.fields.planes import PlaneField, PlanesConfig
 from invgraphics.renderers.planes import PlaneRenderer
 from invgraphics.testing import check_field, check_renderer, toy_cameras, toy_scene

@@ -80,6 +80,28 @@ def test_discs_are_fitted(make_camera: Callable[..., Camera]) -> None:
     assert bool(trace.screen.gradient.any())
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])  # the reference, and the compiled kernel
+def test_absolute_gradients_are_sums_over_pixels_of_absolute_ones(
+    make_camera: Callable[..., Camera], dtype: torch.dtype
+) -> None:
+    """Against the ordinary gradients of one pixel's part of the loss at a time."""
+    view, splats = make_camera(6, 5, 7.0).to(dtype), Gaussians(**{name: x.to(dtype) for name, x in vars(gaussians(4)).items()})
+    splats.means.requires_grad_()
+    factors, ctx = torch.randn(5, 6, 3, dtype=dtype), Context(BOUNDS, training=True)
+
+    def screen(absolute: bool, at: tuple[slice | int, slice | int]) -> torch.Tensor:
+        config = SplattingConfig(absolute_gradients=absolute)
+        picture, trace = Splatting(config).render_image(Fixed(splats), view, ctx)
+        (picture.rgb * factors)[at].sum().backward()
+        assert trace.screen is not None and trace.screen.gradient is not None
+        return trace.screen.gradient
+
+    whole = (slice(None), slice(None))
+    by_pixel = sum(screen(False, (row, column)).abs() for row in range(5) for column in range(6))
+    torch.testing.assert_close(screen(True, whole), by_pixel, rtol=1e-3, atol=1e-5)
+    assert bool((by_pixel > 1.1 * screen(False, whole).abs()).any())
+
+
 def test_far_splats_keep_their_energy(make_camera: Callable[..., Camera]) -> None:
     """A field seen at a quarter of the size: with compensation the light per solid angle stays, without it grows."""
     splats = gaussians(30, scales=torch.full((30, 3), 0.01, dtype=F64), opacities=torch.full((30,), 0.9, dtype=F64))

@@ -27,7 +27,7 @@ from invgraphics.report.statistics.effects import effects_of
 from invgraphics.report.statistics.intervals import Estimate
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.summary import pareto_front, quality_columns, summarise
-from invgraphics.report.statistics.time_to_quality import seconds_to_reach, time_to_quality
+from invgraphics.report.statistics.time_to_quality import span_to_reach, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.report.wording import budget_words, listing, significant_decimals, times
 from invgraphics.runs.run import Run
@@ -52,7 +52,8 @@ def test_time_to_reach_is_the_first_crossing(built_report: Path) -> None:
         measured = [(line["seconds"], line["psnr"]) for line in lines if "psnr" in line]
         for level in (12.0, 20.0, 25.0, 99.0):
             reached = [seconds for seconds, psnr in measured if psnr >= level]
-            assert seconds_to_reach(run, level) == (min(reached) if reached else None)
+            before = [seconds for seconds, _ in measured if reached and seconds < min(reached)]
+            assert span_to_reach(run, level) == ((max(before, default=0.0), min(reached)) if reached else None)
     reach = time_to_quality(comparison)
     assert reach is not None
     assert list(reach.levels) == sorted(reach.levels)

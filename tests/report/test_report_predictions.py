@@ -12,7 +12,7 @@ from scipy import stats
 
 from invgraphics.errors import InputError
 from invgraphics.report.data.factors import Factor, Lost, Observation
-from invgraphics.report.statistics.effects import effects_on
+from invgraphics.report.statistics.effects import contrasts_of, effects_of
 from invgraphics.report.statistics.predictions import judge_predictions, predictions_sentence
 from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.scores import Score
@@ -151,7 +151,7 @@ def test_levels_that_one_side_lacks_are_left_out(planned: list[tuple[str, str]])
     assert judged.estimate is not None
     assert judged.estimate.mean == pytest.approx(0.02)
     quantity = quality_quantity("psnr", made[0].run.scores.quality["psnr"])
-    (effect,) = effects_on(quantity, [Factor(X, ("false", "true"), "false")], made)
+    (effect,) = effects_of(contrasts_of([Factor(X, ("false", "true"), "false")]), quantity, made)
     assert (judged.estimate.mean, judged.estimate.p) == pytest.approx((effect.estimate.mean, effect.estimate.p))
 
 

@@ -12,7 +12,7 @@ from made_up_runs import made_up_run
 
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
-from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of, effects_on
+from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
 from invgraphics.report.statistics.leaders import lead_contrasts
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.sentences import effect_sentence
@@ -45,7 +45,7 @@ def observe(shape: tuple[int, int], values: Values, factor: Factor = METHODS, **
 
 
 def effect_of(shape: tuple[int, int], values: Values, factor: Factor = METHODS, lost: tuple[Lost, ...] = ()) -> Effect:
-    (effect,) = effects_on(PSNR, [factor], observe(shape, values, factor), lost)
+    (effect,) = effects_of(contrasts_of([factor]), PSNR, observe(shape, values, factor), lost)
     return effect
 
 

@@ -14,7 +14,7 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.weightstats import DescrStatsW
 
 from invgraphics.report.data.factors import METHOD, Factor, Observation
-from invgraphics.report.statistics.effects import Effect, effects_on
+from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
 from invgraphics.report.statistics.intervals import Estimate, band, estimate, holm
 from invgraphics.report.statistics.pairing import Contrast, sample
 from invgraphics.report.statistics.sentences import effect_sentence
@@ -82,7 +82,7 @@ def test_views_as_units_would_call_most_null_studies_an_effect() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 4, 8), (3, 3, 8)])
 def test_planted_effect_is_found_and_nothing_else(shape: tuple[int, int, int]) -> None:
-    effects = effects_on(PSNR, FACTORS[1:], simulated(np.random.default_rng(3), FACTORS[1:], shape, effect=-9.0))
+    effects = effects_of(contrasts_of(FACTORS[1:]), PSNR, simulated(np.random.default_rng(3), FACTORS[1:], shape, effect=-9.0))
     assert [effect.found for effect in effects] == [effect.factor == "data.train_views" for effect in effects]
     assert effects[0].estimate.low < -9.0 < effects[0].estimate.high
     assert effect_sentence(effects[0]).startswith("data.train_views 20 instead of 40 costs ")

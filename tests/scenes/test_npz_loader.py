@@ -52,6 +52,20 @@ def test_an_object_by_itself_is_in_a_box(tmp_path: Path, apart: bool) -> None:
     assert_dots_are_found(scene)
 
 
+@pytest.mark.parametrize("most", [1, 255])
+def test_bytes_of_zero_and_one_are_all_or_nothing(tmp_path: Path, most: int) -> None:
+    """Unless any view has more: then a view whose alpha is 1 at most is nearly transparent."""
+    values = arrays()
+    alpha = np.zeros(values["images"].shape[:3], np.uint8)
+    alpha[:, 20:40], alpha[1, 20:40] = most, 1
+    bounds = np.array([[-1.0, -1, -1], [1, 1, 2]])
+    scene = Npz().load(write(tmp_path, **values, alpha=alpha, bounds=bounds), SceneOptions())
+    for view in (*scene.train, *scene.test):
+        assert view.alpha is not None
+        expected = (1 if most == 255 else 255) if view.name == "1" else 255
+        assert view.alpha[30, 0] == expected and view.alpha[0, 0] == 0
+
+
 def test_everything_optional(tmp_path: Path) -> None:
     """Alpha apart, floats, per-view lenses, own split, a box, geometry and points in the world's frame."""
     values = arrays(with_alpha=True)

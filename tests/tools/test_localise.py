@@ -43,7 +43,6 @@ def test_refined_poses_are_scored_and_shown(toy_folder: Path, tmp_path: Path, ca
         assert quality["unit"] == unit
         assert 0 < quality["mean"] <= quality["max"] < 30
         assert len(quality["per_training_view"]) == 12
-    assert "depth_abs_rel" not in scores["quality"] or scores["quality"]["depth_abs_rel"]["mean"] > 0
     # Scored again from the checkpoint: the same numbers.
     assert command(["evaluate", str(out)]) == 0
     again = json.loads((out / "scores.json").read_text())

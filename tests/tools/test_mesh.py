@@ -153,6 +153,11 @@ def test_exact_depth_pictures_fuse_to_the_ball() -> None:
     assert float((surface.rgb - (surface.vertices + 1) / 2).abs().mean()) < 0.03
 
 
+def test_voxels_that_do_not_fit_into_memory_are_refused_before_a_picture_is_rendered() -> None:
+    with pytest.raises(InputError, match=r"Depth fusion with 1,000,000,000,000 voxels needs about 24,000 GB"):
+        fuse_depth(_all_around(), lambda index: pytest.fail("rendered"), BOX, 10_000)
+
+
 def test_gaussians_on_a_sphere_fuse_to_the_sphere() -> None:
     """Splats are fat: seen aslant, their surface lies up to two standard deviations outside of their centres."""
     direction = torch.nn.functional.normalize(torch.randn(3000, 3, generator=torch.Generator().manual_seed(0)), dim=1)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -23,8 +24,9 @@ from invgraphics.runs.study import CellRecord, StudyRecord
 from invgraphics.scenes.npz import save_npz
 from invgraphics.testing import toy_scene
 from invgraphics.tools import infer as module
-from invgraphics.tools import inference_pictures
+from invgraphics.tools import infer_photo, inference_pictures
 from invgraphics.tools.infer import InferRequest
+from invgraphics.tools.infer_photo import PhotoRequest
 from invgraphics.tools.recipe_check import check_recipes
 from invgraphics.training.codes.inference import CodeInference, infer_codes
 from invgraphics.training.codes.penalty import CodePenalty
@@ -131,6 +133,51 @@ def test_from_a_study_to_a_page(fitted_study: Path, tmp_path: Path, monkeypatch:
     assert check_recipes(Path("inferred")).runs == 2
     assert command([*words, "--views", "3"]) == 2 and "has 2 observed views, not 3" in capsys.readouterr().err
     assert command([*words, "--views", "1", "--steps", "3"]) == 2 and "another inference" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "position", "forward"),
+    [
+        (0.0, 0.0, (3.5, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+        (90.0, 0.0, (0.5, 3.0, 0.0), (0.0, -1.0, 0.0)),
+        (180.0, 30.0, (0.5 - 3 * 0.75**0.5, 0.0, 1.5), (0.75**0.5, 0.0, -0.5)),
+    ],
+)
+def test_a_viewpoint_by_angles(toy_class: Scene, azimuth: float, elevation: float, position, forward) -> None:
+    """On the sphere around the box's middle whose radius is the training cameras' mean distance, here of 2 and 4; upright."""
+    views = []
+    for view, place in zip(toy_class.train, ((2.5, 0.0, 0.0), (0.5, 4.0, 0.0)), strict=False):
+        pose = view.camera.cam_to_world.clone()
+        pose[:3, 3] = torch.tensor(place)
+        views.append(replace(view, camera=view.camera.moved(pose)))
+    bounds = replace(toy_class.bounds, lo=torch.tensor([-0.5, -1, -1]), hi=torch.tensor([1.5, 1, 1]))
+    request = PhotoRequest(Path("run"), Path("a.png"), Path("b.png"), azimuth=azimuth, elevation=elevation)
+    camera = infer_photo._camera(request, replace(toy_class, train=tuple(views), bounds=bounds))
+    torch.testing.assert_close(camera.position, torch.tensor(position), atol=1e-5, rtol=0)
+    torch.testing.assert_close(camera.cam_to_world[:3, 2], torch.tensor(forward), atol=1e-5, rtol=0)
+    assert float(camera.cam_to_world[2, 0]) == pytest.approx(0, abs=1e-6)  # its +x is level
+    assert float(camera.cam_to_world[2, 1]) < 0  # and its +y points down
+    assert torch.equal(camera.focal, toy_class.train[0].camera.focal)
+
+
+class OnGpu(torch.Tensor):
+    """Numbers that NumPy cannot read where they are; what is computed from them is on the CPU, as pictures are."""
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    def numpy(self, **options):
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    def cpu(self):
+        return self.as_subclass(torch.Tensor)
+
+
+def test_a_code_on_another_device_is_written(fitted_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(infer_photo, "infer_codes", lambda *_: [torch.full((8,), 0.5).as_subclass(OnGpu)])
+    picture = str(next(fitted_study.glob("runs/film/truth/*/0000.png")))
+    assert command(["infer", str(fitted_study / "runs/film"), picture, "--view", "0002-00", "--out", "photo.png"]) == 0
+    assert np.load("photo.npz")["code"].tolist() == [0.5] * 8
 
 
 def test_the_instance_in_a_photograph(fitted_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:

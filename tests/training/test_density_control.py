@@ -14,6 +14,9 @@ from invgraphics.training.density_control import DensityControlConfig
 from invgraphics.training.hooks import FitState
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 
+XYZ_TO_YZX = (0.5, 0.5, 0.5, 0.5)
+"""The quaternion (w, x, y, z) of the turn that takes +x to +y, +y to +z and +z to +x; its inverse takes +x to +z."""
+
 
 def _scene() -> Scene:
     eye = torch.tensor([0.0, -4.0, 0.0])
@@ -90,6 +93,20 @@ def test_large_gaussians_split_into_two_smaller_ones_nearby() -> None:
     assert torch.allclose(state.field.log_scales[children].exp(), torch.tensor(0.5 / 1.6))
     offsets = (state.field.means[children] - parent).norm(dim=1)
     assert bool((offsets > 0).all()) and bool((offsets < 0.5 * 5).all())
+
+
+def test_parts_of_a_split_gaussian_lie_along_its_turned_axes() -> None:
+    """The long axis points along y, and so do the offsets of two parts of each of 2,000 parents."""
+    state = _state(2000)
+    with torch.no_grad():
+        state.field.means.zero_()
+        state.field.quaternions[:] = torch.tensor(XYZ_TO_YZX)
+        state.field.log_scales[:] = torch.tensor([0.5, 0.05, 0.005]).log()
+    hook = DensityControlConfig(every=10, threshold=1.0).build()
+    _gradients(state, hook, [1.0] * 2000)
+    hook.after_step(state)
+    assert state.field.primitive_count() == 4000
+    torch.testing.assert_close(state.field.means.std(dim=0), torch.tensor([0.005, 0.5, 0.05]), rtol=0.1, atol=0)
 
 
 def test_transparent_gaussians_are_pruned_but_for_one() -> None:

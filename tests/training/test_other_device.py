@@ -41,6 +41,6 @@ def test_the_pretended_device_does_not_mix() -> None:
             there + here
         with pytest.raises(RuntimeError, match="generator"):
             torch.rand(3, device=device, generator=torch.Generator())
-        with pytest.raises(Exception, match=r"numpy|meta"):
+        with pytest.raises((RuntimeError, TypeError), match="numpy"):
             there.numpy()
         assert (there + here.to(device)).cpu().tolist() == [2, 2, 2]

@@ -272,6 +272,14 @@ def test_poses_come_back(blobs: Scene) -> None:
     assert float(after.translation_per_cent.median()) < 0.4 * float(before.translation_per_cent.median())
 
 
+def test_a_photograph_is_composited_once_for_all_steps(blobs: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    over, made = View.over, []
+    monkeypatch.setattr(View, "over", lambda view, *rest: made.append(view) or over(view, *rest))
+    model = Model(Blobs(), VolumetricConfig(StratifiedConfig(8)).build(blobs), blobs.bounds)
+    refine_pose(model, blobs.test[0], blobs, PoseDescent(steps=5, rays=20))
+    assert len(made) == 1
+
+
 def test_a_photograph_finds_its_pose(blobs: Scene) -> None:
     view = blobs.test[0]
     wrong = view.camera.moved(view.camera.cam_to_world @ se3_exp(torch.tensor([0.08, -0.06, 0.1, 0.1, -0.1, 0.15])))

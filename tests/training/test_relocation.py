@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_density_control import _state
+from test_density_control import XYZ_TO_YZX, _state
 
 from invgraphics.errors import InputError
 from invgraphics.training.relocation import RelocationConfig, relocated_opacity
@@ -58,11 +58,13 @@ def test_growth_ends_at_the_cap() -> None:
     assert all(len(value) == 30 for name, value in state.optimiser.state().items() if name.endswith("exp_avg"))
 
 
-def test_noise_moves_the_faint_along_their_long_axis() -> None:
+@pytest.mark.parametrize(("quaternion", "deviations"), [((1.0, 0, 0, 0), (0.1, 0.01, 0.001)), (XYZ_TO_YZX, (0.001, 0.1, 0.01))])
+def test_noise_moves_the_faint_along_their_long_axis(quaternion: tuple[float, ...], deviations: tuple[float, ...]) -> None:
+    """The first axis is the long one; turned, it points along y, and the second along z."""
     state = _state(2000)
     with torch.no_grad():
         state.field.means.zero_()  # so that small steps are not rounded away
-        state.field.quaternions[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        state.field.quaternions[:] = torch.tensor(quaternion)
         state.field.log_scales[:] = torch.tensor([0.1, 0.01, 0.001]).log()
         state.field.opacity_logits[:1000] = math.log(0.001 / 0.999)
         state.field.opacity_logits[1000:] = math.log(0.9 / 0.1)
@@ -72,7 +74,7 @@ def test_noise_moves_the_faint_along_their_long_axis() -> None:
     moved = state.field.means.detach() - before
     assert not moved[1000:].any()
     # Covariance times normal draws, times gate, learning rate and strength.
-    expected = torch.tensor([0.01, 1e-4, 1e-6]) * float(torch.sigmoid(torch.tensor(100 * 0.004))) * 1e6 * 1e-9
+    expected = torch.tensor(deviations).square() * float(torch.sigmoid(torch.tensor(100 * 0.004))) * 1e6 * 1e-9
     torch.testing.assert_close(moved[:1000].std(dim=0), expected, rtol=0.1, atol=0)
 
 

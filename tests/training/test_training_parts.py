@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Batch, Bounds, Context, Rays, Rendering, Samples, Scene, Trace
+from invgraphics.core import Batch, Bounds, Context, Rays, Rendering, Samples, Scene, Screen, Trace
 from invgraphics.core.samples import FieldValues
 from invgraphics.errors import InputError
 from invgraphics.runs import checkpoint
@@ -13,7 +13,7 @@ from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.hooks import FitState, Hook, ShDegreeConfig
-from invgraphics.training.losses import CoarseLoss, DistortionLoss, PhotometricLoss, SsimLoss
+from invgraphics.training.losses import CoarseLoss, DistortionLoss, OpacityLoss, PhotometricLoss, ScaleLoss, SsimLoss
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 
 BOX = Bounds(-torch.ones(3), torch.ones(3))
@@ -117,6 +117,15 @@ def test_ssim_loss_of_the_truth_is_zero() -> None:
     assert SsimLoss(1.0)(picture, Trace(), batch, CTX) == pytest.approx(0.0, abs=1e-5)
 
 
+def test_losses_on_gaussians_are_means_over_all_of_them() -> None:
+    picture, batch = _rendering(2, 3)
+    opacities, scales = torch.tensor([0.2, 0.8]), torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.9]])
+    trace = Trace(screen=Screen(torch.zeros(2, 2), torch.tensor([1.0, 0.0]), 3, 2, opacities=opacities, scales=scales))
+    assert float(OpacityLoss(2.0)(picture, trace, batch, CTX)) == pytest.approx(2 * 0.5)
+    assert float(ScaleLoss(0.5)(picture, trace, batch, CTX)) == pytest.approx(0.5 * 0.4)
+    assert float(OpacityLoss()(picture, Trace(), batch, CTX)) == float(ScaleLoss()(picture, Trace(), batch, CTX)) == 0
+
+
 def test_learning_rates_follow_progress() -> None:
     parameter = torch.nn.Parameter(torch.zeros(2))
     config = OptimiserConfig({"a": GroupConfig("field", 1e-2, 1e-4, warmup=0.1, per_extent=True)})
@@ -176,7 +185,7 @@ def test_background_is_random_only_where_there_is_alpha(scene) -> None:
 def test_ray_count_follows_samples(scene) -> None:
     batches = Batches(BatchConfig(rays=100, samples=5000), scene, torch.Generator(), torch.device("cpu"))
     for _ in range(30):
-        batches.observe(100, 25 * len(batches.rays()[0]))
+        batches.observe(25 * len(batches.rays()[0]))
     assert len(batches.rays()[0]) == pytest.approx(200, abs=2)
 
 

@@ -70,6 +70,15 @@ def weights_from_alphas(alpha: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]
     return torch.stack(weights)
 
 
+def layer_alphas_from_weights(weights: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
+    """Alphas of layers, nearest first, from their weights, whose sum is at most 1; the inverse of `weights_from_alphas`.
+
+    In the weights' own precision, as layers fill the memory; `alphas_from_weights` is for the samples of one ray.
+    """
+    before = weights.cumsum(dim=0) - weights
+    return (weights / (1 - before).clamp_min(MIN_TRANSMITTANCE)).clamp(0, 1)
+
+
 def optical_depth_before(optical_depth: Float[Tensor, "k bins"]) -> Float[Tensor, "k bins"]:
     """Optical depth in front of each of a ray's consecutive intervals."""
     return pad(optical_depth[:, :-1].cumsum(dim=1), (1, 0))

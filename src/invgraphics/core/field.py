@@ -107,7 +107,7 @@ class Field(nn.Module, ABC):
         return None
 
     def primitives(self, want: Quantity, ctx: Context) -> Any:
-        """The explicit primitives of this field: `Gaussians` for ``Quantity.GAUSSIANS``, `Points` for ``Quantity.POINTS``.
+        """The explicit primitives of this field, such as `Gaussians` for ``GAUSSIANS`` or `DepthMaps` for ``DEPTH_MAPS``.
 
         Raises:
             NotComposableError: it has none of that kind.

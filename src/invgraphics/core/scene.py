@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -83,6 +84,19 @@ class View:
 
 def _floats(values: Tensor) -> Tensor:
     return values.float() / 255 if values.dtype == torch.uint8 else values.float()
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMaps:
+    """Photographs with depth, each made when it is asked for: of many, a picture is warped from a few.
+
+    Attributes:
+        cameras: of all of them.
+        view: the photograph with an index, and its depth.
+    """
+
+    cameras: tuple[Camera, ...]
+    view: Callable[[int], View]
 
 
 @dataclass(frozen=True, eq=False)

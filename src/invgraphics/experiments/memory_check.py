@@ -11,6 +11,7 @@ from torch import nn
 from invgraphics.core import Scene, harmonics
 from invgraphics.core.lattice import LatticeField
 from invgraphics.errors import InputError
+from invgraphics.fields.depth_maps import DepthMapsConfig, stored_bytes
 from invgraphics.fields.encodings.lattices import LatticeConfig
 from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.fields.planes import PlanesConfig
@@ -53,6 +54,9 @@ def check_memory(method: Method, scene: Scene) -> None:
         _check_primitives(recipe.field, method.name, scene)
     elif isinstance(recipe.field, PlanesConfig):
         _check_planes(recipe.field, method.name, scene)
+    elif isinstance(recipe.field, DepthMapsConfig):
+        what = f"The field of {method.name} with {len(scene.train):,} photographs and their depth"
+        check_fits(stored_bytes(scene.train), what, "Choose a lower data.train_views, or smaller pictures with --size.")
     else:
         _check_network(recipe, method.name, scene, rays * on_each)
 

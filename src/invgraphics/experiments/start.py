@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from invgraphics.experiments.memory_check import COPIES, RAY_BYTES
 from invgraphics.experiments.mesh_files import mesh_from_file
 from invgraphics.experiments.progress import warn
 from invgraphics.fields.mesh import MeshFieldConfig
+from invgraphics.memory import total_bytes
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.folder import RunFolder, check_run
@@ -130,7 +130,7 @@ def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
         held: bytes, of parameters, gradients, moments, samples and pictures.
 
     Raises:
-        InputError: the primitives need more than this machine has.
+        InputError: the primitives need more than this machine, or the container around the process, has.
     """
     field = plan.model.field
     now = field.primitive_count() or 0
@@ -154,5 +154,5 @@ def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
 
 def _machine_bytes(device: torch.device) -> int:
     if device.type == "cuda":
-        return torch.cuda.get_device_properties(0).total_memory
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        return torch.cuda.get_device_properties(device).total_memory
+    return total_bytes()

@@ -13,6 +13,7 @@ from invgraphics.core.camera import Camera
 from invgraphics.core.mesh import Mesh
 from invgraphics.core.rendering import Rendering
 from invgraphics.fields.isosurface import Extracted, VoxelGrid, compacted, marching_cubes, without_specks
+from invgraphics.memory import check_fits
 
 TRUNCATION = 4.0
 """Truncation distance of signed distances, in voxels."""
@@ -20,6 +21,8 @@ GRAZING = 0.05
 """Least weight of a picture that grazes a surface; one that faces it has 1."""
 CHUNK = 1 << 20
 """Voxels that are evaluated together."""
+VOXEL_BYTES = 24
+"""Of a voxel's sums: of distances, weights, and colours with theirs."""
 
 
 @torch.no_grad()
@@ -37,9 +40,10 @@ def fuse_depth(cameras: Sequence[Camera], render: Callable[[int], Rendering], bo
         resolution: voxels along the longest edge.
 
     Raises:
-        InputError: the pictures show no surface.
+        InputError: the pictures show no surface, or the voxels do not fit into memory.
     """
     grid = VoxelGrid.across(bounds, resolution)
+    check_fits(VOXEL_BYTES * len(grid), f"Depth fusion with {len(grid):,} voxels", "Choose a lower resolution.")
     band = TRUNCATION * grid.step
     sums, counts, light = torch.zeros(len(grid)), torch.zeros(len(grid)), torch.zeros(len(grid), 4)
     for index, camera in enumerate(cameras):

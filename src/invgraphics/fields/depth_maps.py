@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from invgraphics.core import Camera, Context, Field, FieldValues, Quantity, Rays, Samples, Scene, View
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.scene import DepthMaps
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.convert import require_density, uniform_rendering_weights
 
@@ -83,7 +84,7 @@ def _depth_along(field: Field, rays: Rays, bounds: Bounds) -> Float[Tensor, " n"
 
 
 class DepthMapField(Field):
-    """Photographs with depth, all of one size; without parameters.
+    """Photographs with depth, all of one size; without parameters. Colour and alpha stay the bytes that most photographs have.
 
     Args:
         views: the photographs.
@@ -110,13 +111,10 @@ class DepthMapField(Field):
         if len(sizes) > 1:
             remedy = "Give one size with --size WIDTHxHEIGHT."
             raise InputError("Warping by depth needs training views of one size; these differ.", remedy)
-        self.names = tuple(view.name for view in views)
-        self.register_buffer("rgb", torch.stack([view.colour() for view in views]))
-        self.register_buffer("alpha", torch.stack([view.opacity() for view in views]))
-        depth = torch.stack(list(depths))
-        everywhere = torch.ones(depth.shape[1:], dtype=torch.bool)
-        masks = [everywhere if view.mask is None else view.mask for view in views]
-        self.register_buffer("depth", torch.where(depth.isinf() | ~torch.stack(masks), 0.0, depth))
+        opaque = torch.tensor(255, dtype=torch.uint8).expand(views[0].image.shape[:2])
+        self.register_buffer("rgb", _stacked([view.image for view in views]))
+        self.register_buffer("alpha", _stacked([opaque if view.alpha is None else view.alpha for view in views]))
+        self.register_buffer("depth", torch.stack([_finite(*pair) for pair in zip(views, depths, strict=True)]))
         for name, values in (("poses", "cam_to_world"), ("focal", "focal"), ("centre", "principal_point")):
             self.register_buffer(name, torch.stack([getattr(view.camera, values) for view in views]).detach().clone())
 
@@ -124,13 +122,46 @@ class DepthMapField(Field):
         """Refuse pointwise queries: this field has photographs only."""
         raise NotComposableError(f"DepthMapField has no {want.words()} at points.", "It provides depth_maps.")
 
-    def primitives(self, want: Quantity, ctx: Context) -> tuple[View, ...]:
-        """The photographs, each with its depth, in floats."""
+    def primitives(self, want: Quantity, ctx: Context) -> DepthMaps:
+        """The photographs, each with its depth."""
         if want != Quantity.DEPTH_MAPS:
             return super().primitives(want, ctx)
         height, width = self.depth.shape[1:]
         lenses = zip(self.poses, self.focal, self.centre, strict=True)
-        cameras = [Camera(pose, focal, centre, width, height) for pose, focal, centre in lenses]
-        depths = torch.where(self.depth > 0, self.depth, torch.inf)
-        layers = zip(cameras, self.rgb, self.names, self.alpha, depths, strict=True)
-        return tuple(View(camera, rgb, name, alpha=alpha, depth=depth) for camera, rgb, name, alpha, depth in layers)
+        cameras = tuple(Camera(pose, focal, centre, width, height) for pose, focal, centre in lenses)
+
+        def view(index: int) -> View:
+            depth = torch.where(self.depth[index] > 0, self.depth[index], torch.inf)
+            return View(cameras[index], self.rgb[index], str(index), alpha=self.alpha[index], depth=depth)
+
+        return DepthMaps(cameras, view)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Load tensors, as many photographs as the checkpoint holds: a fit may have seen only some of the scene's.
+
+        Those of earlier versions are floats.
+        """
+        for name, value in list(self.named_buffers()):
+            given = state_dict.get(prefix + name)
+            if given is not None and given.ndim == value.ndim:
+                setattr(self, name, torch.empty_like(given, device=value.device))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def stored_bytes(views: Sequence[View]) -> int:
+    """Bytes of a `DepthMapField` of photographs, before it is made."""
+    each = 1 if all(view.image.dtype == torch.uint8 for view in views) else 4
+    return sum((4 * each + 4) * view.camera.width * view.camera.height for view in views)
+
+
+def _stacked(pictures: Sequence[Tensor]) -> Tensor:
+    """Pictures as bytes where all of them are, else as floats in [0, 1]."""
+    if all(picture.dtype == torch.uint8 for picture in pictures):
+        return torch.stack(list(pictures))
+    return torch.stack([picture / 255 if picture.dtype == torch.uint8 else picture.float() for picture in pictures])
+
+
+def _finite(view: View, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """A view's depth, 0 where nothing is hit or the pixel does not count."""
+    absent = depth.isinf() if view.mask is None else depth.isinf() | ~view.mask
+    return torch.where(absent, 0.0, depth)

@@ -110,7 +110,7 @@ class GaussianFieldConfig:
 
     def from_points(self, points: Points, scene: Scene) -> GaussianField:
         """Initialise one Gaussian per point, coloured in the scene's colour space, scaled by its neighbours' distances."""
-        n, rgb = len(points), points.rgb
+        n = len(points)
         scales = starting_scales(points.position, scene.bounds) * self.scale_factor
         logit = torch.logit(torch.tensor(self.opacity))
         tensors = {
@@ -118,7 +118,7 @@ class GaussianFieldConfig:
             "quaternions": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
             "log_scales": scales.log()[:, None].repeat(1, 3),
             "opacity_logits": logit.repeat(n),
-            "sh_dc": ((rgb - 0.5) / harmonics.BAND_0)[:, None, :],
+            "sh_dc": harmonics.constant(points.rgb),
             "sh_rest": torch.zeros(n, harmonics.count(self.sh_degree) - 1, 3),
         }
         few = not self.dropout_views or len(scene.train) <= self.dropout_views

@@ -7,18 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core import Camera, Scene, View
+from invgraphics.core.compositing import layer_alphas_from_weights
 from invgraphics.core.planes import homographies, warp
 
 WHOLE = 0.999
 """Share of the pixels around a texel's image that must be valid (`View.mask`) for it to be seen."""
 FEW = 2.0
 """Views that must see a texel for their agreement to count in full."""
-
-
-def layer_alphas_from_weights(weights: Float[Tensor, "p h w"]) -> Float[Tensor, "p h w"]:
-    """Opacities, nearest plane first, with which compositing gives each plane the weight ``weights`` (their sum at most 1)."""
-    before = weights.cumsum(dim=0) - weights
-    return (weights / (1 - before).clamp_min(1e-6)).clamp(0, 1)
 
 
 @torch.no_grad()

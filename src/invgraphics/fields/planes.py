@@ -10,10 +10,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics.core import Camera, Context, Field, FieldValues, Planes, Quantity, Samples, Scene
+from invgraphics.core.compositing import layer_alphas_from_weights
 from invgraphics.core.planes import WIDEST, inverse_depths, mean_camera, widened, widest_angle
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.mlp import Mlp
-from invgraphics.fields.plane_sweep import layer_alphas_from_weights, plane_sweep
+from invgraphics.fields.plane_sweep import plane_sweep
 
 EPS = 1e-4
 """Colours and opacities are kept this far from 0 and 1 before their logit is taken."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
@@ -49,9 +49,10 @@ def visual_hull(scene: Scene, resolution: int) -> Extracted:
     coverage = torch.ones(len(grid))
     seen = torch.zeros(len(grid), dtype=torch.bool)
     for view in scene.train:
+        layers = _silhouette(view)
         alive = (coverage > CARVED).nonzero()[:, 0]
         for part in alive.split(CHUNK):
-            alpha, inside = _silhouette_at(grid.at(part), view)
+            alpha, inside = _silhouette_at(grid.at(part), view, layers)
             coverage[part] = torch.where(inside, torch.minimum(coverage[part], alpha), coverage[part])
             seen[part] |= inside
     volume = pad(torch.where(seen, coverage, 0.0).view(grid.shape), (1,) * 6)
@@ -60,15 +61,21 @@ def visual_hull(scene: Scene, resolution: int) -> Extracted:
     return without_specks(Mesh(grid.origin + grid.step * (vertices - 1), faces))
 
 
-def _silhouette_at(points: Float[Tensor, "n 3"], view: View) -> tuple[Float[Tensor, " n"], Tensor]:
+def _silhouette(view: View) -> Float[Tensor, "c h w"]:
+    """A view's alpha, and its mask where it has one."""
+    return torch.stack([view.opacity()] if view.mask is None else [view.opacity(), view.mask.float()])
+
+
+def _silhouette_at(
+    points: Float[Tensor, "n 3"], view: View, layers: Float[Tensor, "c h w"]
+) -> tuple[Float[Tensor, " n"], Bool[Tensor, " n"]]:
     """Alpha at the images of points, bilinear between pixel centres, and whether the view says anything about each."""
     camera = view.camera
     place, z = camera.project(points)
     size = torch.tensor([camera.width, camera.height], dtype=place.dtype)
     inside = (z > 0) & (place >= 0).all(dim=1) & (place <= size).all(dim=1)
-    layers = [view.opacity()] if view.mask is None else [view.opacity(), view.mask.float()]
     at = torch.where(inside[:, None], 2 * place / size - 1, 0.0).float()
-    values = grid_sample(torch.stack(layers)[None], at[None, None], padding_mode="border", align_corners=False)[0, :, 0]
+    values = grid_sample(layers[None], at[None, None], padding_mode="border", align_corners=False)[0, :, 0]
     return values[0], inside if view.mask is None else inside & (values[1] > 0.5)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from invgraphics.core import Camera, Context, Field, Quantity, Renderer, Rendering, Scene, Trace, View
+from invgraphics.core.scene import DepthMaps
 from invgraphics.renderers.base import MIN_SURFACE_ALPHA, normals_from_depth, to_rendering
 
 LEAST_COVER = 1e-3
@@ -57,11 +58,11 @@ class DepthWarp(Renderer):
 
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
         """Render every pixel."""
-        views: tuple[View, ...] = field.primitives(Quantity.DEPTH_MAPS, ctx)
-        away = torch.stack([(view.camera.position - camera.position).norm() for view in views]).detach()
-        means, filled = self._warp(views[int(away.argmin())], camera)
+        maps: DepthMaps = field.primitives(Quantity.DEPTH_MAPS, ctx)
+        away = torch.stack([(one.position - camera.position).norm() for one in maps.cameras]).detach()
+        means, filled = self._warp(maps.view(int(away.argmin())), camera)
         for index in away.argsort(stable=True)[1 : self.config.views].tolist():
-            more, reached = self._warp(views[index], camera)
+            more, reached = self._warp(maps.view(index), camera)
             means = torch.where((reached & ~filled)[:, None], more, means)
             filled = filled | reached
         means = means.view(camera.height, camera.width, 5)

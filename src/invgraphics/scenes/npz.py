@@ -129,6 +129,8 @@ def _read(path: Path) -> Arrays:
             raise InputError(f"'{key}' of {path} has shape {arrays[key].shape}, expected {expected}.")
         if key in arrays and arrays[key].dtype.kind not in "fiub":
             raise InputError(f"'{key}' of {path} holds {arrays[key].dtype}, not numbers.")
+    if (alpha := arrays.get("alpha")) is not None and alpha.dtype == np.uint8 and alpha.max(initial=0) == 1:  # 0, 1 are meant
+        arrays["alpha"] = alpha * np.uint8(255)
     return arrays
 
 
@@ -225,9 +227,7 @@ def _view(path: Path, arrays: Arrays, i: int, named: tuple[Camera, str], frame: 
 def _pixels(arrays: Arrays, i: int, path: Path) -> UInt8[np.ndarray, "h w c"]:
     """Straight colour of a view, or colour and alpha."""
     pixels, alpha = _bytes(arrays["images"][i], "images", path), arrays.get("alpha")
-    whole = alpha is not None and alpha.dtype == np.uint8 and alpha.max() == 1  # of all views: 0 and 1 are meant
-    factor = np.uint8(255 if whole else 1)
-    return pixels if alpha is None else np.dstack([pixels[:, :, :3], factor * _bytes(alpha[i], "alpha", path)])
+    return pixels if alpha is None else np.dstack([pixels[:, :, :3], _bytes(alpha[i], "alpha", path)])
 
 
 def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shape"]:

@@ -82,7 +82,7 @@ def infer_photo(request: PhotoRequest) -> float:
         (code,) = infer_codes(model, scene, [[photo]], CodeInference(steps=request.steps))
         inferred = replace(model, field=model.field.at(code))
         _draw(request.out, scene, photo, [inferred.render(one) for one in (camera, *_around(camera, scene))])
-        write_arrays(request.out.with_suffix(".npz"), {"code": code.numpy()})
+        write_arrays(request.out.with_suffix(".npz"), {"code": code.cpu().numpy()})
     return -10 * math.log10(max(photometric_error(inferred, photo, scene), 1e-10))
 
 

@@ -13,9 +13,7 @@ from torch import Tensor
 from invgraphics.core import Batch, Camera, Rays, Scene, View
 from invgraphics.core.camera import rays_through
 from invgraphics.scenes.scales import resized_view
-
-REJECTION_FACTOR = 16
-"""Candidates drawn per foreground pixel before all foreground pixels are listed: enough where a tenth of all pixels is."""
+from invgraphics.training.views.pixels import RandomPixels
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ class Batches:
         self._order = torch.zeros(0, dtype=torch.int64)
         self._rays = config.rays
         self._scaled_views: dict[int, tuple[float, View]] = {}
-        self._foreground_counts: dict[tuple[int, tuple[int, int]], tuple[int, int]] = {}
+        self._pixels = RandomPixels(generator)
         self._pool = _Pool()
 
     def background(self) -> Float[Tensor, 3]:
@@ -143,8 +141,8 @@ class Batches:
         inside = [0] * count
         if config.favours_foreground(progress):
             inside = [self._foreground_ray_count(*one) for one in zip(chosen.tolist(), views, shares, strict=True)]
-        drawn = zip(views, shares, inside, strict=True)
-        flat = [torch.cat([self._sample_foreground(view, k), self._sample_valid(view, n - k)]) for view, n, k in drawn]
+        drawn = zip(chosen.tolist(), views, shares, inside, strict=True)
+        flat = [self._pixels.draw(index, view, n, foreground=k) for index, view, n, k in drawn]
         which = torch.repeat_interleave(torch.arange(count), torch.tensor(shares))
         wide = torch.tensor([view.camera.width for view in views])[which]
         index = torch.cat(flat)
@@ -162,36 +160,11 @@ class Batches:
 
     def _foreground_ray_count(self, index: int, view: View, count: int) -> int:
         """Number of a view's ``count`` rays that are drawn from its foreground, the pixels with alpha."""
-        if view.alpha is None:
-            return 0
-        key = index, size_of(view)
-        if key not in self._foreground_counts:  # computed once per view and size: 2 ms for a picture of 800 x 800 pixels
-            valid = view.alpha.numel() if view.mask is None else int(view.mask.count_nonzero())
-            self._foreground_counts[key] = len(_with_alpha(view, view.alpha)), valid
-        foreground, valid = self._foreground_counts[key]
-        return round(self._config.foreground_share(foreground / valid) * count) if foreground else 0
+        covered = 0.0 if view.alpha is None else self._pixels.covered(index, view)
+        return round(self._config.foreground_share(covered) * count) if covered else 0
 
-    def _sample_foreground(self, view: View, count: int) -> Tensor:
-        """Flat indices of random pixels with alpha within the view's mask, by rejection; there is at least one."""
-        if view.alpha is None or count == 0:
-            return torch.zeros(0, dtype=torch.int64)
-        drawn = self._sample_valid(view, REJECTION_FACTOR * count)
-        kept = drawn[view.alpha.reshape(-1)[drawn] > 0]
-        if len(kept) < count:
-            foreground = _with_alpha(view, view.alpha)
-            more = torch.randint(len(foreground), (count - len(kept),), generator=self._generator)
-            kept = torch.cat([kept, foreground[more]])
-        return kept[:count]
-
-    def _sample_valid(self, view: View, count: int) -> Tensor:
-        """Flat indices of random pixels within the view's mask."""
-        if view.mask is None:
-            return torch.randint(view.camera.width * view.camera.height, (count,), generator=self._generator)
-        valid = view.mask.reshape(-1).nonzero()[:, 0]
-        return valid[torch.randint(len(valid), (count,), generator=self._generator)]
-
-    def observe(self, rays: int, samples: int) -> None:
-        """Adapt the number of rays to the target number of samples, given the ``samples`` that ``rays`` rays had."""
+    def observe(self, samples: int) -> None:
+        """Adapt the number of rays to the target number of samples, given the ``samples`` that the latest rays had."""
         if self._config.samples and samples:
             wanted = self._rays * self._config.samples / samples
             self._rays = int(min(max(0.5 * self._rays + 0.5 * wanted, 128), self.MAX_RAYS))
@@ -230,11 +203,6 @@ class Batches:
     def load(self, state: dict[str, Tensor]) -> None:
         """Inverse of `state`."""
         self._order, self._rays = state["order"], int(state["rays"])
-
-
-def _with_alpha(view: View, alpha: Tensor) -> Tensor:
-    """Flat indices of a view's pixels with alpha, within its mask."""
-    return (alpha > 0 if view.mask is None else (alpha > 0) & view.mask).reshape(-1).nonzero()[:, 0]
 
 
 class _Pool:

@@ -184,7 +184,7 @@ class Fit:
             rays, batch = self._batches.rays(ctx.progress)
             views = rays.view
             rendering, trace = renderer.render_rays(fitted, rays, ctx)
-            self._batches.observe(len(rays), 0 if trace.samples is None else len(trace.samples))
+            self._batches.observe(0 if trace.samples is None else len(trace.samples))
         else:
             camera, batch = self._batches.image(ctx.progress)
             views = batch.view

@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from invgraphics.core import Batch, Camera, Context, Model, RayRenderer, Scene, View
+from invgraphics.core import Camera, Context, Model, RayRenderer, Scene, View
 from invgraphics.scenes.scales import resized_view
 from invgraphics.training.optimisers.adam import DenseAdam
 from invgraphics.training.poses import motion_about, pivot_depth
@@ -56,11 +57,12 @@ def refine_pose(model: Model, view: View, scene: Scene, descent: PoseDescent) ->
     ctx = model.context()
     start = small.camera.to(device)
     pivot = pivot_depth(start, scene)
+    photo = _Photo.of(small, scene, device)
     with _frozen(*model.parts.values()):
         for step in range(descent.steps):
             adam.param_groups[0]["lr"] = descent.rate(step)
             camera = start.moved(start.cam_to_world @ motion_about(twist * reach, pivot))
-            colour, target = _predicted_and_true(model, camera, small, scene, ctx, descent.rays, generator)
+            colour, target = _predicted_and_true(model, camera, photo, ctx, descent.rays, generator)
             loss = (colour - target).square().mean()
             adam.zero_grad()
             loss.backward()
@@ -84,21 +86,39 @@ def _at_scale(view: View, scale: float) -> View:
     return view if (width, height) == (view.camera.width, view.camera.height) else resized_view(view, width, height)
 
 
+@dataclass(frozen=True, eq=False)
+class _Photo:
+    """What a photograph shows, over the scene's background.
+
+    Attributes:
+        flat: indices of the k pixels that count.
+        colour: theirs, on the model's device.
+        background: the scene's, on the model's device.
+    """
+
+    flat: Int[Tensor, " k"]
+    colour: Float[Tensor, "k 3"]
+    background: Float[Tensor, 3]
+
+    @staticmethod
+    def of(view: View, scene: Scene, device: torch.device) -> _Photo:
+        mask = torch.ones(view.image.shape[:2], dtype=torch.bool) if view.mask is None else view.mask
+        flat = mask.reshape(-1).nonzero()[:, 0]
+        return _Photo(flat, view.over(scene.background, flat).to(device), scene.background.to(device))
+
+
 def _predicted_and_true(
-    model: Model, camera: Camera, view: View, scene: Scene, ctx: Context, rays: int, generator: torch.Generator
+    model: Model, camera: Camera, photo: _Photo, ctx: Context, rays: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Rendered and true colours at the pixels of one step; of a ray renderer at up to ``rays`` random ones."""
-    background = scene.background.to(camera.focal.device)
-    batch = Batch(view.over(scene.background), view.opacity(), background)
-    valid = torch.arange(batch.alpha.numel()) if view.mask is None else view.mask.reshape(-1).nonzero()[:, 0]
+    flat, background = photo.flat, photo.background
     if isinstance(model.renderer, RayRenderer):
-        flat = valid[torch.randint(len(valid), (min(rays, len(valid)),), generator=generator)]
-        pixels = camera.pixel_centres_of(flat)
+        chosen = torch.randint(len(flat), (min(rays, len(flat)),), generator=generator)
+        pixels = camera.pixel_centres_of(flat[chosen])
         picture, _ = model.renderer.render_rays(model.field, camera.rays(pixels.to(background)), ctx)
-        return picture.over(background), batch.target.reshape(-1, 3)[flat].to(background)
+        return picture.over(background), photo.colour[chosen.to(background.device)]
     picture, _ = model.renderer.render_image(model.field, camera, ctx)
-    where = valid.to(background.device)
-    return picture.over(background).reshape(-1, 3)[where], batch.target.to(background).reshape(-1, 3)[where]
+    return picture.over(background).reshape(-1, 3)[flat.to(background.device)], photo.colour
 
 
 @contextmanager

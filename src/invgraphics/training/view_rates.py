@@ -17,6 +17,9 @@ from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState, Hook
 from invgraphics.training.penalties import LATTICES
 
+CHUNK = 1 << 14
+"""Points that are projected into all cameras at once: few enough for the cache."""
+
 
 @dataclass(frozen=True)
 class ViewRatesConfig:
@@ -74,9 +77,14 @@ def _rates(lattice: Lattice, field: LatticeField, cameras: Sequence[Camera]) -> 
 @torch.no_grad()
 def view_counts(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """Number of cameras in whose picture each point lies."""
+    here = [camera.to(points.device) for camera in cameras]
+    return torch.cat([_counted(part, here) for part in points.split(CHUNK)])
+
+
+def _counted(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     counts = torch.zeros_like(points[:, 0])
     for camera in cameras:
-        image, depth = camera.to(points.device).project(points)
+        image, depth = camera.project(points)
         x, y = image.unbind(dim=1)
         counts += (depth > 0) & (x >= 0) & (y >= 0) & (x <= camera.width) & (y <= camera.height)
     return counts

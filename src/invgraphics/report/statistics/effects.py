@@ -198,16 +198,6 @@ def _interaction(one: Factor, two: Factor) -> Contrast:
     return Contrast(one.path, before, after, against=(two.path, low, high), name=name)
 
 
-def effects_on(
-    quantity: MeasuredQuantity, factors: Sequence[Factor], observations: Sequence[Observation], lost: Iterable[Lost] = ()
-) -> list[Effect]:
-    """Effects of all compared levels on one quantity, corrected as one family (Holm 1979).
-
-    Pairs of levels that no two runs share are left out.
-    """
-    return effects_of(contrasts_of(factors), quantity, observations, lost)
-
-
 def effects_of(
     contrasts: Sequence[Contrast],
     quantity: MeasuredQuantity,
@@ -216,6 +206,8 @@ def effects_of(
     factors: Sequence[Factor] = (),
 ) -> list[Effect]:
     """Effects of given contrasts on one quantity, corrected as one family (Holm 1979).
+
+    Those that no two runs share are left out.
 
     Args:
         contrasts: what is compared.

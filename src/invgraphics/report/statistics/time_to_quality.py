@@ -14,11 +14,6 @@ FINE_GRID = 0.5
 """Looks of the monitor that are closer than this, in seconds, make a time that is told to a tenth."""
 
 
-def seconds_to_reach(run: Run, level: float) -> float | None:
-    """Seconds of optimisation after which the monitored PSNR first was at least ``level`` dB."""
-    return next((entry.seconds for entry in run.history if entry.psnr is not None and entry.psnr >= level), None)
-
-
 def span_to_reach(run: Run, level: float) -> tuple[float, float] | None:
     """(last evaluation before, first one at which) the monitored PSNR was at least ``level`` dB, seconds; ``None`` if never."""
     before = 0.0
