@@ -166,16 +166,8 @@ def render(
                         batch = inputs, positions, sample_rays, weights, queued
                         _shade_queue(appearance, basis, colour_net, head, geometry_features, batch, room, sums)
                         queued = 0
-        _shade_queue(
-            appearance,
-            basis,
-            colour_net,
-            head,
-            geometry_features,
-            (inputs, positions, sample_rays, weights, queued),
-            room,
-            sums,
-        )
+        batch = inputs, positions, sample_rays, weights, queued
+        _shade_queue(appearance, basis, colour_net, head, geometry_features, batch, room, sums)
 
 
 def pack_crop(field: FusedLattice) -> np.ndarray:
