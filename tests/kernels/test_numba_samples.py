@@ -215,7 +215,7 @@ def test_march_of_nothing_and_of_bad_numbers():
 
 
 def test_warm_up_leaves_nothing_to_compile():
-    """Kernels have machine code afterwards, but for those that serve several threads, and the same calls need no more."""
+    """All but second derivatives of the hash encoding and what serves several threads; the same calls need no more."""
     numba.warm_up()
     before = {kernel: len(kernel.signatures) for kernel in _compiler.kernels}
     for_threads = {"sample_rows", "add_copies"} if numba_threads() == 1 else set()

@@ -136,7 +136,7 @@ class DepthMapField(Field):
 
         return DepthMaps(cameras, view)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Load tensors, as many photographs as the checkpoint holds: a fit may have seen only some of the scene's.
 
         Those of earlier versions are floats.
@@ -145,7 +145,7 @@ class DepthMapField(Field):
             given = state_dict.get(prefix + name)
             if given is not None and given.ndim == value.ndim:
                 setattr(self, name, torch.empty_like(given, device=value.device))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
 def stored_bytes(views: Sequence[View]) -> int:
