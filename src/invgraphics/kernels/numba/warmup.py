@@ -83,7 +83,8 @@ def samples() -> None:
     unit = torch.full((2, 3), 0.4).requires_grad_()
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)
-    (gradient,) = torch.autograd.grad(features.sum(), unit, create_graph=True)
+    scaled = features * torch.ones_like(features).requires_grad_()  # so that second derivatives meet both kernels
+    (gradient,) = torch.autograd.grad(scaled.sum(), unit, create_graph=True)
     factors = [Lattice(torch.zeros(2, 1).requires_grad_(), axis) for axis in "xy"]
     values = lattice_encode(unit, factors, "cp")
     rows = [torch.ones(2, 1) for _ in range(4)]
