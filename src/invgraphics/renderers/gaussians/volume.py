@@ -199,9 +199,9 @@ class GaussianExact(GaussianRays):
         """Contributions by distance, with the transmittance of the whole mixture."""
         weight, moment = self.blending_weights(intersections, rays, axis, True)
         order = intersections.t.argsort(stable=True)
-        order = order[intersections.depth[order] > 0]
+        order = order[intersections.optical_depth[order] > 0]
         t, sigma, optical_depth, weight = (
-            x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight)
+            x[order] for x in (intersections.t, intersections.sigma, intersections.optical_depth, weight)
         )
         return Contributions(
             kind="Gaussians",
@@ -256,9 +256,9 @@ class GaussianSorted(GaussianRays):
         """Contributions in compositing order, with the profile of the same Gaussians as overlapping densities."""
         weight, moment = self.blending_weights(intersections, rays, axis, True)
         order = self.order(intersections, rays, axis)
-        order = order[intersections.depth[order] > 0]  # those below the splats' limit are on the ray all the same
+        order = order[intersections.optical_depth[order] > 0]  # those below the splats' limit are on the ray all the same
         t, sigma, optical_depth, weight = (
-            x[order] for x in (intersections.t, intersections.sigma, intersections.depth, weight)
+            x[order] for x in (intersections.t, intersections.sigma, intersections.optical_depth, weight)
         )
         alpha, reached = alphas_from_weights(weight)
         return Contributions(
