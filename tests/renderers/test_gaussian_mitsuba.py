@@ -49,7 +49,7 @@ class ByEntry(GaussianSorted):
         return GaussianRays._sums(self, *args)  # in plain torch: the compiled order is another one
 
     def order(self, intersections: Intersections, rays: Rays, axis: torch.Tensor | None) -> torch.Tensor:
-        squared = -2 * torch.log(-torch.expm1(-intersections.depth) / self.opacities[intersections.gaussian])
+        squared = -2 * torch.log(-torch.expm1(-intersections.optical_depth) / self.opacities[intersections.gaussian])
         entry = intersections.t - intersections.sigma * (25 - squared.clamp(0, 25)).sqrt()
         return super().order(replace(intersections, t=entry), rays, axis)
 
