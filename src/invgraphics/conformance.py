@@ -74,7 +74,8 @@ def check_field(field: Field, scene: Scene) -> None:
         if quantity in field.provides:
             _check_primitives(field, quantity, ctx)
     if Quantity.DEPTH_MAPS in field.provides:
-        assert all(view.depth is not None for view in field.primitives(Quantity.DEPTH_MAPS, ctx)), "a depth map is missing"
+        maps = field.primitives(Quantity.DEPTH_MAPS, ctx)
+        assert all(maps.view(i).depth is not None for i in range(len(maps.cameras))), "a depth map is missing"
     _check_differentiable(field, samples, ctx)
     _check_reload(field, samples, ctx)
     field.load_state_dict(new)

@@ -133,7 +133,7 @@ def long_chunk(root: Path) -> Path:
 BAD_SCENES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "k1 = 1e30": (table(lambda t: t.update(k1=1e30)), "smear its picture"),
     "k1 = -9": (table(lambda t: t.update(k1=-900.0)), "fold its picture"),
-    "cx = 1e30": (table(lambda t: t.update(cx=1e30, k1=0)), "centre 1e\\+30"),
+    "cx = 1e30": (table(lambda t: t.update(cx=1e30, k1=0)), "principal point 1e\\+30"),
     "fl_x = 1e-30": (table(lambda t: t.update(fl_x=1e-30, k1=0)), "focal length"),
     "fl_x = fl_y = 1e-30": (table(lambda t: t.update(fl_x=1e-30, fl_y=1e-30, k1=0)), "look backwards"),
     "fl_x = 1e30": (table(lambda t: t.update(fl_x=1e30, fl_y=1e30, k1=0)), "field of view is zero"),

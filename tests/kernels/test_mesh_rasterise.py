@@ -93,7 +93,9 @@ def test_both_kernels_agree_on_a_fine_mesh() -> None:
     right = torch.arange(40)[:, None] * 80 + (torch.arange(80) + 1) % 80
     faces = torch.cat([torch.stack([corner, corner + 80, right], -1), torch.stack([right, corner + 80, right + 80], -1)])
     vertices, faces = rings.reshape(-1, 3), faces.reshape(-1, 3)
-    camera = replace(camera_at((0.0, -3.0, 0.0), 96, 72), focal=torch.full((2,), 90.0), centre=torch.tensor([47.7, 36.2]))
+    camera = replace(
+        camera_at((0.0, -3.0, 0.0), 96, 72), focal=torch.full((2,), 90.0), principal_point=torch.tensor([47.7, 36.2])
+    )
     found = {}
     for name in IMPLEMENTATIONS:
         with kernels.using(name):

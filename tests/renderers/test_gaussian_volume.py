@@ -86,7 +86,9 @@ def test_each_gaussian_on_a_ray_is_measured_as_scipy_integrates_it() -> None:
     found = intersect(precompute(gaussians, "physical", 1e-12), rays)
     assert len(found) == 12
     strength = -np.log1p(-gaussians.opacities.numpy()) * mean_inverse_scale(gaussians.scales).numpy() / math.sqrt(2 * math.pi)
-    for r, i, t, depth in zip(*(getattr(found, name).tolist() for name in ("ray", "gaussian", "t", "depth")), strict=True):
+    for r, i, t, depth in zip(
+        *(getattr(found, name).tolist() for name in ("ray", "gaussian", "t", "optical_depth")), strict=True
+    ):
         density = line_density(gaussians, i, rays, r)
         whole, _ = quad(lambda t, density=density: float(density(t)), 0, 7, points=[t], limit=200)
         assert depth == pytest.approx(strength[i] * whole, rel=1e-6)
@@ -122,7 +124,7 @@ def test_extinction_reading_is_the_papers_projection() -> None:
     gaussians, rays = some(3), some_rays(4)
     found = intersect(precompute(gaussians, "extinction", 1e-12), rays)
     theta = -np.log1p(-gaussians.opacities.numpy())
-    for r, i, depth in zip(*(getattr(found, name).tolist() for name in ("ray", "gaussian", "depth")), strict=True):
+    for r, i, depth in zip(*(getattr(found, name).tolist() for name in ("ray", "gaussian", "optical_depth")), strict=True):
         axes = quaternion_to_matrix(gaussians.quaternions)[i].numpy()
         covariance = axes @ np.diag(gaussians.scales[i].numpy() ** 2) @ axes.T
         _, _, frame = np.linalg.svd(rays.directions[r].numpy()[None])
@@ -199,7 +201,7 @@ def test_overlapping_gaussians_are_the_volume_rendering_equation(opacity: str) -
     t = np.linspace(0, 6, 40_001)
     for r in range(4):
         densities = np.zeros((5, len(t)))
-        for i, depth in zip(found.gaussian[found.ray == r].tolist(), found.depth[found.ray == r].tolist(), strict=True):
+        for i, depth in zip(found.gaussian[found.ray == r].tolist(), found.optical_depth[found.ray == r].tolist(), strict=True):
             profile = line_density(gaussians, i, rays, r)(t)
             densities[i] = profile * depth / np.trapezoid(profile, t)
         before = cumulative_trapezoid(densities.sum(0), t, initial=0)
@@ -217,7 +219,7 @@ def test_overlapping_gaussians_agree_with_free_flights() -> None:
     """Monte Carlo: photons stop at the first of each Gaussian's own exponential flights; who stops one gives the colour."""
     gaussians, rays, count = some(3, scales=torch.full((3, 3), 0.4, dtype=F64)), some_rays(1), 400_000
     found = intersect(precompute(gaussians, "peak", 1e-12), rays)
-    t, sigma, depth = (getattr(found, name).numpy() for name in ("t", "sigma", "depth"))
+    t, sigma, depth = (getattr(found, name).numpy() for name in ("t", "sigma", "optical_depth"))
     flights = np.random.default_rng(0).exponential(size=(count, len(t)))
     stops = np.where(flights < depth, t + sigma * norm.ppf(np.minimum(flights / depth, 1)), np.inf)
     white, black = 0.5 / math.sqrt(1 / (4 * math.pi)), -0.5 / math.sqrt(1 / (4 * math.pi))

@@ -87,11 +87,12 @@ def test_faint_alpha_stays_faint(tmp_path: Path) -> None:
     """Only where no view has more than 1 are 0 and 1 meant."""
     alpha = np.zeros((2, 4, 4), np.uint8)
     alpha[0, 0, 0] = 1
-    arrays = {"alpha": alpha}
-    shown = {"images": np.zeros((2, 4, 4, 3), np.uint8)} | arrays
-    assert npz._pixels(shown, 0, tmp_path)[0, 0, 3] == 255
-    alpha[1] = 255
-    assert npz._pixels(shown, 0, tmp_path)[0, 0, 3] == 1
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    for largest, expected in ((0, 255), (255, 1)):
+        alpha[1] = largest
+        path = tmp_path / f"{largest}.npz"
+        np.savez(path, images=np.zeros((2, 4, 4, 3), np.uint8), cam_to_world=poses, focal=np.array(4.0), alpha=alpha)
+        assert npz._pixels(npz._read(path), 0, path)[0, 0, 3] == expected
 
 
 def test_masks_of_every_kind_have_one_brightness() -> None:
