@@ -195,8 +195,7 @@ class GaussianField(Field):
     @torch.no_grad()
     def filter_attenuation(self) -> Float[Tensor, " n"]:
         """Factor in (0, 1] by which the 3D smoothing filter lowers each opacity; 1 without smoothing."""
-        scales = self._gaussians(1).scales
-        return (scales / self._smoothed_scales(scales)).prod(dim=1)
+        return self._filtered(self._gaussians(1).scales)[1]
 
     @torch.no_grad()
     def replace(self, tensors: Mapping[str, Tensor]) -> None:
@@ -233,11 +232,13 @@ class GaussianField(Field):
         """Apply the 3D smoothing filter: wider, and fainter such that each keeps its integral (Mip-Splatting, §5.1)."""
         if not bool(self.smoothing.any()):
             return gaussians
-        scales = self._smoothed_scales(gaussians.scales)
-        return replace(gaussians, scales=scales, opacities=gaussians.opacities * (gaussians.scales / scales).prod(dim=1))
+        scales, attenuation = self._filtered(gaussians.scales)
+        return replace(gaussians, scales=scales, opacities=gaussians.opacities * attenuation)
 
-    def _smoothed_scales(self, scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        return (scales.square() + self.smoothing[:, None].square()).sqrt()
+    def _filtered(self, scales: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+        """Scales behind the 3D filter, and the factor on opacities that keeps each Gaussian's integral."""
+        wide = (scales.square() + self.smoothing[:, None].square()).sqrt()
+        return wide, (scales / wide).prod(dim=1)
 
     def _with_dropout(self, gaussians: Gaussians, ctx: Context) -> Gaussians:
         """Make a random share of the Gaussians transparent, and the others that much more opaque (DropGaussian, eq. 6)."""

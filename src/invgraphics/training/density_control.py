@@ -145,7 +145,7 @@ class DensityControl(Hook):
 
     @override
     def before_step(self, state: FitState) -> None:
-        """Reset opacities, if the step before has asked for it."""
+        """Reset opacities, where that became due in the step before."""
         if self._reset_pending:
             self._reset_pending = False
             self._reset_opacities(state)
@@ -168,7 +168,7 @@ class DensityControl(Hook):
 
     @override
     def after_step(self, state: FitState) -> None:
-        """Grow and prune as scheduled, and say whether opacities are to be reset."""
+        """Grow and prune as scheduled; a reset that is due waits for the next step."""
         config, progress = self._config, state.ctx.progress
         field = cast(GaussianParameters, state.field)
         starts = self._started < 0 and self._due_to_start(state)
