@@ -31,6 +31,7 @@ def test_runs_from_before_have_no_share() -> None:
         "fit_cpu_seconds": None,
         "fit_processor_share": None,
         "fit_standstill_seconds": None,
+        "fit_processor_speed": None,
         "steps": 7,
         "peak_memory_bytes": None,
     }

@@ -9,6 +9,7 @@ from report_folders import write_comparison
 
 from invgraphics.report.build import build_report
 from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.pages.facts import shared_facts
 from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.statistics.verdict import verdict
 from invgraphics.runs.run import Run
@@ -17,9 +18,10 @@ from invgraphics.runs.scores import Score
 TOLD = "had 50 % of the processor time that it was ready to use; other programs had the rest"
 
 
-def _run(method: str, seed: int, fps: float, disturbed: str = "") -> Run:
+def _run(method: str, seed: int, fps: float, disturbed: str = "", speed: float | None = None) -> Run:
     quality = {"psnr": Score(mean=30.0 + fps / 100 + 1e-3 * seed, unit="dB", higher_is_better=True)}
     cost = {"fit_seconds": 60.0, "fit_cpu_seconds": 100.0, "render_fps": fps + 0.02 * seed, "model_bytes": 1e6 * fps}
+    cost |= {} if speed is None else {"fit_processor_speed": speed}
     return made_up_run(quality, method, seed, scene="s", preset="laptop", cost=cost, disturbed=disturbed)
 
 
@@ -39,6 +41,32 @@ def test_disturbed_times_are_shown_but_not_ranked() -> None:
     assert summary.disturbances == (f"The times of fast are not ranked: seed 1 {TOLD}.",)
     assert any("mid renders fastest" in sentence for sentence in verdict(disturbed, summary))
     assert summary.cell(summary.rows[0], "render_fps").text == "90.0"
+
+
+def test_times_of_a_slower_or_faster_processor_are_not_ranked() -> None:
+    """A fit's core may do less in a second beside a neighbour, with all of its time to itself."""
+    runs = (_run("fast", 0, 90.0, speed=700.0), _run("fast", 1, 90.0, speed=1000.0), _run("slow", 0, 20.0, speed=1020.0))
+    runs += (_run("slow", 1, 20.0, speed=1180.0), _run("mid", 0, 50.0, speed=1000.0), _run("mid", 1, 50.0, speed=880.0))
+    comparison = Comparison("s", "?", ("fast", "mid", "slow"), runs, budget="60s")
+    summary = summarise(comparison)
+    assert summary.disturbances == (
+        "The times of fast are not ranked: seed 0 had a processor that did 30 % less per second than in the median fit, "
+        "so fewer steps in equal time.",
+        "The times of slow are not ranked: seed 1 had a processor that did 18 % more per second than in the median fit, "
+        "so more steps in equal time.",
+    )
+    assert _best(summary, "render_fps") == []
+    assert dict(shared_facts(comparison))["processor speed during the fits"] == "0.70 to 1.18 of the median"
+    busy = replace(runs[0], scores=replace(runs[0].scores, disturbed=TOLD))
+    both = summarise(replace(comparison, runs=(busy, *runs[1:]))).disturbances[0]
+    assert both.startswith(f"The times of fast are not ranked: seed 0 {TOLD}, and had a processor that did 30 % less")
+
+
+def test_two_fits_and_unmeasured_ones_have_no_usual_speed() -> None:
+    runs = (_run("a", 0, 90.0, speed=700.0), _run("b", 0, 90.0, speed=1000.0), _run("c", 0, 90.0))
+    comparison = Comparison("s", "?", ("a", "b", "c"), runs, budget="60s")
+    assert summarise(comparison).disturbances == ()
+    assert "processor speed during the fits" not in dict(shared_facts(comparison))
 
 
 def _best(summary, key: str) -> list[str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from invgraphics.training import clock
-from invgraphics.training.clock import SchedulerTimes
+from invgraphics.training.clock import PROBE_EVERY, SchedulerTimes, SpeedProbe
 
 WORK = """
 import os, time
@@ -61,7 +61,7 @@ def test_a_standstill_is_neither_running_nor_waiting(tmp_path: Path, monkeypatch
 
 STOPPED = """
 import time
-from invgraphics.training.clock import SchedulerTimes
+from invgraphics.training.clock import PROBE_EVERY, SchedulerTimes, SpeedProbe
 times, began, cpu_began = SchedulerTimes(), time.perf_counter(), time.process_time()
 print("began", flush=True)
 while time.process_time() - cpu_began < 1:
@@ -140,3 +140,26 @@ def test_idle_threads_sleep_whatever_is_imported_first(first: str) -> None:
     told, seconds = done.stdout.split()
     assert (int(told) > 0) == (first == "torch")
     assert float(seconds) < 1.5e-3
+
+
+def _busy(seconds: float) -> None:
+    end = time.thread_time() + seconds
+    while time.thread_time() < end:
+        pass
+
+
+def test_speed_is_the_mean_rate_of_the_probes(monkeypatch) -> None:
+    """Half as fast for half of the time: the mean of the rates, as steps would add up, not the inverse of the mean time."""
+    probe = SpeedProbe()
+    assert probe.speed is None
+    for index, work in enumerate((2e-3, 2e-3, 4e-3, 4e-3)):
+        monkeypatch.setattr(probe, "_work", lambda work=work: (_busy(work), time.sleep(5e-3)))  # who waits is not slow
+        probe.probe_at(index * PROBE_EVERY)
+        probe.probe_at(index * PROBE_EVERY + 0.9 * PROBE_EVERY)
+    assert probe.probes == 4
+    assert probe.speed == pytest.approx(375, rel=0.1)
+    later = SpeedProbe(probe.speed, probe.probes)
+    assert later.speed == pytest.approx(probe.speed)
+    monkeypatch.setattr(later, "_work", lambda: _busy(1e-3))
+    later.probe_at(100.0)
+    assert later.speed == pytest.approx((4 * 375 + 1000) / 5, rel=0.1)

@@ -29,6 +29,8 @@ def fit_record(steps: int, clocks: Mapping[str, float | None], peak_memory_bytes
         ran_seconds=clocks["ran_seconds"],
         waited_seconds=clocks["waited_seconds"],
         standstill_seconds=clocks["standstill_seconds"],
+        processor_speed=clocks["processor_speed"],
+        speed_probes=int(clocks["speed_probes"] or 0),
         peak_memory_bytes=peak_memory_bytes,
     )
 
@@ -40,6 +42,7 @@ def fit_costs(fit: FitRecord) -> dict[str, float | None]:
         "fit_cpu_seconds": fit.cpu_seconds,
         "fit_processor_share": processor_share(fit),
         "fit_standstill_seconds": fit.standstill_seconds,
+        "fit_processor_speed": fit.processor_speed,
         "steps": fit.steps,
         "peak_memory_bytes": fit.peak_memory_bytes,
     }

@@ -20,6 +20,9 @@ class FitRecord(Record):
         ran_seconds: that busy threads had a core; ``None`` where the system does not say.
         waited_seconds: that busy threads waited for a core.
         standstill_seconds: in which the process was stopped or its machine suspended; not among ``seconds``.
+        processor_speed: repetitions per second of a fixed piece of work beside the fit (`training.clock.SpeedProbe`): it falls
+            where another program has the core's other hyperthread or fills its caches; ``None`` on a GPU.
+        speed_probes: repetitions that this is the mean of.
         peak_memory_bytes: most memory so far above what its process held before the fit, the largest where a fit was resumed.
         cores: that the process may use; known at the end.
         load_average: known at the end.
@@ -33,6 +36,8 @@ class FitRecord(Record):
     ran_seconds: float | None = None
     waited_seconds: float | None = None
     standstill_seconds: float | None = None
+    processor_speed: float | None = None
+    speed_probes: int = 0
     peak_memory_bytes: int | None = None
     cores: int | None = None
     load_average: LoadAverage | None = None

@@ -16,6 +16,7 @@ COST_UNITS = {
     "fit_cpu_seconds": "s",
     "fit_processor_share": "",
     "fit_standstill_seconds": "s",
+    "fit_processor_speed": "1/s",
     "steps": "",
     "peak_memory_bytes": "bytes",
     "render_seconds_per_view": "s",

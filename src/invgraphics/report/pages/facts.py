@@ -11,6 +11,7 @@ from typing import Any
 from invgraphics.recipes.suitable import starts_from_points
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.statistics.clocks import Speeds
 from invgraphics.report.wording import budget_words, grouped, listing
 from invgraphics.runs.folder import PUBLISHED, RECIPE
 from invgraphics.runs.run import Run
@@ -181,6 +182,8 @@ def shared_facts(comparison: Comparison) -> Facts:
     shared = {key: value for key, value in tables[0].items() if all(t.get(key) == value for t in tables)} if tables else {}
     for key, value in comparison.environment.facts().items():
         shared.setdefault(_words(str(key)), _text(value))
+    if speeds := Speeds.of(comparison.runs).words:
+        shared["processor speed during the fits"] = speeds
     if comparison.wall_seconds is not None:
         shared["whole command took"] = duration(comparison.wall_seconds)
     return tuple(shared.items())

@@ -18,6 +18,7 @@ from invgraphics.report.pages.comparison import markdown_commands, markdown_figu
 from invgraphics.report.pages.longtable import write_table
 from invgraphics.report.pages.study import study_facts
 from invgraphics.report.pages.tables import escape_markdown
+from invgraphics.report.statistics.clocks import Speeds
 from invgraphics.report.statistics.rules import (
     RULES,
     STANDINGS,
@@ -114,9 +115,11 @@ class VerdictPage:
 
     @property
     def disturbances(self) -> list[str]:
-        """A sentence per cell whose fit had less than its cores: its seconds bought fewer steps."""
-        cells = [field.judged.cell for field in self.fields]
-        return [f"{cell.label}: {cell.run.scores.disturbed}." for cell in cells if cell.run and cell.run.scores.disturbed]
+        """A sentence per cell whose fit had less than its cores, or slower or faster ones than the median fit."""
+        runs = [(field.judged.cell.label, field.judged.cell.run) for field in self.fields]
+        known = [(label, run) for label, run in runs if run is not None]
+        speeds = Speeds.of([run for _, run in known])
+        return [f"{label}: {why}." for label, run in known if (why := speeds.disturbance(run))]
 
     @property
     def counts(self) -> list[RuleCount]:

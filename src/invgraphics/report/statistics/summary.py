@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.statistics.clocks import Speeds
 from invgraphics.report.statistics.intervals import mean_half_width
 from invgraphics.report.statistics.leaders import leaders
 from invgraphics.report.statistics.values import diverged, value_of
@@ -124,13 +125,14 @@ def summarise(comparison: Comparison, tables: int = 1) -> Summary:
     columns = table_columns(comparison)
     absences: dict[str, list[str]] = {}
     rows = []
+    speeds = Speeds.of(comparison.runs)
     most = max((len(comparison.runs_of(method)) for method in comparison.methods), default=0)
     for series, method in enumerate(comparison.methods):
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
         cells = tuple(_method_cell(column, runs, absences) for column in columns)
         kind: Literal["method", "failed"] = "method" if runs else "failed"
         lost = frozenset(column.key for column in columns if any(diverged(run, column) for run in runs))
-        rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs), lost))
+        rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs, speeds), lost))
     for name, quality in comparison.baselines.items():
         cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
         rows.append(Row(name, "baseline", -1, 1, (), cells))
@@ -231,9 +233,9 @@ def _mark_best(
     return tuple(marked)
 
 
-def _disturbed(runs: Sequence[Run]) -> str:
+def _disturbed(runs: Sequence[Run], speeds: Speeds) -> str:
     """Seeds of a method whose timings were disturbed, with the cause; empty where none were."""
-    seeds = {run.seed: run.scores.disturbed for run in runs if run.scores.disturbed}
+    seeds = {run.seed: why for run in runs if (why := speeds.disturbance(run))}
     return "; ".join(f"seed {seed} {how}" for seed, how in seeds.items())
 
 
