@@ -1,15 +1,21 @@
 """docs/files.md: its examples are read, and its tables are those of the dataclasses that the files fill."""
 
 import dataclasses
+import json
 import re
+import zipfile
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
+import torch
 
+from invgraphics.core import Camera, Planes
+from invgraphics.formats.mpi import PlaneFile, write_mpi
 from invgraphics.report.statistics.rules import RULES
 from invgraphics.report.wording import MARGINS
 from invgraphics.runs.study import Approximation, KnownDeviation, Prediction
+from invgraphics.scenes import npz
 from invgraphics.scenes.degrade import TrainingData
 from invgraphics.scenes.mitsuba.build import BUILDERS
 from invgraphics.scenes.mitsuba.rig import RIGS, Forward, Hemisphere, InsideOut, Sphere, cameras, make_rig
@@ -18,6 +24,7 @@ from invgraphics.studies.analyses import ANALYSES
 from invgraphics.studies.reading import read_study
 from invgraphics.studies.study import Study
 from invgraphics.tables import inline_toml
+from invgraphics.tools.camera_path import CameraPath, Keyframe
 
 PAGE = (Path(__file__).parents[1] / "docs" / "files.md").read_text()
 SECTIONS = {
@@ -91,3 +98,37 @@ def test_the_example_of_a_study_is_read_and_expands(tmp_path: Path) -> None:
     # The base, fewer photographs, and a larger table that only one of the two methods has; two scenes, three seeds.
     assert len(study.expand()) == 2 * 3 * (2 + 2 + 1)
     assert study.margins == {"psnr": 0.3} and study.predictions[0].low == 1.0
+
+
+def _keys(heading: str) -> list[str]:
+    """Every name in code in the first cells of a section's tables."""
+    section = re.split(r"^#+ ", PAGE.split(f"\n{heading}\n")[1], flags=re.M)[0]
+    cells = re.findall(r"^\| ([^|]*) \|", section, flags=re.M)
+    return [key for cell in cells for key in re.findall(r"`(\w+)`", cell)]
+
+
+def test_keys_of_a_scene_as_npz() -> None:
+    found = re.findall(r"^(\w+) {2,}\(", npz.__doc__ or "", flags=re.M)
+    assert len(found) > 10
+    assert _keys("## Scenes as `.npz`") == found
+    needed = {key for key, (_, need, _) in _rows("## Scenes as `.npz`").items() if need == "yes"}
+    assert needed == set(npz._REQUIRED)
+
+
+def test_keys_of_a_camera_path() -> None:
+    path = CameraPath((Keyframe(torch.eye(4), 1.0),))
+    table = json.loads(path.to_json())
+    assert _keys("## Camera paths") == list(table)
+    section = PAGE.split("## Camera paths")[1].split("\n## ")[0]
+    assert all(f"`{key}`" in section for key in table["keyframes"][0])
+
+
+def test_keys_of_a_multi_plane_image(tmp_path: Path) -> None:
+    camera = Camera(torch.eye(4), torch.tensor([8.0, 8.0]), torch.tensor([4.0, 4.0]), 8, 8)
+    planes = Planes(camera, torch.tensor([1.0, 2.0]), torch.zeros(2, 3, 8, 8), torch.zeros(2, 8, 8))
+    write_mpi(tmp_path / "a.zip", PlaneFile(planes))
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
+        table = json.loads(archive.read("mpi.json"))
+    section = PAGE.split("## Multi-plane images")[1].split("\n## ")[0]
+    assert sorted(set(_keys("## Multi-plane images")) - {"json"}) == sorted(table)
+    assert all(f"`{key}`" in section for key in (*table["camera"], *table["layers"][0]))

@@ -151,3 +151,14 @@ def test_a_closed_pipe_is_no_accident(argument: str) -> None:
         process.stdout.close()  # before the command writes its first line
         assert process.stderr.read() == ""
     assert process.returncode == 1
+
+
+def test_an_empty_list_of_methods_is_refused(tmp_path, capsys) -> None:
+    """An unset shell variable is no request for the default ones."""
+    assert main.run(["compare", "bricks", "--methods", "", "--out", str(tmp_path / "out")]) == main.BAD_INPUT
+    assert "--methods is empty" in capsys.readouterr().err
+
+
+def test_a_missing_file_of_a_study_is_named(tmp_path, capsys) -> None:
+    assert main.run(["ablate", "nosuch.toml", "--out", str(tmp_path / "out")]) == main.BAD_INPUT
+    assert "The file 'nosuch.toml' does not exist." in capsys.readouterr().err

@@ -16,7 +16,7 @@ COMPARE = ["compare", "bricks", "--out", "no/report", "--methods"]
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([*EXPORT, "mesh", "--planes", "8"], "--planes does nothing with --to mesh.\nLeave --planes away: it is for --to mpi."),
+        ([*EXPORT, "mesh", "--planes", "8"], "--planes does nothing with --to mesh.\nLeave out --planes: it is for --to mpi."),
         ([*EXPORT, "ply", "--level", "0.0"], "--level does nothing with --to ply."),
         ([*EXPORT, "mpi", "--resolution", "192"], "--resolution does nothing with --to mpi."),
         ([*EXPORT, "spz", "--view", "0000"], "--view does nothing with --to spz."),
@@ -33,7 +33,7 @@ COMPARE = ["compare", "bricks", "--out", "no/report", "--methods"]
         ),
         (
             ["ablate", "families", "--gpus", "0"],
-            "--gpus does nothing on this machine.\nLeave --gpus away, or add --executor ray.",
+            "--gpus does nothing on this machine.\nLeave out --gpus, or add --executor ray.",
         ),
         (["ablate", "families", "--gpus", "1", "--address", "a:1"], "--gpus and --address do nothing on this machine."),
         (["infer", "no/run", "--azimuth", "0"], "--azimuth does nothing without a photograph."),

@@ -157,7 +157,7 @@ def test_built_in_scenes_are_rendered_then_loaded(tmp_path: Path, monkeypatch, s
 
 def test_samples_are_for_what_is_rendered(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").touch()
-    with pytest.raises(InputError, match=r"holds pictures, whose samples per pixel are what they are\.\nLeave --spp away"):
+    with pytest.raises(InputError, match=r"holds pictures, whose samples per pixel are what they are\.\nLeave out --spp"):
         open_scene(str(tmp_path), SceneOptions(spp=64))
 
 
@@ -242,3 +242,13 @@ def test_a_principal_point_far_outside_is_warned_of(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err == ""
     validate(scene().with_views(train=(view(0), _lens(principal_point=torch.tensor([40.0, 3.0])))))
     assert "Warning: 'v1' has its principal point far outside the picture" in capsys.readouterr().err
+
+
+def test_the_name_of_a_real_data_set_is_answered_with_its_path(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "fox").mkdir()
+    monkeypatch.setenv("INVGRAPHICS_DATA", str(tmp_path))
+    with pytest.raises(InputError, match=r"Did you mean '\$INVGRAPHICS_DATA/fox'\?"):
+        open_scene("fox")
+    with pytest.raises(InputError) as refused:
+        open_scene("atlantis")
+    assert "INVGRAPHICS_DATA" not in str(refused.value)

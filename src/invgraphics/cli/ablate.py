@@ -50,7 +50,8 @@ class Ablate:
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the study's)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str | None, arg(metavar="N|all", help_behavior_hint="(default: the study's)")] = None
-    """How many test views are scored: the first of a built-in scene, which are even, or evenly spaced ones."""
+    """How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set N evenly
+    spaced ones."""
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the study's)")] = None
     """Samples per pixel of the training views of scenes that are rendered."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None

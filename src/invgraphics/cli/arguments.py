@@ -46,7 +46,8 @@ class Shared:
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
-    """How many test views are scored: the first of a built-in scene, which are even, or evenly spaced ones."""
+    """How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set N evenly
+    spaced ones."""
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
     """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
@@ -172,7 +173,7 @@ def refuse_idle(given: Mapping[str, Any], why: str, remedy: str = "") -> None:
     Args:
         given: option -> its value; ``None`` where it was not given.
         why: beside what they do nothing, in words that follow "does nothing".
-        remedy: what to do besides leaving them away; may be empty.
+        remedy: what to do besides leaving them out; may be empty.
 
     Raises:
         InputError: one of them was given.
@@ -180,7 +181,7 @@ def refuse_idle(given: Mapping[str, Any], why: str, remedy: str = "") -> None:
     idle = [option for option, value in given.items() if value is not None]
     if idle:
         names = ", ".join(idle[:-1]) + " and " + idle[-1] if len(idle) > 1 else idle[0]
-        raise InputError(f"{names} {'do' if len(idle) > 1 else 'does'} nothing {why}.", f"Leave {names} away{remedy}.")
+        raise InputError(f"{names} {'do' if len(idle) > 1 else 'does'} nothing {why}.", f"Leave out {names}{remedy}.")
 
 
 def parse_size(text: str) -> int | tuple[int, int]:

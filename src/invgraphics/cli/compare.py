@@ -26,7 +26,7 @@ class Compare(Shared):
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """A built-in scene (see `invgraphics list scenes`), or the path of a data set."""
-    methods: Annotated[str, arg(metavar="A,B,C", help_behavior_hint="(default: those that suit the scene)")] = ""
+    methods: Annotated[str | None, arg(metavar="A,B,C", help_behavior_hint="(default: those that suit the scene)")] = None
     """Methods with commas between them (see `invgraphics list methods`); METHOD:key=value changes a value of the recipe.
     `all`, or a pattern such as `volumetric/*`, takes those that go with the scene."""
     seeds: Annotated[str, arg(metavar="0,1,2")] = "0"
@@ -58,7 +58,9 @@ class Compare(Shared):
     def request(self) -> CompareRequest:
         """Convert the options to a validated request, without opening any data."""
         out = Path("reports") / f"compare-{Path(self.scene).resolve().name}" if self.out is None else self.out
-        methods, optional = expand(parse_list(self.methods, "--methods")) if self.methods else ((), frozenset[str]())
+        methods, optional = (
+            expand(parse_list(self.methods, "--methods")) if self.methods is not None else ((), frozenset[str]())
+        )
         request = CompareRequest(
             scene=self.scene,
             methods=methods,
@@ -68,7 +70,7 @@ class Compare(Shared):
             keep=self.keep,
             **self.settings(),
         )
-        return replace(request, asked=self.methods) if optional else request
+        return replace(request, asked=self.methods or "") if optional else request
 
 
 def _report_what_is_finished(folder: Path) -> None:

@@ -34,8 +34,8 @@ class Convert:
     refit: Annotated[str, arg(metavar="10s|500steps")] = "10s"
     """Budget of the refit."""
     size: Annotated[int | None, arg(metavar="N", help_behavior_hint=f"(default: {SIZES})")] = None
-    """Number of Gaussians or points, or of vertices or voxels along the longest edge of a lattice or of what a mesh is cut
-    from."""
+    """Gaussians and points: how many. Lattice: vertices along the longest edge. Mesh: voxels along the longest edge of the grid
+    that the surface is extracted from."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
     """Change one value of the method's recipe."""
     seed: int = 0

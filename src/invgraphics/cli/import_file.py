@@ -36,7 +36,8 @@ class ImportFile:
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
-    """How many test views are scored: the first of a built-in scene, which are even, or evenly spaced ones."""
+    """How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set N evenly
+    spaced ones."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
     """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None

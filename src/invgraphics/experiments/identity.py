@@ -139,7 +139,7 @@ def check_existing(job: Job) -> None:
     if request.existing == "refuse" and present:
         raise InputError(f"{folder.root} already holds a run.", "Add --resume to continue it, or choose another --out.")
     if request.existing == "resume" and not present:
-        raise InputError(f"{folder.root} holds no run to resume.", "Leave --resume away to start one.")
+        raise InputError(f"{folder.root} holds no run to resume.", "Leave out --resume to start one.")
     if request.existing != "refuse":
         check_replaceable(job)
 

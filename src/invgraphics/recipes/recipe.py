@@ -222,7 +222,8 @@ def source(name: str) -> dict[str, Any]:
         if not path.is_file():
             known = methods()
             sentence = f"There is no method '{name}'.{suggested_method(name, known)}"
-            raise InputError(sentence, f"Known methods: {', '.join(known)}; or the path of a .toml.")
+            others = "Those of other packages are known once the package is installed."
+            raise InputError(sentence, f"Known methods: {', '.join(known)}; or the path of a .toml. {others}")
     return _parse(read_text(path, LIMITS.toml_bytes), str(path))
 
 

@@ -93,7 +93,7 @@ class TrainingData:
         check_scales(self.scales, "scales")
         check_scales((1, *self.test_scales), "test_scales")
         if self.size is not None and self.scales != (1,):
-            raise ValueError("'size' and 'scales' both resize the photographs: leave one away.")
+            raise ValueError("'size' and 'scales' both resize the photographs: leave one out.")
         if isinstance(self.background, str):
             if self.background not in (KEEP, *COLOURS):
                 raise ValueError(f"'background' is one of {KEEP}, {', '.join(COLOURS)}, or [r, g, b], not '{self.background}'.")

@@ -16,6 +16,9 @@ from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.pictures.images import image_files
 from invgraphics.scenes.validation import validate
 
+DATA = "INVGRAPHICS_DATA"
+"""Environment variable: the folder of real data sets that recipes and studies name."""
+
 __all__ = [
     "Loader",
     "SceneOptions",
@@ -96,12 +99,14 @@ def _load(spec: str, options: SceneOptions, progress: Callable[[int, int, str], 
     if not path.exists():
         if reason := missing_data_reason(spec):
             raise InputError(f"'{spec}' cannot be opened: {reason}.", "Set the variable to the folder that holds it.")
+        guess = did_you_mean(spec, _built_in())
+        if os.environ.get(DATA) and (Path(os.environ[DATA]) / spec).exists():
+            guess = f" Did you mean '${DATA}/{spec}'?"
         raise InputError(
-            f"'{spec}' is neither a built-in scene nor an existing path.{did_you_mean(spec, _built_in())}",
-            f"Built-in scenes: {', '.join(_built_in())}.",
+            f"'{spec}' is neither a built-in scene nor an existing path.{guess}", f"Built-in scenes: {', '.join(_built_in())}."
         )
     if options.spp is not None:
-        raise InputError(f"{path} holds pictures, whose samples per pixel are what they are.", "Leave --spp away.")
+        raise InputError(f"{path} holds pictures, whose samples per pixel are what they are.", "Leave out --spp.")
     return find_loader(path).load(path, options)
 
 

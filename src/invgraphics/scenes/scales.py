@@ -47,7 +47,7 @@ def scene_at(scene: Scene, divisor: int) -> Scene:
     if min(sides) // divisor < SMALLEST:
         raise InputError(
             f"Pictures of '{scene.name}' at 1/{divisor} would have a side of {min(sides) // divisor} pixels.",
-            f"The least is {SMALLEST}: leave that scale away, or give a larger --size.",
+            f"The least is {SMALLEST}: leave out that scale, or give a larger --size.",
         )
     source = source_of(scene)
     longest = {max(view.camera.width, view.camera.height) for view in (*scene.train, *scene.val, *scene.test)}

@@ -26,6 +26,10 @@ def locate(name: str) -> Path:
     for path in (Path(name), Path(name) / FILE):
         if path.suffix == ".toml" and path.is_file():
             return path
+    if name.endswith(".toml"):
+        raise InputError(
+            f"The file '{name}' does not exist.", f"Expected: the name of a built-in study, or the path of a {FILE}."
+        )
     known = [path.parent.name for path in sorted(find("studies").glob(f"*/{FILE}"))]
     if name in known:
         return find("studies", name) / FILE

@@ -130,7 +130,7 @@ class SceneSpec:
             InputError: it is a single scene, or the number leaves none to train on or none unseen.
         """
         if self.instances is None:
-            raise InputError(f"'{self.name}' is a single scene, not a class of objects.", "Leave --instances away.")
+            raise InputError(f"'{self.name}' is a single scene, not a class of objects.", "Leave out --instances.")
         if total < 2:
             raise InputError(
                 f"The number of instances cannot be {total}.", "Expected: at least 2, one to train and one unseen."

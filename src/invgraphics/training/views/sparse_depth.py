@@ -25,7 +25,7 @@ class SparseDepthConfig:
     """Supervision of depth at points of structure from motion.
 
     Attributes:
-        weight: factor of the penalty; 0 leaves it away. On fox, dtu_scan24, bonsai_photos, colmap_statue and colmap_beer 0.1
+        weight: factor of the penalty; 0 leaves it out. On fox, dtu_scan24, bonsai_photos, colmap_statue and colmap_beer 0.1
             gains 3.1, 2.6, 1.9, 1.7 and -0.2 dB, and 1.0 3.2, 2.9, 1.5, 1.1 and -0.4 (volumetric/hash, 480 px, 1,700 steps).
         rays: rays through points in each step, beside those of the batch. 32 do as much as 128 or 256 (fox, colmap_statue),
             which take up to two fifths of a step's time where batches are small.
