@@ -115,26 +115,32 @@ def over_seeds(scenes: Sequence[Groups], confidence: float = CONFIDENCE) -> Esti
     """Mean over these scenes, with the interval for new fits on them; ``None`` without scenes.
 
     The mean of scene means has variance Σ s²ₖ/nₖ / S² over all groups of fits, with Welch's (1947) degrees of freedom. Where a
-    group is a single fit, all use the variance pooled over groups.
+    group is a single fit, the groups in its place on all scenes use the variance pooled over them; of the other side, a method
+    whose fits may scatter differently, nothing is borrowed, and without spread on each side there is no interval.
     """
     if not scenes:
         return None
     parts = [values for groups in scenes for _, values in groups]
     mean = float(np.mean([_signed_mean(groups) for groups in scenes]))
-    counts = np.array([len(values) for values in parts])
-    sums, freedom = np.array([((values - values.mean()) ** 2).sum() for values in parts]), counts - 1
     size = len(scenes), _seeds(scenes)
     scale = max(float(np.abs(values).max()) for values in parts)
-    if freedom.sum() == 0 or sums.sum() <= (1e-12 * scale) ** 2:
+    sides = [_shares([values for _, values in side]) for side in zip(*scenes, strict=True)]
+    shares = np.array([share for side in sides for share in side])
+    if not all(sides) or sum(((values - values.mean()) ** 2).sum() for values in parts) <= (1e-12 * scale) ** 2:
         return Estimate(mean, mean, mean, None, "none", *size)
+    variances, freedom = shares[shares[:, 0] > 0].T
+    satterthwaite = float(variances.sum() ** 2 / (variances**2 / freedom).sum())
+    return _student_estimate(mean, (math.sqrt(variances.sum()) / len(scenes), satterthwaite), "seed", size, confidence)
+
+
+def _shares(side: Sequence[Float[ndarray, " fit"]]) -> list[tuple[float, int]]:
+    """(variance of its mean, degrees of freedom) of each group of a side; pooled where one is a single fit, empty where all are."""
+    counts = np.array([len(values) for values in side])
+    sums, freedom = np.array([((values - values.mean()) ** 2).sum() for values in side]), counts - 1
     if (freedom > 0).all():
-        shares = sums / freedom / counts
-        known = shares > 0
-        satterthwaite = float(shares.sum() ** 2 / (shares[known] ** 2 / freedom[known]).sum())
-    else:
-        shares = sums.sum() / freedom.sum() / counts
-        satterthwaite = float(freedom.sum())
-    return _student_estimate(mean, (math.sqrt(shares.sum()) / len(scenes), satterthwaite), "seed", size, confidence)
+        return [(float(share), int(free)) for share, free in zip(sums / freedom / counts, freedom, strict=True)]
+    total = int(freedom.sum())
+    return [(float(sums.sum() / total * (1 / counts).sum()), total)] if total else []
 
 
 def over_scenes(scenes: Sequence[Groups], confidence: float = CONFIDENCE, least_error: float = 0.0) -> Estimate | None:

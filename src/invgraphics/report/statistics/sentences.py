@@ -100,6 +100,8 @@ def _unmeasured(effect: Effect, magnitude: str) -> str:
         return f"{effect.label}: no difference at all, {value.size}."
     if value.seeds[1] == 1 and value.scenes == 1:
         return f"{_subject(effect)} {magnitude} with one seed only, which cannot be told from chance."
+    if value.seeds[0] == 1 and value.scenes == 1:
+        return f"{_subject(effect)} {magnitude} with one seed only on one side, which cannot be told from chance."
     words = f"{_subject(effect)} {magnitude} by the same amount each time, {value.size}"
     return f"{words}: no spread is known, so nothing is tested."
 
