@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from jinja2 import Environment, PackageLoader
 from made_up_runs import made_up_run
 
 from invgraphics.report.data.factors import METHOD, Observation
+from invgraphics.report.figures.effects import draw_intervals
+from invgraphics.report.pages.tables import markdown_effects, write_latex_effects
 from invgraphics.report.statistics.effects import Effect, effects_of
 from invgraphics.report.statistics.intervals import over_seeds
 from invgraphics.report.statistics.pairing import Contrast
@@ -57,3 +61,47 @@ def test_a_side_borrows_spread_from_its_own_fits_on_other_scenes() -> None:
     total = sum(share for share, _ in parts)
     assert found.error == pytest.approx(np.sqrt(total) / 2, rel=1e-12)
     assert found.freedom == pytest.approx(total**2 / sum(share**2 / free for share, free in parts), rel=1e-12)
+
+
+GAINS = (1.0, 1.2, 1.1, 0.9, 1.0, 1.05, -0.5)
+
+
+def test_an_effect_that_a_scene_contradicts_is_no_winner(tmp_path: Path) -> None:
+    """Six scenes gain 1 dB, the seventh loses 0.5: the mean is significant over scenes, and not true of the seventh."""
+    rng = np.random.default_rng(3)
+    contrary = effect_of(A_TO_B, fits_of(7, 4, lambda s, m: 20 + GAINS[s] * (m == "B") + rng.normal(0, 0.02)))
+    assert contrary.adjusted is not None and contrary.adjusted < 0.02 and contrary.scenes("lower") == ["s6"]
+    assert not contrary.found and not contrary.uncorrected and contrary.contradicted
+    sentence = effect_sentence(contrary)
+    assert "no common direction" in sentence and "worse on s6" in sentence and "gains" not in sentence
+    common = effect_of(A_TO_B, fits_of(7, 4, lambda s, m: 20 + abs(GAINS[s]) * (m == "B") + rng.normal(0, 0.02)))
+    assert common.found
+    assert _bold(common, tmp_path) == (True, True, True, True)
+    assert _bold(contrary, tmp_path) == (False, False, False, False)
+
+
+def _bold(effect: Effect, folder: Path) -> tuple[bool, bool, bool, bool]:
+    """Whether a difference is bold in Markdown, LaTeX and HTML, and its mark filled in the plot."""
+    mean = effect.text(effect.estimate.mean)
+    write_latex_effects([effect], "caption", folder / "effects.tex")
+    environment = Environment(loader=PackageLoader("invgraphics.report", "templates"))
+    macros: Any = environment.get_template("sections.html").make_module()
+    figure = draw_intervals([effect], folder)
+    assert figure is not None
+    return (
+        f"**{mean} dB**" in markdown_effects([effect]),
+        f"textbf{{{mean} dB}}" in (folder / "effects.tex").read_text(),
+        f"<b>{mean}</b>" in macros.effect_table(effect.quantity, [effect]).split("this scene alone")[0],
+        "stroke-width: 1.8" not in figure.path.read_text(),
+    )
+
+
+def test_scenes_of_opposite_signs_are_not_equal() -> None:
+    """Sixteen scenes that gain or lose 0.35 dB: their mean is zero within 0.2, and no scene is."""
+    rng = np.random.default_rng(4)
+    for size, equal in ((0.35, False), (0.05, True)):
+        signs = [size if s % 2 else -size for s in range(16)]
+        effect = effect_of(A_TO_B, fits_of(16, 1, lambda s, m, g=signs: 20 + g[s] * (m == "B") + rng.normal(0, 0.03)))
+        assert effect.equivalence is not None and effect.equivalence < 0.05
+        assert effect.equivalent == equal
+        assert ("no effect beyond" in effect_sentence(effect)) == equal

@@ -88,25 +88,42 @@ class Effect:
 
     @property
     def found(self) -> bool:
-        """Whether the difference is significant after Holm's correction, and not due to fits that dropped out."""
-        return self.adjusted is not None and self.adjusted <= ALPHA and not self.flattered
+        """Whether the difference is significant after correction, not due to lost fits, and opposed by no scene or setting."""
+        return self.adjusted is not None and self.adjusted <= ALPHA and self._common
 
     @property
     def uncorrected(self) -> bool:
         """Whether the difference is significant before correction only."""
-        return not self.found and self.claim.p is not None and self.claim.p <= ALPHA and not self.flattered
+        return not self.found and self.claim.p is not None and self.claim.p <= ALPHA and self._common
 
     @property
     def equivalent(self) -> bool:
-        """Whether the difference lies within the margin after correction, with no scene or setting that contradicts it."""
+        """Whether the difference lies within the margin after correction, with no scene or setting that contradicts it.
+
+        A scene whose own mean is outside the margin does: means of opposite signs cancel, and few fits find none of them.
+        """
+        if self.equivalence is None or self.equivalence > ALPHA or self.lost != (0, 0) or self.quantity.margin is None:
+            return False
+        margin = self.quantity.margin
         contradicted = any(one.verdict in ("higher", "lower") for one in self.by_scene.values())
-        contradicted |= any(one.sign for one in self.by_setting.values())
-        return self.equivalence is not None and self.equivalence <= ALPHA and not contradicted and self.lost == (0, 0)
+        contradicted |= any(abs(one.estimate.mean) > margin for one in self.by_scene.values())
+        return not contradicted and not any(one.sign for one in self.by_setting.values())
 
     @property
     def opposed(self) -> bool:
         """Whether the difference is significant with one sign at some levels of other factors, and with the other at others."""
         return {1, -1} <= {one.sign for one in self.by_setting.values()}
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the difference is significant with the other sign on a scene alone, or with both signs on two scenes."""
+        found = {one.verdict for one in self.by_scene.values()}
+        return {"higher", "lower"} <= found or ("lower" if self.claim.mean > 0 else "higher") in found
+
+    @property
+    def _common(self) -> bool:
+        """Whether a significant mean may be told as the direction of all: no fits are missing, no part says otherwise."""
+        return not (self.flattered or self.opposed or self.contradicted)
 
     @property
     def detectable(self) -> float | None:

@@ -134,7 +134,7 @@ def over_seeds(scenes: Sequence[Groups], confidence: float = CONFIDENCE) -> Esti
 
 
 def _shares(side: Sequence[Float[ndarray, " fit"]]) -> list[tuple[float, int]]:
-    """(variance of its mean, degrees of freedom) of each group of a side; pooled where one is a single fit, empty where all are."""
+    """(variance of the mean, degrees of freedom) of a side's groups; pooled where one is a single fit, empty if all are."""
     counts = np.array([len(values) for values in side])
     sums, freedom = np.array([((values - values.mean()) ** 2).sum() for values in side]), counts - 1
     if (freedom > 0).all():

@@ -70,7 +70,7 @@ def _verdict(effect: Effect) -> str:
         return f"{effect.label}: the sign depends on other factors, {basis}: {_settings(effect)}; {mean}."
     if effect.found:
         return f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}."
-    if _contradict(effect):
+    if effect.contradicted:
         mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
         return f"{effect.label}: no common direction, {basis}; {mean}."
     if effect.scenes("higher") or effect.scenes("lower"):
@@ -159,10 +159,6 @@ def _direction(effect: Effect, verdict: Verdict) -> str:
     if effect.quantity.better == "none":
         return "more" if verdict == "higher" else "less"
     return "better" if (verdict == "higher") == (effect.quantity.better == "higher") else "worse"
-
-
-def _contradict(effect: Effect) -> bool:
-    return bool(effect.scenes("higher")) and bool(effect.scenes("lower"))
 
 
 def _averaged(effect: Effect) -> str:
