@@ -6,7 +6,6 @@ nothing in common but the number: they are two independent groups.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,9 +16,9 @@ from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.data.variants import level_words
-from invgraphics.report.statistics.values import clipped, diverged, value_of
+from invgraphics.report.statistics.losses import lost_among
+from invgraphics.report.statistics.values import diverged, run_values, value_of
 from invgraphics.report.wording import MeasuredQuantity
-from invgraphics.runs.run import Run
 
 Sign = float
 
@@ -131,26 +130,6 @@ def _sides(contrast: Contrast) -> list[dict[str, str]]:
         return sides
     factor, *places = contrast.against
     return [{**side, factor: place} for side in sides for place in places]
-
-
-def lost_among(gone: Sequence[Lost], known: Sequence[Observation], sides: Sequence[Mapping[str, str]]) -> list[Lost]:
-    """The lost fits at some sides' levels whose scene and other levels all sides have, lost or not: others are not missing.
-
-    Args:
-        gone: fits that failed or diverged.
-        known: fits with a score.
-        sides: factor -> level of each side of a comparison.
-    """
-    named = {factor for side in sides for factor in side}
-
-    def stratum(one: Lost | Observation) -> tuple[Any, ...]:
-        return one.scene, *sorted((key, level) for key, level in one.levels.items() if key not in named)
-
-    def at(one: Lost | Observation, side: Mapping[str, str]) -> bool:
-        return all(one.levels.get(factor) == level for factor, level in side.items())
-
-    common = set.intersection(*({stratum(one) for one in (*known, *gone) if at(one, side)} for side in sides))
-    return [one for one in gone if stratum(one) in common and any(at(one, side) for side in sides)]
 
 
 def _raises(contrast: Contrast, cell: Lost) -> bool:
@@ -269,25 +248,3 @@ def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantit
             for seed, value in zip(table[key], values, strict=False):
                 found.setdefault(seed, []).append(value)
     return np.array([sum(values) / strata for values in found.values() if len(values) == strata])
-
-
-def run_values(runs: Sequence[Run], quantity: MeasuredQuantity) -> list[float] | None:
-    """Mean of each run over the views in which all of them have a finite score; over all where single views have none."""
-    if quantity.group != "cost":
-        tables = [_views(run, quantity) for run in runs]
-        if all(tables):
-            names = [name for name in tables[0] if all(name in table for table in tables)]
-            return [sum(table[name] for name in names) / len(names) for table in tables] if names else None
-    values = [value_of(run, quantity) for run in runs]
-    known = [value for value in values if value is not None and math.isfinite(value)]
-    return known if len(known) == len(values) else None
-
-
-def _views(run: Run, quantity: MeasuredQuantity) -> dict[str, float]:
-    """View -> finite score; empty where single views have none."""
-    score = run.scores.quality.get(quantity.key)
-    if score is None or not score.per_view:
-        return {}
-    values = (clipped(value, quantity) for value in score.per_view)
-    pairs = zip(run.scores.views, values, strict=True)
-    return {name: value for name, value in pairs if value is not None and math.isfinite(value)}

@@ -18,7 +18,7 @@ from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
-from invgraphics.report.statistics.pairing import lost_among
+from invgraphics.report.statistics.losses import lost_among
 from invgraphics.report.statistics.values import diverged, value_of
 from invgraphics.report.wording import ABSENT, MeasuredQuantity, listing, quality_quantity, significant_decimals
 from invgraphics.runs.study import Prediction, level_text
