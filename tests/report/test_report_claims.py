@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from jinja2 import Environment, PackageLoader
 from made_up_runs import made_up_run
 
+from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD, Observation
 from invgraphics.report.figures.effects import draw_intervals
 from invgraphics.report.pages.tables import markdown_effects, write_latex_effects
@@ -18,7 +20,9 @@ from invgraphics.report.statistics.effects import Effect, effects_of
 from invgraphics.report.statistics.intervals import over_seeds
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.wording import quality_quantity
+from invgraphics.runs.run import Run
 from invgraphics.runs.scores import Score
 
 PSNR = quality_quantity("psnr", Score(mean=0.0, unit="dB", higher_is_better=True))
@@ -105,3 +109,33 @@ def test_scenes_of_opposite_signs_are_not_equal() -> None:
         assert effect.equivalence is not None and effect.equivalence < 0.05
         assert effect.equivalent == equal
         assert ("no effect beyond" in effect_sentence(effect)) == equal
+
+
+NORMALS = Score(mean=0.0, unit="degrees", higher_is_better=False)
+UNSEEN = "view 0001: no pixel shows a surface (alpha >= 0.5) in both truth and prediction"
+
+
+def surface(method: str, seed: int, degrees: float | None) -> Run:
+    """A fit with an error of its normals, or with the reason why it has none."""
+    quality = {"psnr": Score(mean=30 + 0.01 * seed, unit="dB", higher_is_better=True)}
+    quality |= {} if degrees is None else {"normal_deg": replace(NORMALS, mean=degrees, per_view=(degrees, degrees))}
+    skipped = {"normal_deg": UNSEEN} if degrees is None else {}
+    return made_up_run(quality, method, seed, "s", views=("0", "1"), skipped=skipped)
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_seed_without_a_value_does_not_help_its_method(lost: bool) -> None:
+    """The fourth fit of A has no surface to score; the other three look better than B."""
+    errors = {"A": (10.0, 10.1, 10.05, None if lost else 10.02), "B": (12.0, 12.1, 12.05, 12.02)}
+    runs = tuple(surface(method, seed, value) for method, values in errors.items() for seed, value in enumerate(values))
+    quantity = quality_quantity("normal_deg", NORMALS)
+    observations = [Observation(run, "s", {METHOD: run.method}) for run in runs]
+    (effect,) = effects_of([Contrast(METHOD, "B", "A")], quantity, observations)
+    assert (effect.lost, effect.found, effect.flattered) == ((0, int(lost)), not lost, lost)
+    summary = summarise(Comparison("s", "?", ("A", "B"), runs, budget="60s"))
+    assert any(row.cells[1].best for row in summary.rows) != lost and summary.rows[0].ranked_in(quantity) != lost
+    if lost:
+        unscored = [replace(run, scores=replace(run.scores, quality={})) for run in runs if run.method == "A"]
+        others = [Observation(run, "s", {METHOD: "A"}) for run in unscored]
+        assert not effects_of([A_TO_B], quantity, [*others, *observations[4:]]), "what no seed has is undefined, not lost"
+        assert summarise(Comparison("s", "?", ("A", "B"), (*unscored, *runs[4:]))).rows[0].lost == frozenset()

@@ -6,6 +6,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from invgraphics.report.data.factors import Lost, Observation
+from invgraphics.report.statistics.values import without_score
+from invgraphics.report.wording import MeasuredQuantity
+
+
+def scoreless(observations: Sequence[Observation], quantity: MeasuredQuantity) -> list[Observation]:
+    """Finished fits that failed at a quantity: they diverged, or lack a metric that another seed at the same levels has."""
+    cells: dict[tuple[Any, ...], list[Observation]] = {}
+    for one in observations:
+        cells.setdefault((one.scene, *sorted(one.levels.items())), []).append(one)
+    found = []
+    for cell in cells.values():
+        failed = set(map(id, without_score([one.run for one in cell], quantity)))
+        found += [one for one in cell if id(one.run) in failed]
+    return found
 
 
 def lost_among(gone: Sequence[Lost], known: Sequence[Observation], sides: Sequence[Mapping[str, str]]) -> list[Lost]:

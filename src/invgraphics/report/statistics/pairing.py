@@ -16,8 +16,8 @@ from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.data.variants import level_words
-from invgraphics.report.statistics.losses import lost_among
-from invgraphics.report.statistics.values import diverged, run_values, value_of
+from invgraphics.report.statistics.losses import lost_among, scoreless
+from invgraphics.report.statistics.values import run_values, value_of
 from invgraphics.report.wording import MeasuredQuantity
 
 Sign = float
@@ -103,8 +103,10 @@ def sample(
     """
     counted = [one for one in observations if all(one.levels.get(key) == level for key, level in contrast.where.items())]
     sided = [one for one in counted if one.levels.get(contrast.factor, "") in contrast.levels]
-    gone = [Lost(one.scene, one.levels) for one in sided if diverged(one.run, quantity)]
-    known = [one for one in sided if not diverged(one.run, quantity) and value_of(one.run, quantity) is not None]
+    failed = scoreless(sided, quantity)
+    gone = [Lost(one.scene, one.levels) for one in failed]
+    left_out = set(map(id, failed))
+    known = [one for one in sided if id(one) not in left_out and value_of(one.run, quantity) is not None]
     gone += [cell for cell in lost if all(cell.levels.get(key) == value for key, value in contrast.where.items())]
     gone = lost_among(gone, known, _sides(contrast))
     missing = dict.fromkeys(cell.scene for cell in gone)

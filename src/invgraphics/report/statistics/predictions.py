@@ -18,7 +18,7 @@ from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
-from invgraphics.report.statistics.losses import lost_among
+from invgraphics.report.statistics.losses import lost_among, scoreless
 from invgraphics.report.statistics.values import diverged, value_of
 from invgraphics.report.wording import ABSENT, MeasuredQuantity, listing, quality_quantity, significant_decimals
 from invgraphics.runs.study import Prediction, level_text
@@ -105,7 +105,7 @@ def _judge(prediction: Prediction, observations: Sequence[Observation], failures
     known = {name: groups for name, (groups, _) in found.items() if groups}
     value = over_seeds(list(known.values()))
     gone = [one for one in failures if one.scene in names]
-    gone += [Lost(one.scene, one.levels) for one in observations if one.scene in names and diverged(one.run, quantity)]
+    gone += [Lost(one.scene, one.levels) for one in scoreless(observations, quantity) if one.scene in names]
     count = len(lost_among(gone, [one for one in scored if one.scene in names], [levels for _, levels in terms]))
     reason = "; ".join(dict.fromkeys(why for _, why in found.values())) if value is None else ""
     return JudgedPrediction(prediction, quantity, value, tuple(known), count, _verdict(prediction, value, count), reason)

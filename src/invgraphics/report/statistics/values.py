@@ -49,6 +49,17 @@ def diverged(run: Run, column: MeasuredQuantity) -> bool:
     return any(broken) if column.group == "image" else all(broken)
 
 
+def without_score(runs: Sequence[Run], column: MeasuredQuantity) -> list[Run]:
+    """Runs of one method and scene that failed at a quantity: diverged, or without a quality metric that another of them has.
+
+    A metric that all of them lack is undefined there. One that only some lack, as where no surface was found, went wrong in
+    these, and a mean over the others would be the better for it.
+    """
+    valued = [value_of(run, column) is not None and not diverged(run, column) for run in runs]
+    owed = column.group != "cost" and any(valued)
+    return [run for run, has in zip(runs, valued, strict=True) if not has and (owed or diverged(run, column))]
+
+
 def run_values(runs: Sequence[Run], quantity: MeasuredQuantity) -> list[float] | None:
     """Mean of each run over the views in which all of them have a finite score; over all where single views have none."""
     if quantity.group != "cost":

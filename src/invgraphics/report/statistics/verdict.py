@@ -180,8 +180,8 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
             reasons.setdefault(run.method, run.scores.below_baseline)
     sentences += reasons.values()
     if columns and (broken := [row.label for row in summary.methods if columns[0].key in row.lost]):
-        what = "a fit whose" if len(broken) == 1 else "fits whose"
-        sentences.append(f"{listing(broken)}: {what} {columns[0].label} is not a number, and so left out of the ranking.")
+        what = "a fit" if len(broken) == 1 else "fits"
+        sentences.append(f"{listing(broken)}: {what} without a number for {columns[0].label}, and so left out of the ranking.")
     short = [row.label for row in summary.methods if not row.complete]
     if short:
         words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"
