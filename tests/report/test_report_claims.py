@@ -19,11 +19,13 @@ from invgraphics.report.pages.tables import markdown_effects, write_latex_effect
 from invgraphics.report.statistics.effects import Effect, effects_of
 from invgraphics.report.statistics.intervals import over_seeds
 from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.predictions import judge_predictions
 from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.run import Run
 from invgraphics.runs.scores import Score
+from invgraphics.runs.study import Prediction
 
 PSNR = quality_quantity("psnr", Score(mean=0.0, unit="dB", higher_is_better=True))
 A_TO_B = Contrast(METHOD, "A", "B")
@@ -139,3 +141,35 @@ def test_a_seed_without_a_value_does_not_help_its_method(lost: bool) -> None:
         others = [Observation(run, "s", {METHOD: "A"}) for run in unscored]
         assert not effects_of([A_TO_B], quantity, [*others, *observations[4:]]), "what no seed has is undefined, not lost"
         assert summarise(Comparison("s", "?", ("A", "B"), (*unscored, *runs[4:]))).rows[0].lost == frozenset()
+
+
+def factorial(*missing: tuple[int, str], seeds: int = 4) -> list[Observation]:
+    """Pairs of two sizes with 5 photographs, where the second gains 5 dB, and with 40, where it gains nothing."""
+    rng = np.random.default_rng(5)
+    places = [(k, views, gain) for k in range(seeds) for views, gain in (("5", 5.0), ("40", 0.0)) if (k, views) not in missing]
+    return [
+        fit(20 + gain * (size == "16") + rng.normal(0, 0.02), seed=k, size=size, views=views)
+        for k, views, gain in places
+        for size in ("8", "16")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("missing", "mean", "seeds"),
+    [
+        ([], 2.5, 4),
+        ([(3, "40")], 2.5, 3),  # the seed goes: three of both settings are more than four of one
+        ([(1, "40"), (2, "40"), (3, "40")], 5.0, 4),  # the setting goes, which a single seed has
+        ([(0, "40"), (1, "40"), (2, "5"), (3, "5")], 5.0, 2),  # no seed has both
+    ],
+)
+def test_incomplete_seeds_do_not_mix_settings(missing: list[tuple[int, str]], mean: float, seeds: int) -> None:
+    """A seed that has one of two settings has that setting's difference, which is no draw of their mean."""
+    fits = factorial(*missing)
+    effect = effect_of(SIZE, fits)
+    assert effect.estimate.mean == pytest.approx(mean, abs=0.05) and effect.estimate.half_width < 0.3
+    assert effect.estimate.seeds == (seeds, seeds)
+    stated = Prediction(text="?", source="?", before={"size": "8"}, after={"size": "16"}, low=mean - 0.5, high=mean + 0.5)
+    (judged,) = judge_predictions([stated], fits)
+    assert judged.verdict == "held" or seeds == 2
+    assert judged.estimate is not None and judged.estimate.mean == pytest.approx(effect.estimate.mean)

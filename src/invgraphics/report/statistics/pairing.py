@@ -173,8 +173,8 @@ def _difference(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[O
         sides = (_side(table, other, shared, quantity) for table, other in ((after, before), (before, after)))
         groups = [(sign, values) for sign, values in zip((1.0, -1.0), sides, strict=True) if len(values)]
         return groups if len(groups) == 2 else []
-    values = _paired(before, after, quantity)
-    return [(1.0, values)] if len(values) else []
+    values = balanced(_differences(before, after, quantity))
+    return [(1.0, np.array(list(values.values())))] if values else []
 
 
 def _interaction(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
@@ -195,7 +195,7 @@ def _interaction(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[
     groups = corners if factor == METHOD else len(corners) * [[table for tables in corners for table in tables]]
     seeds = map(_whole_seeds, groups)
     corners = [[_of_seeds(table, whole) for table in tables] for tables, whole in zip(corners, seeds, strict=True)]
-    sides = [_by_seed(before, after, quantity) for before, after in corners]
+    sides = [balanced(_differences(before, after, quantity)) for before, after in corners]
     if not all(sides):
         return []
     if factor == METHOD:
@@ -223,19 +223,30 @@ def _table(path: str, level: str, observations: Sequence[Observation], drop: str
     return table
 
 
-def _paired(before: Table, after: Table, quantity: MeasuredQuantity) -> Float[ndarray, " seed"]:
-    return np.array(list(_by_seed(before, after, quantity).values()))
-
-
-def _by_seed(before: Table, after: Table, quantity: MeasuredQuantity) -> dict[int, float]:
-    """Seed -> paired difference on shared views; other factors are averaged, since they add no independent seed."""
-    found: dict[int, list[float]] = {}
+def _differences(before: Table, after: Table, quantity: MeasuredQuantity) -> dict[tuple[Any, ...], dict[int, float]]:
+    """Stratum -> seed -> paired difference on shared views."""
+    found: dict[tuple[Any, ...], dict[int, float]] = {}
     for key, runs in before.items():
         for seed, one in runs.items():
             other = after.get(key, {}).get(seed)
             if other is not None and (values := run_values((one.run, other.run), quantity)) is not None:
-                found.setdefault(seed, []).append(values[1] - values[0])
-    return {seed: sum(values) / len(values) for seed, values in found.items()}
+                found.setdefault(key, {})[seed] = values[1] - values[0]
+    return found
+
+
+def balanced(table: Mapping[Any, Mapping[int, float]]) -> dict[int, float]:
+    """Seed -> mean over strata, since other factors add no independent seed, of the largest block of values without a hole.
+
+    Where a seed lacks a stratum, as in unfinished studies, its mean over the others would be of another quantity than that of
+    the next seed. So seeds or strata are left out, whichever loses fewer values; of equal blocks the one with more seeds stays.
+    """
+    sets = [frozenset(values) for values in table.values() if values]
+    if not sets:
+        return {}
+    candidates = [*sets, frozenset.intersection(*sets)]
+    kept = max(candidates, key=lambda seeds: (len(seeds) * sum(seeds <= own for own in sets), len(seeds)))
+    strata = [values for values in table.values() if kept <= values.keys()]
+    return {seed: sum(values[seed] for values in strata) / len(strata) for seed in sorted(kept)}
 
 
 def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantity: MeasuredQuantity) -> Float[ndarray, " seed"]:

@@ -19,6 +19,7 @@ from numpy import ndarray
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
 from invgraphics.report.statistics.losses import lost_among, scoreless
+from invgraphics.report.statistics.pairing import balanced
 from invgraphics.report.statistics.values import diverged, value_of
 from invgraphics.report.wording import ABSENT, MeasuredQuantity, listing, quality_quantity, significant_decimals
 from invgraphics.runs.study import Prediction, level_text
@@ -192,13 +193,15 @@ def _by_seed(table: Strata, shared: Sequence[Stratum], whole: bool) -> Float[nda
     Args:
         table: of one method.
         shared: the strata that all methods have.
-        whole: leave out seeds that lack one of them: only differences within a method may be averaged over fewer.
+        whole: leave out seeds that lack one of them: only where differences within a method are all may strata go instead.
     """
+    if not whole:
+        return np.array(list(balanced({stratum: table[stratum] for stratum in shared}).values()))
     found: dict[int, list[float]] = {}
     for stratum in shared:
         for seed, value in table[stratum].items():
             found.setdefault(seed, []).append(value)
-    return np.array([sum(values) / len(values) for values in found.values() if not whole or len(values) == len(shared)])
+    return np.array([sum(values) / len(values) for values in found.values() if len(values) == len(shared)])
 
 
 def _apart(tables: Sequence[Strata]) -> str:
