@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -247,3 +248,20 @@ def test_nothing_has_no_sign() -> None:
 def test_many_levels_are_compared_with_the_reference_only() -> None:
     assert Factor("x", ("1", "2", "3"), "2").pairs() == [("2", "1"), ("2", "3"), ("1", "3")]
     assert Factor("x", tuple("12345"), "3").pairs() == [("3", "1"), ("3", "2"), ("3", "4"), ("3", "5")]
+
+
+@pytest.mark.parametrize("comparisons", [1, 5, 20, 63, 1000])
+def test_the_detectable_effect_of_two_fits_grows_with_the_number_of_comparisons(comparisons: int) -> None:
+    """At one degree of freedom the ratio of effects is half-Cauchy: 80 % power needs tan(0.4 pi) = 3.08 critical values."""
+    expected = math.tan(0.4 * math.pi) * stats.t.isf(0.025 / comparisons, 1)
+    assert Estimate(1, 0, 2, 0.5, "seed", 1, (2, 2), 1.0, 1.0).detectable(comparisons) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(("freedom", "comparisons"), [(2.0, 1), (2.0, 100), (3.7, 4), (12.0, 1), (500.0, 3)])
+def test_the_detectable_effect_is_that_of_simulated_repetitions(freedom: float, comparisons: int) -> None:
+    rng = np.random.default_rng(12)
+    effect = Estimate(1, 0, 2, 0.5, "seed", 1, (3, 3), 1.0, freedom).detectable(comparisons)
+    assert effect is not None
+    stated, repeated = np.sqrt(rng.chisquare(freedom, (2, 200_000)) / freedom)
+    found = rng.normal(size=200_000) + effect * stated > stats.t.isf(0.025 / comparisons, freedom) * repeated
+    assert found.mean() == pytest.approx(0.8, abs=0.004)

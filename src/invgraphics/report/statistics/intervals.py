@@ -23,7 +23,7 @@ from numpy import ndarray
 CONFIDENCE = 0.95
 POWER = 0.8
 """Probability with which a detectable effect is found."""
-NODES = 48
+NODES = 96
 """Quantiles of the estimated spread over which power is averaged."""
 
 Nested = Sequence[Sequence[Float[ndarray, " view"]]]
@@ -217,18 +217,25 @@ def _student(statistic: float, freedom: float, confidence: float) -> tuple[float
 
 @functools.lru_cache(maxsize=4096)
 def _detectable_errors(freedom: float, level: float, power: float) -> float:
-    """True effect, in estimated standard errors, that a two-sided t-test of ``level`` finds with probability ``power``."""
-    from scipy.optimize import brentq
-    from scipy.special import chdtri, nctdtr, stdtrit
+    """True effect, in estimated standard errors, that a two-sided t-test of ``level`` finds with probability ``power``.
 
-    critical = float(stdtrit(freedom, 1 - level / 2))
-    # Quantiles of the estimated over the true standard error.
+    The test finds it where z + r x > c q: z is normal, q and r are the estimated over the true standard error, of the
+    repetition and of this study, and c is the critical value. The normal tail is averaged over quantiles of both, since SciPy's
+    non-central t fails at the shifts of thousands that one degree of freedom needs.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import chdtri, ndtr, stdtrit
+
+    critical = -float(stdtrit(freedom, level / 2))
     ratios = np.sqrt(chdtri(freedom, 1 - (np.arange(NODES) + 0.5) / NODES) / freedom)
 
     def missed(log_errors: float) -> float:
-        shift = ratios * math.exp(log_errors)
-        below = nctdtr(freedom, np.minimum(shift, 1e3), critical)
-        return float(np.nan_to_num(below, nan=0.0).mean()) - (1 - power)
+        return float(ndtr(critical * ratios[:, None] - math.exp(log_errors) * ratios).mean()) - (1 - power)
 
-    root = brentq(missed, math.log(critical) - 3, math.log(critical) + 6, xtol=1e-3)
+    low, high = math.log(critical) - 1, math.log(critical) + 1
+    while missed(low) < 0:
+        low -= 1
+    while missed(high) > 0:
+        high += 1
+    root = brentq(missed, low, high, xtol=1e-3)
     return math.exp(root)  # pyright: ignore[reportArgumentType]  # a tuple only with full_output

@@ -1,9 +1,9 @@
 """Predictions of a study, judged: the predicted difference with its intervals, and whether it lies within its bounds.
 
 The intervals are those of `invgraphics.report.statistics.intervals`, for new fits on the same scenes and for scenes like these;
-a verdict rests on the latter where there are several scenes, as in all comparisons. Fits of one method pair by seed; fits of two
-methods are independent groups. Factors that no side names are held equal: differences are taken at those of their levels that
-all sides have, a stratum each, and averaged over the strata.
+a verdict rests on the latter where there are several scenes, as in all comparisons. Fits of one method pair by seed; those of
+two methods are independent groups. Factors that no side names are held equal: differences are taken at those of their levels
+that all sides have, a stratum each, and averaged over the strata.
 """
 
 from __future__ import annotations
