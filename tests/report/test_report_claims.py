@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader
 from made_up_runs import made_up_run
 
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Observation
+from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.figures.effects import draw_intervals
 from invgraphics.report.pages.tables import markdown_effects, write_latex_effects
 from invgraphics.report.statistics.effects import Effect, effects_of
@@ -173,3 +173,30 @@ def test_incomplete_seeds_do_not_mix_settings(missing: list[tuple[int, str]], me
     (judged,) = judge_predictions([stated], fits)
     assert judged.verdict == "held" or seeds == 2
     assert judged.estimate is not None and judged.estimate.mean == pytest.approx(effect.estimate.mean)
+
+
+def test_a_fit_lost_on_a_scene_does_not_help_its_method_there() -> None:
+    """B gains 2 dB on both scenes and lost a fit on the first, A one on the second: in total they lost equally many."""
+    rng = np.random.default_rng(7)
+    missing = {("s0", "B"), ("s1", "A")}
+    fits = fits_of(2, 5, lambda s, m: 25 + 2 * (m == "B") + rng.normal(0, 0.1))
+    fits = [one for one in fits if (one.scene, one.levels[METHOD]) not in missing or one.run.seed]
+    effect = effect_of(A_TO_B, fits, *(Lost(scene, {METHOD: method}) for scene, method in missing))
+    assert effect.lost == (1, 1) and not effect.flattered
+    assert {scene: one.verdict for scene, one in effect.by_scene.items()} == {"s0": "undecided", "s1": "higher"}
+
+
+def test_fits_lost_at_settings_make_no_opposite_signs() -> None:
+    """At each setting the side that lost its worst fit looks better by 1 dB, which is no sign that depends on the setting."""
+    rng = np.random.default_rng(8)
+    fits, lost = [], []
+    for views, loser in (("5", "16"), ("40", "8")):
+        for seed, size in ((seed, size) for seed in range(5) for size in ("8", "16")):
+            if size == loser and seed == 0:
+                lost.append(Lost("s", {METHOD: "m", "size": size, "views": views}))
+            else:
+                fits.append(fit(20 + (size == loser) + rng.normal(0, 0.1), seed=seed, size=size, views=views))
+    effect = effect_of(SIZE, fits, *lost)
+    assert effect.lost == (1, 1) and not effect.opposed
+    assert [one.sign for one in effect.by_setting.values()] == [0, 0]
+    assert effect_of(SIZE, fits).opposed, "with nothing lost they are opposite"

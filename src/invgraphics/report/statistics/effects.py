@@ -8,8 +8,15 @@ from typing import Literal
 
 from invgraphics.report.data.factors import Factor, Lost, Observation
 from invgraphics.report.statistics.intervals import Estimate, holm, over_seeds
-from invgraphics.report.statistics.pairing import Contrast, Sample, contrast_words, sample
-from invgraphics.report.statistics.settings import ALPHA, SettingEffect, across_scenes, effects_by_setting
+from invgraphics.report.statistics.pairing import Contrast, contrast_words, sample
+from invgraphics.report.statistics.settings import (
+    ALPHA,
+    SettingEffect,
+    across_scenes,
+    effects_by_setting,
+    favoured,
+    flattered,
+)
 from invgraphics.report.wording import MeasuredQuantity, significant_decimals
 
 Verdict = Literal["higher", "lower", "undecided", "untested"]
@@ -22,13 +29,14 @@ class SceneEffect:
 
     estimate: Estimate
     adjusted: float | None
+    flattered: bool = False
 
     @property
     def verdict(self) -> Verdict:
-        """Sign of the difference, where it is significant."""
+        """Sign of the difference, where it is significant and the side that looks better lost no more fits there."""
         if self.adjusted is None:
             return "untested"
-        if self.adjusted > ALPHA:
+        if self.adjusted > ALPHA or self.flattered:
             return "undecided"
         return "higher" if self.estimate.mean > 0 else "lower"
 
@@ -76,15 +84,12 @@ class Effect:
     @property
     def better(self) -> int:
         """1 where ``after`` is better, -1 where ``before`` is, 0 where neither direction is or there is no difference."""
-        if self.quantity.better == "none" or self.claim.mean == 0:
-            return 0
-        return 1 if (self.claim.mean > 0) == (self.quantity.better == "higher") else -1
+        return favoured(self.quantity, self.claim.mean)
 
     @property
     def flattered(self) -> bool:
         """Whether the side that looks better lost more fits than the other: its mean is over those that went well."""
-        before, after = self.lost
-        return (self.better > 0 and after > before) or (self.better < 0 and before > after)
+        return flattered(self.quantity, self.claim.mean, self.lost)
 
     @property
     def found(self) -> bool:
@@ -235,10 +240,7 @@ def effects_of(
     """
     failed = tuple(lost)
     found = [
-        effect
-        for contrast in contrasts
-        if (effect := _effect(contrast, quantity, sample(contrast, quantity, observations, failed), observations, factors))
-        is not None
+        effect for contrast in contrasts if (effect := _effect(contrast, quantity, (observations, failed), factors)) is not None
     ]
     adjusted = holm([effect.claim.p for effect in found])
     margin = quantity.margin
@@ -262,10 +264,10 @@ def effects_of(
 def _effect(
     contrast: Contrast,
     quantity: MeasuredQuantity,
-    values: Sample,
-    observations: Sequence[Observation],
+    observed: tuple[Sequence[Observation], Sequence[Lost]],
     factors: Sequence[Factor],
 ) -> Effect | None:
+    values = sample(contrast, quantity, *observed)
     groups = list(values.scenes.values())
     whole = over_seeds(groups)
     if whole is None:
@@ -279,9 +281,13 @@ def _effect(
         adjusted=None,
         comparisons=0,
         pairs=values.pairs,
-        by_scene={scene: SceneEffect(one, None) for scene, one in alone.items() if one is not None},
-        by_setting=effects_by_setting(contrast, quantity, observations, factors),
-        lost=values.lost,
+        by_scene={
+            scene: SceneEffect(one, None, flattered(quantity, one.mean, values.lost.get(scene, (0, 0))))
+            for scene, one in alone.items()
+            if one is not None
+        },
+        by_setting=effects_by_setting(contrast, quantity, *observed, factors),
+        lost=values.all_lost,
         silent=values.silent,
         truths_differ=values.truths_differ,
     )

@@ -73,17 +73,22 @@ class Sample:
 
     Attributes:
         scenes: scene -> signed groups of values, one value per fit.
-        lost: diverged or failed fits that are (subtracted, added): of (before, after), or of an interaction's corners.
+        lost: scene -> diverged or failed fits that are (subtracted, added): of (before, after), or of an interaction's corners.
         silent: scenes where one side has no number at all.
         pairs: fits compared, on the side that has fewer.
         truths_differ: some were scored against different pictures, because the factor changes the truth.
     """
 
     scenes: dict[str, list[tuple[Sign, Float[ndarray, " fit"]]]]
-    lost: tuple[int, int]
+    lost: dict[str, tuple[int, int]]
     silent: tuple[str, ...]
     pairs: int
     truths_differ: bool
+
+    @property
+    def all_lost(self) -> tuple[int, int]:
+        """Lost fits of all scenes that are (subtracted, added)."""
+        return sum(one for one, _ in self.lost.values()), sum(one for _, one in self.lost.values())
 
 
 Table = dict[tuple[Any, ...], dict[int, Observation]]
@@ -109,7 +114,6 @@ def sample(
     known = [one for one in sided if id(one) not in left_out and value_of(one.run, quantity) is not None]
     gone += [cell for cell in lost if all(cell.levels.get(key) == value for key, value in contrast.where.items())]
     gone = lost_among(gone, known, _sides(contrast))
-    missing = dict.fromkeys(cell.scene for cell in gone)
     differ = False
     scenes: dict[str, list[tuple[Sign, ndarray]]] = {}
     pairs = 0
@@ -120,9 +124,17 @@ def sample(
             scenes[scene] = groups
             pairs += min(len(values) for _, values in groups)
             differ |= len({one.run.provenance.truth_sha256 for one in here}) > 1
-    silent = tuple(scene for scene in missing if scene not in scenes)
+    losses = {
+        scene: _counted(contrast, [cell for cell in gone if cell.scene == scene])
+        for scene in dict.fromkeys(cell.scene for cell in gone)
+    }
+    return Sample(scenes, losses, tuple(scene for scene in losses if scene not in scenes), pairs, differ)
+
+
+def _counted(contrast: Contrast, gone: Sequence[Lost]) -> tuple[int, int]:
+    """Numbers of lost fits that are (subtracted, added)."""
     raised = sum(_raises(contrast, cell) for cell in gone)
-    return Sample(scenes, (len(gone) - raised, raised), silent, pairs, differ)
+    return len(gone) - raised, raised
 
 
 def _sides(contrast: Contrast) -> list[dict[str, str]]:
