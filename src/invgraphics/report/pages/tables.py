@@ -129,7 +129,8 @@ def effect_cells(effect: Effect) -> list[str]:
     if effect.contrast.against is not None:
         factor, low, high = effect.contrast.against
         levels += f", at {factor} {high} − {low}"
-    return [where, levels, mean, effect.interval, effect.across_interval, corrected, effect.estimate.size]
+    based = f"{effect.estimate.size}, {effect.disturbed} left out: clock" if effect.disturbed else effect.estimate.size
+    return [where, levels, mean, effect.interval, effect.across_interval, corrected, based]
 
 
 def markdown_effects(effects: list[Effect]) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from invgraphics.report.data.factors import Factor, Lost, Observation
+from invgraphics.report.statistics.clocks import disturbed_fits
 from invgraphics.report.statistics.intervals import Estimate, holm, over_seeds
 from invgraphics.report.statistics.pairing import Contrast, contrast_words, sample
 from invgraphics.report.statistics.settings import (
@@ -60,6 +61,7 @@ class Effect:
         lost: diverged or failed fits that are (subtracted, added), see `Sample`.
         silent: scenes where one side has no number at all.
         truths_differ: some pairs were scored against different pictures, because the factor changes the truth.
+        disturbed: fits whose times are left out, because their clocks were disturbed.
     """
 
     contrast: Contrast
@@ -75,6 +77,7 @@ class Effect:
     lost: tuple[int, int] = (0, 0)
     silent: tuple[str, ...] = ()
     truths_differ: bool = False
+    disturbed: int = 0
 
     @property
     def claim(self) -> Estimate:
@@ -229,7 +232,7 @@ def effects_of(
 ) -> list[Effect]:
     """Effects of given contrasts on one quantity, corrected as one family (Holm 1979).
 
-    Those that no two runs share are left out.
+    Those that no two runs share are left out, and of times the fits whose clocks were disturbed.
 
     Args:
         contrasts: what is compared.
@@ -238,7 +241,9 @@ def effects_of(
         lost: fits that failed.
         factors: of the study, whose words name the levels of other factors.
     """
-    failed = tuple(lost)
+    failed, disturbed = tuple(lost), disturbed_fits(observations, quantity)
+    left_out = set(map(id, disturbed))
+    observations = [one for one in observations if id(one) not in left_out]
     found = [
         effect for contrast in contrasts if (effect := _effect(contrast, quantity, (observations, failed), factors)) is not None
     ]
@@ -254,6 +259,7 @@ def effects_of(
             adjusted=p,
             equivalence=within,
             comparisons=family,
+            disturbed=sum(map(effect.contrast.takes, disturbed)),
             by_scene={scene: replace(one, adjusted=next(scenes)) for scene, one in effect.by_scene.items()},
             by_setting={name: replace(one, adjusted=next(settings)) for name, one in effect.by_setting.items()},
         )

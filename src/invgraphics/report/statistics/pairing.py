@@ -55,9 +55,23 @@ class Contrast:
         return self.before, self.after
 
     @property
+    def sides(self) -> list[dict[str, str]]:
+        """Levels of the compared factors that fits are taken from: of the two sides, or of an interaction's four corners."""
+        sides = [{self.factor: level} for level in self.levels]
+        if self.against is None:
+            return sides
+        factor, *places = self.against
+        return [{**side, factor: place} for side in sides for place in places]
+
+    @property
     def independent(self) -> bool:
         """Whether the two sides are independent groups of fits: different methods, whose seeds do not pair."""
         return METHOD in (self.factor, self.against[0] if self.against else "")
+
+    def takes(self, one: Observation | Lost) -> bool:
+        """Whether a fit is at the levels of one of its sides."""
+        included = all(one.levels.get(key) == level for key, level in self.where.items())
+        return included and any(all(one.levels.get(key) == level for key, level in side.items()) for side in self.sides)
 
 
 def contrast_words(factor: str, before: str, after: str) -> str:
@@ -113,7 +127,7 @@ def sample(
     left_out = set(map(id, failed))
     known = [one for one in sided if id(one) not in left_out and value_of(one.run, quantity) is not None]
     gone += [cell for cell in lost if all(cell.levels.get(key) == value for key, value in contrast.where.items())]
-    gone = lost_among(gone, known, _sides(contrast))
+    gone = lost_among(gone, known, contrast.sides)
     differ = False
     scenes: dict[str, list[tuple[Sign, ndarray]]] = {}
     pairs = 0
@@ -135,15 +149,6 @@ def _counted(contrast: Contrast, gone: Sequence[Lost]) -> tuple[int, int]:
     """Numbers of lost fits that are (subtracted, added)."""
     raised = sum(_raises(contrast, cell) for cell in gone)
     return len(gone) - raised, raised
-
-
-def _sides(contrast: Contrast) -> list[dict[str, str]]:
-    """Levels of the compared factors that a contrast takes fits from: of its two sides, or of an interaction's four corners."""
-    sides = [{contrast.factor: level} for level in contrast.levels]
-    if contrast.against is None:
-        return sides
-    factor, *places = contrast.against
-    return [{**side, factor: place} for side in sides for place in places]
 
 
 def _raises(contrast: Contrast, cell: Lost) -> bool:

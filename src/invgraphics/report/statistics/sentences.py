@@ -19,10 +19,15 @@ MOST_LISTED = 6
 
 def effect_sentence(effect: Effect) -> str:
     """An effect in one or two sentences."""
-    parts = [_verdict(effect), _lost(effect), _silent(effect)]
+    parts = [_verdict(effect), _lost(effect), _silent(effect), disturbed_words(effect.disturbed)]
     if effect.truths_differ:
         parts.append("The factor changes the truth itself, so the two were scored against different pictures.")
     return " ".join(part for part in parts if part)
+
+
+def disturbed_words(count: int) -> str:
+    """How many fits' times are left out of comparisons, in a sentence; empty for none."""
+    return f"Times of {count} {'fit' if count == 1 else 'fits'} are left out: their clocks were disturbed." if count else ""
 
 
 def unscored_sentences(metric: str, shown: MeasuredQuantity | None) -> list[str]:
