@@ -465,6 +465,23 @@ def test_identical_methods_lead_on_few_pages() -> None:
     assert bold and "It also leads in" in told and "that lead lies in" in told
 
 
+def test_the_closest_of_many_is_rarely_called_equal_to_the_best() -> None:
+    """The best is truly ahead of all others by the margin; that one of them comes close by chance is not that it is equal."""
+
+    def told_equal(rng: np.random.Generator, methods: int, gap: float, spread: float) -> bool:
+        names = tuple(f"m/{i}" for i in range(methods))
+        runs = []
+        for name, seed in ((name, seed) for name in names for seed in range(5)):
+            psnr = 25 + gap * (name == names[0]) + rng.normal(0, spread)
+            runs.append(made_up_run({"psnr": Score(mean=psnr, unit="dB", higher_is_better=True)}, name, seed))
+        comparison = Comparison("s", "?", names, tuple(runs), environment=Environment())
+        return "are equal within 0.20 dB" in " ".join(verdict(comparison, summarise(comparison)))
+
+    assert rate(150, lambda rng: told_equal(rng, 8, 0.2, 0.1), seed=23) <= 0.05
+    assert rate(20, lambda rng: told_equal(rng, 8, 0.0, 0.03), seed=24) >= 0.9
+    assert rate(20, lambda rng: told_equal(rng, 2, 0.0, 0.05), seed=25) >= 0.9
+
+
 def test_one_seed_names_no_winner() -> None:
     bold, told = claims(page(np.random.default_rng(17), 1, gain=20.0))
     assert not bold
