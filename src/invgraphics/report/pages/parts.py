@@ -166,7 +166,7 @@ def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[A
         time_to_quality=time_to_quality(comparison),
         drawn=drawn,
         thumbnails=_thumbnails(comparison, drawn, folder),
-        cross_table=cross_table(comparison, approximations, folder),
+        cross_table=cross_table(comparison, approximations, folder, tables),
     )
 
 
