@@ -200,3 +200,17 @@ def test_fits_lost_at_settings_make_no_opposite_signs() -> None:
     assert effect.lost == (1, 1) and not effect.opposed
     assert [one.sign for one in effect.by_setting.values()] == [0, 0]
     assert effect_of(SIZE, fits).opposed, "with nothing lost they are opposite"
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.001])
+def test_equal_differences_are_equal_whatever_rounding_makes_of_them(gain: float) -> None:
+    """The differences of 20.31 + 0.001 and 33.07 + 0.001 are not the same number: two seeds gave a p-value of 1e-12."""
+    rng = np.random.default_rng(10)
+    for base in rng.uniform(20, 40, (40, 2)).round(2):
+        fits = [fit(psnr + more, seed=k, size=size) for k, psnr in enumerate(base) for size, more in (("8", 0.0), ("16", gain))]
+        one = effect_of(SIZE, fits)
+        assert one.estimate.p is None and not one.found and "nothing is tested" in effect_sentence(one)
+        scenes = effect_of(SIZE, [fit(a.run.scores.quality["psnr"].mean, f"s{a.run.seed}", **a.levels) for a in fits])
+        assert scenes.across is not None and scenes.across.p is None
+        stated = Prediction(text="?", source="?", before={"size": "8"}, after={"size": "16"}, low=0.0)
+        assert judge_predictions([stated], fits)[0].verdict == "undecided"

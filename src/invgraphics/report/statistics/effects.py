@@ -8,12 +8,11 @@ from typing import Literal
 
 from invgraphics.report.data.factors import Factor, Lost, Observation
 from invgraphics.report.statistics.clocks import disturbed_fits
-from invgraphics.report.statistics.intervals import Estimate, holm, over_seeds
+from invgraphics.report.statistics.intervals import Estimate, holm
 from invgraphics.report.statistics.pairing import Contrast, contrast_words, sample
 from invgraphics.report.statistics.settings import (
     ALPHA,
     SettingEffect,
-    across_scenes,
     effects_by_setting,
     favoured,
     flattered,
@@ -274,23 +273,20 @@ def _effect(
     factors: Sequence[Factor],
 ) -> Effect | None:
     values = sample(contrast, quantity, *observed)
-    groups = list(values.scenes.values())
-    whole = over_seeds(groups)
+    whole = values.whole
     if whole is None:
         return None
-    alone = {scene: over_seeds([one]) for scene, one in values.scenes.items()} if len(groups) > 1 else {}
     return Effect(
         contrast=contrast,
         quantity=quantity,
         estimate=whole,
-        across=across_scenes(values, whole),
+        across=values.across,
         adjusted=None,
         comparisons=0,
         pairs=values.pairs,
         by_scene={
             scene: SceneEffect(one, None, flattered(quantity, one.mean, values.lost.get(scene, (0, 0))))
-            for scene, one in alone.items()
-            if one is not None
+            for scene, one in values.alone.items()
         },
         by_setting=effects_by_setting(contrast, quantity, *observed, factors),
         lost=values.all_lost,

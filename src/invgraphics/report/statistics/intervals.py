@@ -23,6 +23,8 @@ from numpy import ndarray
 CONFIDENCE = 0.95
 POWER = 0.8
 """Probability with which a detectable effect is found."""
+ROUNDING = 1e-12
+"""Spread, relative to the scores, below which values count as equal: a thousand times the rounding of a difference."""
 NODES = 96
 """Quantiles of the estimated spread over which power is averaged."""
 
@@ -111,22 +113,27 @@ def estimate(nested: Nested, over: Literal["seeds", "scenes"] = "seeds", confide
     return over_scenes(groups, confidence) if over == "scenes" else over_seeds(groups, confidence)
 
 
-def over_seeds(scenes: Sequence[Groups], confidence: float = CONFIDENCE) -> Estimate | None:
+def over_seeds(scenes: Sequence[Groups], confidence: float = CONFIDENCE, scores: float = 0.0) -> Estimate | None:
     """Mean over these scenes, with the interval for new fits on them; ``None`` without scenes.
 
     The mean of scene means has variance Σ s²ₖ/nₖ / S² over all groups of fits, with Welch's (1947) degrees of freedom. Where a
     group is a single fit, the groups in its place on all scenes use the variance pooled over them; of the other side, a method
     whose fits may scatter differently, nothing is borrowed, and without spread on each side there is no interval.
+
+    Args:
+        scenes: groups of fits of each.
+        confidence: of the interval.
+        scores: largest magnitude of the scores that the values are differences of: what its rounding makes is no spread.
     """
     if not scenes:
         return None
     parts = [values for groups in scenes for _, values in groups]
     mean = float(np.mean([_signed_mean(groups) for groups in scenes]))
     size = len(scenes), _seeds(scenes)
-    scale = max(float(np.abs(values).max()) for values in parts)
+    scale = max(scores, *(float(np.abs(values).max()) for values in parts))
     sides = [_shares([values for _, values in side]) for side in zip(*scenes, strict=True)]
     shares = np.array([share for side in sides for share in side])
-    if not all(sides) or sum(((values - values.mean()) ** 2).sum() for values in parts) <= (1e-12 * scale) ** 2:
+    if not all(sides) or sum(((values - values.mean()) ** 2).sum() for values in parts) <= (ROUNDING * scale) ** 2:
         return Estimate(mean, mean, mean, None, "none", *size)
     variances, freedom = shares[shares[:, 0] > 0].T
     satterthwaite = float(variances.sum() ** 2 / (variances**2 / freedom).sum())
@@ -143,20 +150,23 @@ def _shares(side: Sequence[Float[ndarray, " fit"]]) -> list[tuple[float, int]]:
     return [(float(sums.sum() / total * (1 / counts).sum()), total)] if total else []
 
 
-def over_scenes(scenes: Sequence[Groups], confidence: float = CONFIDENCE, least_error: float = 0.0) -> Estimate | None:
+def over_scenes(
+    scenes: Sequence[Groups], confidence: float = CONFIDENCE, least_error: float = 0.0, scores: float = 0.0
+) -> Estimate | None:
     """Mean over scenes as a sample of scenes, with the interval for scenes like these; ``None`` without scenes.
 
     Args:
         scenes: groups of fits of each.
         confidence: of the interval.
         least_error: standard error that the fits' own spread makes; scenes that agree better than that do so by chance.
+        scores: as in `over_seeds`.
     """
     if not scenes:
         return None
     means = np.array([_signed_mean(groups) for groups in scenes])
     mean, size = float(means.mean()), (len(scenes), _seeds(scenes))
     spread = float(means.std(ddof=1)) if len(means) > 1 else 0.0
-    if spread <= 1e-12 * float(np.abs(means).max()):
+    if spread <= ROUNDING * max(scores, float(np.abs(means).max())):
         return Estimate(mean, mean, mean, None, "none", *size)
     error = max(spread / math.sqrt(len(means)), least_error)
     return _student_estimate(mean, (error, len(means) - 1.0), "scene", size, confidence)

@@ -6,6 +6,7 @@ nothing in common but the number: they are two independent groups.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,7 @@ from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.data.variants import level_words
+from invgraphics.report.statistics.intervals import Estimate, over_scenes, over_seeds
 from invgraphics.report.statistics.losses import lost_among, scoreless
 from invgraphics.report.statistics.values import run_values, value_of
 from invgraphics.report.wording import MeasuredQuantity
@@ -91,6 +93,7 @@ class Sample:
         silent: scenes where one side has no number at all.
         pairs: fits compared, on the side that has fewer.
         truths_differ: some were scored against different pictures, because the factor changes the truth.
+        scores: the largest magnitude of a score that was compared.
     """
 
     scenes: dict[str, list[tuple[Sign, Float[ndarray, " fit"]]]]
@@ -98,6 +101,25 @@ class Sample:
     silent: tuple[str, ...]
     pairs: int
     truths_differ: bool
+    scores: float
+
+    @property
+    def whole(self) -> Estimate | None:
+        """The difference over new fits on these scenes; ``None`` without any."""
+        return over_seeds(list(self.scenes.values()), scores=self.scores)
+
+    @property
+    def alone(self) -> dict[str, Estimate]:
+        """The same of each scene by itself; empty for one scene."""
+        scenes = self.scenes.items() if len(self.scenes) > 1 else ()
+        return {name: own for name, groups in scenes if (own := over_seeds([groups], scores=self.scores)) is not None}
+
+    @property
+    def across(self) -> Estimate | None:
+        """The difference over scenes as a sample of scenes; ``None`` for one scene."""
+        if len(self.scenes) < 2 or (whole := self.whole) is None:
+            return None
+        return over_scenes(list(self.scenes.values()), least_error=whole.error, scores=self.scores)
 
     @property
     def all_lost(self) -> tuple[int, int]:
@@ -142,7 +164,9 @@ def sample(
         scene: _counted(contrast, [cell for cell in gone if cell.scene == scene])
         for scene in dict.fromkeys(cell.scene for cell in gone)
     }
-    return Sample(scenes, losses, tuple(scene for scene in losses if scene not in scenes), pairs, differ)
+    silent = tuple(scene for scene in losses if scene not in scenes)
+    scores = max((abs(value) for one in known if math.isfinite(value := value_of(one.run, quantity) or 0.0)), default=0.0)
+    return Sample(scenes, losses, silent, pairs, differ, scores)
 
 
 def _counted(contrast: Contrast, gone: Sequence[Lost]) -> tuple[int, int]:
@@ -158,26 +182,6 @@ def _raises(contrast: Contrast, cell: Lost) -> bool:
         return added
     factor, _, high = contrast.against
     return added == (cell.levels.get(factor) == high)
-
-
-def settings_of(contrast: Contrast, observations: Sequence[Observation]) -> list[tuple[dict[str, str], list[Observation]]]:
-    """Levels of all other factors, the method included, at which both sides of a contrast have runs, with these runs.
-
-    Levels that all of them share are left out.
-
-    Args:
-        contrast: two levels of a factor, no interaction.
-        observations: finished runs.
-    """
-    groups: dict[tuple[tuple[str, str], ...], list[Observation]] = {}
-    for one in observations:
-        fits = all(one.levels.get(key) == level for key, level in contrast.where.items())
-        if fits and one.levels.get(contrast.factor) in contrast.levels:
-            others = tuple(sorted((key, level) for key, level in one.levels.items() if key != contrast.factor))
-            groups.setdefault(others, []).append(one)
-    both = {key: runs for key, runs in groups.items() if len({run.levels[contrast.factor] for run in runs}) == 2}
-    shared = set.intersection(*map(set, both)) if both else set()
-    return [({key: level for key, level in levels if (key, level) not in shared}, both[levels]) for levels in sorted(both)]
 
 
 def _difference(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:

@@ -109,14 +109,15 @@ def _judge(prediction: Prediction, observations: Sequence[Observation], failures
     terms = _terms(prediction)
     found = {name: _groups(terms, quantity, [one for one in scored if one.scene == name]) for name in names}
     known = {name: groups for name, (groups, _) in found.items() if groups}
-    value = over_seeds(list(known.values()))
+    size = max((abs(score) for one in scored if math.isfinite(score := value_of(one.run, quantity) or 0.0)), default=0.0)
+    value = over_seeds(list(known.values()), scores=size)
     gone = [one for one in failures if one.scene in names]
     gone += [Lost(one.scene, one.levels) for one in scoreless(observations, quantity) if one.scene in names]
     count = len(lost_among(gone, [one for one in scored if one.scene in names], [levels for _, levels in terms]))
     if value is None:
         reason = "; ".join(dict.fromkeys(why for _, why in found.values()))
         return JudgedPrediction(prediction, quantity, None, (), count, "open", reason)
-    across = over_scenes(list(known.values()), least_error=value.error) if len(known) > 1 else None
+    across = over_scenes(list(known.values()), least_error=value.error, scores=size) if len(known) > 1 else None
     claim = value if across is None else across
     reason = _unsettled(prediction, claim, known, count)
     verdict = "undecided" if reason else _within(prediction, claim)
