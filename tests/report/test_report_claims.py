@@ -49,7 +49,7 @@ def fits_of(scenes: int, seeds: int, psnr: Callable[[int, str], float]) -> list[
 
 
 def test_one_fit_of_a_method_borrows_no_spread_from_another() -> None:
-    """Three close fits of A tell nothing of how fits of B scatter: with ten times A's spread, half of such pages were wrong."""
+    """Three close fits of A tell nothing of how fits of B scatter: with ten times A's spread, two pages of three were wrong."""
     one = effect_of(A_TO_B, [*(fit(25 + 0.01 * k, seed=k, method="A") for k in range(3)), fit(26.0, method="B")])
     assert one.estimate.p is None and one.estimate.unit == "none" and not one.found
     assert (

@@ -10,13 +10,7 @@ from invgraphics.report.data.factors import Factor, Lost, Observation
 from invgraphics.report.statistics.clocks import disturbed_fits
 from invgraphics.report.statistics.intervals import Estimate, holm
 from invgraphics.report.statistics.pairing import Contrast, contrast_words, sample
-from invgraphics.report.statistics.settings import (
-    ALPHA,
-    SettingEffect,
-    effects_by_setting,
-    favoured,
-    flattered,
-)
+from invgraphics.report.statistics.settings import ALPHA, SettingEffect, effects_by_setting, favoured, flattered
 from invgraphics.report.wording import MeasuredQuantity, significant_decimals
 
 Verdict = Literal["higher", "lower", "undecided", "untested"]
@@ -25,7 +19,13 @@ Verdict = Literal["higher", "lower", "undecided", "untested"]
 
 @dataclass(frozen=True)
 class SceneEffect:
-    """The same difference on one scene alone, with its p-value after Holm's correction over all scenes and comparisons."""
+    """The same difference on one scene alone.
+
+    Attributes:
+        estimate: over new fits on this scene.
+        adjusted: p-value after Holm's correction over all scenes and comparisons; ``None`` without one.
+        flattered: the side that looks better lost more fits here than the other.
+    """
 
     estimate: Estimate
     adjusted: float | None
@@ -96,7 +96,7 @@ class Effect:
     @property
     def found(self) -> bool:
         """Whether the difference is significant after correction, not due to lost fits, and opposed by no scene or setting."""
-        return self.adjusted is not None and self.adjusted <= ALPHA and self._common
+        return self._sign != 0 and self._common
 
     @property
     def uncorrected(self) -> bool:
@@ -118,14 +118,20 @@ class Effect:
 
     @property
     def opposed(self) -> bool:
-        """Whether the difference is significant with one sign at some levels of other factors, and with the other at others."""
-        return {1, -1} <= {one.sign for one in self.by_setting.values()}
+        """Whether the difference is significant with one sign at some levels of other factors, and with the other elsewhere."""
+        return {1, -1} <= {self._sign, *(one.sign for one in self.by_setting.values())}
 
     @property
     def contradicted(self) -> bool:
-        """Whether the difference is significant with the other sign on a scene alone, or with both signs on two scenes."""
-        found = {one.verdict for one in self.by_scene.values()}
-        return {"higher", "lower"} <= found or ("lower" if self.claim.mean > 0 else "higher") in found
+        """Whether the difference is significant with one sign on some scenes, and with the other on others or over all."""
+        signs: dict[Verdict, int] = {"higher": 1, "lower": -1}
+        return {1, -1} <= {self._sign, *(signs.get(one.verdict, 0) for one in self.by_scene.values())}
+
+    @property
+    def _sign(self) -> int:
+        """Sign of the mean where it is significant after correction; 0 for none."""
+        significant = self.adjusted is not None and self.adjusted <= ALPHA
+        return 0 if not significant else 1 if self.claim.mean > 0 else -1
 
     @property
     def _common(self) -> bool:
@@ -273,8 +279,7 @@ def _effect(
     factors: Sequence[Factor],
 ) -> Effect | None:
     values = sample(contrast, quantity, *observed)
-    whole = values.whole
-    if whole is None:
+    if (whole := values.whole) is None:
         return None
     return Effect(
         contrast=contrast,

@@ -180,7 +180,8 @@ def _settings(effect: Effect) -> str:
     """The difference at each combination of other factors' levels, or at the significant ends of many, with its interval."""
     rising = sorted(effect.by_setting.items(), key=lambda item: item[1].claim.mean)
     significant = [item for item in rising if item[1].sign]
-    shown = rising if len(rising) <= MOST_LISTED else [significant[0], significant[-1]]
+    ends = significant if len(significant) > 1 else rising
+    shown = rising if len(rising) <= MOST_LISTED else [ends[0], ends[-1]]
     unit = _unit(effect.quantity)
     parts = (f"{effect.text(one.claim.mean)} {unit} {effect.bounds(one.claim)}".strip() + f" ({name})" for name, one in shown)
     return f"{'from ' if len(shown) < len(rising) else ''}{(' to ' if len(shown) < len(rising) else ', ').join(parts)}"
