@@ -210,7 +210,7 @@ def test_equal_differences_are_equal_whatever_rounding_makes_of_them(gain: float
         fits = [fit(psnr + more, seed=k, size=size) for k, psnr in enumerate(base) for size, more in (("8", 0.0), ("16", gain))]
         one = effect_of(SIZE, fits)
         assert one.estimate.p is None and not one.found and "nothing is tested" in effect_sentence(one)
-        scenes = effect_of(SIZE, [fit(a.run.scores.quality["psnr"].mean, f"s{a.run.seed}", **a.levels) for a in fits])
+        scenes = effect_of(SIZE, [replace(one, scene=f"s{one.run.seed}") for one in fits])
         assert scenes.across is not None and scenes.across.p is None
         stated = Prediction(text="?", source="?", before={"size": "8"}, after={"size": "16"}, low=0.0)
         assert judge_predictions([stated], fits)[0].verdict == "undecided"

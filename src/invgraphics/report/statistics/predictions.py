@@ -287,8 +287,9 @@ def _bounds(prediction: Prediction, digits: int) -> str:
 
 
 def _interval(value: Estimate | None, digits: int) -> str:
-    absent = value is None or value.unit == "none"
-    return ABSENT if absent else f"{_signed(value.low, digits)} to {_signed(value.high, digits)}"
+    if value is None or value.unit == "none":
+        return ABSENT
+    return f"{_signed(value.low, digits)} to {_signed(value.high, digits)}"
 
 
 def _signed(value: float, digits: int) -> str:
