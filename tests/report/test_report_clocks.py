@@ -4,14 +4,23 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from made_up_runs import made_up_run
 from report_folders import write_comparison
 
 from invgraphics.report.build import build_report
+from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
+from invgraphics.report.data.factors import METHOD, Observation
 from invgraphics.report.pages.facts import shared_facts
+from invgraphics.report.pages.parts import draw_contrasts
+from invgraphics.report.pages.tables import markdown_effects
+from invgraphics.report.statistics.effects import effects_of
+from invgraphics.report.statistics.pairing import Contrast
+from invgraphics.report.statistics.sentences import effect_sentence
 from invgraphics.report.statistics.summary import summarise
 from invgraphics.report.statistics.verdict import verdict
+from invgraphics.report.wording import COSTS
 from invgraphics.runs.run import Run
 from invgraphics.runs.scores import Score
 
@@ -80,3 +89,26 @@ def test_a_page_says_it_in_red(tmp_path: Path) -> None:
     page = build_report(root)
     assert '<p class="disturbed" role="note">The times of ' in page.read_text()
     assert "are not ranked: seed 0 had 50 % of the processor time" in (root / "index.md").read_text()
+
+
+@pytest.mark.parametrize("speeds", [False, True])
+def test_disturbed_times_are_in_no_comparison(speeds: bool, tmp_path: Path) -> None:
+    """Two of a's five fits had half of the processor: the table of effects is of the other three, and says so."""
+    told = {"speed": 1000.0} if speeds else {}
+    ill = {"speed": 500.0} if speeds else {"disturbed": TOLD}
+    runs = [_run("a", seed, 40.0 if seed < 2 else 20.0, **(ill if seed < 2 else told)) for seed in range(5)]
+    runs += [_run("b", seed, 20.0, **told) for seed in range(5)]
+    observations = [Observation(run, "s", {METHOD: run.method}) for run in runs]
+    fps, size = (next(cost for cost in COSTS if cost.key == key) for key in ("render_fps", "model_bytes"))
+    (effect,) = effects_of([Contrast(METHOD, "b", "a")], fps, observations)
+    assert abs(effect.estimate.mean) < 0.1 and effect.estimate.seeds == (3, 5)
+    assert effect.disturbed == 2
+    assert "Times of 2 fits are left out: their clocks were disturbed." in effect_sentence(effect)
+    assert "3 to 5 seeds, 2 left out: clock" in markdown_effects([effect])
+    (other,) = effects_of([Contrast(METHOD, "b", "a")], size, observations)
+    assert (other.disturbed, other.estimate.seeds) == (0, (5, 5))  # what is no time stays
+    all_of_a = [replace(run, scores=replace(run.scores, disturbed=TOLD)) for run in runs[:5]]
+    gone = [Observation(run, "s", {METHOD: run.method}) for run in (*all_of_a, *runs[5:])]
+    assert effects_of([Contrast(METHOD, "b", "a")], fps, gone) == []
+    contrasts = draw_contrasts([fps], [Contrast(METHOD, "b", "a")], (gone, []), Folder(tmp_path))
+    assert contrasts.tables == () and contrasts.disturbed == "Times of 5 fits are left out: their clocks were disturbed."

@@ -6,15 +6,20 @@ import re
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from made_up_runs import made_up_run
 from report_folders import METHODS, SEEDS, VIEWS, truth_frame, write_run
 
 from invgraphics.errors import InputError
 from invgraphics.report.build import build_report
 from invgraphics.report.data.assets import Folder
-from invgraphics.report.data.comparison import read_comparison
-from invgraphics.report.statistics.cross_render import cross_table
+from invgraphics.report.data.comparison import Comparison, read_comparison
+from invgraphics.report.statistics import cross_render
+from invgraphics.report.statistics.cross_render import CrossRendered, cross_table
 from invgraphics.report.study import build_study_report
+from invgraphics.runs.run import Run
+from invgraphics.runs.scores import Score
 from invgraphics.runs.study import Approximation
 
 OWN, OTHER = METHODS[2], "gaussian-volume/exact:opacity=physical"
@@ -117,3 +122,31 @@ def test_a_broken_analysis_is_explained(small_study: Path) -> None:
     (small_study / "analyses" / "one.json").write_text('{"title": "A"}')
     with pytest.raises(InputError, match="lacks the key 'sentence'"):
         build_study_report(small_study)
+
+
+def test_the_best_renderers_of_a_page_are_one_family(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four methods and two renderers that are the same, on a page of five such tables: few pages may show a best one."""
+    rng = np.random.default_rng(9)
+    methods, made = tuple("abcd"), {}
+
+    def shown(method: str, seed: int, psnr: float) -> Run:
+        score = Score(mean=psnr, unit="dB", higher_is_better=True)
+        return replace(made_up_run({"psnr": score}, method, seed), folder=tmp_path)
+
+    def table(gain: float = 0.0, tables: int = 1) -> list[bool]:
+        made.clear()
+        for method in methods:
+            for seed in range(3):
+                own, other = (shown(method, seed, 25 + more + rng.normal(0, 0.1)) for more in (gain, 0.0))
+                made[method, seed] = CrossRendered(own, {OWN: own, OTHER: other}, {})
+        comparison = Comparison("s", "?", methods, tuple(one.fit for one in made.values()))
+        crossed = cross_table(comparison, [], Folder(tmp_path), tables)
+        assert crossed is not None
+        return [bool(cell and cell.best) for row in crossed.rows for cell in row.cells]
+
+    monkeypatch.setattr(cross_render, "read_renderings", lambda run, clean=str: made[run.method, run.seed])
+    alone = [any(table()) for _ in range(100)]
+    assert sum(alone) <= 8
+    pages = [any(any(table(tables=5)) for _ in range(5)) for _ in range(20)]
+    assert sum(pages) <= 3
+    assert table(gain=2.0, tables=5) == [True, False] * 4

@@ -13,7 +13,7 @@ from scipy import stats
 from invgraphics.errors import InputError
 from invgraphics.report.data.factors import Factor, Lost, Observation
 from invgraphics.report.statistics.effects import contrasts_of, effects_of
-from invgraphics.report.statistics.predictions import judge_predictions, predictions_sentence
+from invgraphics.report.statistics.predictions import PREDICTION_HEADS, judge_predictions, predictions_sentence
 from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.scores import Score
 from invgraphics.runs.study import Prediction
@@ -242,3 +242,68 @@ def test_a_prediction_needs_bounds_in_order() -> None:
     for low, high in ((None, None), (1.0, 0.0)):
         with pytest.raises(ValueError, match="low"):
             replace(METHODS, low=low, high=high)
+
+
+def gains(*gains: float, seeds: int = 3, noise: float = 0.03) -> list[Observation]:
+    """Fits of two methods, the second better by so much on each scene."""
+    rng = np.random.default_rng(6)
+    return [
+        fit(f"s{index}", method, 4, seed, 20 + gain * (method == EXACT) + rng.normal(0, noise))
+        for index, gain in enumerate(gains)
+        for seed in range(seeds)
+        for method in (SPLAT, EXACT)
+    ]
+
+
+BETTER = replace(METHODS, low=1.0, high=None)
+
+
+def test_several_scenes_are_judged_as_a_sample_of_scenes() -> None:
+    """Three seeds tell a mean of three scenes to 0.04 dB, and nothing of a fourth."""
+    (judged,) = judge_predictions([BETTER], gains(3.0, 2.9, -1.0))
+    assert judged.estimate is not None and judged.estimate.low > 1.0  # on these scenes it holds
+    assert judged.verdict == "undecided" and judged.across is not None and judged.across.low < 1.0
+    low, high = stats.t.interval(0.95, 2, judged.across.mean, stats.sem([3.0, 2.9, -1.0]))
+    assert (judged.across.low, judged.across.high) == pytest.approx((low, high), abs=0.2)
+    assert judged.cells[5] != judged.cells[6] and len(judged.cells) == len(PREDICTION_HEADS)
+    (alike,) = judge_predictions([BETTER], gains(3.0, 2.9, 3.1))
+    assert alike.verdict == "held" and alike.reason == ""
+    (alone,) = judge_predictions([replace(BETTER, scenes=("s2",))], gains(3.0, 2.9, -1.0))
+    assert alone.verdict == "failed" and alone.across is None
+
+
+def test_a_scene_that_says_the_opposite_leaves_a_prediction_undecided() -> None:
+    made = gains(*[3.0] * 9, 0.5)
+    (judged,) = judge_predictions([BETTER], made)
+    assert judged.across is not None and judged.across.low > 1.0
+    assert (judged.verdict, judged.reason) == ("undecided", "did not hold on s9")
+    (contrary,) = judge_predictions([replace(BETTER, low=None, high=1.0)], made)
+    assert (contrary.verdict, contrary.reason) == ("undecided", "held on s9")
+
+
+def test_scenes_without_fits_leave_a_prediction_undecided() -> None:
+    wanted = replace(BETTER, scenes=("s0", "s1", "s2"))
+    assert judge_predictions([wanted], gains(3.0, 2.9, 3.1))[0].verdict == "held"
+    (judged,) = judge_predictions([wanted], gains(3.0))
+    assert judged.cells[-1] == "undecided: no fits of all sides on s1 and s2"
+
+
+@pytest.mark.parametrize("methods", [(SPLAT, SPLAT), (SPLAT, EXACT)])
+def test_predictions_hold_views_equal(methods: tuple[str, str]) -> None:
+    """A view of 20 degrees that one fit lacks is no gain of that fit, whether fits pair or not."""
+    made = []
+    for method, level in zip(methods, ("false", "true"), strict=True):
+        for seed in range(3):
+            own = 5 + 0.01 * seed * (level == "true")
+            values = (own, None if (level, seed) == ("true", 1) else 20.0)
+            score = Score(mean=own if None in values else (own + 20) / 2, higher_is_better=False, per_view=values)
+            run = made_up_run({"normal_deg": score}, method=method, seed=seed, views=("0", "1"))
+            made.append(Observation(run, "ball", {"method": method, X: "false" if methods[0] != methods[1] else level}))
+    sides = ({"method": SPLAT}, {"method": EXACT}) if methods[0] != methods[1] else ({X: False}, {X: True})
+    stated = Prediction(text="?", source="?", before=sides[0], after=sides[1], metric="normal_deg", high=-1.0)
+    (judged,) = judge_predictions([stated], made)
+    assert judged.estimate is not None and judged.estimate.mean == pytest.approx(0.0075, abs=0.01)
+    factor = Factor("method", methods, SPLAT) if methods[0] != methods[1] else Factor(X, ("false", "true"), "false")
+    quantity = quality_quantity("normal_deg", made[0].run.scores.quality["normal_deg"])
+    (effect,) = effects_of(contrasts_of([factor]), quantity, made)
+    assert judged.estimate == effect.estimate

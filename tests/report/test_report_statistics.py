@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -14,10 +15,11 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.weightstats import DescrStatsW
 
 from invgraphics.report.data.factors import METHOD, Factor, Observation
-from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
+from invgraphics.report.statistics.effects import Effect, SceneEffect, contrasts_of, effects_of
 from invgraphics.report.statistics.intervals import Estimate, band, estimate, holm
 from invgraphics.report.statistics.pairing import Contrast, sample
 from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.settings import SettingEffect
 from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.run import Run
 from invgraphics.runs.scores import Score
@@ -247,3 +249,37 @@ def test_nothing_has_no_sign() -> None:
 def test_many_levels_are_compared_with_the_reference_only() -> None:
     assert Factor("x", ("1", "2", "3"), "2").pairs() == [("2", "1"), ("2", "3"), ("1", "3")]
     assert Factor("x", tuple("12345"), "3").pairs() == [("3", "1"), ("3", "2"), ("3", "4"), ("3", "5")]
+
+
+@pytest.mark.parametrize("comparisons", [1, 5, 20, 63, 1000])
+def test_the_detectable_effect_of_two_fits_grows_with_the_number_of_comparisons(comparisons: int) -> None:
+    """At one degree of freedom the ratio of effects is half-Cauchy: 80 % power needs tan(0.4 pi) = 3.08 critical values."""
+    expected = math.tan(0.4 * math.pi) * stats.t.isf(0.025 / comparisons, 1)
+    assert Estimate(1, 0, 2, 0.5, "seed", 1, (2, 2), 1.0, 1.0).detectable(comparisons) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(("freedom", "comparisons"), [(2.0, 1), (2.0, 100), (3.7, 4), (12.0, 1), (500.0, 3)])
+def test_the_detectable_effect_is_that_of_simulated_repetitions(freedom: float, comparisons: int) -> None:
+    rng = np.random.default_rng(12)
+    effect = Estimate(1, 0, 2, 0.5, "seed", 1, (3, 3), 1.0, freedom).detectable(comparisons)
+    assert effect is not None
+    stated, repeated = np.sqrt(rng.chisquare(freedom, (2, 200_000)) / freedom)
+    found = rng.normal(size=200_000) + effect * stated > stats.t.isf(0.025 / comparisons, freedom) * repeated
+    assert found.mean() == pytest.approx(0.8, abs=0.004)
+
+
+def test_a_significant_mean_and_one_significant_setting_or_scene_of_the_other_sign_are_opposed() -> None:
+    """The mean has a sign, and no other setting is significant by itself."""
+    ill = Estimate(-0.5, -0.6, -0.4, 0.001, "seed", 1, (3, 3), 0.05, 2.0)
+    well = Estimate(2.0, -0.5, 4.5, 0.08, "seed", 1, (3, 3), 0.5, 2.0)
+    places = {str(i): (well, 0.2) for i in range(7)} | {"bad": (ill, 0.01)}
+    settings = {name: SettingEffect(one, None, adjusted) for name, (one, adjusted) in places.items()}
+    scenes = {name: SceneEffect(one, adjusted) for name, (one, adjusted) in places.items()}
+    for adjusted, opposed in ((0.01, True), (0.2, False)):
+        by_setting, by_scene = (
+            effect_with(1.7, 0.3, adjusted=adjusted, **{k: v}) for k, v in (("by_setting", settings), ("by_scene", scenes))
+        )
+        assert (by_setting.opposed, by_scene.contradicted) == (opposed, opposed)
+        assert not by_setting.found and not by_scene.found
+        assert ("the sign depends on other factors" in effect_sentence(by_setting)) == opposed
+        assert ("no common direction" in effect_sentence(by_scene)) == opposed

@@ -14,10 +14,11 @@ from invgraphics.report.figures.effects import draw_intervals
 from invgraphics.report.figures.style import Figure
 from invgraphics.report.figures.tradeoffs import draw_tradeoffs
 from invgraphics.report.figures.views import ViewPage, draw_views, publish_truth
+from invgraphics.report.statistics.clocks import disturbed_fits
 from invgraphics.report.statistics.cross_render import CrossTable, cross_table
 from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
 from invgraphics.report.statistics.pairing import Contrast
-from invgraphics.report.statistics.sentences import effect_sentence
+from invgraphics.report.statistics.sentences import disturbed_words, effect_sentence
 from invgraphics.report.statistics.summary import Row, Summary, quality_columns, summarise
 from invgraphics.report.statistics.time_to_quality import TimeToQuality, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
@@ -66,10 +67,12 @@ class Contrasts:
     Attributes:
         tables: (metric, its effects); the first metric is the one that sentences and plot are about.
         figure: interval plot of the first metric.
+        disturbed: how many fits' times are compared with nothing, in a sentence; empty for none.
     """
 
     tables: tuple[tuple[MeasuredQuantity, list[Effect]], ...]
     figure: Figure | None
+    disturbed: str = ""
 
     @property
     def first(self) -> list[Effect]:
@@ -163,7 +166,7 @@ def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[A
         time_to_quality=time_to_quality(comparison),
         drawn=drawn,
         thumbnails=_thumbnails(comparison, drawn, folder),
-        cross_table=cross_table(comparison, approximations, folder),
+        cross_table=cross_table(comparison, approximations, folder, tables),
     )
 
 
@@ -185,7 +188,8 @@ def draw_contrasts(
     """
     every = ((quantity, effects_of(contrasts, quantity, *observed, factors=factors)) for quantity in quantities)
     tables = tuple((quantity, found) for quantity, found in every if found)
-    return Contrasts(tables, draw_intervals(tables[0][1], folder.figures) if tables else None)
+    words = disturbed_words(max((len(disturbed_fits(observed[0], quantity)) for quantity in quantities), default=0))
+    return Contrasts(tables, draw_intervals(tables[0][1], folder.figures) if tables else None, words)
 
 
 def method_contrasts(comparison: Comparison, folder: Folder) -> Contrasts:

@@ -129,7 +129,8 @@ def effect_cells(effect: Effect) -> list[str]:
     if effect.contrast.against is not None:
         factor, low, high = effect.contrast.against
         levels += f", at {factor} {high} − {low}"
-    return [where, levels, mean, effect.interval, effect.across_interval, corrected, effect.estimate.size]
+    based = f"{effect.estimate.size}, {effect.disturbed} left out: clock" if effect.disturbed else effect.estimate.size
+    return [where, levels, mean, effect.interval, effect.across_interval, corrected, based]
 
 
 def markdown_effects(effects: list[Effect]) -> str:
@@ -159,7 +160,8 @@ def effects_caption(effects: list[Effect]) -> str:
     quantity, family = effects[0].quantity, effects[0].comparisons
     unit = f" ({quantity.unit})" if quantity.unit else ""
     text = f"Differences in {quantity.label}{unit} with 95% intervals, for new fits on these scenes and for scenes like these."
-    return f"{text} Bold: significant at a family-wise 5% (Holm's correction over {family} comparisons)."
+    bold = f"Bold: significant at a family-wise 5% (Holm's correction over {family} comparisons)"
+    return f"{text} {bold}, with no scene or setting that has the opposite sign significantly."
 
 
 def write_latex_effects(effects: list[Effect], caption: str, path: Path) -> None:

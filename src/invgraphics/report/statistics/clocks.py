@@ -6,6 +6,8 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from invgraphics.report.data.factors import Observation
+from invgraphics.report.wording import TIMES, MeasuredQuantity
 from invgraphics.runs.run import Run
 
 LEAST_RATIO = 0.85
@@ -52,6 +54,16 @@ class Speeds:
     def words(self) -> str:
         """Lowest and highest speed; empty where they are unknown."""
         return "" if self.median is None else f"{self.least:.2f} to {self.most:.2f} of the median"
+
+
+def disturbed_fits(observations: Sequence[Observation], quantity: MeasuredQuantity) -> list[Observation]:
+    """Fits whose value of a quantity is a time that is not to be compared; the usual speed is that of their scene's fits."""
+    if quantity.key not in TIMES:
+        return []
+    speeds = {
+        name: Speeds.of([one.run for one in observations if one.scene == name]) for name in {one.scene for one in observations}
+    }
+    return [one for one in observations if speeds[one.scene].disturbance(one.run)]
 
 
 def _speed(run: Run) -> float | None:

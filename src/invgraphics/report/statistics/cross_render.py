@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import Factor, Observation
-from invgraphics.report.statistics.effects import Effect, effects_of
+from invgraphics.report.statistics.effects import ALPHA, Effect, effects_of
+from invgraphics.report.statistics.intervals import holm
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.summary import quality_columns
 from invgraphics.report.statistics.values import value_of
@@ -133,20 +134,31 @@ def read_renderings(run: Run, clean: Callable[[str], str] = str) -> CrossRendere
     return CrossRendered(run, seen, differences)
 
 
-def cross_table(comparison: Comparison, approximations: Sequence[Approximation], folder: Folder) -> CrossTable | None:
-    """Fit x render table of a scene; ``None`` without fits rendered by several renderers."""
+def cross_table(
+    comparison: Comparison, approximations: Sequence[Approximation], folder: Folder, tables: int = 1
+) -> CrossTable | None:
+    """Fit x render table of a scene; ``None`` without fits rendered by several renderers.
+
+    Args:
+        comparison: the runs of the scene.
+        approximations: pairs of renderers.
+        folder: of the page.
+        tables: such tables on the page, over whose rows the tests of the best renderers are corrected.
+    """
     clean = folder.redactor.text if folder.redactor is not None else str
     fits = [found for run in comparison.runs if (found := read_renderings(run, clean)) is not None]
     columns = quality_columns(comparison)
     if not fits or not columns:
         return None
     renderers = tuple(dict.fromkeys(name for fit in fits for name in fit.seen))
-    rows = []
+    rows, leads = [], []
     for series, method in enumerate(comparison.methods):
         own = [fit for fit in fits if fit.fit.method == method]
         if own:
             cells = tuple(_cell(own, name, columns[0], folder) for name in renderers)
-            rows.append(CrossRow(method, series, _mark_best(own, renderers, cells, columns[0])))
+            rows.append(CrossRow(method, series, cells))
+            leads.append(_lead(own, renderers, cells, columns[0]))
+    rows = _mark_best(rows, renderers, leads, tables)
     groups = [[fit for fit in fits if fit.fit.method == row.method] for row in rows]
     steps = tuple(
         StepRow(
@@ -207,24 +219,41 @@ def _cell(fits: Sequence[CrossRendered], name: str, quantity: MeasuredQuantity, 
     return CrossCell(quantity.text(score), difference, own, best=False, picture=picture)
 
 
-def _mark_best(
+def _lead(
     fits: Sequence[CrossRendered], renderers: Sequence[str], cells: Sequence[CrossCell | None], quantity: MeasuredQuantity
-) -> tuple[CrossCell | None, ...]:
-    """Mark the renderer that shows these fits better than every other one by more than chance, paired by fit."""
+) -> tuple[str, float | None]:
+    """The renderer that shows these fits best, and the p-value of its being better than every other one, paired by fit.
+
+    That is the largest of its pairwise tests (Berger 1982), as where methods lead; ``None`` where nothing is tested.
+    """
     scores = {
         name: quantity.sort_key(_score(fits, name, quantity) or 0.0)
         for name, cell in zip(renderers, cells, strict=True)
         if cell
     }
     if len(scores) < 2:
-        return tuple(cells)
+        return "", None
     best = min(scores, key=lambda name: scores[name])
     shown = [
         Observation(replace(run, seed=fit.fit.seed), "", {RENDERER: name}) for fit in fits for name, run in fit.seen.items()
     ]
     effects = [effects_of([Contrast(RENDERER, other, best)], quantity, shown) for other in scores if other != best]
-    leads = all(found and found[0].found and found[0].better > 0 for found in effects)
-    return tuple(cell and replace(cell, best=leads and name == best) for name, cell in zip(renderers, cells, strict=True))
+    better = [found[0].claim.p if found and found[0].better > 0 and not found[0].flattered else None for found in effects]
+    known = [p for p in better if p is not None]
+    return best, max(known) if len(known) == len(better) else None
+
+
+def _mark_best(
+    rows: Sequence[CrossRow], renderers: Sequence[str], leads: Sequence[tuple[str, float | None]], tables: int
+) -> list[CrossRow]:
+    """Mark the renderers that lead their rows by more than chance, corrected over the rows (Holm) and the page's tables."""
+    corrected = holm([None if p is None else min(1.0, tables * p) for _, p in leads])
+    marked = []
+    for row, (best, _), p in zip(rows, leads, corrected, strict=True):
+        named = best if p is not None and p <= ALPHA else ""
+        cells = (cell and replace(cell, best=name == named) for name, cell in zip(renderers, row.cells, strict=True))
+        marked.append(replace(row, cells=tuple(cells)))
+    return marked
 
 
 def _decibels(fits: Sequence[CrossRendered], pair: frozenset[str] | None, name: str = "") -> str:

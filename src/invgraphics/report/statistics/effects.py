@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from invgraphics.report.data.factors import Factor, Lost, Observation
-from invgraphics.report.statistics.intervals import Estimate, holm, over_seeds
-from invgraphics.report.statistics.pairing import Contrast, Sample, contrast_words, sample
-from invgraphics.report.statistics.settings import ALPHA, SettingEffect, across_scenes, effects_by_setting
+from invgraphics.report.statistics.clocks import disturbed_fits
+from invgraphics.report.statistics.intervals import Estimate, holm
+from invgraphics.report.statistics.pairing import Contrast, contrast_words, sample
+from invgraphics.report.statistics.settings import ALPHA, SettingEffect, effects_by_setting, favoured, flattered
 from invgraphics.report.wording import MeasuredQuantity, significant_decimals
 
 Verdict = Literal["higher", "lower", "undecided", "untested"]
@@ -18,17 +19,24 @@ Verdict = Literal["higher", "lower", "undecided", "untested"]
 
 @dataclass(frozen=True)
 class SceneEffect:
-    """The same difference on one scene alone, with its p-value after Holm's correction over all scenes and comparisons."""
+    """The same difference on one scene alone.
+
+    Attributes:
+        estimate: over new fits on this scene.
+        adjusted: p-value after Holm's correction over all scenes and comparisons; ``None`` without one.
+        flattered: the side that looks better lost more fits here than the other.
+    """
 
     estimate: Estimate
     adjusted: float | None
+    flattered: bool = False
 
     @property
     def verdict(self) -> Verdict:
-        """Sign of the difference, where it is significant."""
+        """Sign of the difference, where it is significant and the side that looks better lost no more fits there."""
         if self.adjusted is None:
             return "untested"
-        if self.adjusted > ALPHA:
+        if self.adjusted > ALPHA or self.flattered:
             return "undecided"
         return "higher" if self.estimate.mean > 0 else "lower"
 
@@ -52,6 +60,7 @@ class Effect:
         lost: diverged or failed fits that are (subtracted, added), see `Sample`.
         silent: scenes where one side has no number at all.
         truths_differ: some pairs were scored against different pictures, because the factor changes the truth.
+        disturbed: fits whose times are left out, because their clocks were disturbed.
     """
 
     contrast: Contrast
@@ -67,6 +76,7 @@ class Effect:
     lost: tuple[int, int] = (0, 0)
     silent: tuple[str, ...] = ()
     truths_differ: bool = False
+    disturbed: int = 0
 
     @property
     def claim(self) -> Estimate:
@@ -76,37 +86,57 @@ class Effect:
     @property
     def better(self) -> int:
         """1 where ``after`` is better, -1 where ``before`` is, 0 where neither direction is or there is no difference."""
-        if self.quantity.better == "none" or self.claim.mean == 0:
-            return 0
-        return 1 if (self.claim.mean > 0) == (self.quantity.better == "higher") else -1
+        return favoured(self.quantity, self.claim.mean)
 
     @property
     def flattered(self) -> bool:
         """Whether the side that looks better lost more fits than the other: its mean is over those that went well."""
-        before, after = self.lost
-        return (self.better > 0 and after > before) or (self.better < 0 and before > after)
+        return flattered(self.quantity, self.claim.mean, self.lost)
 
     @property
     def found(self) -> bool:
-        """Whether the difference is significant after Holm's correction, and not due to fits that dropped out."""
-        return self.adjusted is not None and self.adjusted <= ALPHA and not self.flattered
+        """Whether the difference is significant after correction, not due to lost fits, and opposed by no scene or setting."""
+        return self._sign != 0 and self._common
 
     @property
     def uncorrected(self) -> bool:
         """Whether the difference is significant before correction only."""
-        return not self.found and self.claim.p is not None and self.claim.p <= ALPHA and not self.flattered
+        return not self.found and self.claim.p is not None and self.claim.p <= ALPHA and self._common
 
     @property
     def equivalent(self) -> bool:
-        """Whether the difference lies within the margin after correction, with no scene or setting that contradicts it."""
+        """Whether the difference lies within the margin after correction, with no scene or setting that contradicts it.
+
+        A scene whose own mean is outside the margin does: means of opposite signs cancel, and few fits find none of them.
+        """
+        if self.equivalence is None or self.equivalence > ALPHA or self.lost != (0, 0) or self.quantity.margin is None:
+            return False
+        margin = self.quantity.margin
         contradicted = any(one.verdict in ("higher", "lower") for one in self.by_scene.values())
-        contradicted |= any(one.sign for one in self.by_setting.values())
-        return self.equivalence is not None and self.equivalence <= ALPHA and not contradicted and self.lost == (0, 0)
+        contradicted |= any(abs(one.estimate.mean) > margin for one in self.by_scene.values())
+        return not contradicted and not any(one.sign for one in self.by_setting.values())
 
     @property
     def opposed(self) -> bool:
-        """Whether the difference is significant with one sign at some levels of other factors, and with the other at others."""
-        return {1, -1} <= {one.sign for one in self.by_setting.values()}
+        """Whether the difference is significant with one sign at some levels of other factors, and with the other elsewhere."""
+        return {1, -1} <= {self._sign, *(one.sign for one in self.by_setting.values())}
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the difference is significant with one sign on some scenes, and with the other on others or over all."""
+        signs: dict[Verdict, int] = {"higher": 1, "lower": -1}
+        return {1, -1} <= {self._sign, *(signs.get(one.verdict, 0) for one in self.by_scene.values())}
+
+    @property
+    def _sign(self) -> int:
+        """Sign of the mean where it is significant after correction; 0 for none."""
+        significant = self.adjusted is not None and self.adjusted <= ALPHA
+        return 0 if not significant else 1 if self.claim.mean > 0 else -1
+
+    @property
+    def _common(self) -> bool:
+        """Whether a significant mean may be told as the direction of all: no fits are missing, no part says otherwise."""
+        return not (self.flattered or self.opposed or self.contradicted)
 
     @property
     def detectable(self) -> float | None:
@@ -207,7 +237,7 @@ def effects_of(
 ) -> list[Effect]:
     """Effects of given contrasts on one quantity, corrected as one family (Holm 1979).
 
-    Those that no two runs share are left out.
+    Those that no two runs share are left out, and of times the fits whose clocks were disturbed.
 
     Args:
         contrasts: what is compared.
@@ -216,12 +246,11 @@ def effects_of(
         lost: fits that failed.
         factors: of the study, whose words name the levels of other factors.
     """
-    failed = tuple(lost)
+    failed, disturbed = tuple(lost), disturbed_fits(observations, quantity)
+    left_out = set(map(id, disturbed))
+    observations = [one for one in observations if id(one) not in left_out]
     found = [
-        effect
-        for contrast in contrasts
-        if (effect := _effect(contrast, quantity, sample(contrast, quantity, observations, failed), observations, factors))
-        is not None
+        effect for contrast in contrasts if (effect := _effect(contrast, quantity, (observations, failed), factors)) is not None
     ]
     adjusted = holm([effect.claim.p for effect in found])
     margin = quantity.margin
@@ -235,6 +264,7 @@ def effects_of(
             adjusted=p,
             equivalence=within,
             comparisons=family,
+            disturbed=sum(map(effect.contrast.takes, disturbed)),
             by_scene={scene: replace(one, adjusted=next(scenes)) for scene, one in effect.by_scene.items()},
             by_setting={name: replace(one, adjusted=next(settings)) for name, one in effect.by_setting.items()},
         )
@@ -245,26 +275,26 @@ def effects_of(
 def _effect(
     contrast: Contrast,
     quantity: MeasuredQuantity,
-    values: Sample,
-    observations: Sequence[Observation],
+    observed: tuple[Sequence[Observation], Sequence[Lost]],
     factors: Sequence[Factor],
 ) -> Effect | None:
-    groups = list(values.scenes.values())
-    whole = over_seeds(groups)
-    if whole is None:
+    values = sample(contrast, quantity, *observed)
+    if (whole := values.whole) is None:
         return None
-    alone = {scene: over_seeds([one]) for scene, one in values.scenes.items()} if len(groups) > 1 else {}
     return Effect(
         contrast=contrast,
         quantity=quantity,
         estimate=whole,
-        across=across_scenes(values, whole),
+        across=values.across,
         adjusted=None,
         comparisons=0,
         pairs=values.pairs,
-        by_scene={scene: SceneEffect(one, None) for scene, one in alone.items() if one is not None},
-        by_setting=effects_by_setting(contrast, quantity, observations, factors),
-        lost=values.lost,
+        by_scene={
+            scene: SceneEffect(one, None, flattered(quantity, one.mean, values.lost.get(scene, (0, 0))))
+            for scene, one in values.alone.items()
+        },
+        by_setting=effects_by_setting(contrast, quantity, *observed, factors),
+        lost=values.all_lost,
         silent=values.silent,
         truths_differ=values.truths_differ,
     )

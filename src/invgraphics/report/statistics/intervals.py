@@ -23,7 +23,9 @@ from numpy import ndarray
 CONFIDENCE = 0.95
 POWER = 0.8
 """Probability with which a detectable effect is found."""
-NODES = 48
+ROUNDING = 1e-12
+"""Spread, relative to the scores, below which values count as equal: a thousand times the rounding of a difference."""
+NODES = 96
 """Quantiles of the estimated spread over which power is averaged."""
 
 Nested = Sequence[Sequence[Float[ndarray, " view"]]]
@@ -111,46 +113,60 @@ def estimate(nested: Nested, over: Literal["seeds", "scenes"] = "seeds", confide
     return over_scenes(groups, confidence) if over == "scenes" else over_seeds(groups, confidence)
 
 
-def over_seeds(scenes: Sequence[Groups], confidence: float = CONFIDENCE) -> Estimate | None:
+def over_seeds(scenes: Sequence[Groups], confidence: float = CONFIDENCE, scores: float = 0.0) -> Estimate | None:
     """Mean over these scenes, with the interval for new fits on them; ``None`` without scenes.
 
     The mean of scene means has variance Σ s²ₖ/nₖ / S² over all groups of fits, with Welch's (1947) degrees of freedom. Where a
-    group is a single fit, all use the variance pooled over groups.
+    group is a single fit, the groups in its place on all scenes use the variance pooled over them; of the other side, a method
+    whose fits may scatter differently, nothing is borrowed, and without spread on each side there is no interval.
+
+    Args:
+        scenes: groups of fits of each.
+        confidence: of the interval.
+        scores: largest magnitude of the scores that the values are differences of: what its rounding makes is no spread.
     """
     if not scenes:
         return None
     parts = [values for groups in scenes for _, values in groups]
     mean = float(np.mean([_signed_mean(groups) for groups in scenes]))
-    counts = np.array([len(values) for values in parts])
-    sums, freedom = np.array([((values - values.mean()) ** 2).sum() for values in parts]), counts - 1
     size = len(scenes), _seeds(scenes)
-    scale = max(float(np.abs(values).max()) for values in parts)
-    if freedom.sum() == 0 or sums.sum() <= (1e-12 * scale) ** 2:
+    scale = max(scores, *(float(np.abs(values).max()) for values in parts))
+    sides = [_shares([values for _, values in side]) for side in zip(*scenes, strict=True)]
+    shares = np.array([share for side in sides for share in side])
+    if not all(sides) or sum(((values - values.mean()) ** 2).sum() for values in parts) <= (ROUNDING * scale) ** 2:
         return Estimate(mean, mean, mean, None, "none", *size)
+    variances, freedom = shares[shares[:, 0] > 0].T
+    satterthwaite = float(variances.sum() ** 2 / (variances**2 / freedom).sum())
+    return _student_estimate(mean, (math.sqrt(variances.sum()) / len(scenes), satterthwaite), "seed", size, confidence)
+
+
+def _shares(side: Sequence[Float[ndarray, " fit"]]) -> list[tuple[float, int]]:
+    """(variance of the mean, degrees of freedom) of a side's groups; pooled where one is a single fit, empty if all are."""
+    counts = np.array([len(values) for values in side])
+    sums, freedom = np.array([((values - values.mean()) ** 2).sum() for values in side]), counts - 1
     if (freedom > 0).all():
-        shares = sums / freedom / counts
-        known = shares > 0
-        satterthwaite = float(shares.sum() ** 2 / (shares[known] ** 2 / freedom[known]).sum())
-    else:
-        shares = sums.sum() / freedom.sum() / counts
-        satterthwaite = float(freedom.sum())
-    return _student_estimate(mean, (math.sqrt(shares.sum()) / len(scenes), satterthwaite), "seed", size, confidence)
+        return [(float(share), int(free)) for share, free in zip(sums / freedom / counts, freedom, strict=True)]
+    total = int(freedom.sum())
+    return [(float(sums.sum() / total * (1 / counts).sum()), total)] if total else []
 
 
-def over_scenes(scenes: Sequence[Groups], confidence: float = CONFIDENCE, least_error: float = 0.0) -> Estimate | None:
+def over_scenes(
+    scenes: Sequence[Groups], confidence: float = CONFIDENCE, least_error: float = 0.0, scores: float = 0.0
+) -> Estimate | None:
     """Mean over scenes as a sample of scenes, with the interval for scenes like these; ``None`` without scenes.
 
     Args:
         scenes: groups of fits of each.
         confidence: of the interval.
         least_error: standard error that the fits' own spread makes; scenes that agree better than that do so by chance.
+        scores: as in `over_seeds`.
     """
     if not scenes:
         return None
     means = np.array([_signed_mean(groups) for groups in scenes])
     mean, size = float(means.mean()), (len(scenes), _seeds(scenes))
     spread = float(means.std(ddof=1)) if len(means) > 1 else 0.0
-    if spread <= 1e-12 * float(np.abs(means).max()):
+    if spread <= ROUNDING * max(scores, float(np.abs(means).max())):
         return Estimate(mean, mean, mean, None, "none", *size)
     error = max(spread / math.sqrt(len(means)), least_error)
     return _student_estimate(mean, (error, len(means) - 1.0), "scene", size, confidence)
@@ -211,18 +227,25 @@ def _student(statistic: float, freedom: float, confidence: float) -> tuple[float
 
 @functools.lru_cache(maxsize=4096)
 def _detectable_errors(freedom: float, level: float, power: float) -> float:
-    """True effect, in estimated standard errors, that a two-sided t-test of ``level`` finds with probability ``power``."""
-    from scipy.optimize import brentq
-    from scipy.special import chdtri, nctdtr, stdtrit
+    """True effect, in estimated standard errors, that a two-sided t-test of ``level`` finds with probability ``power``.
 
-    critical = float(stdtrit(freedom, 1 - level / 2))
-    # Quantiles of the estimated over the true standard error.
+    The test finds it where z + r x > c q: z is normal, q and r are the estimated over the true standard error, of the
+    repetition and of this study, and c is the critical value. The normal tail is averaged over quantiles of both, since SciPy's
+    non-central t fails at the shifts of thousands that one degree of freedom needs.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import chdtri, ndtr, stdtrit
+
+    critical = -float(stdtrit(freedom, level / 2))
     ratios = np.sqrt(chdtri(freedom, 1 - (np.arange(NODES) + 0.5) / NODES) / freedom)
 
     def missed(log_errors: float) -> float:
-        shift = ratios * math.exp(log_errors)
-        below = nctdtr(freedom, np.minimum(shift, 1e3), critical)
-        return float(np.nan_to_num(below, nan=0.0).mean()) - (1 - power)
+        return float(ndtr(critical * ratios[:, None] - math.exp(log_errors) * ratios).mean()) - (1 - power)
 
-    root = brentq(missed, math.log(critical) - 3, math.log(critical) + 6, xtol=1e-3)
+    low, high = math.log(critical) - 1, math.log(critical) + 1
+    while missed(low) < 0:
+        low -= 1
+    while missed(high) > 0:
+        high += 1
+    root = brentq(missed, low, high, xtol=1e-3)
     return math.exp(root)  # pyright: ignore[reportArgumentType]  # a tuple only with full_output

@@ -17,9 +17,10 @@ from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
 from invgraphics.report.data.variants import level_words
-from invgraphics.report.statistics.values import clipped, diverged, value_of
+from invgraphics.report.statistics.intervals import Estimate, over_scenes, over_seeds
+from invgraphics.report.statistics.losses import lost_among, scoreless
+from invgraphics.report.statistics.values import run_values, value_of
 from invgraphics.report.wording import MeasuredQuantity
-from invgraphics.runs.run import Run
 
 Sign = float
 
@@ -56,9 +57,23 @@ class Contrast:
         return self.before, self.after
 
     @property
+    def sides(self) -> list[dict[str, str]]:
+        """Levels of the compared factors that fits are taken from: of the two sides, or of an interaction's four corners."""
+        sides = [{self.factor: level} for level in self.levels]
+        if self.against is None:
+            return sides
+        factor, *places = self.against
+        return [{**side, factor: place} for side in sides for place in places]
+
+    @property
     def independent(self) -> bool:
         """Whether the two sides are independent groups of fits: different methods, whose seeds do not pair."""
         return METHOD in (self.factor, self.against[0] if self.against else "")
+
+    def takes(self, one: Observation | Lost) -> bool:
+        """Whether a fit is at the levels of one of its sides."""
+        included = all(one.levels.get(key) == level for key, level in self.where.items())
+        return included and any(all(one.levels.get(key) == level for key, level in side.items()) for side in self.sides)
 
 
 def contrast_words(factor: str, before: str, after: str) -> str:
@@ -74,17 +89,42 @@ class Sample:
 
     Attributes:
         scenes: scene -> signed groups of values, one value per fit.
-        lost: diverged or failed fits that are (subtracted, added): of (before, after), or of an interaction's corners.
+        lost: scene -> diverged or failed fits that are (subtracted, added): of (before, after), or of an interaction's corners.
         silent: scenes where one side has no number at all.
         pairs: fits compared, on the side that has fewer.
         truths_differ: some were scored against different pictures, because the factor changes the truth.
+        scores: the largest magnitude of a score that was compared.
     """
 
     scenes: dict[str, list[tuple[Sign, Float[ndarray, " fit"]]]]
-    lost: tuple[int, int]
+    lost: dict[str, tuple[int, int]]
     silent: tuple[str, ...]
     pairs: int
     truths_differ: bool
+    scores: float
+
+    @property
+    def whole(self) -> Estimate | None:
+        """The difference over new fits on these scenes; ``None`` without any."""
+        return over_seeds(list(self.scenes.values()), scores=self.scores)
+
+    @property
+    def alone(self) -> dict[str, Estimate]:
+        """The same of each scene by itself; empty for one scene."""
+        scenes = self.scenes.items() if len(self.scenes) > 1 else ()
+        return {name: own for name, groups in scenes if (own := over_seeds([groups], scores=self.scores)) is not None}
+
+    @property
+    def across(self) -> Estimate | None:
+        """The difference over scenes as a sample of scenes; ``None`` for one scene."""
+        if len(self.scenes) < 2 or (whole := self.whole) is None:
+            return None
+        return over_scenes(list(self.scenes.values()), least_error=whole.error, scores=self.scores)
+
+    @property
+    def all_lost(self) -> tuple[int, int]:
+        """Lost fits of all scenes that are (subtracted, added)."""
+        return sum(one for one, _ in self.lost.values()), sum(one for _, one in self.lost.values())
 
 
 Table = dict[tuple[Any, ...], dict[int, Observation]]
@@ -104,11 +144,12 @@ def sample(
     """
     counted = [one for one in observations if all(one.levels.get(key) == level for key, level in contrast.where.items())]
     sided = [one for one in counted if one.levels.get(contrast.factor, "") in contrast.levels]
-    gone = [Lost(one.scene, one.levels) for one in sided if diverged(one.run, quantity)]
-    known = [one for one in sided if not diverged(one.run, quantity) and value_of(one.run, quantity) is not None]
+    failed = scoreless(sided, quantity)
+    gone = [Lost(one.scene, one.levels) for one in failed]
+    left_out = set(map(id, failed))
+    known = [one for one in sided if id(one) not in left_out and value_of(one.run, quantity) is not None]
     gone += [cell for cell in lost if all(cell.levels.get(key) == value for key, value in contrast.where.items())]
-    gone = lost_among(gone, known, _sides(contrast))
-    missing = dict.fromkeys(cell.scene for cell in gone)
+    gone = lost_among(gone, known, contrast.sides)
     differ = False
     scenes: dict[str, list[tuple[Sign, ndarray]]] = {}
     pairs = 0
@@ -119,38 +160,19 @@ def sample(
             scenes[scene] = groups
             pairs += min(len(values) for _, values in groups)
             differ |= len({one.run.provenance.truth_sha256 for one in here}) > 1
-    silent = tuple(scene for scene in missing if scene not in scenes)
+    losses = {
+        scene: _counted(contrast, [cell for cell in gone if cell.scene == scene])
+        for scene in dict.fromkeys(cell.scene for cell in gone)
+    }
+    silent = tuple(scene for scene in losses if scene not in scenes)
+    scores = max((abs(value) for one in known if math.isfinite(value := value_of(one.run, quantity) or 0.0)), default=0.0)
+    return Sample(scenes, losses, silent, pairs, differ, scores)
+
+
+def _counted(contrast: Contrast, gone: Sequence[Lost]) -> tuple[int, int]:
+    """Numbers of lost fits that are (subtracted, added)."""
     raised = sum(_raises(contrast, cell) for cell in gone)
-    return Sample(scenes, (len(gone) - raised, raised), silent, pairs, differ)
-
-
-def _sides(contrast: Contrast) -> list[dict[str, str]]:
-    """Levels of the compared factors that a contrast takes fits from: of its two sides, or of an interaction's four corners."""
-    sides = [{contrast.factor: level} for level in contrast.levels]
-    if contrast.against is None:
-        return sides
-    factor, *places = contrast.against
-    return [{**side, factor: place} for side in sides for place in places]
-
-
-def lost_among(gone: Sequence[Lost], known: Sequence[Observation], sides: Sequence[Mapping[str, str]]) -> list[Lost]:
-    """The lost fits at some sides' levels whose scene and other levels all sides have, lost or not: others are not missing.
-
-    Args:
-        gone: fits that failed or diverged.
-        known: fits with a score.
-        sides: factor -> level of each side of a comparison.
-    """
-    named = {factor for side in sides for factor in side}
-
-    def stratum(one: Lost | Observation) -> tuple[Any, ...]:
-        return one.scene, *sorted((key, level) for key, level in one.levels.items() if key not in named)
-
-    def at(one: Lost | Observation, side: Mapping[str, str]) -> bool:
-        return all(one.levels.get(factor) == level for factor, level in side.items())
-
-    common = set.intersection(*({stratum(one) for one in (*known, *gone) if at(one, side)} for side in sides))
-    return [one for one in gone if stratum(one) in common and any(at(one, side) for side in sides)]
+    return len(gone) - raised, raised
 
 
 def _raises(contrast: Contrast, cell: Lost) -> bool:
@@ -160,26 +182,6 @@ def _raises(contrast: Contrast, cell: Lost) -> bool:
         return added
     factor, _, high = contrast.against
     return added == (cell.levels.get(factor) == high)
-
-
-def settings_of(contrast: Contrast, observations: Sequence[Observation]) -> list[tuple[dict[str, str], list[Observation]]]:
-    """Levels of all other factors, the method included, at which both sides of a contrast have runs, with these runs.
-
-    Levels that all of them share are left out.
-
-    Args:
-        contrast: two levels of a factor, no interaction.
-        observations: finished runs.
-    """
-    groups: dict[tuple[tuple[str, str], ...], list[Observation]] = {}
-    for one in observations:
-        fits = all(one.levels.get(key) == level for key, level in contrast.where.items())
-        if fits and one.levels.get(contrast.factor) in contrast.levels:
-            others = tuple(sorted((key, level) for key, level in one.levels.items() if key != contrast.factor))
-            groups.setdefault(others, []).append(one)
-    both = {key: runs for key, runs in groups.items() if len({run.levels[contrast.factor] for run in runs}) == 2}
-    shared = set.intersection(*map(set, both)) if both else set()
-    return [({key: level for key, level in levels if (key, level) not in shared}, both[levels]) for levels in sorted(both)]
 
 
 def _difference(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
@@ -192,8 +194,8 @@ def _difference(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[O
         sides = (_side(table, other, shared, quantity) for table, other in ((after, before), (before, after)))
         groups = [(sign, values) for sign, values in zip((1.0, -1.0), sides, strict=True) if len(values)]
         return groups if len(groups) == 2 else []
-    values = _paired(before, after, quantity)
-    return [(1.0, values)] if len(values) else []
+    values = balanced(_differences(before, after, quantity))
+    return [(1.0, np.array(list(values.values())))] if values else []
 
 
 def _interaction(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[Observation]) -> list[tuple[Sign, ndarray]]:
@@ -214,7 +216,7 @@ def _interaction(contrast: Contrast, quantity: MeasuredQuantity, here: Sequence[
     groups = corners if factor == METHOD else len(corners) * [[table for tables in corners for table in tables]]
     seeds = map(_whole_seeds, groups)
     corners = [[_of_seeds(table, whole) for table in tables] for tables, whole in zip(corners, seeds, strict=True)]
-    sides = [_by_seed(before, after, quantity) for before, after in corners]
+    sides = [balanced(_differences(before, after, quantity)) for before, after in corners]
     if not all(sides):
         return []
     if factor == METHOD:
@@ -242,19 +244,30 @@ def _table(path: str, level: str, observations: Sequence[Observation], drop: str
     return table
 
 
-def _paired(before: Table, after: Table, quantity: MeasuredQuantity) -> Float[ndarray, " seed"]:
-    return np.array(list(_by_seed(before, after, quantity).values()))
-
-
-def _by_seed(before: Table, after: Table, quantity: MeasuredQuantity) -> dict[int, float]:
-    """Seed -> paired difference on shared views; other factors are averaged, since they add no independent seed."""
-    found: dict[int, list[float]] = {}
+def _differences(before: Table, after: Table, quantity: MeasuredQuantity) -> dict[tuple[Any, ...], dict[int, float]]:
+    """Stratum -> seed -> paired difference on shared views."""
+    found: dict[tuple[Any, ...], dict[int, float]] = {}
     for key, runs in before.items():
         for seed, one in runs.items():
             other = after.get(key, {}).get(seed)
             if other is not None and (values := run_values((one.run, other.run), quantity)) is not None:
-                found.setdefault(seed, []).append(values[1] - values[0])
-    return {seed: sum(values) / len(values) for seed, values in found.items()}
+                found.setdefault(key, {})[seed] = values[1] - values[0]
+    return found
+
+
+def balanced(table: Mapping[Any, Mapping[int, float]]) -> dict[int, float]:
+    """Seed -> mean over strata, since other factors add no independent seed, of the largest block of values without a hole.
+
+    Where a seed lacks a stratum, as in unfinished studies, its mean over the others would be of another quantity than that of
+    the next seed. So seeds or strata are left out, whichever loses fewer values; of equal blocks the one with more seeds stays.
+    """
+    sets = [frozenset(values) for values in table.values() if values]
+    if not sets:
+        return {}
+    candidates = [*sets, frozenset.intersection(*sets)]
+    kept = max(candidates, key=lambda seeds: (len(seeds) * sum(seeds <= own for own in sets), len(seeds)))
+    strata = [values for values in table.values() if kept <= values.keys()]
+    return {seed: sum(values[seed] for values in strata) / len(strata) for seed in sorted(kept)}
 
 
 def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantity: MeasuredQuantity) -> Float[ndarray, " seed"]:
@@ -269,25 +282,3 @@ def _side(table: Table, other: Table, shared: Sequence[tuple[Any, ...]], quantit
             for seed, value in zip(table[key], values, strict=False):
                 found.setdefault(seed, []).append(value)
     return np.array([sum(values) / strata for values in found.values() if len(values) == strata])
-
-
-def run_values(runs: Sequence[Run], quantity: MeasuredQuantity) -> list[float] | None:
-    """Mean of each run over the views in which all of them have a finite score; over all where single views have none."""
-    if quantity.group != "cost":
-        tables = [_views(run, quantity) for run in runs]
-        if all(tables):
-            names = [name for name in tables[0] if all(name in table for table in tables)]
-            return [sum(table[name] for name in names) / len(names) for table in tables] if names else None
-    values = [value_of(run, quantity) for run in runs]
-    known = [value for value in values if value is not None and math.isfinite(value)]
-    return known if len(known) == len(values) else None
-
-
-def _views(run: Run, quantity: MeasuredQuantity) -> dict[str, float]:
-    """View -> finite score; empty where single views have none."""
-    score = run.scores.quality.get(quantity.key)
-    if score is None or not score.per_view:
-        return {}
-    values = (clipped(value, quantity) for value in score.per_view)
-    pairs = zip(run.scores.views, values, strict=True)
-    return {name: value for name, value in pairs if value is not None and math.isfinite(value)}

@@ -1,8 +1,9 @@
-"""Predictions of a study, judged: the predicted difference with its interval over seeds, and whether it lies within its bounds.
+"""Predictions of a study, judged: the predicted difference with its intervals, and whether it lies within its bounds.
 
-The interval is the one over seeds of `invgraphics.report.statistics.intervals`: for new fits on the same scenes. Fits of one
-method pair by seed; fits of two methods are independent groups, as in all comparisons. Factors that no side names are held
-equal: differences are taken at those of their levels that all sides have, a stratum each, and averaged over the strata.
+The intervals are those of `invgraphics.report.statistics.intervals`, for new fits on the same scenes and for scenes like these;
+a verdict rests on the latter where there are several scenes, as in all comparisons. Fits of one method pair by seed; those of
+two methods are independent groups. Factors that no side names are held equal: differences are taken at those of their levels
+that all sides have, a stratum each, and averaged over the strata.
 """
 
 from __future__ import annotations
@@ -10,20 +11,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from invgraphics.report.data.factors import METHOD, Lost, Observation
-from invgraphics.report.statistics.intervals import Estimate, Groups, over_seeds
-from invgraphics.report.statistics.pairing import lost_among
-from invgraphics.report.statistics.values import diverged, value_of
+from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, Groups, over_scenes, over_seeds
+from invgraphics.report.statistics.losses import lost_among, scoreless
+from invgraphics.report.statistics.pairing import balanced
+from invgraphics.report.statistics.values import diverged, run_values, value_of
 from invgraphics.report.wording import ABSENT, MeasuredQuantity, listing, quality_quantity, significant_decimals
 from invgraphics.runs.study import Prediction, level_text
 
-PREDICTION_HEADS = ("Prediction", "Source", "Scenes", "Expected", "Measured", "95% interval", "Fits", "Verdict")
+INTERVALS = ("95%, these scenes", "95%, scenes like these")
+PREDICTION_HEADS = ("Prediction", "Source", "Scenes", "Expected", "Measured", *INTERVALS, "Fits", "Verdict")
 """Columns of the table of predictions."""
 VERDICTS = {"held": "held", "failed": "did not hold", "undecided": "undecided", "open": "not measured"}
 
@@ -47,9 +50,10 @@ class JudgedPrediction:
         estimate: the difference over these scenes with its interval over seeds; ``None`` where fits of one side are missing.
         scenes: that both sides have fits on.
         lost: failed and diverged fits of both sides: with any, nothing is claimed.
-        verdict: ``held`` or ``failed`` where the whole interval lies within or outside the bounds, ``undecided`` where an end
-            of one lies within the other or there is no interval, ``open`` where fits are missing.
-        reason: why it is ``open``; empty otherwise.
+        verdict: ``held`` or ``failed`` where the whole interval of `claim` lies within or outside the bounds, ``undecided``
+            where an end of one lies within the other or there is no interval, ``open`` where fits are missing.
+        reason: why it is ``open``, or why it is ``undecided`` though the interval says something.
+        across: the difference with its interval over scenes; ``None`` for one scene.
     """
 
     prediction: Prediction
@@ -59,6 +63,12 @@ class JudgedPrediction:
     lost: int
     verdict: Verdict
     reason: str = ""
+    across: Estimate | None = None
+
+    @property
+    def claim(self) -> Estimate | None:
+        """The estimate that the verdict rests on: over scenes where there are several, else over seeds."""
+        return self.estimate if self.across is None else self.across
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -67,15 +77,11 @@ class JudgedPrediction:
         digits = _digits(one, self.quantity)
         stated = one.text, one.source, listing(self.scenes) or ABSENT, _bounds(one, digits)
         if value is None or self.quantity is None:
-            return *stated, ABSENT, ABSENT, ABSENT, f"{VERDICTS[self.verdict]}: {self.reason}"
-        interval = ABSENT if value.unit == "none" else f"{_signed(value.low, digits)} to {_signed(value.high, digits)}"
-        words = VERDICTS[self.verdict]
-        if self.lost:
-            words = f"{words}: {self.lost} {'fit' if self.lost == 1 else 'fits'} lost"
-        elif value.unit == "none":
-            words = f"{words}: no interval from {value.size}"
+            return *stated, ABSENT, ABSENT, ABSENT, ABSENT, f"{VERDICTS[self.verdict]}: {self.reason}"
+        intervals = (_interval(bar, digits) for bar in (value, self.across))
+        words = f"{VERDICTS[self.verdict]}{': ' if self.reason else ''}{self.reason}"
         unit = f" {self.quantity.unit}" if self.quantity.unit else ""
-        return *stated, f"{_signed(value.mean, digits)}{unit}", interval, value.size, words
+        return *stated, f"{_signed(value.mean, digits)}{unit}", *intervals, value.size, words
 
 
 def judge_predictions(
@@ -103,21 +109,47 @@ def _judge(prediction: Prediction, observations: Sequence[Observation], failures
     terms = _terms(prediction)
     found = {name: _groups(terms, quantity, [one for one in scored if one.scene == name]) for name in names}
     known = {name: groups for name, (groups, _) in found.items() if groups}
-    value = over_seeds(list(known.values()))
+    size = max((abs(score) for one in scored if math.isfinite(score := value_of(one.run, quantity) or 0.0)), default=0.0)
+    value = over_seeds(list(known.values()), scores=size)
     gone = [one for one in failures if one.scene in names]
-    gone += [Lost(one.scene, one.levels) for one in observations if one.scene in names and diverged(one.run, quantity)]
+    gone += [Lost(one.scene, one.levels) for one in scoreless(observations, quantity) if one.scene in names]
     count = len(lost_among(gone, [one for one in scored if one.scene in names], [levels for _, levels in terms]))
-    reason = "; ".join(dict.fromkeys(why for _, why in found.values())) if value is None else ""
-    return JudgedPrediction(prediction, quantity, value, tuple(known), count, _verdict(prediction, value, count), reason)
-
-
-def _verdict(prediction: Prediction, value: Estimate | None, lost: int) -> Verdict:
     if value is None:
-        return "open"
-    if value.unit == "none" or lost:
-        return "undecided"
+        reason = "; ".join(dict.fromkeys(why for _, why in found.values()))
+        return JudgedPrediction(prediction, quantity, None, (), count, "open", reason)
+    across = over_scenes(list(known.values()), least_error=value.error, scores=size) if len(known) > 1 else None
+    claim = value if across is None else across
+    reason = _unsettled(prediction, claim, known, count)
+    verdict = "undecided" if reason else _within(prediction, claim)
+    return JudgedPrediction(prediction, quantity, value, tuple(known), count, verdict, reason, across)
+
+
+def _unsettled(prediction: Prediction, claim: Estimate, known: Mapping[str, Groups], lost: int) -> str:
+    """Why a prediction is undecided whatever the interval of all scenes says; empty where that decides it.
+
+    A scene contradicts by its own interval, which is corrected for their number (Bonferroni).
+    """
+    if lost:
+        return f"{lost} {'fit' if lost == 1 else 'fits'} lost"
+    if missing := [name for name in prediction.scenes if name not in known]:
+        return f"no fits of all sides on {listing(missing)}"
+    if claim.unit == "none":
+        return f"no interval from {claim.size}"
+    confidence = 1 - (1 - CONFIDENCE) / len(known)
+    alone = {name: _within(prediction, own) for name, groups in known.items() if (own := over_seeds([groups], confidence))}
+    contrary: Verdict = "failed" if _within(prediction, claim) == "held" else "held"
+    scenes = [name for name, one in alone.items() if one == contrary]
+    if scenes and _within(prediction, claim) != "undecided":
+        return f"{'did not hold' if contrary == 'failed' else 'held'} on {listing(scenes)}"
+    return ""
+
+
+def _within(prediction: Prediction, value: Estimate) -> Verdict:
+    """Whether an interval lies within the bounds of a prediction, outside, or across one of them."""
     low = -math.inf if prediction.low is None else prediction.low
     high = math.inf if prediction.high is None else prediction.high
+    if value.unit == "none":
+        return "undecided"
     if low <= value.low and value.high <= high:
         return "held"
     return "failed" if value.high < low or value.low > high else "undecided"
@@ -137,7 +169,8 @@ def _terms(prediction: Prediction) -> Terms:
 def _groups(terms: Terms, quantity: MeasuredQuantity, here: Sequence[Observation]) -> tuple[Groups, str]:
     """Signed groups of one scene, one for each method that the terms name, and why there are none."""
     named = frozenset(name for _, levels in terms for name in levels)
-    tables = [_strata(here, levels, named, quantity) for _, levels in terms]
+    scores = _scores(here, terms, named, quantity)
+    tables = [_strata(scores, levels, named) for _, levels in terms]
     for (_, levels), table in zip(terms, tables, strict=True):
         if not table:
             return [], f"no finished fit at {_level_words(levels)}"
@@ -155,14 +188,29 @@ def _groups(terms: Terms, quantity: MeasuredQuantity, here: Sequence[Observation
     return groups, ""
 
 
-def _strata(
-    here: Sequence[Observation], wanted: Mapping[str, str], named: frozenset[str], quantity: MeasuredQuantity
-) -> Strata:
+def _scores(
+    here: Sequence[Observation], terms: Terms, named: frozenset[str], quantity: MeasuredQuantity
+) -> list[tuple[Observation, float]]:
+    """Fits of a scene at the levels of any term with their scores, over the views in which all that are compared have one.
+
+    These are fits of one seed, which pair, or of all seeds where terms are of several methods; of one stratum in any case.
+    """
+    pairs = len({levels.get(METHOD) for _, levels in terms}) == 1
+    compared: dict[tuple[Any, ...], list[Observation]] = {}
+    for one in here:
+        value = None if diverged(one.run, quantity) else value_of(one.run, quantity)
+        if value is not None and math.isfinite(value) and any(_has(one.levels, levels) for _, levels in terms):
+            others = sorted(pair for pair in one.levels.items() if pair[0] not in named)
+            compared.setdefault((*others, one.run.seed if pairs else None), []).append(one)
+    values = ((fits, run_values([one.run for one in fits], quantity)) for fits in compared.values())
+    return [pair for fits, scores in values if scores is not None for pair in zip(fits, scores, strict=True)]
+
+
+def _strata(scores: Sequence[tuple[Observation, float]], wanted: Mapping[str, str], named: frozenset[str]) -> Strata:
     """Scores of the fits at some levels; over factors that other terms alone name they are means, where none is missing."""
     found: dict[tuple[Stratum, int], dict[Stratum, float]] = {}
-    for one in here:
-        value = value_of(one.run, quantity) if _has(one.levels, wanted) and not diverged(one.run, quantity) else None
-        if value is not None and math.isfinite(value):
+    for one, value in scores:
+        if _has(one.levels, wanted):
             levels = sorted(one.levels.items())
             others = tuple(pair for pair in levels if pair[0] not in named)
             free = tuple(pair for pair in levels if pair[0] in named and pair[0] not in wanted)
@@ -192,13 +240,15 @@ def _by_seed(table: Strata, shared: Sequence[Stratum], whole: bool) -> Float[nda
     Args:
         table: of one method.
         shared: the strata that all methods have.
-        whole: leave out seeds that lack one of them: only differences within a method may be averaged over fewer.
+        whole: leave out seeds that lack one of them: only where differences within a method are all may strata go instead.
     """
+    if not whole:
+        return np.array(list(balanced({stratum: table[stratum] for stratum in shared}).values()))
     found: dict[int, list[float]] = {}
     for stratum in shared:
         for seed, value in table[stratum].items():
             found.setdefault(seed, []).append(value)
-    return np.array([sum(values) / len(values) for values in found.values() if not whole or len(values) == len(shared)])
+    return np.array([sum(values) / len(values) for values in found.values() if len(values) == len(shared)])
 
 
 def _apart(tables: Sequence[Strata]) -> str:
@@ -234,6 +284,12 @@ def _bounds(prediction: Prediction, digits: int) -> str:
     if prediction.high is None:
         return f"at least {_signed(prediction.low, digits)}"
     return f"{_signed(prediction.low, digits)} to {_signed(prediction.high, digits)}"
+
+
+def _interval(value: Estimate | None, digits: int) -> str:
+    if value is None or value.unit == "none":
+        return ABSENT
+    return f"{_signed(value.low, digits)} to {_signed(value.high, digits)}"
 
 
 def _signed(value: float, digits: int) -> str:

@@ -19,10 +19,15 @@ MOST_LISTED = 6
 
 def effect_sentence(effect: Effect) -> str:
     """An effect in one or two sentences."""
-    parts = [_verdict(effect), _lost(effect), _silent(effect)]
+    parts = [_verdict(effect), _lost(effect), _silent(effect), disturbed_words(effect.disturbed)]
     if effect.truths_differ:
         parts.append("The factor changes the truth itself, so the two were scored against different pictures.")
     return " ".join(part for part in parts if part)
+
+
+def disturbed_words(count: int) -> str:
+    """How many fits' times are left out of comparisons, in a sentence; empty for none."""
+    return f"Times of {count} {'fit' if count == 1 else 'fits'} are left out: their clocks were disturbed." if count else ""
 
 
 def unscored_sentences(metric: str, shown: MeasuredQuantity | None) -> list[str]:
@@ -70,7 +75,7 @@ def _verdict(effect: Effect) -> str:
         return f"{effect.label}: the sign depends on other factors, {basis}: {_settings(effect)}; {mean}."
     if effect.found:
         return f"{_subject(effect)} {magnitude} {_intervals(effect, value.mean)}, {basis}."
-    if _contradict(effect):
+    if effect.contradicted:
         mean = f"on average {effect.text(value.mean)} {unit} {_intervals(effect)}"
         return f"{effect.label}: no common direction, {basis}; {mean}."
     if effect.scenes("higher") or effect.scenes("lower"):
@@ -100,6 +105,8 @@ def _unmeasured(effect: Effect, magnitude: str) -> str:
         return f"{effect.label}: no difference at all, {value.size}."
     if value.seeds[1] == 1 and value.scenes == 1:
         return f"{_subject(effect)} {magnitude} with one seed only, which cannot be told from chance."
+    if value.seeds[0] == 1 and value.scenes == 1:
+        return f"{_subject(effect)} {magnitude} with one seed only on one side, which cannot be told from chance."
     words = f"{_subject(effect)} {magnitude} by the same amount each time, {value.size}"
     return f"{words}: no spread is known, so nothing is tested."
 
@@ -159,10 +166,6 @@ def _direction(effect: Effect, verdict: Verdict) -> str:
     return "better" if (verdict == "higher") == (effect.quantity.better == "higher") else "worse"
 
 
-def _contradict(effect: Effect) -> bool:
-    return bool(effect.scenes("higher")) and bool(effect.scenes("lower"))
-
-
 def _averaged(effect: Effect) -> str:
     """Over how many combinations of other factors' levels an effect is averaged, and how far it goes from one to another."""
     if not effect.by_setting:
@@ -177,7 +180,8 @@ def _settings(effect: Effect) -> str:
     """The difference at each combination of other factors' levels, or at the significant ends of many, with its interval."""
     rising = sorted(effect.by_setting.items(), key=lambda item: item[1].claim.mean)
     significant = [item for item in rising if item[1].sign]
-    shown = rising if len(rising) <= MOST_LISTED else [significant[0], significant[-1]]
+    ends = significant if len(significant) > 1 else rising
+    shown = rising if len(rising) <= MOST_LISTED else [ends[0], ends[-1]]
     unit = _unit(effect.quantity)
     parts = (f"{effect.text(one.claim.mean)} {unit} {effect.bounds(one.claim)}".strip() + f" ({name})" for name, one in shown)
     return f"{'from ' if len(shown) < len(rising) else ''}{(' to ' if len(shown) < len(rising) else ', ').join(parts)}"

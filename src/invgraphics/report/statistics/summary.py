@@ -12,7 +12,7 @@ from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.statistics.clocks import Speeds
 from invgraphics.report.statistics.intervals import mean_half_width
 from invgraphics.report.statistics.leaders import leaders
-from invgraphics.report.statistics.values import diverged, value_of
+from invgraphics.report.statistics.values import value_of, without_score
 from invgraphics.report.wording import ABSENT, COSTS, TIMES, MeasuredQuantity, metric_label, quality_quantity
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.run import Run
@@ -56,7 +56,7 @@ class Row:
         complete: it has as many runs as the method with the most. Others are shown but never ranked: a hard seed that is
             missing makes a mean look better than it is.
         disturbed: why its times are not ranked: what is wrong with the clock of its fits; empty where nothing is.
-        lost: keys of the columns in which one of its fits diverged; what is left of those is not ranked either.
+        lost: keys of the columns in which one of its fits diverged, or alone has no value; the others are not ranked either.
     """
 
     label: str
@@ -70,7 +70,7 @@ class Row:
     lost: frozenset[str] = frozenset()
 
     def ranked_in(self, column: MeasuredQuantity) -> bool:
-        """Whether it is ranked in a column: it lacks no seed, none diverged, and for times no clock was disturbed."""
+        """Whether it is ranked in a column: it lacks no seed and no seed's value, and for times no clock was disturbed."""
         return self.complete and column.key not in self.lost and not (self.disturbed and column.key in TIMES)
 
 
@@ -131,7 +131,7 @@ def summarise(comparison: Comparison, tables: int = 1) -> Summary:
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
         cells = tuple(_method_cell(column, runs, absences) for column in columns)
         kind: Literal["method", "failed"] = "method" if runs else "failed"
-        lost = frozenset(column.key for column in columns if any(diverged(run, column) for run in runs))
+        lost = frozenset(column.key for column in columns if without_score(runs, column))
         rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs, speeds), lost))
     for name, quality in comparison.baselines.items():
         cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)

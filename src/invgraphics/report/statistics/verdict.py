@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD, Observation
-from invgraphics.report.statistics.effects import effects_of
+from invgraphics.report.statistics.effects import ALPHA, effects_of
 from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.rules import DEAD_SHARE
 from invgraphics.report.statistics.sentences import detectable_words
@@ -90,7 +90,9 @@ def _resolution(comparison: Comparison, column: MeasuredQuantity, ranking: list[
     low, high = sorted((abs(lead.estimate.low), abs(lead.estimate.high)))
     if lead.found:
         return f"Over {lead.estimate.size} that lead lies in [{lead.text(low)}, {lead.text(high)}]{unit} (95% interval)."
-    if lead.equivalent and column.margin is not None:
+    # Any of the others could have come second, and the closest is chosen after the fact (Bonferroni over them).
+    chosen = math.inf if lead.equivalence is None else lead.equivalence * (len(ranking) - 1)
+    if lead.equivalent and chosen <= ALPHA and column.margin is not None:
         return f"Over {lead.estimate.size} the two are equal within {lead.text(column.margin)}{unit} (equivalence test)."
     return f"{size} cannot tell that lead from chance: {detectable_words(lead)}."
 
@@ -180,8 +182,8 @@ def _warnings(comparison: Comparison, summary: Summary) -> list[str]:
             reasons.setdefault(run.method, run.scores.below_baseline)
     sentences += reasons.values()
     if columns and (broken := [row.label for row in summary.methods if columns[0].key in row.lost]):
-        what = "a fit whose" if len(broken) == 1 else "fits whose"
-        sentences.append(f"{listing(broken)}: {what} {columns[0].label} is not a number, and so left out of the ranking.")
+        what = "a fit" if len(broken) == 1 else "fits"
+        sentences.append(f"{listing(broken)}: {what} without a number for {columns[0].label}, and so left out of the ranking.")
     short = [row.label for row in summary.methods if not row.complete]
     if short:
         words = "lacks seeds that others have and is" if len(short) == 1 else "lack seeds that others have and are"
