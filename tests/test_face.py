@@ -27,7 +27,7 @@ from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.experiments import compare as comparing
 from invgraphics.experiments.request import AblateRequest
-from invgraphics.experiments.session import ScoreTable
+from invgraphics.experiments.score_table import ScoreTable
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.scenes.npz import Npz, save_npz

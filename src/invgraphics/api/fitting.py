@@ -17,7 +17,8 @@ from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import make_run
-from invgraphics.experiments.session import FittedRun, FolderRun, MemoryRun, OnStep, ScoreTable
+from invgraphics.experiments.score_table import ScoreTable
+from invgraphics.experiments.session import FittedRun, FolderRun, MemoryRun, OnStep
 from invgraphics.interruption import Terminated
 from invgraphics.runs.folder import RECIPE, RunFolder
 from invgraphics.scenes.open import source_of
