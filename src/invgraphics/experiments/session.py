@@ -11,7 +11,7 @@ from typing import final
 
 from invgraphics.core import Model, Scene
 from invgraphics.experiments.build import configure_torch, use_kernels
-from invgraphics.experiments.clocks import fit_costs, fit_record
+from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record
 from invgraphics.experiments.display import curve_svg
 from invgraphics.experiments.evaluate import scene_as_trained, score_model
 from invgraphics.experiments.fitted import Fitted
@@ -198,9 +198,9 @@ class MemoryRun(FittedRun):
     def scores(self) -> ScoreTable:
         """Scores under the default protocol, computed on first access."""
         if self._scores is None:
-            scores = self.evaluate()
-            costs = fit_costs(fit_record(self.fit.steps, self.fit.clocks()))
-            self._scores = ScoreTable(replace(scores.record, cost=costs | scores.record.cost))
+            found = self.evaluate().record
+            cost = fit_costs(fit_record(self.fit.steps, self.fit.clocks())) | found.cost
+            self._scores = ScoreTable(replace(found, cost=cost, disturbed=disturbance(cost)))
         return self._scores
 
 
