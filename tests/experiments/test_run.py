@@ -274,6 +274,22 @@ def test_a_resumed_fit_keeps_its_peak_memory(run: Path, toy_folder: Path, tmp_pa
     assert json.loads((folder / "fit.json").read_text())["peak_memory_bytes"] == 10**12
 
 
+def test_steps_whose_clock_was_lost_count_all_the_same(
+    run: Path, toy_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A kill between the writing of checkpoint and clocks: the budget is that of all steps, and it is said."""
+    folder = shutil.copytree(run, tmp_path / "run")
+    (folder / "scores.json").unlink()
+    record = json.loads((folder / "fit.json").read_text())
+    known = {"steps": 10, "seconds": 40.0, "cpu_seconds": 60.0, "ran_seconds": 50.0, "waited_seconds": 1.0}
+    (folder / "fit.json").write_text(json.dumps(record | known))
+    fit_run(_request(toy_folder, folder, existing="resume"))
+    after, cost = (json.loads((folder / name).read_text()) for name in ("fit.json", "scores.json"))
+    assert after["steps"] == 30 and after["seconds"] == pytest.approx(120.0) and cost["cost"]["fit_seconds"] == after["seconds"]
+    assert after["cpu_seconds"] == pytest.approx(180.0) and after["ran_seconds"] >= 150.0 and after["waited_seconds"] >= 3.0
+    assert "the times of steps 10 to 30 of" in capsys.readouterr().err
+
+
 def _spawn(request: FitRequest, folder: Path) -> subprocess.Popen:
     job = folder / "job.json"
     job.write_text(json.dumps(request.to_json()))

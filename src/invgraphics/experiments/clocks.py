@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 
 from invgraphics.core import Camera, Model, Rendering
 from invgraphics.runs.fit import FitRecord
@@ -88,6 +89,15 @@ def fit_costs(fit: FitRecord) -> dict[str, float | None]:
         "steps": fit.steps,
         "peak_memory_bytes": fit.peak_memory_bytes,
     }
+
+
+def at_step(fit: FitRecord, steps: int) -> FitRecord:
+    """Clock readings of a fit at a step after its record: the steps in between count at the mean rate of those before."""
+    if not fit.steps or steps <= fit.steps:
+        return fit
+    clocks = ("seconds", "cpu_seconds", "ran_seconds", "waited_seconds")
+    known = {name: value for name in clocks if (value := getattr(fit, name)) is not None}
+    return replace(fit, steps=steps, **{name: value * steps / fit.steps for name, value in known.items()})
 
 
 def processor_share(fit: FitRecord) -> float | None:

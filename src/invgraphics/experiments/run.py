@@ -21,7 +21,7 @@ from invgraphics.experiments.build import (
     open_with_progress,
     use_kernels,
 )
-from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average
+from invgraphics.experiments.clocks import at_step, disturbance, fit_costs, fit_record, load_average
 from invgraphics.experiments.environment import code_version, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
@@ -135,9 +135,16 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
 
 
 def _resumed(fit: Fit, job: Job) -> FitRecord:
-    """Load the folder's checkpoint into the fit, with the clocks at that moment; returns the record of the time before."""
-    earlier = job.folder.read(FitRecord)
-    fit.load(checkpoint.load(job.folder.checkpoint, job.device), earlier.seconds or 0.0)
+    """Load the folder's checkpoint into the fit, with the clocks at that moment; returns the record of the time before.
+
+    Checkpoint and clocks are two files: of a fit that was killed between them, the clocks are those of the checkpoint before.
+    """
+    state, known = checkpoint.load(job.folder.checkpoint, job.device), job.folder.read(FitRecord)
+    earlier = at_step(known, int(state["fit"]["steps"]))
+    if earlier is not known:
+        lost = f"steps {known.steps} to {earlier.steps} of {job.folder.root}, which was killed as it wrote a checkpoint"
+        warn(f"Warning: the times of {lost}, are not known; they count at the mean rate of the steps before.")
+    fit.load(state, earlier.seconds or 0.0)
     fit.resume_clocks(asdict(earlier))
     return earlier
 
