@@ -290,6 +290,21 @@ def test_steps_whose_clock_was_lost_count_all_the_same(
     assert "the times of steps 10 to 30 of" in capsys.readouterr().err
 
 
+def test_a_fit_that_goes_on_elsewhere_keeps_where_it_began(
+    run: Path, toy_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(run, tmp_path / "run")
+    path, here = folder / "environment.json", json.loads((run / "environment.json").read_text())
+    path.write_text(json.dumps(here | {"cpu": "An abacus", "cores": 3, "date": "1623-01-01 00:00 UTC"}))
+    for _ in range(2):  # the second time nothing has changed
+        (folder / "scores.json").unlink()
+        fit_run(_request(toy_folder, folder, existing="resume"))
+        found = json.loads(path.read_text())
+        assert found["cpu"] == here["cpu"] and len(found["begun_on"]) == 1
+        assert found["begun_on"][0].startswith("An abacus, 3 cores") and here["torch"] in found["begun_on"][0]
+    assert capsys.readouterr().err.count("the fit was begun elsewhere (An abacus, 3 cores") == 1
+
+
 def _spawn(request: FitRequest, folder: Path) -> subprocess.Popen:
     job = folder / "job.json"
     job.write_text(json.dumps(request.to_json()))
