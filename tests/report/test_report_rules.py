@@ -119,6 +119,18 @@ def test_numbers_are_finite(tmp_path: Path) -> None:
     assert found[3].standing == "red" and outcome(found[3], "monitor") == "none"
 
 
+def test_a_perfect_view_breaks_no_rule(tmp_path: Path) -> None:
+    """Nor do perfect ones beside a bad one: a PSNR of equal pictures counts as 100 dB everywhere."""
+    cells = [
+        entry(HASH, "fence", 128, "60s", psnr=[30.0, math.inf, 31.0], history=rising(40.0, 60.0)),
+        entry(HASH, "fence", 128, "5min", psnr=[math.inf, math.inf, 93.0], history=rising(40.0, 300.0)),
+    ]
+    first, second = judged(tmp_path, *cells)
+    assert [outcome(one, rule) for one in (first, second) for rule in ("finite", "views")] == ["ok"] * 4
+    assert sentence(second, "views") == "The worst view, 0002, scores 93.00 dB, 7.00 dB below the median."
+    assert sentence(second, "budget") == "97.67 dB after 300 s, 44.00 dB above the 53.67 dB of 60 s."
+
+
 @pytest.mark.parametrize(("seconds", "expected"), [(3600 + 71.0, "red"), (3600 + 69.0, "ok"), (None, "none")])
 def test_no_cell_is_an_hour_late(tmp_path: Path, seconds: float | None, expected: str) -> None:
     (one,) = judged(tmp_path, entry(HASH, "fence", 128, "60s", seconds=seconds))

@@ -7,11 +7,14 @@ import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from typing import Literal
 
 from invgraphics.report.data.factors import METHOD, StudyCell
-from invgraphics.report.wording import listing
+from invgraphics.report.statistics.values import clipped, value_of
+from invgraphics.report.wording import listing, quality_quantity
 from invgraphics.runs.run import Run
+from invgraphics.runs.scores import Score
 from invgraphics.runs.study import KnownDeviation
 from invgraphics.text import duration
 
@@ -117,19 +120,18 @@ def headline(judged: Sequence[JudgedCell]) -> list[str]:
 
 
 def psnr_of(cell: StudyCell) -> float | None:
-    """Mean PSNR over the cell's test views, dB; ``None`` without a run."""
+    """Mean PSNR over the cell's test views, dB, that of equal pictures at a finite value; ``None`` without a run."""
     score = None if cell.run is None else cell.run.scores.quality.get("psnr")
-    return None if score is None else score.mean
+    return None if cell.run is None or score is None else value_of(cell.run, quality_quantity("psnr", score))
 
 
 def worst_view(run: Run) -> tuple[str, float, float] | None:
     """(name, PSNR, PSNR below the median) of the worst view, dB; ``None`` where single views have no scores."""
     score = run.scores.quality.get("psnr")
-    values = [
-        (value, view)
-        for value, view in zip(score.per_view if score else (), run.scores.views, strict=False)
-        if value is not None
-    ]
+    if score is None:
+        return None
+    clip = partial(clipped, column=quality_quantity("psnr", score))
+    values = [(clip(value), view) for value, view in zip(score.per_view, run.scores.views, strict=False) if value is not None]
     if not values:
         return None
     worst, view = min(values)
@@ -233,8 +235,8 @@ def _memory(run: Run) -> Verdict:
 
 
 def _finite(run: Run) -> Verdict:
-    """Check scores, costs and history for non-finite values, metrics skipped for that reason included."""
-    found = [name for name, score in run.scores.quality.items() if not _all_finite([score.mean, *score.per_view])]
+    """Check scores, costs and history for non-finite values, metrics skipped for that reason included; perfect PSNR is fine."""
+    found = [name for name, score in run.scores.quality.items() if not _all_finite(name, score)]
     found += [name for name, why in run.scores.skipped.items() if "finite" in why]
     found += [name for name, value in run.scores.cost.items() if value is not None and not math.isfinite(value)]
     found += [f"{name} at step {entry.step}" for entry in run.history for name in entry.not_finite]
@@ -245,8 +247,9 @@ def _finite(run: Run) -> Verdict:
     return Verdict("finite", "ok", "All metrics, costs and curves are finite.", 0.0, 0.0)
 
 
-def _all_finite(values: Sequence[float | None]) -> bool:
-    return all(value is not None and math.isfinite(value) for value in values)
+def _all_finite(name: str, score: Score) -> bool:
+    column = quality_quantity(name, score)
+    return all(math.isfinite(clipped(value, column)) for value in (score.mean, *score.per_view))
 
 
 def _late(cell: StudyCell) -> Verdict:
