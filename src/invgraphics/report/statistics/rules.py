@@ -94,7 +94,14 @@ class JudgedCell:
 
 def judge(cells: Sequence[StudyCell], known: Sequence[KnownDeviation] = ()) -> tuple[JudgedCell, ...]:
     """Evaluate every rule on every cell that has run."""
-    return tuple(JudgedCell(cell, tuple(_excused(cell, one, known) for one in _verdicts(cell, cells))) for cell in cells)
+    groups: dict[tuple[object, ...], list[StudyCell]] = {}
+    keys = [_without_budget(cell) for cell in cells]
+    for key, cell in zip(keys, cells, strict=True):
+        groups.setdefault(key, []).append(cell)
+    judged = []
+    for key, cell in zip(keys, cells, strict=True):
+        judged.append(JudgedCell(cell, tuple(_excused(cell, one, known) for one in _verdicts(cell, groups[key]))))
+    return tuple(judged)
 
 
 def unused(judged: Sequence[JudgedCell], known: Sequence[KnownDeviation]) -> tuple[KnownDeviation, ...]:
@@ -145,14 +152,15 @@ def dead_share(run: Run) -> float | None:
     return next((entry.dead for entry in reversed(run.history) if entry.dead is not None), None)
 
 
-def _verdicts(cell: StudyCell, cells: Sequence[StudyCell]) -> list[Verdict]:
+def _verdicts(cell: StudyCell, alike: Sequence[StudyCell]) -> list[Verdict]:
+    """Outcome of every rule on a cell; ``alike`` are those that differ from it in nothing but the budget."""
     if cell.status == "failed":
         rest = [Verdict(rule, "none", "The fit failed.") for rule in RULES if rule not in ("finite", "late")]
         return [*rest, Verdict("finite", "red", f"The fit failed: {cell.error}"), _late(cell)]
     if cell.run is None:
         return []
     of_run: tuple[Callable[[Run], Verdict], ...] = (_monitor, _views, _dead, _memory, _finite)
-    return [_budget(cell, cells), *(rule(cell.run) for rule in of_run), _late(cell)]
+    return [_budget(cell, alike), *(rule(cell.run) for rule in of_run), _late(cell)]
 
 
 def _excused(cell: StudyCell, verdict: Verdict, known: Sequence[KnownDeviation]) -> Verdict:
@@ -168,14 +176,13 @@ def _verdict(rule: str, broken: bool, sentence: str, value: float, limit: float)
     return Verdict(rule, "red" if broken else "ok", sentence, value, limit)
 
 
-def _budget(cell: StudyCell, cells: Sequence[StudyCell]) -> Verdict:
+def _budget(cell: StudyCell, alike: Sequence[StudyCell]) -> Verdict:
     """PSNR against the best of all shorter budgets, so that a fall and a later recovery are told apart."""
     own = psnr_of(cell)
     shorter = [
         (value, other)
-        for other in cells
-        if cell.amount and other.amount and _without_budget(other) == _without_budget(cell)
-        if other.amount[0] == cell.amount[0] and other.amount[1] < cell.amount[1]
+        for other in alike
+        if cell.amount and other.amount and other.amount[0] == cell.amount[0] and other.amount[1] < cell.amount[1]
         if (value := psnr_of(other)) is not None
     ]
     if own is None or not shorter:
