@@ -12,7 +12,7 @@ from typing import final
 from invgraphics.core import Model, Scene
 from invgraphics.experiments.build import configure_torch, use_kernels
 from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record
-from invgraphics.experiments.display import curve_svg
+from invgraphics.experiments.display import ScoreTable, curve_svg
 from invgraphics.experiments.evaluate import scene_as_trained, score_model
 from invgraphics.experiments.fitted import Fitted
 from invgraphics.experiments.job import Job, in_region, make_training_scene, region_of
@@ -20,7 +20,6 @@ from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.renderings import check_variants
 from invgraphics.experiments.run import prepare, warm_up
 from invgraphics.experiments.scaled import scaled_scores
-from invgraphics.experiments.score_table import ScoreTable
 from invgraphics.experiments.variants import as_shown, variant_named, with_renderer
 from invgraphics.interruption import Terminated
 from invgraphics.metrics.cost import PeakMemory
