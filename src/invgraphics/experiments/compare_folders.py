@@ -75,9 +75,11 @@ def made_before(request: CompareRequest, jobs: Sequence[Job], scene: Scene | Non
         jobs: one of each method.
         scene: as loaded; ``None`` where no run is finished.
     """
+    if scene is None:
+        return set()
     methods, truth = {job.request.method: job.method for job in jobs}, ""
     found = set()
-    for fit in request.fits() if scene is not None else ():
+    for fit in request.fits():
         job = Job.of(fit, methods[fit.method])
         if request.keep and is_kept(job):
             found.add(fit.out)
