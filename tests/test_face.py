@@ -26,8 +26,8 @@ from invgraphics.core import Scene, View
 from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.experiments import compare as comparing
+from invgraphics.experiments.display import ScoreTable
 from invgraphics.experiments.request import AblateRequest
-from invgraphics.experiments.session import ScoreTable
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.scenes.npz import Npz, save_npz

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+import torch
 from made_up_runs import provenance_table
+from training_fixtures import SMALL
 
 from invgraphics.errors import InputError
-from invgraphics.experiments.identity import check_replaceable
+from invgraphics.experiments.compare import compare
+from invgraphics.experiments.executors.base import Outcome
+from invgraphics.experiments.identity import check_replaceable, run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.renderings import is_kept
-from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.request import CompareRequest, FitRequest
 from invgraphics.recipes.recipe import load_method
+from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 
 METHOD = "splatting/gaussians"
@@ -47,3 +53,43 @@ def test_another_recipe_is_another_run_at_every_size(tmp_path: Path) -> None:
     assert not is_kept(job)
     with pytest.raises(InputError, match="its recipe is"):
         check_replaceable(job)
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_comparison_that_is_interrupted_lists_no_run_of_earlier_code(
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: bool
+) -> None:
+    """Such a run was about to be fitted again; what this code made, or what the command keeps, is part of the comparison."""
+    ended = []
+
+    def run(self: object, requests: Sequence[FitRequest], jobs: Path) -> Iterator[Outcome]:
+        ended.extend(Path(request.out).name for request in requests)
+        yield from ()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("invgraphics.experiments.compare.LocalExecutor.run", run)
+    overrides = tuple(SMALL[METHOD])
+    request = CompareRequest(
+        scene=str(toy_folder),
+        out=str(tmp_path),
+        methods=(METHOD,),
+        seeds=(0, 1, 2),
+        budget="9steps",
+        overrides=overrides,
+        keep=keep,
+    )
+    truth = truth_digest(open_scene(str(toy_folder), SceneOptions()))
+    for seed, fit in enumerate(request.fits()[:2]):
+        job = Job.of(fit)
+        identity = run_digest(job, truth, torch.get_num_threads()) if seed else "of earlier code"
+        record = provenance_table(
+            method=METHOD, scene=fit.scene, seed=seed, budget=fit.budget, recipe_sha256=job.method.digest, cell_sha256=identity
+        )
+        job.folder.create()
+        (job.folder.root / "provenance.json").write_text(json.dumps(record | {"options": {"test_views": fit.test_views}}))
+        (job.folder.root / "scores.json").write_text("{}")
+    with pytest.raises(KeyboardInterrupt):
+        compare(request)
+    found = [Path(name).name for name in json.loads((tmp_path / "compare.json").read_text())["runs"]]
+    assert ended == (["seed-2"] if keep else ["seed-0", "seed-1", "seed-2"])
+    assert found == (["seed-0", "seed-1"] if keep else ["seed-1"])

@@ -12,6 +12,7 @@ from invgraphics.report.build import build_report
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.data.factors import METHOD, Observation
+from invgraphics.report.figures.tradeoffs import draw_tradeoffs
 from invgraphics.report.pages.facts import shared_facts
 from invgraphics.report.pages.parts import draw_contrasts
 from invgraphics.report.pages.tables import markdown_effects
@@ -76,6 +77,28 @@ def test_two_fits_and_unmeasured_ones_have_no_usual_speed() -> None:
     comparison = Comparison("s", "?", ("a", "b", "c"), runs, budget="60s")
     assert summarise(comparison).disturbances == ()
     assert "processor speed during the fits" not in dict(shared_facts(comparison))
+
+
+@pytest.mark.parametrize("quiet", [0, 1, 2])
+def test_disturbed_times_make_no_pareto_front(tmp_path: Path, quiet: int) -> None:
+    """Two methods whose clocks can be compared are the fewest that make one; sizes are compared whatever the clocks."""
+    runs = [_run(method, seed, fps) for method, fps in (("a", 90.0), ("b", 50.0), ("c", 20.0)) for seed in (0, 1)]
+    runs = [
+        one if "abc".index(one.method) < quiet else replace(one, scores=replace(one.scores, disturbed=TOLD)) for one in runs
+    ]
+    comparison = Comparison("s", "?", ("a", "b", "c"), tuple(runs), budget="500steps")
+    drawn = {figure.path.stem: figure for figure in draw_tradeoffs(summarise(comparison), tmp_path)}
+    size = drawn["psnr-against-model-bytes"]
+    assert "On the Pareto front: c, b and a" in size.alt and "Dashed: Pareto front" in size.path.read_text()
+    for name in ("psnr-against-render-fps", "psnr-against-fit-seconds"):
+        alt, picture = drawn[name].alt, drawn[name].path.read_text()
+        assert (
+            ("On the Pareto front: a" in alt)
+            == ("Pareto front" in picture)
+            == ("stroke-dasharray: 4.4" in picture)
+            == (quiet == 2)
+        )
+        assert ("not ranked" in alt) == (quiet < 2)
 
 
 def _best(summary, key: str) -> list[str]:

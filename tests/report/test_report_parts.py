@@ -16,11 +16,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from made_up_runs import made_up_run
 from PIL import Image
 
 from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.data.factors import METHOD, Observation
 from invgraphics.report.figures import views as pictures
+from invgraphics.report.figures.distributions import per_view
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
 from invgraphics.report.figures.tradeoffs import draw_tradeoffs
 from invgraphics.report.statistics.effects import effects_of
@@ -29,8 +31,10 @@ from invgraphics.report.statistics.pairing import Contrast
 from invgraphics.report.statistics.summary import pareto_front, quality_columns, summarise
 from invgraphics.report.statistics.time_to_quality import span_to_reach, time_to_quality
 from invgraphics.report.statistics.verdict import verdict
-from invgraphics.report.wording import budget_words, listing, significant_decimals, times
+from invgraphics.report.wording import budget_words, listing, quality_quantity, significant_decimals, times
+from invgraphics.runs.comparison import Failure
 from invgraphics.runs.run import Run
+from invgraphics.runs.scores import Score
 from invgraphics.text import duration
 
 
@@ -107,6 +111,25 @@ def test_the_median_time_counts_seeds_that_never_got_there(
     reach = time_to_quality(replace(comparison, methods=names, runs=runs))
     assert reach is not None and reach.levels[-1] == 20
     assert reach.rows[0][2][-1] == told and reach.rows[1][2][-1] == "5.0 s"
+
+
+def test_failed_fits_never_get_there(built_report: Path) -> None:
+    """One of three seeds is there after 20 s, two have failed: a median over all seeds is no 20 s."""
+    comparison = read_comparison(built_report)
+    first, name = comparison.runs[0], comparison.methods[0]
+    moments = ((0.0, 10.0), (19.9, 10.0), (20.0, 20.0))
+    history = tuple(replace(first.history[0], seconds=at, psnr=psnr) for at, psnr in moments)
+    one = replace(comparison, methods=(name,), runs=(replace(first, history=history),), failures=())
+    for failed, told in ((0, "20.0 s"), (1, "not reached"), (2, "not reached")):
+        lost = tuple(Failure(method=name, seed=seed + 1, error="The fit failed.") for seed in range(failed))
+        reach = time_to_quality(replace(one, failures=lost))
+        assert reach is not None and reach.rows[0][2][-1] == told
+
+
+def test_perfect_views_are_drawn_among_the_others() -> None:
+    score = Score(mean=math.inf, per_view=(30.0, math.inf, None), unit="dB", higher_is_better=True)
+    runs = [made_up_run({"psnr": replace(score, per_view=values)}) for values in (score.per_view, (32.0, 60.0, 10.0))]
+    assert per_view(runs, quality_quantity("psnr", score)) == [31.0, 80.0, 10.0]
 
 
 def test_methods_of_a_comparison_are_compared_as_the_page_says(built_report: Path) -> None:

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
-from judged_folders import entry, rising, write_judged
+from judged_folders import SECONDS, entry, rising, write_judged
 
 from invgraphics.cli import main
 from invgraphics.report.data.studies import read_study
+from invgraphics.report.statistics import rules
 from invgraphics.report.statistics.rules import RULES, JudgedCell, judge, unused
 from invgraphics.report.study import build_study_report
 from invgraphics.studies.study import KnownDeviation
@@ -117,6 +118,28 @@ def test_numbers_are_finite(tmp_path: Path) -> None:
     words = ["loss at step 30", "psnr", "ssim", "Step 3: the loss is not finite."]
     assert all(word in sentence(one, "finite") for one, word in zip(found, words, strict=True))
     assert found[3].standing == "red" and outcome(found[3], "monitor") == "none"
+
+
+def test_time_to_judge_grows_with_the_cells_and_not_with_their_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What cells have in common is looked at once for each, and not once for each pair."""
+    seen, plain = [], rules._without_budget
+    monkeypatch.setattr(rules, "_without_budget", lambda cell: (seen.append(cell), plain(cell))[1])
+    cells = [entry(HASH, "fence", size, budget, psnr=[30.0]) for size in range(100, 110) for budget in SECONDS]
+    found = judged(tmp_path, *cells)
+    assert len(seen) <= 2 * len(cells)
+    assert [outcome(one, "budget") for one in found] == ["none", "ok", "ok"] * 10
+
+
+def test_a_perfect_view_breaks_no_rule(tmp_path: Path) -> None:
+    """Nor do perfect ones beside a bad one: a PSNR of equal pictures counts as 100 dB everywhere."""
+    cells = [
+        entry(HASH, "fence", 128, "60s", psnr=[30.0, math.inf, 31.0], history=rising(40.0, 60.0)),
+        entry(HASH, "fence", 128, "5min", psnr=[math.inf, math.inf, 93.0], history=rising(40.0, 300.0)),
+    ]
+    first, second = judged(tmp_path, *cells)
+    assert [outcome(one, rule) for one in (first, second) for rule in ("finite", "views")] == ["ok"] * 4
+    assert sentence(second, "views") == "The worst view, 0002, scores 93.00 dB, 7.00 dB below the median."
+    assert sentence(second, "budget") == "97.67 dB after 300 s, 44.00 dB above the 53.67 dB of 60 s."
 
 
 @pytest.mark.parametrize(("seconds", "expected"), [(3600 + 71.0, "red"), (3600 + 69.0, "ok"), (None, "none")])

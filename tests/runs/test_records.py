@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import typing
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -223,3 +224,14 @@ def test_what_says_nothing_is_left_out() -> None:
     assert Analysis("t", "s", "x", "y", (Curve("c", (0.0,), (1.0,)),)).to_table()["curves"] == [
         {"label": "c", "x": [0.0], "y": [1.0]}
     ]
+
+
+def test_one_folder_is_created_by_several_at_a_time(tmp_path: Path) -> None:
+    """As by the fits of a study that share it: the check that it can be written leaves nothing, and disturbs no other."""
+
+    def create(_: int) -> None:
+        RunFolder(tmp_path / "run").create()
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len(list(pool.map(create, range(2000)))) == 2000
+    assert not list((tmp_path / "run").iterdir())

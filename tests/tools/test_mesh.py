@@ -16,14 +16,13 @@ from invgraphics.cli import main
 from invgraphics.core import Bounds, Camera, Context, Mesh, Quantity, Rendering
 from invgraphics.errors import InputError
 from invgraphics.experiments import fitted as opened
-from invgraphics.experiments.mesh_files import mesh_from_file
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.fields.analytic import GaussianBlob, Sphere
 from invgraphics.fields.depth_fusion import fuse_depth
 from invgraphics.fields.isosurface import VoxelGrid, default_level, extract_mesh, without_specks
 from invgraphics.fields.mesh import MeshField
-from invgraphics.formats.mesh import read_mesh
+from invgraphics.formats.mesh import mesh_from_file, read_mesh
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.runs.folder import RunFolder
 from invgraphics.studies.approximations import field_of, isotropic_gaussians

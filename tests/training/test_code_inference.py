@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from PIL import Image
 
 from invgraphics.cli.main import run as command
-from invgraphics.core import Context, Model, Scene, View
+from invgraphics.core import Context, Model, Rendering, Scene, View
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model
 from invgraphics.experiments.subjects import UnseenInstances
@@ -18,7 +19,8 @@ from invgraphics.fields.neural import NeuralFieldConfig
 from invgraphics.recipes.recipe import load_method
 from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
-from invgraphics.report.statistics.instances import paired, table_of
+from invgraphics.report.inference import build_inference_report, inference_sentences
+from invgraphics.report.statistics.instances import mean_of, paired, table_of
 from invgraphics.runs.inference import Inference, InstanceScores
 from invgraphics.runs.study import CellRecord, StudyRecord
 from invgraphics.scenes.npz import save_npz
@@ -241,3 +243,67 @@ def test_intervals_are_those_of_paired_instances() -> None:
     assert (gain.low, gain.high) == pytest.approx(tuple(test.confidence_interval()))
     cell = table_of(record, "psnr", ["b", "a"])["a"][1]
     assert cell.gain == gain and cell.mean == pytest.approx(76.5 / 3) and cell.certain == (test.pvalue < 0.05)
+
+
+def inferred(values: dict[str, dict[str, list[tuple[float | None, ...]]]], counts: tuple[int, ...] = (1,)) -> Inference:
+    """Record of made-up scores: method -> metric -> instance -> test views, the first method a prior."""
+    scores = tuple(
+        InstanceScores(
+            subject=s, observed=n, how=how, quality={metric: rows[s] for metric, rows in metrics.items()}, input_psnr=20.0
+        )
+        for how, metrics in values.items()
+        for s in range(len(metrics["psnr"]))
+        for n in counts
+    )
+    runs, given = {next(iter(values)): "runs/x"}, {"command": "", "date": "", "pictures": (), "columns": {}}
+    return Inference(scene="chairs", runs=runs, instances=scores, **given)
+
+
+@pytest.mark.parametrize(("loser", "bold"), [("prior", True), ("B", False), (None, True)])
+def test_who_lacks_instances_is_not_called_better(tmp_path: Path, loser: str | None, bold: bool) -> None:
+    """B is a decibel and five degrees better where both have scores; the three hard instances are not among them."""
+    easy = {"prior": {"psnr": 20.0, "normal_deg": 25.0}, "B": {"psnr": 21.0, "normal_deg": 20.0}}
+    values = {
+        how: {
+            metric: [(None, None) if how == loser and s >= 5 else (value + 0.01 * s * (how == "B"), value) for s in range(8)]
+            for metric, value in metrics.items()
+        }
+        for how, metrics in easy.items()
+    }
+    record = inferred(values, (1, 2))
+    for metric in ("psnr", "normal_deg"):
+        cell = table_of(record, metric, ["prior", "B"])["B"][1]
+        assert cell.gain is not None and cell.gain.p is not None and cell.gain.p < 1e-3 and cell.certain is bold
+    record.write(tmp_path / Inference.FILE)
+    (sentence,), page = inference_sentences(tmp_path), build_inference_report(tmp_path)
+    if loser == "B":
+        assert sentence == "From 1 view, prior against B: not compared, since B lacks scores of 3 instances."
+        assert "21.01 (5 of 8)" in page.read_text()
+    else:
+        assert "dB of PSNR on other views" in sentence and ("where prior lacks scores of 3 instances" in sentence) == bool(
+            loser
+        )
+    text = page.with_suffix(".md").read_text()
+    assert ("3 instances incomplete" in text) == (loser is not None) and ("**+1.0" in text) is bold
+
+
+def test_a_single_view_that_is_lost_is_lost_and_a_perfect_one_counts() -> None:
+    rows = [(20.0, 21.0), (22.0, 23.0), (24.0, 25.5)]
+    record = inferred({"prior": {"psnr": rows}, "B": {"psnr": [(26.0, 27.0), (28.0, 29.1), (30.0, None)]}})
+    assert not table_of(record, "psnr", ["prior", "B"])["B"][1].certain
+    record = inferred({"prior": {"psnr": rows}, "B": {"psnr": []}})
+    assert table_of(record, "psnr", ["prior", "B"])["B"] == {1: replace(table_of(record, "psnr", ["B"])["B"][1], lost=(3, 0))}
+    perfect = mean_of(inferred({"prior": {"psnr": [(np.inf, 20.0)]}}), "psnr", 1, "prior")
+    assert perfect is not None and perfect.mean == 60.0  # equal pictures count as 100 dB
+
+
+def test_a_picture_that_is_not_finite_ends_no_inference(toy_class: Scene) -> None:
+    class Broken:
+        def render(self, camera, normals: bool = True) -> Rendering:
+            rgb = torch.full((camera.height, camera.width, 3), torch.nan)
+            return Rendering(rgb, torch.ones(rgb.shape[:2]), torch.ones(rgb.shape[:2]))
+
+    methods = SimpleNamespace(scene=toy_class, _request=SimpleNamespace(tests=1))
+    views = [view for view in toy_class.observed if view.subject == 2]
+    found = module._InferenceMethods.score(methods, Broken(), views, "prior", 1.0)  # pyright: ignore[reportArgumentType]
+    assert found.input_psnr is None and found.quality["psnr"] == (None,)

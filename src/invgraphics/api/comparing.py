@@ -21,9 +21,9 @@ from invgraphics.api.loading import (
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments import compare as comparing
-from invgraphics.experiments.display import table_html
+from invgraphics.experiments.display import ScoreTable, table_html
 from invgraphics.experiments.request import CompareRequest
-from invgraphics.experiments.session import FolderRun, ScoreTable
+from invgraphics.experiments.session import FolderRun
 from invgraphics.recipes.recipe import Method, expand
 from invgraphics.report.build import build_report
 from invgraphics.report.data.comparison import Comparison, read_comparison

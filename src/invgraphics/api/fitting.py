@@ -12,12 +12,13 @@ from typing import Any, Literal, TypedDict, Unpack, overload
 from invgraphics.api.loading import MethodLike, as_scene, data_overrides, reopenable_scene, resolved, whole_seeds
 from invgraphics.core import Model, Scene
 from invgraphics.errors import InputError
+from invgraphics.experiments.display import ScoreTable
 from invgraphics.experiments.evaluate import score_model
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import make_run
-from invgraphics.experiments.session import FittedRun, FolderRun, MemoryRun, OnStep, ScoreTable
+from invgraphics.experiments.session import FittedRun, FolderRun, MemoryRun, OnStep
 from invgraphics.interruption import Terminated
 from invgraphics.runs.folder import RECIPE, RunFolder
 from invgraphics.scenes.open import source_of

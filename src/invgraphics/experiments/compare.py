@@ -15,23 +15,21 @@ import torch
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, open_with_progress
+from invgraphics.experiments.compare_folders import any_finished, check_folders, made_before, missing_fits, name_others
 from invgraphics.experiments.environment import environment
-from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.posed import exposure_note, protocol_note
-from invgraphics.experiments.progress import warn
-from invgraphics.experiments.renderings import check_variants, is_kept
-from invgraphics.experiments.request import DATA, CompareRequest, FitRequest
+from invgraphics.experiments.renderings import check_variants
+from invgraphics.experiments.request import DATA, CompareRequest
 from invgraphics.experiments.start import check_source
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.metrics.baselines import baseline_scores
 from invgraphics.recipes.suitable import default_methods, is_open_space, starts_from_points
 from invgraphics.recipes.table import cell_of
 from invgraphics.runs.comparison import ComparisonRecord, Failure, Refusal, SceneFacts
-from invgraphics.runs.folder import RUNS, RunFolder, output_folder
-from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.folder import RunFolder, output_folder
 from invgraphics.scenes.degrade import degrade
 from invgraphics.scenes.open import SceneOptions, space_note
 from invgraphics.scenes.truth import POINTS as EXACT_POINTS
@@ -62,25 +60,29 @@ def compare(request: CompareRequest) -> tuple[Path, int]:
 def _compare(request: CompareRequest) -> tuple[Path, int]:
     began = time.monotonic()
     request, choice, opened = (request, "", None) if request.methods else _choose_methods(request)
+    if opened is None and any_finished(request):
+        opened = open_with_progress(request.scene, SceneOptions(request.size, request.test_views, request.spp))
     request, jobs, scene, refused = _resolve(request, opened)
     folder = RunFolder(Path(request.out))
     failures: list[Failure] = []
-    _name_others(request)
-    earlier = any(RunFolder(Path(fit.out)).finished for fit in request.fits())
+    name_others(request)
+    earlier, made = any_finished(request), made_before(request, jobs, opened)
     summary = replace(_summary(request, jobs, scene), refused=tuple(refused), method_choice=choice)
     interrupted: KeyboardInterrupt | None = None
     try:
-        with closing(LocalExecutor().run(_missing(request, jobs), folder.root / "jobs")) as outcomes:
+        with closing(LocalExecutor().run(missing_fits(request, jobs), folder.root / "jobs")) as outcomes:
             for outcome in outcomes:
                 if outcome.status == INTERRUPTED:
                     raise KeyboardInterrupt
+                fit = outcome.request
+                made.add(fit.out)
                 if outcome.status != 0:
-                    fit = outcome.request
                     failures.append(Failure(method=fit.method, seed=fit.seed, error=outcome.error))
     except KeyboardInterrupt as error:
         interrupted = error
     failed = {(failure.method, failure.seed) for failure in failures}
-    done = [fit for fit in request.fits() if (fit.method, fit.seed) not in failed and RunFolder(Path(fit.out)).finished]
+    ended = [fit for fit in request.fits() if fit.out in made and (fit.method, fit.seed) not in failed]
+    done = [fit for fit in ended if RunFolder(Path(fit.out)).finished]
     runs = tuple(Path(fit.out).relative_to(request.out).as_posix() for fit in done)
     seconds = None if earlier else round(time.monotonic() - began, 1)
     folder.write(replace(summary, runs=runs, failures=tuple(failures), wall_seconds=seconds))
@@ -117,7 +119,7 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     for what, named in (("method", request.methods), ("seed", request.seeds)):
         if twice := [one for one, count in Counter(named).items() if count > 1]:
             raise InputError(f"The {what} '{twice[0]}' is named twice.", "Name it once.")
-    _check_folders(request)
+    check_folders(request)
     jobs, refused = _jobs(request)
     full = opened or open_with_progress(request.scene, jobs[0].options)
     if start := _start_for_all(request, jobs, full):
@@ -135,47 +137,6 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     request = replace(request, methods=tuple(job.request.method for job in jobs))
     check_variants(jobs[0].variants, [job.method for job in jobs], full)
     return request, jobs, scene, [*refused, *unsuitable]
-
-
-def _name_others(request: CompareRequest) -> None:
-    """Warn of runs of earlier commands in the same folder, which are not part of this report."""
-    mine = {Path(fit.out) for fit in request.fits()}
-    others = sorted(path.parent for path in Path(request.out).glob(f"{RUNS}/*/seed-*/{Provenance.FILE}"))
-    if left := [folder.relative_to(request.out).as_posix() for folder in others if folder not in mine]:
-        warn(f"Not part of this report, but of an earlier command on {request.out}: {', '.join(left)}.")
-
-
-def _check_folders(request: CompareRequest) -> None:
-    """Refuse methods of other names whose runs would share a folder: a built-in method, and a file of that name.
-
-    Raises:
-        InputError: names two of them.
-    """
-    owners: dict[Path, str] = {}
-    for method in request.methods:
-        folder = request.folder(method, request.seeds[0]).parent
-        other = owners.setdefault(folder, method)
-        if other != method:
-            raise InputError(
-                f"The runs of '{other}' and '{method}' would share the folder {folder}.", "Rename the recipe's file."
-            )
-
-
-def _missing(request: CompareRequest, jobs: Sequence[Job]) -> list[FitRequest]:
-    """Fits to start: all, since each knows by itself whether it is finished, but those that are kept whatever the code.
-
-    Kept ones that the request's protocol has not scored yet are scored here, from their checkpoints.
-    """
-    methods = {job.request.method: job.method for job in jobs}
-    missing = []
-    for fit in request.fits():
-        job = Job.of(fit, methods[fit.method])
-        if not (request.keep and is_kept(job)):
-            missing.append(fit)
-            continue
-        for protocol in job.unscored():
-            evaluate_run(job.folder.root, protocol=protocol)
-    return missing
 
 
 def _jobs(request: CompareRequest) -> tuple[list[Job], list[Refusal]]:

@@ -6,6 +6,7 @@ import hashlib
 import os
 import platform
 import subprocess
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -15,6 +16,7 @@ from pathlib import Path
 import torch
 
 from invgraphics import kernels
+from invgraphics.experiments.progress import warn
 from invgraphics.runs.environment import Environment
 
 PACKAGES = ("numpy", "numba", "mitsuba", "pycolmap", "scikit-image")
@@ -64,6 +66,28 @@ def cpu_name() -> str:
         return platform.processor() or platform.machine()
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.machine()
+
+
+def continued(here: Environment, before: Environment | None) -> Environment:
+    """Environment of a resumed fit: machines and packages of its earlier parts are kept where they are others than here.
+
+    Args:
+        here: of this part.
+        before: that the fit's folder holds; ``None`` of a fit that starts here.
+    """
+    if before is None:
+        return here
+    changed = () if _machine(before) == _machine(here) else (_machine(before),)
+    if changed:
+        warn(f"Warning: the fit was begun elsewhere ({changed[0]}). Its times are of both, and not to be compared.")
+    return replace(here, begun_on=(*before.begun_on, *changed))
+
+
+def _machine(found: Environment) -> str:
+    """Machine and packages in words, without what differs between two processes on it."""
+    packages = (f"{name} {number}" for name, number in found.packages.items() if number)
+    facts = (found.cpu, f"{found.cores} cores", found.gpu, found.platform, f"Python {found.python}", f"torch {found.torch}")
+    return ", ".join([*(fact for fact in facts if fact), *packages])
 
 
 def environment(device: torch.device) -> Environment:

@@ -20,7 +20,7 @@ from invgraphics.core import Camera, Model, Quantity, Rendering, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
-from invgraphics.experiments.clocks import disturbance, fit_costs
+from invgraphics.experiments.clocks import PictureClock, disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
 from invgraphics.experiments.identity import check_truth, truth_digest
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
@@ -100,7 +100,7 @@ def evaluate(
         preset_choice=method.preset_choice,
         seed=provenance.seed,
         cost=costs | found.cost,
-        disturbed=disturbance(costs),
+        disturbed=disturbance(costs | found.cost),
         test_poses="" if poses is None else protocol_note(method),
         test_exposure=provenance.test_exposure,
     )
@@ -153,7 +153,7 @@ def score_model(
     rules = protocol_named(protocol)
     if found := model.describe_non_finite():
         raise NumericalError(f"{title} cannot be scored: {found}.")
-    scores, seconds, statistics_of_views = [], [], []
+    scores, statistics_of_views, clock = [], [], PictureClock()
     posed = None if poses is None else PosedEvaluation(poses, scene, model)
     unseen = UnseenInstances.infer(model, scene) if scene.is_class else None
     with Reporter(f"{title} evaluation") as reporter:
@@ -162,8 +162,7 @@ def score_model(
             camera = view.camera if posed is None else posed.camera(view)
             timed = index % ceil(len(scene.test) / TIMED) == 0
             view_model = model if unseen is None else unseen.of(view)
-            picture, view_seconds = _picture(view_model, camera, normals=view.normal is not None, timed=timed)
-            seconds += view_seconds
+            picture = _picture(view_model, camera, clock, normals=view.normal is not None, timed=timed)
             picture = picture if posed is None else posed.to_scene_frame(picture, camera, view)
             on_picture(index, picture)
             scores.append(score(picture, view, scene, rules))
@@ -173,27 +172,37 @@ def score_model(
             reporter.show((index + 1) / len(scene.test), f"view {index + 1} of {len(scene.test)}")
     quality, skipped = summarise(scores, rules)
     splats = Quantity.GAUSSIANS in model.field.provides
+    cost = _picture_costs(clock) | _model_costs(model, scene)
     surface, surface_skipped = surface_scores(model, scene if poses is None else scene_in_fit_frame(poses, scene))
     return Scores(
         method=title,
         scene=scene.name,
         protocol=protocol,
         views=tuple(view.name for view in scene.test),
-        cost=_model_costs(model, scene, statistics.median(seconds)),
+        cost=cost,
         quality=quality | surface | ({} if posed is None else posed.quality()),
         skipped=skipped | surface_skipped,
+        disturbed=disturbance(cost),
         below_baseline=below_baseline(title, quality, statistics_of_views, training_scene or scene, rules, gaussians=splats),
     )
 
 
-def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, float | None]:
-    """Costs of a fitted model: size and ``seconds`` per view; warns of primitives that can receive no gradient."""
+def _picture_costs(clock: PictureClock) -> dict[str, float | None]:
+    """Costs of rendering a view, and the share of the processor that they were measured with."""
+    seconds = statistics.median(clock.seconds)
+    return {
+        "render_seconds_per_view": seconds,
+        "render_fps": 1 / max(seconds, 1e-9),
+        "render_processor_share": clock.processor_share,
+    }
+
+
+def _model_costs(model: Model, scene: Scene) -> dict[str, float | None]:
+    """Costs of a fitted model: its size; warns of primitives that can receive no gradient."""
     dead = dead_gaussians(model.field, [view.camera for view in scene.train])
     if dead is not None and dead.share > DEAD_SHARE:
         warn(f"Warning: {dead.sentence()}")
     return {
-        "render_seconds_per_view": seconds,
-        "render_fps": 1 / max(seconds, 1e-9),
         "model_bytes": model_bytes(model.parts.values()),
         "parameters": parameter_count(model.parts.values()),
         "primitives": model.field.primitive_count(),
@@ -201,14 +210,12 @@ def _model_costs(model: Model, scene: Scene, seconds: float) -> dict[str, float 
     }
 
 
-def _picture(model: Model, camera: Camera, *, normals: bool, timed: bool) -> tuple[Rendering, list[float]]:
-    """Render one view for scoring; also time it as a viewer renders it (colour, alpha, depth), in seconds."""
+def _picture(model: Model, camera: Camera, clock: PictureClock, *, normals: bool, timed: bool) -> Rendering:
+    """Render one view for scoring; ``clock`` also times it as a viewer renders it (colour, alpha, depth)."""
     if normals and not timed:
-        return model.render(camera), []
-    began = time.perf_counter()
-    picture = model.render(camera, normals=False)
-    seconds = [time.perf_counter() - began]
-    return (model.render(camera) if normals else picture), seconds
+        return model.render(camera)
+    picture = clock.render(model, camera)
+    return model.render(camera) if normals else picture
 
 
 def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "default") -> Scores:

@@ -21,8 +21,8 @@ from invgraphics.experiments.build import (
     open_with_progress,
     use_kernels,
 )
-from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average
-from invgraphics.experiments.environment import code_version, environment
+from invgraphics.experiments.clocks import at_step, disturbance, fit_costs, fit_record, load_average
+from invgraphics.experiments.environment import code_version, continued, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import check_existing, run_digest, truth_digest
@@ -40,6 +40,7 @@ from invgraphics.recipes.presets import announcements
 from invgraphics.recipes.recipe import Method
 from invgraphics.recipes.suitable import suggestion
 from invgraphics.runs import checkpoint
+from invgraphics.runs.environment import Environment
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import TRUTH, RunFolder
 from invgraphics.runs.provenance import LoadAverage, Options, Provenance
@@ -117,7 +118,8 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
                 folder.cut_history(fit.steps)
             else:
                 folder.clear()
-            described = write_description(job, scene, training_scene, identity, fit.plan)
+            before = folder.read(Environment) if earlier is not None and folder.has(Environment) else None
+            described = write_description(job, scene, training_scene, identity, fit.plan, before)
             folder.write(replace(described, memory_forecast_bytes=forecast.bytes))
             if "inconsistent_poses" in scene.notes:
                 warn(f"SUSPICIOUS poses: {scene.notes['inconsistent_poses']}")
@@ -135,9 +137,16 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
 
 
 def _resumed(fit: Fit, job: Job) -> FitRecord:
-    """Load the folder's checkpoint into the fit, with the clocks at that moment; returns the record of the time before."""
-    earlier = job.folder.read(FitRecord)
-    fit.load(checkpoint.load(job.folder.checkpoint, job.device), earlier.seconds or 0.0)
+    """Load the folder's checkpoint into the fit, with the clocks at that moment; returns the record of the time before.
+
+    Checkpoint and clocks are two files: of a fit that was killed between them, the clocks are those of the checkpoint before.
+    """
+    state, known = checkpoint.load(job.folder.checkpoint, job.device), job.folder.read(FitRecord)
+    earlier = at_step(known, int(state["fit"]["steps"]))
+    if earlier is not known:
+        lost = f"steps {known.steps} to {earlier.steps} of {job.folder.root}, which was killed as it wrote a checkpoint"
+        warn(f"Warning: the times of {lost}, are not known; they count at the mean rate of the steps before.")
+    fit.load(state, earlier.seconds or 0.0)
     fit.resume_clocks(asdict(earlier))
     return earlier
 
@@ -213,7 +222,9 @@ def _evaluate(job: Job, scene: Scene, fit: Fit, spent: FitRecord) -> None:
         evaluate(job.folder, scene, fit.plan.model, protocol, fit_costs(spent), job.method, fit.plan.poses)
 
 
-def write_description(job: Job, scene: Scene, training_scene: Scene, identity: str, plan: Plan | None = None) -> Provenance:
+def write_description(
+    job: Job, scene: Scene, training_scene: Scene, identity: str, plan: Plan | None = None, before: Environment | None = None
+) -> Provenance:
     """Write the run's recipe, environment and truth; return its provenance as known before the fit.
 
     Args:
@@ -222,10 +233,11 @@ def write_description(job: Job, scene: Scene, training_scene: Scene, identity: s
         training_scene: as the fit sees it.
         identity: of the run.
         plan: of the fit; ``None`` for none.
+        before: where the part of the fit that is resumed was made; ``None`` where it starts here.
     """
     request, method, folder = job.request, job.method, job.folder
     folder.write_recipe(method.table)
-    folder.write(environment(job.device))
+    folder.write(continued(environment(job.device), before))
     truth = save_truth(scene, Path(request.truth) if request.truth else folder.root / TRUTH)
     red, green, blue = scene.background.tolist()
     return Provenance(

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import final
 
 from invgraphics.core import Model, Scene
 from invgraphics.experiments.build import configure_torch, use_kernels
-from invgraphics.experiments.clocks import fit_costs, fit_record
-from invgraphics.experiments.display import curve_svg, table_html
+from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record
+from invgraphics.experiments.display import ScoreTable, curve_svg
 from invgraphics.experiments.evaluate import scene_as_trained, score_model
 from invgraphics.experiments.fitted import Fitted
 from invgraphics.experiments.job import Job, in_region, make_training_scene, region_of
@@ -27,65 +26,11 @@ from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.recipe import Method
 from invgraphics.runs.history import Moment, read_history
 from invgraphics.runs.provenance import Provenance
-from invgraphics.runs.scores import Scores
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 from invgraphics.training.poses import Poses
 
 OnStep = Callable[[Fit], None]
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class ScoreTable(Mapping[str, float]):
-    """Scores of a model on a scene's test views: metric -> mean over the views.
-
-    Attributes:
-        record: everything, as a run folder holds it: ``quality``, ``cost``, ``views``, ``skipped``, ``protocol``.
-
-    Example:
-        >>> import invgraphics as ig
-        >>> from invgraphics.testing import TwoBalls, toy_scene
-        >>> scene = toy_scene(views=2, size=16)
-        >>> renderer = ig.load_method("volumetric/nerf").recipe.renderer.build(scene)
-        >>> scores = ig.evaluate(ig.Model(TwoBalls(), renderer, scene.bounds), scene)
-        >>> scores["psnr"] > 25 and scores.unit("psnr") == "dB" and len(scores.per_view("psnr")) == len(scene.test)
-        True
-    """
-
-    record: Scores
-
-    def __getitem__(self, metric: str) -> float:
-        mean = self.record.quality[metric].mean
-        return math.nan if mean is None else mean
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.record.quality)
-
-    def __len__(self) -> int:
-        return len(self.record.quality)
-
-    def per_view(self, metric: str) -> tuple[float, ...]:
-        """One value for each test view, in the scene's order; NaN where a view has none."""
-        return tuple(math.nan if value is None else value for value in self.record.quality[metric].per_view)
-
-    def unit(self, metric: str) -> str:
-        """The metric's unit; empty where it has none."""
-        return self.record.quality[metric].unit
-
-    def _title(self) -> str:
-        return f"{self.record.scene}, {len(self.record.views)} test views, protocol {self.record.protocol}"
-
-    def __repr__(self) -> str:
-        return "\n".join([self._title(), *(f"  {name:20} {value:10.4g} {self.unit(name)}" for name, value in self.items())])
-
-    def _repr_html_(self) -> str:
-        better = {True: "higher", False: "lower"}
-        rows = [
-            (name, f"{value:.4g}", self.unit(name), better[self.record.quality[name].higher_is_better])
-            for name, value in self.items()
-        ]
-        return table_html(self._title(), ("metric", "mean", "unit", "better"), rows)
 
 
 class FittedRun(ABC):
@@ -252,9 +197,9 @@ class MemoryRun(FittedRun):
     def scores(self) -> ScoreTable:
         """Scores under the default protocol, computed on first access."""
         if self._scores is None:
-            scores = self.evaluate()
-            costs = fit_costs(fit_record(self.fit.steps, self.fit.clocks()))
-            self._scores = ScoreTable(replace(scores.record, cost=costs | scores.record.cost))
+            found = self.evaluate().record
+            cost = fit_costs(fit_record(self.fit.steps, self.fit.clocks())) | found.cost
+            self._scores = ScoreTable(replace(found, cost=cost, disturbed=disturbance(cost)))
         return self._scores
 
 

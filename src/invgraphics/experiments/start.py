@@ -13,9 +13,9 @@ from invgraphics.core import Field, RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.memory_check import COPIES, RAY_BYTES
-from invgraphics.experiments.mesh_files import mesh_from_file
 from invgraphics.experiments.progress import warn
 from invgraphics.fields.mesh import MeshFieldConfig
+from invgraphics.formats.mesh import mesh_from_file
 from invgraphics.memory import total_bytes
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method

@@ -12,14 +12,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core import Mesh
+from invgraphics.core import Mesh, Scene
 from invgraphics.core.colour import linear_to_srgb, srgb_to_linear
+from invgraphics.core.transforms import axes_to_opencv, opencv_to_axes
 from invgraphics.errors import InputError
 from invgraphics.files import write_bytes
 
 SUFFIXES = (".glb", ".obj", ".ply")
 AXES = {".glb": "RUB"}
 """Axes of formats that name some: glTF is right, up, back. The others hold the data set's world."""
+UP = "z-up"
+"""How the world's axes point for glTF, by default: +z is up (CONVENTIONS.md)."""
 LINEAR = "_LINEAR_RGB"
 """Second name of a GLB file's linear vertex colours, for readers that round ``COLOR_0`` to bytes and so lose dark ones."""
 
@@ -123,3 +126,16 @@ def _colours(loaded: Any, suffix: str) -> Float[Tensor, "v 3"] | None:
         return None
     rgb = torch.from_numpy(loaded.visual.vertex_colors[:, :3].astype(np.float32) / 255)
     return linear_to_srgb(rgb) if suffix == ".glb" else rgb
+
+
+def mesh_from_file(path: Path, scene: Scene) -> Mesh:
+    """Read a mesh file to a scene's local frame: PLY and OBJ are in the data set's world, GLB is y-up and the world z-up.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    axes = AXES.get(check_suffix(path))
+    similarity = torch.linalg.inv(scene.world_from_local.double())
+    if axes is not None:
+        similarity = similarity @ opencv_to_axes(UP) @ axes_to_opencv(axes)
+    return read_mesh(path).transformed(similarity)

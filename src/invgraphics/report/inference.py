@@ -17,6 +17,9 @@ from invgraphics.report.pages.tables import escape_markdown
 from invgraphics.report.statistics.instances import (
     Cell,
     counts_of,
+    flattered,
+    lacking,
+    lost,
     mean_of,
     methods_of,
     paired,
@@ -25,6 +28,7 @@ from invgraphics.report.statistics.instances import (
     table_of,
 )
 from invgraphics.report.statistics.intervals import Estimate
+from invgraphics.report.statistics.values import PERFECT_DB
 from invgraphics.runs.inference import Inference
 
 SHOWN = {
@@ -134,13 +138,34 @@ def inference_sentences(folder: Path) -> list[str]:
         gain = None if other == first else paired(record, "psnr", observed, (first, other))
         if gain is None:
             continue
-        sentence = f"From {_views(observed)}, {first} against {other}: {_signed(gain)} dB of PSNR on other views"
-        errors = [mean_of(record, "normal_deg", observed, method) for method in (first, other)]
-        turned = paired(record, "normal_deg", observed, (first, other))
-        if errors[0] is not None and errors[1] is not None and turned is not None:
-            sentence += f"; normals are off by {errors[0].mean:.1f} instead of {errors[1].mean:.1f} degrees ({_signed(turned)})"
-        sentences.append(f"{sentence}.")
+        sentence, pair = f"From {_views(observed)}, {first} against {other}: ", (first, other)
+        lacks = lost(record, "psnr", observed, pair)
+        if flattered("psnr", gain, lacks):
+            sentences.append(f"{sentence}not compared, since {_lost_words(pair, lacks)}.")
+            continue
+        sentence += f"{_signed(gain)} dB of PSNR on other views" + (f", where {_lost_words(pair, lacks)}" if any(lacks) else "")
+        sentences.append(f"{sentence}{_normals_words(record, observed, pair)}.")
     return sentences
+
+
+def _normals_words(record: Inference, observed: int, pair: tuple[str, str]) -> str:
+    """Difference of the errors of normals, as the end of a sentence; empty where it is not known, or says too much."""
+    errors = [mean_of(record, "normal_deg", observed, method) for method in pair]
+    turned, lacks = paired(record, "normal_deg", observed, pair), lost(record, "normal_deg", observed, pair)
+    if errors[0] is None or errors[1] is None or turned is None or flattered("normal_deg", turned, lacks):
+        return ""
+    lost_words = f", where {_lost_words(pair, lacks)}" if any(lacks) else ""
+    return f"; normals are off by {errors[0].mean:.1f} instead of {errors[1].mean:.1f} degrees ({_signed(turned)}){lost_words}"
+
+
+def _lost_words(pair: tuple[str, str], lacks: tuple[int, int]) -> str:
+    """Say which of two methods lacks scores of how many instances that the other one has."""
+    told = [f"{name} lacks scores of {_instances(count)}" for name, count in zip(pair, lacks, strict=True) if count]
+    return " and ".join(told)
+
+
+def _instances(count: int) -> str:
+    return "1 instance" if count == 1 else f"{count} instances"
 
 
 def _views(count: int) -> str:
@@ -164,18 +189,31 @@ def _rows(record: Inference) -> list[Row]:
             if not found:
                 continue
             means = {metric: mean_of(record, metric, observed, method) for metric in SHOWN}
-            cells = tuple(_text(metric, None if mean is None else mean.mean) for metric, mean in means.items())
+            cells = tuple(
+                _text(metric, None if mean is None else mean.mean) + _counted(record, metric, observed, method)
+                for metric, mean in means.items()
+            )
             spent = [one.seconds for one in found if one.seconds is not None]
-            seen = float(np.mean([one.input_psnr for one in found]))
-            rows.append(Row(method, observed, cells, f"{seen:.2f}", f"{sum(spent):.0f}" if spent else "–"))
+            seen = [one.input_psnr for one in found if one.input_psnr is not None]
+            text = _text("psnr", float(np.mean(seen)) if seen else None)
+            rows.append(Row(method, observed, cells, text, f"{sum(spent):.0f}" if spent else "–"))
     return rows
+
+
+def _counted(record: Inference, metric: str, observed: int, method: str) -> str:
+    """Number of instances of which all is known, in brackets; empty where a method lacks no score that another one has."""
+    total, lacks = len(subjects_of(record, observed)), lacking(record, metric, observed, method)
+    return f" ({total - lacks} of {total})" if lacks else ""
 
 
 def _differences(record: Inference, metric: str, methods: Sequence[str], *, bold: bool) -> Differences:
     """Table of a metric; ``bold`` where chance is that of the instances alone, as it is not between two fits."""
 
     def words(cell: Cell) -> tuple[str, str, bool]:
-        return _text(metric, cell.mean), "" if cell.gain is None else _signed(cell.gain), bold and cell.certain
+        gain = "" if cell.gain is None else _signed(cell.gain)
+        if gain and any(cell.lost):
+            gain += f", {_instances(sum(cell.lost))} incomplete"
+        return _text(metric, cell.mean), gain, bold and cell.certain
 
     table = table_of(record, metric, methods)
     return Differences(DRAWN[metric], {method: [words(cell) for cell in cells.values()] for method, cells in table.items()})
@@ -187,7 +225,7 @@ def _strips(record: Inference, observed: int) -> list[Strip]:
         texts = []
         for method in record.columns[str(observed)]:
             own = [one for one in scores_of(record, observed, method) if one.subject == subject]
-            values = [value for one in own for value in one.quality.get("psnr", ()) if value is not None]
+            values = [min(value, PERFECT_DB) for one in own for value in one.quality.get("psnr", ()) if value is not None]
             texts.append(f"{np.mean(values):.1f} dB" if values else "")
         strips.append(Strip(subject, f"pictures/{observed}/{subject:04d}.png", tuple(texts)))
     return strips

@@ -28,6 +28,7 @@ class Environment(Record):
         packages: name -> version; ``None`` where it is not installed.
         gpu: its name.
         note: what limits repeatability, a sentence.
+        begun_on: machines and packages of earlier parts of a fit, where it was resumed with others.
         executor: of a study: what ran its fits.
         jobs: of a study: fits that shared the machine.
     """
@@ -50,6 +51,7 @@ class Environment(Record):
     packages: dict[str, str | None] = field(default_factory=dict)
     gpu: str = ""
     note: str = ""
+    begun_on: tuple[str, ...] = ()
     executor: str = ""
     jobs: int | None = None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -100,9 +101,8 @@ class RunFolder:
         """
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            probe = self.root / ".writable"
-            probe.write_text("")
-            probe.unlink()
+            with tempfile.TemporaryFile(dir=self.root):  # of no name, or one of its own: others may check at the same time
+                pass
         except OSError as error:
             raise InputError(f"The folder {self.root} cannot be written: {error.strerror}.", "Choose another --out.") from error
 

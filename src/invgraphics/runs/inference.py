@@ -17,7 +17,7 @@ class InstanceScores:
         observed: number of views that it was inferred from.
         how: what made it: a method with a prior, or a baseline.
         quality: metric -> value of each test view; ``None`` where a view has none.
-        input_psnr: PSNR in dB of the observed views themselves.
+        input_psnr: PSNR in dB of the observed views themselves; ``None`` where a picture of one was not finite.
         seconds: of optimisation or search; ``None`` where it was not measured.
     """
 
@@ -25,7 +25,7 @@ class InstanceScores:
     observed: int
     how: str
     quality: dict[str, tuple[float | None, ...]]
-    input_psnr: float
+    input_psnr: float | None = None
     seconds: float | None = None
 
 

@@ -21,6 +21,7 @@ COST_UNITS = {
     "peak_memory_bytes": "bytes",
     "render_seconds_per_view": "s",
     "render_fps": "1/s",
+    "render_processor_share": "",
     "model_bytes": "bytes",
     "parameters": "",
     "primitives": "",

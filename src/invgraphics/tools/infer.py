@@ -189,12 +189,13 @@ class _InferenceMethods:
         tests = evenly([view for view in scene.test if view.subject == subject], self._request.tests)
         found = [score(model.render(view.camera), view, scene, rules, METRICS) for view in tests]
         seen = [score(model.render(view.camera, normals=False), view, scene, rules, ("psnr",)) for view in views]
+        known = [one.values["psnr"] for one in seen if "psnr" in one.values]  # not of pictures that are not finite
         return InstanceScores(
             subject=subject,
             observed=len(views),
             how=method,
             quality={metric: tuple(one.values.get(metric) for one in found) for metric in METRICS},
-            input_psnr=sum(one.values["psnr"] for one in seen) / len(seen),
+            input_psnr=sum(known) / len(known) if len(known) == len(views) else None,
             seconds=seconds,
         )
 

@@ -8,12 +8,11 @@ from invgraphics.core import Mesh, Quantity, Rendering
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import Fitted
-from invgraphics.experiments.mesh_files import UP
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.surface_scores import mesh_scores
 from invgraphics.fields.depth_fusion import TRUNCATION, fuse_depth
 from invgraphics.fields.isosurface import Extracted, default_level, extract_mesh, with_attributes
-from invgraphics.formats.mesh import AXES, check_suffix, write_mesh
+from invgraphics.formats.mesh import AXES, UP, check_suffix, write_mesh
 from invgraphics.tools.export import Exported, ExportRequest
 from invgraphics.tools.file_frames import file_from_local
 

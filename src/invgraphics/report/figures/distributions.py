@@ -11,6 +11,7 @@ from typing import Any
 from invgraphics.report.data.comparison import Comparison
 from invgraphics.report.figures.style import GRID, INK, PAGE, PANEL, Figure, canvas, save, series_style
 from invgraphics.report.statistics.summary import Summary
+from invgraphics.report.statistics.values import clipped
 from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.runs.run import Run
 from invgraphics.text import file_name
@@ -20,21 +21,19 @@ def draw_distributions(comparison: Comparison, summary: Summary, folder: Path) -
     """One strip plot per quality metric: a dot per test view, with median and quartiles."""
     figures = []
     for column in (column for column in summary.columns if column.group != "cost"):
-        values = {row.series: per_view(comparison.runs_of(row.label), column.key) for row in summary.methods}
+        values = {row.series: per_view(comparison.runs_of(row.label), column) for row in summary.methods}
         if any(values.values()):
             stem = folder / f"views-{file_name(column.key)}"
             figures.append((column, _draw(summary, column, values, stem)))
     return figures
 
 
-def per_view(runs: Sequence[Run], key: str) -> list[float]:
-    """A metric on each test view, averaged over ``runs``; views without a finite score are left out."""
-    columns = [
-        run.scores.quality[key].per_view for run in runs if key in run.scores.quality and run.scores.quality[key].per_view
-    ]
+def per_view(runs: Sequence[Run], column: MeasuredQuantity) -> list[float]:
+    """A metric on each test view, averaged over ``runs``, perfect ones at a finite value; those without are left out."""
+    scores = [run.scores.quality[column.key] for run in runs if column.key in run.scores.quality]
     means = []
-    for values in zip(*columns, strict=True):
-        finite = [value for value in values if value is not None and math.isfinite(value)]
+    for values in zip(*(score.per_view for score in scores if score.per_view), strict=True):
+        finite = [value for value in (clipped(value, column) for value in values) if math.isfinite(value)]
         if finite:
             means.append(statistics.fmean(finite))
     return means

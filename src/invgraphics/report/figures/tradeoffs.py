@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from invgraphics.report.figures.style import INK, MUTED, PAGE, PANEL, Figure, canvas, save, series_style
 from invgraphics.report.statistics.summary import Row, Summary, pareto_front
-from invgraphics.report.wording import MeasuredQuantity, listing
+from invgraphics.report.wording import TIMES, MeasuredQuantity, listing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,23 +79,31 @@ def _draw(points: Sequence[Point], quality: MeasuredQuantity, cost: MeasuredQuan
             mark: dict[str, Any] = {"markeredgecolor": PAGE.light, "markeredgewidth": 1.0, "markersize": 11, "zorder": 4}
             axes.vlines(point.cost, point.quality - point.spread, point.quality + point.spread, color=look.colour, zorder=3)
             axes.plot(point.cost, point.quality, look.marker, color=look.colour, **mark)
-        _staircase(axes, front, cost, quality)
+        if front:
+            _staircase(axes, front, cost, quality)
         towards = f"{'up' if quality.better == 'higher' else 'down'} and {'right' if cost.better == 'higher' else 'left'}"
         axes.set_title(title, pad=24)
-        note = f"better: {towards}.  Dashed: Pareto front"
+        note = f"better: {towards}." + ("  Dashed: Pareto front" if front else "")
         axes.text(0, 1.03, note, transform=axes.transAxes, fontsize=11, color=MUTED.light)
         axes.set_xlabel(f"{SUBJECTS[cost.key]} ({cost.unit})")
         axes.set_ylabel(f"{quality.label} ({quality.unit})" if quality.unit else quality.label)
         figure.draw_without_rendering()  # settles the layout, in whose pixels labels are placed
-        _labels(axes, points if len(points) <= MOST_LABELS else front)
+        _labels(axes, front if front and len(points) > MOST_LABELS else points)
         path = save(figure, stem)
-    best = listing(point.row.label for point in front)
-    return Figure(path, None, title, f"{title}. On the Pareto front: {best}.")
+    best = f"On the Pareto front: {listing(point.row.label for point in front)}" if front else "These times are not ranked"
+    return Figure(path, None, title, f"{title}. {best}.")
 
 
 def _front(points: Sequence[Point], quality: MeasuredQuantity, cost: MeasuredQuantity) -> list[Point]:
-    """Pareto front by cost, over methods that are ranked in both (over all if none is): no seed lost, no clock disturbed."""
-    ranked = [point for point in points if point.row.ranked_in(cost) and point.row.ranked_in(quality)] or list(points)
+    """Pareto front by cost, over methods that are ranked in both: no seed lost, no clock disturbed.
+
+    Where none is ranked, the front is that of all: what they have lost says nothing of their sizes. Times that a clock
+    measured are then no cost at all: of fewer than two ranked methods there is no front.
+    """
+    ranked = [point for point in points if point.row.ranked_in(cost) and point.row.ranked_in(quality)]
+    if cost.key in TIMES and len(ranked) < 2:
+        return []
+    ranked = ranked or list(points)
     # Costs are compared as written, to three digits: a hundredth of a second more does not change the front.
     keys = [(cost.sort_key(float(f"{point.cost:.3g}")), quality.sort_key(point.quality)) for point in ranked]
     return [ranked[i] for i in pareto_front(keys)]

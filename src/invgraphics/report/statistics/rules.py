@@ -7,11 +7,14 @@ import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from typing import Literal
 
 from invgraphics.report.data.factors import METHOD, StudyCell
-from invgraphics.report.wording import listing
+from invgraphics.report.statistics.values import clipped, value_of
+from invgraphics.report.wording import listing, quality_quantity
 from invgraphics.runs.run import Run
+from invgraphics.runs.scores import Score
 from invgraphics.runs.study import KnownDeviation
 from invgraphics.text import duration
 
@@ -91,7 +94,14 @@ class JudgedCell:
 
 def judge(cells: Sequence[StudyCell], known: Sequence[KnownDeviation] = ()) -> tuple[JudgedCell, ...]:
     """Evaluate every rule on every cell that has run."""
-    return tuple(JudgedCell(cell, tuple(_excused(cell, one, known) for one in _verdicts(cell, cells))) for cell in cells)
+    groups: dict[tuple[object, ...], list[StudyCell]] = {}
+    keys = [_without_budget(cell) for cell in cells]
+    for key, cell in zip(keys, cells, strict=True):
+        groups.setdefault(key, []).append(cell)
+    judged = []
+    for key, cell in zip(keys, cells, strict=True):
+        judged.append(JudgedCell(cell, tuple(_excused(cell, one, known) for one in _verdicts(cell, groups[key]))))
+    return tuple(judged)
 
 
 def unused(judged: Sequence[JudgedCell], known: Sequence[KnownDeviation]) -> tuple[KnownDeviation, ...]:
@@ -117,19 +127,18 @@ def headline(judged: Sequence[JudgedCell]) -> list[str]:
 
 
 def psnr_of(cell: StudyCell) -> float | None:
-    """Mean PSNR over the cell's test views, dB; ``None`` without a run."""
+    """Mean PSNR over the cell's test views, dB, that of equal pictures at a finite value; ``None`` without a run."""
     score = None if cell.run is None else cell.run.scores.quality.get("psnr")
-    return None if score is None else score.mean
+    return None if cell.run is None or score is None else value_of(cell.run, quality_quantity("psnr", score))
 
 
 def worst_view(run: Run) -> tuple[str, float, float] | None:
     """(name, PSNR, PSNR below the median) of the worst view, dB; ``None`` where single views have no scores."""
     score = run.scores.quality.get("psnr")
-    values = [
-        (value, view)
-        for value, view in zip(score.per_view if score else (), run.scores.views, strict=False)
-        if value is not None
-    ]
+    if score is None:
+        return None
+    clip = partial(clipped, column=quality_quantity("psnr", score))
+    values = [(clip(value), view) for value, view in zip(score.per_view, run.scores.views, strict=False) if value is not None]
     if not values:
         return None
     worst, view = min(values)
@@ -143,14 +152,15 @@ def dead_share(run: Run) -> float | None:
     return next((entry.dead for entry in reversed(run.history) if entry.dead is not None), None)
 
 
-def _verdicts(cell: StudyCell, cells: Sequence[StudyCell]) -> list[Verdict]:
+def _verdicts(cell: StudyCell, alike: Sequence[StudyCell]) -> list[Verdict]:
+    """Outcome of every rule on a cell; ``alike`` are those that differ from it in nothing but the budget."""
     if cell.status == "failed":
         rest = [Verdict(rule, "none", "The fit failed.") for rule in RULES if rule not in ("finite", "late")]
         return [*rest, Verdict("finite", "red", f"The fit failed: {cell.error}"), _late(cell)]
     if cell.run is None:
         return []
     of_run: tuple[Callable[[Run], Verdict], ...] = (_monitor, _views, _dead, _memory, _finite)
-    return [_budget(cell, cells), *(rule(cell.run) for rule in of_run), _late(cell)]
+    return [_budget(cell, alike), *(rule(cell.run) for rule in of_run), _late(cell)]
 
 
 def _excused(cell: StudyCell, verdict: Verdict, known: Sequence[KnownDeviation]) -> Verdict:
@@ -166,14 +176,13 @@ def _verdict(rule: str, broken: bool, sentence: str, value: float, limit: float)
     return Verdict(rule, "red" if broken else "ok", sentence, value, limit)
 
 
-def _budget(cell: StudyCell, cells: Sequence[StudyCell]) -> Verdict:
+def _budget(cell: StudyCell, alike: Sequence[StudyCell]) -> Verdict:
     """PSNR against the best of all shorter budgets, so that a fall and a later recovery are told apart."""
     own = psnr_of(cell)
     shorter = [
         (value, other)
-        for other in cells
-        if cell.amount and other.amount and _without_budget(other) == _without_budget(cell)
-        if other.amount[0] == cell.amount[0] and other.amount[1] < cell.amount[1]
+        for other in alike
+        if cell.amount and other.amount and other.amount[0] == cell.amount[0] and other.amount[1] < cell.amount[1]
         if (value := psnr_of(other)) is not None
     ]
     if own is None or not shorter:
@@ -233,8 +242,8 @@ def _memory(run: Run) -> Verdict:
 
 
 def _finite(run: Run) -> Verdict:
-    """Check scores, costs and history for non-finite values, metrics skipped for that reason included."""
-    found = [name for name, score in run.scores.quality.items() if not _all_finite([score.mean, *score.per_view])]
+    """Check scores, costs and history for non-finite values, metrics skipped for that reason included; perfect PSNR is fine."""
+    found = [name for name, score in run.scores.quality.items() if not _all_finite(name, score)]
     found += [name for name, why in run.scores.skipped.items() if "finite" in why]
     found += [name for name, value in run.scores.cost.items() if value is not None and not math.isfinite(value)]
     found += [f"{name} at step {entry.step}" for entry in run.history for name in entry.not_finite]
@@ -245,8 +254,9 @@ def _finite(run: Run) -> Verdict:
     return Verdict("finite", "ok", "All metrics, costs and curves are finite.", 0.0, 0.0)
 
 
-def _all_finite(values: Sequence[float | None]) -> bool:
-    return all(value is not None and math.isfinite(value) for value in values)
+def _all_finite(name: str, score: Score) -> bool:
+    column = quality_quantity(name, score)
+    return all(math.isfinite(clipped(value, column)) for value in (score.mean, *score.per_view))
 
 
 def _late(cell: StudyCell) -> Verdict:

@@ -60,16 +60,19 @@ def time_to_quality(comparison: Comparison, count: int = 4) -> TimeToQuality | N
     for series, method in enumerate(comparison.methods):
         runs = comparison.runs_of(method)
         if runs:
-            rows.append((method, series, tuple(_reach_text(runs, level) for level in levels)))
+            lost = len(comparison.failures_of(method))
+            rows.append((method, series, tuple(_reach_text(runs, level, lost) for level in levels)))
     return TimeToQuality(levels, tuple(rows))
 
 
-def _reach_text(runs: Sequence[Run], level: float) -> str:
+def _reach_text(runs: Sequence[Run], level: float, lost: int) -> str:
     """Median time in words, as exact as the monitor looked: ``36–42 s`` where it looked every 6 s, ``4.2 s`` where often.
 
-    A seed that never got there took for ever: without it the median would be one over the seeds that went well.
+    A seed that never got there took for ever, and so did the ``lost`` ones whose fits failed: without them the median would be
+    one over the seeds that went well.
     """
-    spans = [span_to_reach(run, level) or (math.inf, math.inf) for run in runs]
+    never = (math.inf, math.inf)
+    spans = [span_to_reach(run, level) or never for run in runs] + [never] * lost
     first, last = (statistics.median(ends) for ends in zip(*spans, strict=True))
     if math.isinf(last):
         return "not reached"

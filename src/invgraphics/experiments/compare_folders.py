@@ -1,0 +1,90 @@
+"""Run folders of a comparison: whose they are, which fits are still to be made, and which finished runs count as made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from invgraphics.core import Scene
+from invgraphics.errors import InputError
+from invgraphics.experiments.evaluate import evaluate_run
+from invgraphics.experiments.identity import run_digest, truth_digest
+from invgraphics.experiments.job import Job
+from invgraphics.experiments.progress import warn
+from invgraphics.experiments.renderings import is_kept, renderings_complete
+from invgraphics.experiments.request import CompareRequest, FitRequest
+from invgraphics.runs.folder import RUNS, RunFolder
+from invgraphics.runs.provenance import Provenance
+
+
+def name_others(request: CompareRequest) -> None:
+    """Warn of runs of earlier commands in the same folder, which are not part of this report."""
+    mine = {Path(fit.out) for fit in request.fits()}
+    others = sorted(path.parent for path in Path(request.out).glob(f"{RUNS}/*/seed-*/{Provenance.FILE}"))
+    if left := [folder.relative_to(request.out).as_posix() for folder in others if folder not in mine]:
+        warn(f"Not part of this report, but of an earlier command on {request.out}: {', '.join(left)}.")
+
+
+def check_folders(request: CompareRequest) -> None:
+    """Refuse methods of other names whose runs would share a folder: a built-in method, and a file of that name.
+
+    Raises:
+        InputError: names two of them.
+    """
+    owners: dict[Path, str] = {}
+    for method in request.methods:
+        folder = request.folder(method, request.seeds[0]).parent
+        other = owners.setdefault(folder, method)
+        if other != method:
+            raise InputError(
+                f"The runs of '{other}' and '{method}' would share the folder {folder}.", "Rename the recipe's file."
+            )
+
+
+def missing_fits(request: CompareRequest, jobs: Sequence[Job]) -> list[FitRequest]:
+    """Fits to start: all, since each knows by itself whether it is finished, but those that are kept whatever the code.
+
+    Kept ones that the request's protocol has not scored yet are scored here, from their checkpoints.
+    """
+    methods = {job.request.method: job.method for job in jobs}
+    missing = []
+    for fit in request.fits():
+        job = Job.of(fit, methods[fit.method])
+        if not (request.keep and is_kept(job)):
+            missing.append(fit)
+            continue
+        for protocol in job.unscored():
+            evaluate_run(job.folder.root, protocol=protocol)
+    return missing
+
+
+def any_finished(request: CompareRequest) -> bool:
+    """Whether a run of an earlier command is finished in one of the folders, by whatever code."""
+    return any(RunFolder(Path(fit.out)).finished for fit in request.fits())
+
+
+def made_before(request: CompareRequest, jobs: Sequence[Job], scene: Scene | None) -> set[str]:
+    """Folders of finished runs that count though no fit of this command has ended: of this code and these pictures, or kept.
+
+    Those of earlier code are about to be replaced, and are no result of this command if it is interrupted before.
+
+    Args:
+        request: with its methods.
+        jobs: one of each method.
+        scene: as loaded; ``None`` where no run is finished.
+    """
+    if scene is None:
+        return set()
+    methods, truth = {job.request.method: job.method for job in jobs}, ""
+    found = set()
+    for fit in request.fits():
+        job = Job.of(fit, methods[fit.method])
+        if request.keep and is_kept(job):
+            found.add(fit.out)
+        elif job.folder.finished and renderings_complete(job):
+            truth = truth or truth_digest(scene)
+            if job.folder.identity == run_digest(job, truth, torch.get_num_threads()):
+                found.add(fit.out)
+    return found
