@@ -1,6 +1,8 @@
 """Reading, resizing and undistorting photographs."""
 
+import io
 import json
+import struct
 import subprocess
 import sys
 from dataclasses import replace
@@ -108,6 +110,62 @@ def test_calibrated_pixels_are_taken_as_stored(tmp_path: Path, orientation: int)
         assert image_size(path, like=size) == size
         np.testing.assert_array_equal(read_pixels(path, like=size), pycolmap.Bitmap.read(str(path), True).to_array())
         np.testing.assert_array_equal(read_pixels(path), np.asarray(ImageOps.exif_transpose(Image.open(path))))
+
+
+WRONG_TAGS = {
+    "no other tag": [],
+    "XResolution as text": [(0x011A, 2, 4, b"72\0\0")],
+    "ImageWidth negative": [(0x0100, 9, 1, struct.pack("<l", -1))],
+    "ImageHeight as a signed short": [(0x0101, 8, 1, struct.pack("<hh", -5, 0))],
+    "BitsPerSample as a signed byte": [(0x0102, 6, 1, b"\xff\0\0\0")],
+    "an EXIF folder as text": [(0x8769, 2, 4, b"abc\0")],
+    "an EXIF folder beyond the end": [(0x8769, 4, 1, struct.pack("<L", 99999))],
+    "GPS that points to itself": [(0x8825, 4, 1, struct.pack("<L", 8))],
+    "an unknown type": [(0x9999, 99, 1, bytes(4))],
+    "a count beyond the end": [(0x9999, 3, 0x7FFFFFFF, bytes(4))],
+}
+
+
+def jpeg_with_tags(picture: np.ndarray, tags: list[tuple[int, int, int, bytes]]) -> bytes:
+    """A JPEG file with an EXIF segment of these entries: tag, type, count, value."""
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, "JPEG", quality=95)
+    plain = stream.getvalue()
+    entries = b"".join(struct.pack("<HHL", tag, kind, count) + value for tag, kind, count, value in tags)
+    exif = b"Exif\0\0II*\0" + struct.pack("<LH", 8, len(tags)) + entries + bytes(4)
+    return plain[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + plain[2:]
+
+
+@pytest.mark.parametrize("tags", WRONG_TAGS.values(), ids=WRONG_TAGS)
+def test_tags_of_wrong_types_do_not_keep_a_photograph_from_being_turned(tmp_path: Path, tags: list) -> None:
+    """Of all EXIF only the orientation counts."""
+    picture = np.zeros((16, 32, 3), np.uint8)
+    picture[:8, :16] = 255  # the upper left quarter
+    turn = (0x0112, 3, 1, struct.pack("<HH", 6, 0))  # by 90 degrees clockwise: the upper right one
+    (tmp_path / "a.jpg").write_bytes(jpeg_with_tags(picture, [turn, *tags]))
+    assert image_size(tmp_path / "a.jpg") == (16, 32)
+    expected = np.rot90(picture, -1).astype(int)
+    assert np.abs(read_pixels(tmp_path / "a.jpg").astype(int) - expected).max() < 8
+
+
+def test_an_orientation_that_is_no_number_is_none(tmp_path: Path) -> None:
+    picture = np.zeros((16, 32, 3), np.uint8)
+    (tmp_path / "a.jpg").write_bytes(jpeg_with_tags(picture, [(0x0112, 2, 4, b"6\0\0\0")]))
+    assert image_size(tmp_path / "a.jpg") == (32, 16)
+    assert read_pixels(tmp_path / "a.jpg").shape == (16, 32, 3)
+
+
+@pytest.mark.parametrize("error", [TypeError, KeyError, OverflowError, struct.error])
+def test_whatever_pillow_raises_about_tags_is_a_sentence(tmp_path: Path, monkeypatch, error: type[Exception]) -> None:
+    def fail(image):
+        raise error("wrong tag")
+
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    monkeypatch.setattr(Image.Image, "getexif", fail)
+    monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.getexif", fail)
+    for read in (read_pixels, image_size):
+        with pytest.raises(InputError, match=r"a\.png is damaged \(4x4\): '?wrong tag"):
+            read(tmp_path / "a.png")
 
 
 def test_truncated_png_is_named(tmp_path: Path) -> None:

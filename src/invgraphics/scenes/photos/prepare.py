@@ -18,7 +18,7 @@ from invgraphics.files import write_picture, write_text
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
 from invgraphics.scenes.pictures import png
-from invgraphics.scenes.pictures.images import SUFFIXES, image_files, read_pixels
+from invgraphics.scenes.pictures.images import SUFFIXES, UNREADABLE, image_files, read_pixels
 from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
 from invgraphics.tables import read_json
@@ -166,7 +166,7 @@ def _exif(path: Path) -> dict[int, Any]:
         with Image.open(path) as image:
             exif = image.getexif()
             return dict(exif) | dict(exif.get_ifd(0x8769))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except (*UNREADABLE, Image.DecompressionBombError):
         return {}
 
 

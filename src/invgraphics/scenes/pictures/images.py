@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,6 +23,14 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 _ORIENTATION = 0x0112  # EXIF tag
 _TURNED = (5, 6, 7, 8)  # orientations that exchange width and height
+_UPRIGHT = {
+    2: "FLIP_LEFT_RIGHT", 3: "ROTATE_180", 4: "FLIP_TOP_BOTTOM",
+    5: "TRANSPOSE", 6: "ROTATE_270", 7: "TRANSVERSE", 8: "ROTATE_90",
+}  # fmt: skip
+"""Orientation -> Pillow's name of the transposition that makes the stored picture upright."""
+
+UNREADABLE = (OSError, ValueError, SyntaxError, TypeError, KeyError, OverflowError, struct.error)
+"""What Pillow raises about damaged files and about EXIF tags of types that they should not have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +102,10 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
     Raises:
         InputError: the file is missing, no picture, cut short, or of floating-point numbers.
     """
-    from PIL import ImageOps
-
     with _open(path) as image, _naming_damaged_file(path, image):
         if wrong := png.damage(path):
             raise ValueError(wrong)
-        upright = ImageOps.exif_transpose(image) if like is None or _is_turned(image, like) else image
+        upright = _transposed(image, _orientation(image)) if like is None or _is_turned(image, like) else image
         if upright.mode.startswith("I"):
             grey = (np.asarray(upright).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
             return np.repeat(grey[:, :, None], 3, axis=2)
@@ -112,7 +119,7 @@ def _naming_damaged_file(path: Path, image: Any) -> Iterator[None]:
     width, height = image.size
     try:
         yield
-    except (OSError, ValueError, SyntaxError) as error:
+    except UNREADABLE as error:
         raise InputError(f"{path} is damaged ({width}x{height}): {error}.", "Copy the file again.") from error
 
 
@@ -130,13 +137,26 @@ def _open(path: Path) -> Any:
         return image
     except FileNotFoundError:
         raise InputError(f"{path} does not exist.") from None
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, *UNREADABLE) as error:
         raise InputError(f"{path} cannot be read as a picture: {type(error).__name__}.", "Copy or convert the file.") from error
+
+
+def _orientation(image: Any) -> int:
+    """EXIF orientation, 1 to 8; 1, as it is stored, where there is none or what is there is no such number."""
+    found = image.getexif().get(_ORIENTATION, 1)
+    return found if found in _UPRIGHT else 1
+
+
+def _transposed(image: Any, orientation: int) -> Any:
+    """A stored picture made upright; Pillow's `exif_transpose` writes EXIF anew, and fails at tags of the wrong types."""
+    from PIL import Image
+
+    return image.transpose(Image.Transpose[_UPRIGHT[orientation]]) if orientation in _UPRIGHT else image
 
 
 def _is_turned(image: Any, like: tuple[int, int] | None) -> bool:
     """Whether reading exchanges width and height: EXIF says so, and the camera, if known, has the turned shape only."""
-    if image.getexif().get(_ORIENTATION, 1) not in _TURNED:
+    if _orientation(image) not in _TURNED:
         return False
     return like is None or (like[0] - like[1]) * (image.width - image.height) < 0
 
