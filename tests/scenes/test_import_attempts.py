@@ -112,6 +112,50 @@ def test_the_best_of_the_suspicious_is_kept(truth, tmp_path: Path) -> None:
     assert best.consistency["suspicious"]
 
 
+def bent(truth: pycolmap.Reconstruction, cameras: tuple[int, ...] = (2,)) -> pycolmap.Reconstruction:
+    """A copy in which some cameras have a lens that nothing straightens."""
+    copy = pycolmap.Reconstruction(truth)
+    for number in cameras:
+        focal, x, y, _ = copy.cameras[number].params
+        copy.cameras[number].params = [focal, x, y, -1.0]
+    return copy
+
+
+@pytest.fixture
+def two_cameras() -> pycolmap.Reconstruction:
+    """Five photographs by each of two cameras."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 1, COUNT // 2, 80
+    model = pycolmap.synthesize_dataset(options)
+    for number, image in model.images.items():
+        image.name = f"{number}.png"
+    return model
+
+
+def test_poses_whose_lenses_can_be_removed_are_better(two_cameras, tmp_path: Path) -> None:
+    """Even where they explain fewer of the matches: of the others not all photographs can be written."""
+    best, rows, _ = tried(two_cameras, [bent(two_cameras), turned(two_cameras, 2)], tmp_path)
+    assert rows[0]["support"] > rows[1]["support"] + 0.2 and rows[0]["suspicious"] and rows[1]["suspicious"]
+    assert [row["kept"] for row in rows].index(True) == 1
+    assert (best.registered, best.outliers) == (COUNT, {})
+
+
+def test_photographs_whose_lens_cannot_be_removed_are_left_out(two_cameras, tmp_path: Path) -> None:
+    best, rows, _ = tried(two_cameras, [bent(two_cameras)], tmp_path)
+    placed = {image.camera_id for image in best.pieces[0].images.values() if image.has_pose}
+    assert (placed, best.registered, rows[0]["registered"]) == ({1}, COUNT // 2, COUNT // 2)
+    gone = {f"{number}.jpg" for number, image in two_cameras.images.items() if image.camera_id == 2}
+    assert set(best.outliers) == gone and rows[0]["outlier_cameras"] == len(gone)
+    assert all(why.startswith("no straight picture can be made of it: The distort") for why in best.outliers.values())
+    assert not best.consistency["implausible"], "judged anew, without them"
+
+
+def test_without_any_lens_that_can_be_removed_nothing_is_placed(two_cameras, tmp_path: Path) -> None:
+    best, rows, _ = tried(two_cameras, [bent(two_cameras, (1, 2))], tmp_path)
+    assert (best.registered, best.pieces, best.consistency, len(best.outliers)) == (0, [], None, COUNT)
+    assert rows[0]["outcome"] == "nothing placed"
+
+
 def test_settings_restrict_what_is_tried() -> None:
     photos = [Prepared("a.png", "a", 10, 10, "")]
     anything = strategies(PhotoJob("p"), photos)

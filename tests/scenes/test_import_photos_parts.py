@@ -204,6 +204,28 @@ def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None
     assert [path.name for path in (tmp_path / "result/masks").iterdir()] == ["0.png.png"]
 
 
+def test_the_lens_of_a_removed_photograph_does_not_matter(tmp_path: Path) -> None:
+    """The last of five cameras has a lens that nothing straightens, and no photograph in the scene."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for number in range(1, 6):
+        save(noise(number, 160, 106), tmp_path / f"photos/{number}.png")
+        params = [120.0, 80.0, 53.0, -1.0] if number == 5 else [190.0, 80.0, 53.0, 0.01]
+        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=160, height=106, params=params, camera_id=number)
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(f"{number}.png", [], number, number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([np.eye(3), [number, 0, 0]])))
+    photos = prepared(tmp_path / "photos", tmp_path).photos
+    model.deregister_frame(model.images[5].frame_id)
+    moved = write_scene(model, photos, tmp_path / "work", tmp_path / "result", quiet)
+    assert 0 < moved < 1, "of the pictures that are written"
+    assert len(list((tmp_path / "result/images").iterdir())) == 4
+    written = pycolmap.Reconstruction(str(tmp_path / "result/sparse/0"))
+    assert written.num_reg_images() == 4
+    assert {camera.model_name for camera in written.cameras.values()} == {"PINHOLE"}
+
+
 def test_features_without_a_ray_are_outside_the_straight_picture() -> None:
     """In the corners of strong barrel distortion the lens has no inverse; a model must hold no NaN."""
     import pycolmap

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from invgraphics.scenes.photos.consistency import check_consistency
 from invgraphics.scenes.photos.mapping import Matched, reconstruct
-from invgraphics.scenes.photos.outlier_cameras import remove_outlier_cameras
+from invgraphics.scenes.photos.outlier_cameras import bent_cameras, remove_bent_cameras, remove_outlier_cameras
 from invgraphics.scenes.photos.quality import is_usable, registration_obstacle
 from invgraphics.scenes.photos.strategies import Strategy, strategies
 from invgraphics.scenes.process import Progress
@@ -27,6 +27,7 @@ class Attempt:
         outliers: photograph -> why its camera was removed from the largest piece.
         consistency: see `invgraphics.scenes.photos.consistency.check_consistency`; ``None`` where nothing was placed.
         seconds: that it took.
+        straight: whether all lenses of the largest piece can be removed.
     """
 
     strategy: Strategy
@@ -34,6 +35,7 @@ class Attempt:
     outliers: dict[str, str]
     consistency: dict[str, Any] | None
     seconds: float
+    straight: bool = True
 
     @property
     def registered(self) -> int:
@@ -41,12 +43,27 @@ class Attempt:
         return self.pieces[0].num_reg_images() if self.pieces else 0
 
     def passes(self, count: int) -> bool:
-        """Whether enough of ``count`` photographs are placed and nothing is suspicious."""
-        return self.consistency is not None and not self.consistency["suspicious"] and is_usable(self.registered, count)
+        """Whether enough of ``count`` photographs are placed, their lenses can be removed, and nothing is suspicious."""
+        sound = self.consistency is not None and not self.consistency["suspicious"]
+        return sound and self.straight and is_usable(self.registered, count)
 
-    def rank(self, count: int) -> tuple[bool, float]:
-        """Sorting key, best last: whether it passes, then the share of all verified matches that the poses explain."""
-        return self.passes(count), self.consistency["support"] if self.consistency is not None else -1.0
+    def rank(self, count: int) -> tuple[bool, bool, float]:
+        """Sorting key, best last: whether it passes, whether all lenses can be removed, the share of all verified matches
+        that the poses explain."""
+        if self.consistency is None:
+            return False, False, -1.0
+        return self.passes(count), self.straight, self.consistency["support"]
+
+    def straightened(self, matched: Matched) -> Attempt:
+        """The attempt without the photographs whose lenses cannot be removed; of less than a pair nothing is left."""
+        if self.straight:
+            return self
+        removed = remove_bent_cameras(self.pieces[0], matched.photos)
+        outliers = self.outliers | removed
+        if self.registered < 2:
+            return replace(self, pieces=[], outliers=outliers, consistency=None, straight=True)
+        consistency = check_consistency(self.pieces[0], matched.photos, matched.evidence)
+        return replace(self, outliers=outliers, consistency=consistency, straight=True)
 
     def row(self, kept: bool) -> dict[str, Any]:
         """Its figures for the report."""
@@ -92,18 +109,20 @@ def try_strategies(
         if attempts[-1].passes(count) or registration_obstacle(matched.photos, matched.evidence) is not None:
             break
     best = max(attempts, key=lambda attempt: attempt.rank(count))
-    return best, [attempt.row(attempt is best) for attempt in attempts]
+    kept = best.straightened(matched)
+    return kept, [kept.row(True) if attempt is best else attempt.row(False) for attempt in attempts]
 
 
 def _attempt(strategy: Strategy, matched: Matched, progress: Progress, place: Reconstruct) -> Attempt:
     since = time.perf_counter()
     pieces = place(strategy, matched, progress)
     progress(1, 1, "checking poses against the matches")
-    outliers, consistency = {}, None
+    outliers, consistency, straight = {}, None, True
     if pieces:
         outliers = remove_outlier_cameras(pieces[0], matched.photos)
         consistency = check_consistency(pieces[0], matched.photos, matched.evidence)
-    return Attempt(strategy, pieces, outliers, consistency, time.perf_counter() - since)
+        straight = not bent_cameras(pieces[0])
+    return Attempt(strategy, pieces, outliers, consistency, time.perf_counter() - since, straight)
 
 
 def _attempt_progress(progress: Progress, before: int) -> Progress:

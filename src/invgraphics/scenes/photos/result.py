@@ -32,13 +32,14 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
     """Write ``images`` and ``sparse/0`` for the photographs that ``model`` places; the model itself is changed on the way.
 
     Returns:
-        The largest distance that a lens moves a pixel of its picture.
+        The largest distance that a lens moves a pixel of a picture that is written.
     """
     (result / "images").mkdir(parents=True, exist_ok=True)
-    lenses = {camera_id: _lens(camera) for camera_id, camera in model.cameras.items()}
-    bends = {camera_id: max_distortion(lens) for camera_id, lens in lenses.items()}
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
     kept = [photo for photo in photos if photo.name in by_name]
+    used = {by_name[photo.name].camera_id for photo in kept}
+    lenses = {camera_id: lens_of(model.cameras[camera_id]) for camera_id in used}
+    bends = {camera_id: max_distortion(lens) for camera_id, lens in lenses.items()}
     for index, photo in enumerate(kept):
         progress(index, len(kept), f"straightening {photo.name}")
         image = by_name[photo.name]
@@ -48,7 +49,8 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
             (result / FOLDER).mkdir(exist_ok=True)
             copy_file(work / OWN_MASKS / f"{photo.name}.png", result / FOLDER / f"{photo.name}.png")
     for camera_id, camera in model.cameras.items():
-        straight = straighten(lenses[camera_id]) if bends[camera_id] > STRAIGHT else None
+        # A camera of removed photographs may have a lens that nothing straightens; no picture of it is written.
+        straight = straighten(lenses[camera_id]) if bends.get(camera_id, 0.0) > STRAIGHT else None
         if straight is not None:
             for image in model.images.values():
                 if image.camera_id == camera_id:
@@ -87,7 +89,8 @@ def max_distortion(lens: Lens) -> float:
     return float(moved.max()) if len(moved) else float(max(lens.width, lens.height))
 
 
-def _lens(camera: Any) -> Lens:
+def lens_of(camera: Any) -> Lens:
+    """Lens of a ``pycolmap.Camera``."""
     return Lens(camera.model_name, tuple(float(value) for value in camera.params), camera.width, camera.height)
 
 
