@@ -15,7 +15,7 @@ from PIL import Image, ImageOps
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
-from invgraphics.scenes.pictures.images import Photo, image_files, image_size, match_sizes, read_pixels
+from invgraphics.scenes.pictures.images import Photo, image_files, image_size, match_sizes, read_pixels, stored_size
 from invgraphics.scenes.pictures.lens import Lens, straighten, undistort
 from invgraphics.scenes.pictures.resize import area_resize, wanted_size
 from invgraphics.scenes.pictures.views import load_view
@@ -96,12 +96,13 @@ def test_exif_orientation_is_applied_unless_the_camera_contradicts(tmp_path: Pat
     assert image_size(path, like=(200, 300)) == (2, 3)
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_calibrated_pixels_are_taken_as_stored(tmp_path: Path, orientation: int) -> None:
+def test_calibrated_pixels_are_taken_as_stored(tmp_path: Path, orientation: int, suffix: str) -> None:
     """As COLMAP reads them, whatever EXIF says; without a camera they are upright, as Pillow turns them."""
     import pycolmap
 
-    rng, path = np.random.default_rng(0), tmp_path / "a.png"
+    rng, path = np.random.default_rng(0), tmp_path / f"a.{suffix}"
     for size in ((6, 6), (8, 6)):
         picture = Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8))
         exif = picture.getexif()
@@ -166,6 +167,30 @@ def test_whatever_pillow_raises_about_tags_is_a_sentence(tmp_path: Path, monkeyp
     for read in (read_pixels, image_size):
         with pytest.raises(InputError, match=r"a\.png is damaged \(4x4\): '?wrong tag"):
             read(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+@pytest.mark.parametrize("suffix", ["tif", "jpg", "png", "webp"])
+def test_every_format_is_turned_once(tmp_path: Path, suffix: str, orientation: int) -> None:
+    """The upper left quarter is white as stored; sizes and pixels agree with each other, upright and stored."""
+    stored = np.zeros((16, 32, 3), np.uint8)
+    stored[:8, :16] = 255
+    quarters = {1: 0, 3: 2, 6: -1, 8: 1}[orientation]  # anticlockwise, as numpy turns
+    upright = np.rot90(stored, quarters)
+    path, exif = tmp_path / f"a.{suffix}", Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(stored).save(path, exif=exif, **{"webp": {"lossless": True}, "jpg": {"quality": 95}}.get(suffix, {}))
+
+    def same(pixels: np.ndarray, expected: np.ndarray) -> bool:
+        return pixels.shape == expected.shape and np.abs(pixels.astype(int) - expected).max() < 8
+
+    assert stored_size(path) == image_size(path, like=(64, 32)) == (32, 16)
+    assert image_size(path) == upright.shape[1::-1]
+    assert same(read_pixels(path), upright)
+    assert same(read_pixels(path, like=(64, 32)), stored), "the camera has the stored shape"
+    turned = orientation in (6, 8)
+    assert image_size(path, like=(32, 64)) == ((16, 32) if turned else (32, 16))
+    assert same(read_pixels(path, like=(32, 64)), upright if turned else stored)
 
 
 def test_truncated_png_is_named(tmp_path: Path) -> None:

@@ -174,13 +174,15 @@ def test_scaled_copies_of_the_photographs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("orientation", [3, 6])
 @pytest.mark.parametrize("sized", [True, False])
-def test_exif_turns_no_calibrated_photograph(tmp_path: Path, orientation: int, sized: bool) -> None:
-    write(tmp_path, ring(9), {})
-    for path in (tmp_path / "images").iterdir():
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_exif_turns_no_calibrated_photograph(tmp_path: Path, orientation: int, sized: bool, suffix: str) -> None:
+    write(tmp_path, ring(9), {}, suffix="")
+    for path in sorted((tmp_path / "images").iterdir()):
         picture = Image.open(path)
         exif = picture.getexif()
         exif[0x0112] = orientation
-        picture.save(path, exif=exif)
+        path.unlink()
+        picture.save(path.with_suffix(suffix), exif=exif)
     edit(tmp_path, lambda table: None if sized else (table.pop("w"), table.pop("h")))
     assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
 

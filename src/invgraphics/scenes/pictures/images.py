@@ -28,6 +28,8 @@ _UPRIGHT = {
     5: "TRANSPOSE", 6: "ROTATE_270", 7: "TRANSVERSE", 8: "ROTATE_90",
 }  # fmt: skip
 """Orientation -> Pillow's name of the transposition that makes the stored picture upright."""
+_OPPOSITE = {6: 8, 8: 6}  # quarter turns; every other orientation undoes itself
+_WIDTH, _HEIGHT = 256, 257  # TIFF tags
 
 UNREADABLE = (OSError, ValueError, SyntaxError, TypeError, KeyError, OverflowError, struct.error)
 """What Pillow raises about damaged files and about EXIF tags of types that they should not have."""
@@ -73,17 +75,18 @@ def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, in
         InputError: the file is missing, no picture, or cut short.
     """
     with _open(path) as image, _naming_damaged_file(path, image):
-        return image.size[::-1] if _is_turned(image, like) else image.size
+        size = _stored_size(image)
+        return size[::-1] if _is_turned(image, like) else size
 
 
 def stored_size(path: Path) -> tuple[int, int]:
     """Read width and height in pixels as they are stored, for a camera whose file does not state them.
 
     Raises:
-        InputError: the file is missing or no picture.
+        InputError: the file is missing, no picture, or cut short.
     """
-    with _open(path) as image:
-        return image.size
+    with _open(path) as image, _naming_damaged_file(path, image):
+        return _stored_size(image)
 
 
 def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w c"]:
@@ -105,18 +108,18 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
     with _open(path) as image, _naming_damaged_file(path, image):
         if wrong := png.damage(path):
             raise ValueError(wrong)
-        upright = _transposed(image, _orientation(image)) if like is None or _is_turned(image, like) else image
-        if upright.mode.startswith("I"):
-            grey = (np.asarray(upright).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
+        turned = _loaded(image, upright=like is None or _is_turned(image, like))
+        if turned.mode.startswith("I"):
+            grey = (np.asarray(turned).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
             return np.repeat(grey[:, :, None], 3, axis=2)
-        clear = upright.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in upright.info
-        return np.array(upright.convert("RGBA" if clear else "RGB"))
+        clear = turned.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in turned.info
+        return np.array(turned.convert("RGBA" if clear else "RGB"))
 
 
 @contextmanager
 def _naming_damaged_file(path: Path, image: Any) -> Iterator[None]:
     """Turn decoding errors into an `InputError` that names the file; even its EXIF tags may lie behind the pixels."""
-    width, height = image.size
+    width, height = _stored_size(image)
     try:
         yield
     except UNREADABLE as error:
@@ -147,18 +150,32 @@ def _orientation(image: Any) -> int:
     return found if found in _UPRIGHT else 1
 
 
-def _transposed(image: Any, orientation: int) -> Any:
-    """A stored picture made upright; Pillow's `exif_transpose` writes EXIF anew, and fails at tags of the wrong types."""
+def _stored_size(image: Any) -> tuple[int, int]:
+    """Width and height as stored; the size that Pillow states of a TIFF is that after its orientation is applied."""
+    return (image.tag_v2[_WIDTH], image.tag_v2[_HEIGHT]) if image.format == "TIFF" else image.size
+
+
+def _loaded(image: Any, upright: bool) -> Any:
+    """A picture with its pixels, upright or as they are stored.
+
+    Not by Pillow's `exif_transpose`, which writes EXIF anew and fails at tags of wrong types.
+    """
     from PIL import Image
 
-    return image.transpose(Image.Transpose[_UPRIGHT[orientation]]) if orientation in _UPRIGHT else image
+    orientation = _orientation(image)
+    image.load()
+    made_upright = _orientation(image) != orientation  # TIFFs, of which Pillow then forgets it
+    if orientation == 1 or upright == made_upright:
+        return image
+    return image.transpose(Image.Transpose[_UPRIGHT[orientation if upright else _OPPOSITE.get(orientation, orientation)]])
 
 
 def _is_turned(image: Any, like: tuple[int, int] | None) -> bool:
     """Whether reading exchanges width and height: EXIF says so, and the camera, if known, has the turned shape only."""
     if _orientation(image) not in _TURNED:
         return False
-    return like is None or (like[0] - like[1]) * (image.width - image.height) < 0
+    width, height = _stored_size(image)
+    return like is None or (like[0] - like[1]) * (width - height) < 0
 
 
 def match_sizes(photos: Sequence[Photo]) -> list[Photo]:
