@@ -105,6 +105,27 @@ def test_the_pictures_of_a_data_set_are_taken_as_fits_see_them(tmp_path: Path) -
         np.testing.assert_array_equal(copy, noise(index, 96, 80))
 
 
+def test_the_pictures_of_a_data_set_are_reduced_while_they_are_read(tmp_path: Path, monkeypatch) -> None:
+    """None is kept at its full size; the copies and their cameras are as if each had been reduced by itself."""
+    from invgraphics.scenes.nerfstudio import Nerfstudio
+
+    table = {"fl_x": 180.0, "cx": 100.0, "cy": 84.0, "w": 192, "h": 160, "camera_model": "PINHOLE", "frames": []}
+    for index in range(9):
+        save(noise(index, 192, 160), tmp_path / f"set/images/{index}.png")
+        pose = np.eye(4)
+        pose[0, 3] = index
+        table["frames"].append({"file_path": f"images/{index}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "set/transforms.json").write_text(json.dumps(table))
+    load, scenes = Nerfstudio.load, []
+    monkeypatch.setattr(Nerfstudio, "load", lambda *arguments: scenes.append(load(*arguments)) or scenes[-1])
+    photos = prepared(tmp_path / "set", tmp_path, max_size=96).photos
+    assert {view.image.shape for view in (*scenes[0].train, *scenes[0].test)} == {(80, 96, 3)}
+    assert {(photo.width, photo.height, photo.focal, photo.centre) for photo in photos} == {(96, 80, 90.0, (50.0, 42.0))}
+    for index in range(9):
+        copy = np.array(Image.open(tmp_path / f"work/photos/{index}.png"))
+        assert np.abs(copy - noise(index, 192, 160).reshape(80, 2, 96, 2, 3).mean((1, 3))).max() <= 0.51
+
+
 def test_names_are_told_apart(tmp_path: Path) -> None:
     for index, name in enumerate(["my photo.png", "my photo.jpg", "other.png"]):
         save(noise(index, 64, 64), tmp_path / "photos" / name)

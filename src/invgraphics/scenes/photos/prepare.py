@@ -105,7 +105,7 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
     (work / MASKS).mkdir(exist_ok=True)
     (work / OWN_MASKS).mkdir(exist_ok=True)
     skipped: dict[str, str] = {}
-    sources = _data_set(job.path) if not image_files(job.path) and _is_data_set(job.path) else _files(job.path, skipped)
+    sources = _data_set(job) if not image_files(job.path) and _is_data_set(job.path) else _files(job.path, skipped)
     seen: dict[str, str] = {}
     photos: list[Prepared] = []
     names = _working_names([source.name for source in sources])
@@ -201,11 +201,11 @@ def _is_data_set(folder: Path) -> bool:
     return True
 
 
-def _data_set(folder: Path) -> list[_Source]:
-    """A data set's pictures as fits see them: straight, with their alpha."""
+def _data_set(job: PhotoJob) -> list[_Source]:
+    """A data set's pictures as fits see them: straight, with their alpha, no larger than they are worked with."""
     from invgraphics.scenes.open import find_loader
 
-    scene = find_loader(folder).load(folder, SceneOptions(test_views=None))
+    scene = find_loader(job.path).load(job.path, SceneOptions(size=job.max_size, test_views=None))
     sources: list[_Source] = []
     for split in ("train", "val", "test"):
         for view in getattr(scene, split):
