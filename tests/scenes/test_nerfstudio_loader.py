@@ -86,6 +86,20 @@ def test_dots_are_where_the_cameras_say(tmp_path: Path, distortion, top: dict) -
     assert ("undistortion" in scene.notes) == (distortion is not None)
 
 
+@pytest.mark.parametrize("model", [None, "OPENCV", "RADIAL"])
+def test_a_fourth_radial_term_is_not_taken_for_a_denominator(tmp_path: Path, model: str | None) -> None:
+    """Nerfstudio's polynomial, 1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸, is no model of COLMAP's."""
+    named = {} if model is None else {"camera_model": model}
+    write(tmp_path, ring(9), {"k1": 0.05, "k4": -0.05, **named})
+    with pytest.raises(InputError, match=r"frame 0 .* has a 'k4' that is not 0, .* (OPENCV|RADIAL) .*\n.*FULL_OPENCV"):
+        Nerfstudio().load(tmp_path, SceneOptions())
+    edit(tmp_path, lambda table: table.update(k4=0.0, k6=0.1))
+    with pytest.raises(InputError, match="'k6' that is not 0"):
+        Nerfstudio().load(tmp_path, SceneOptions())
+    edit(tmp_path, lambda table: table.update(k6=0.0))
+    assert Nerfstudio().load(tmp_path, SceneOptions()).notes["undistortion"].startswith("OPENCV removed")
+
+
 def test_distortion_matters(tmp_path: Path) -> None:
     """The check above can fail: the same pictures without their coefficients put the dots elsewhere."""
     write(tmp_path, ring(distortion=opencv), {})
