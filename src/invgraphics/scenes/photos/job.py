@@ -36,6 +36,9 @@ MODELS: dict[str, str] = {
 EXHAUSTIVE = 200
 """Most photographs of which every pair is matched by default: 20 thousand pairs."""
 
+SECOND_TRY = 500
+"""Most photographs of which every pair is matched where their neighbours in name order place few: 125 thousand pairs."""
+
 
 @dataclass(frozen=True)
 class PhotoJob:
@@ -43,9 +46,11 @@ class PhotoJob:
 
     Attributes:
         folder: of the photographs; or a data set that `invgraphics.scenes.open` knows, whose pictures (not poses) are taken.
-        matching: which pairs are compared: all, each with those near it in name order, or ``auto`` by their number.
-        mapper: COLMAP's incremental mapper, or its global one (GLOMAP); ``auto``: the first, and others where it is suspicious.
-        lens: what distortion is estimated; data sets are straight already. ``auto``: radial, and others where it is suspicious.
+        matching: which pairs are compared: all, each with those near it in name order, or ``auto`` by their number, and all
+            where these place few.
+        mapper: COLMAP's incremental mapper, or its global one (GLOMAP); ``auto``: the first, and the other where the result is
+            suspicious or leaves out a tenth of the photographs.
+        lens: what distortion is estimated; data sets are straight already. ``auto``: radial, and pinhole and opencv likewise.
         cameras: photographs of one size and one EXIF lens share their intrinsics, or all do, or none.
         max_size: longest side that pictures are reduced to, pixels.
         seed: of all random choices.

@@ -15,7 +15,7 @@ from typing import Any
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
 from invgraphics.scenes.photos import sfm
-from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
+from invgraphics.scenes.photos.attempts import Attempt, choice, try_all_pairs, try_strategies
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, SCHEMA, TOP_VIEW, PhotoJob
 from invgraphics.scenes.photos.maker import JOB, RESULT
 from invgraphics.scenes.photos.mapping import Matched
@@ -70,7 +70,7 @@ def main(work: Path) -> None:
     clock.start("poses")
     evidence = read_verified_matches(work / DATABASE, preparation.photos)
     matched = Matched(job, preparation.photos, evidence, work)
-    best, attempts = try_strategies(matched, clock.show)
+    matched, best, attempts = try_all_pairs(matched, *try_strategies(matched, clock.show), clock.show)
     quality = _finish(matched, preparation.skipped, best, result, clock) | {"choice": choice(attempts), "attempts": attempts}
     write_text(result / QUALITY, json.dumps({"schema": SCHEMA, "key": asked["key"], **quality}, indent=1))
 
