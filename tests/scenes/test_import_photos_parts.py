@@ -17,9 +17,10 @@ from PIL import Image
 from invgraphics.errors import InputError
 from invgraphics.scenes.photos import PhotoJob
 from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
-from invgraphics.scenes.photos.prepare import Preparation, natural, prepare
+from invgraphics.scenes.photos.prepare import Preparation, prepare
 from invgraphics.scenes.photos.result import _move_points, max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
+from invgraphics.scenes.photos.sources import natural
 from invgraphics.scenes.pictures.lens import Lens, straighten
 from invgraphics.scenes.process import run_worker
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -15,25 +15,17 @@ from jaxtyping import Bool, UInt8
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_picture, write_text
-from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
-from invgraphics.scenes.pictures import png
-from invgraphics.scenes.pictures.images import SUFFIXES, UNREADABLE, image_files, read_pixels
+from invgraphics.scenes.photos.sources import PHONE, Source, find_sources
+from invgraphics.scenes.pictures.images import image_files
 from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
 from invgraphics.tables import read_json
 
 PHOTOS, MASKS, OWN_MASKS, PREPARED = "photos", "masks", "own-masks", "prepared.json"
 
-PHONE = (".heic", ".heif", ".avif")
-"""Read where Pillow has a decoder for them."""
-
-RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
-"""Sensor data: what Pillow finds in some of them is a thumbnail."""
-
 ADVICE = "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."
 
-FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length is a mistake
 _OPAQUE = 128
 
 
@@ -83,18 +75,6 @@ class Preparation:
         return Preparation(tuple(photos), table["skipped"])
 
 
-@dataclass(frozen=True, eq=False)
-class _Source:
-    """One picture, not read yet: its name, group, known intrinsics (of what ``load`` returns) and the data set's mask."""
-
-    name: str
-    load: Callable[[], UInt8[np.ndarray, "h w c"]]
-    group: str
-    focal_share: float | None = None  # focal length over the longest side
-    camera: Camera | None = None
-    mask: Bool[np.ndarray, "h w"] | None = None
-
-
 def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
     """Write the working copies into ``work``.
 
@@ -105,7 +85,7 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
     (work / MASKS).mkdir(exist_ok=True)
     (work / OWN_MASKS).mkdir(exist_ok=True)
     skipped: dict[str, str] = {}
-    sources = _data_set(job) if not image_files(job.path) and _is_data_set(job.path) else _files(job.path, skipped)
+    sources = find_sources(job, skipped)
     seen: dict[str, str] = {}
     photos: list[Prepared] = []
     names = _working_names([source.name for source in sources])
@@ -126,105 +106,11 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
     return Preparation(tuple(photos), skipped)
 
 
-def natural(name: str) -> list[tuple[int, str]]:
-    """Sorting key: digits count as numbers, so that photograph 9 comes before photograph 10."""
-    import re
-
-    return [(int(part), "") if part.isdigit() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]
-
-
 def _working_names(names: Sequence[str]) -> list[str]:
     """PNG names without spaces (which part the words of COLMAP's text files), told apart as simply as possible."""
     plain = ["_".join(name.split()) for name in names]
     candidates = ([Path(name).stem for name in plain], plain, [f"{index:04}-{name}" for index, name in enumerate(plain)])
     return next([f"{stem}.png" for stem in stems] for stems in candidates if len(set(stems)) == len(stems))
-
-
-def _files(folder: Path, skipped: dict[str, str]) -> list[_Source]:
-    _register_decoders()
-    found = []
-    for path in sorted(folder.iterdir(), key=lambda path: natural(path.name)):
-        suffix = path.suffix.lower()
-        if suffix in RAW:
-            skipped[path.name] = "raw sensor data; export it as JPEG or PNG"
-        elif suffix in SUFFIXES + PHONE and path.is_file() and not path.name.startswith("._"):
-            exif = _exif(path)
-            group = "/".join(str(exif.get(tag, "")) for tag in _LENS_TAGS)
-            found.append(_Source(path.name, lambda path=path: read_pixels(path), group, _focal_share(path)))
-    return found
-
-
-_LENS_TAGS = (0x010F, 0x0110, 0x920A, 0xA405, 0xA434)  # make, model, focal length, its 35 mm equivalent, lens
-
-
-def _exif(path: Path) -> dict[int, Any]:
-    from PIL import Image
-
-    try:
-        if png.cut_off(path):
-            return {}
-        with Image.open(path) as image:
-            exif = image.getexif()
-            return dict(exif) | dict(exif.get_ifd(0x8769))
-    except (*UNREADABLE, Image.DecompressionBombError):
-        return {}
-
-
-def _focal_share(path: Path) -> float | None:
-    """Focal length over the longest side, as COLMAP reads it from EXIF (35 mm equivalent, focal plane, sensor data base)."""
-    from invgraphics.scenes.colmap_library import pycolmap
-
-    try:
-        camera = pycolmap.infer_camera_from_image(str(path))
-    except (ValueError, RuntimeError):
-        return None
-    share = camera.mean_focal_length() / max(camera.width, camera.height)
-    return share if camera.has_prior_focal_length and FOCAL_RANGE[0] < share < FOCAL_RANGE[1] else None
-
-
-def _register_decoders() -> None:
-    """Register Pillow's HEIC plug-in where it is installed."""
-    try:
-        from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return
-    register_heif_opener()
-
-
-def _is_data_set(folder: Path) -> bool:
-    from invgraphics.scenes.open import find_loader
-
-    try:
-        find_loader(folder)
-    except InputError:
-        return False
-    return True
-
-
-def _data_set(job: PhotoJob) -> list[_Source]:
-    """A data set's pictures as fits see them: straight, with their alpha, no larger than they are worked with."""
-    from invgraphics.scenes.open import find_loader
-
-    scene = find_loader(job.path).load(job.path, SceneOptions(size=job.max_size, test_views=None))
-    sources: list[_Source] = []
-    for split in ("train", "val", "test"):
-        for view in getattr(scene, split):
-            name = Path(view.name).name
-            label = name if Path(name).suffix.lower() in SUFFIXES else f"{split}-{name}"
-
-            def load(view: Any = view) -> UInt8[np.ndarray, "h w c"]:
-                image = (view.colour() * 255 + 0.5).byte().numpy()
-                alpha = [] if view.alpha is None else [(view.opacity() * 255 + 0.5).byte().numpy()[..., None]]
-                return np.concatenate([image, *alpha], axis=-1)
-
-            mask = None if view.mask is None else view.mask.numpy()
-            sources.append(_Source(label, load, _calibration(view.camera), camera=view.camera, mask=mask))
-    return sorted(sources, key=lambda source: natural(source.name))
-
-
-def _calibration(camera: Camera) -> str:
-    """Name of a group of cameras of one calibration: focal lengths equal to a thousandth, principal points to a pixel."""
-    return "data set f={:.3g},{:.3g} c={:.0f},{:.0f}".format(*camera.focal.tolist(), *camera.principal_point.tolist())
 
 
 def _reduced(pixels: UInt8[np.ndarray, "h w c"], longest: int) -> UInt8[np.ndarray, "h w c"]:
@@ -239,7 +125,7 @@ def _reduced(pixels: UInt8[np.ndarray, "h w c"], longest: int) -> UInt8[np.ndarr
     return np.concatenate([view.image.numpy(), *alpha], axis=-1)
 
 
-def _write(work: Path, name: str, source: _Source, pixels: UInt8[np.ndarray, "h w c"], job: PhotoJob) -> Prepared:
+def _write(work: Path, name: str, source: Source, pixels: UInt8[np.ndarray, "h w c"], job: PhotoJob) -> Prepared:
     from PIL import Image
 
     height, width = pixels.shape[:2]
