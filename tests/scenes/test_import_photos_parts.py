@@ -1,6 +1,8 @@
 """The stages of an import on their own: working copies, pairs, lens removal, and the process that does the work."""
 
 import json
+import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -134,6 +136,31 @@ def test_names_are_told_apart(tmp_path: Path) -> None:
     assert names == ["my_photo.jpg.png", "my_photo.png.png", "other.png.png"]
 
 
+def test_names_that_no_text_file_takes(tmp_path: Path) -> None:
+    """Not UTF-8, a comment of COLMAP's list of pairs, a digit that is no number, letters that become the same."""
+    (tmp_path / "photos").mkdir()
+    for index, name in enumerate((b"foto_\xe9_1.png", b"foto_\xe8_1.png", b"#3.png", "1²3.png".encode(), b"a\nb.png")):
+        save(noise(index, 64, 64), tmp_path / "a.png")
+        (tmp_path / "a.png").rename(tmp_path / "photos" / os.fsdecode(name))
+    photos = prepared(tmp_path / "photos", tmp_path).photos
+    assert all(re.fullmatch(r"[A-Za-z0-9_.-]+\.png", photo.name) for photo in photos)
+    assert len({photo.name for photo in photos}) == len({photo.source for photo in photos}) == 5
+    "".join(photo.source for photo in photos).encode()
+    assert any("foto_\\udce9_1" in photo.source for photo in photos)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_progress_is_reported_in_any_encoding(encoding: str) -> None:
+    """A name is no reason to end the work."""
+    script = "from invgraphics.scenes.process import write_progress; write_progress(1, 2, 'foto \\udce9\\n \u0444')"
+    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.decode(encoding) == (
+        "progress 1 2 foto ? \u0444\n" if encoding == "utf-8" else "progress 1 2 foto ? ?\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
@@ -160,6 +187,7 @@ def test_one_camera_cannot_have_two_sizes(tmp_path: Path) -> None:
 
 def test_numbers_in_names_count_as_numbers() -> None:
     assert sorted(["b10", "B9", "a2b11", "a2b3"], key=natural) == ["a2b3", "a2b11", "B9", "b10"]
+    assert sorted(["1²3", "1²10", "٣"], key=natural) == ["1²3", "1²10", "٣"], "raised to a power is no number, any script's is"
 
 
 def test_pairs() -> None:

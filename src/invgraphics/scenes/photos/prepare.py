@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_picture, write_text
 from invgraphics.scenes.photos.job import PhotoJob
-from invgraphics.scenes.photos.sources import PHONE, Source, find_sources
+from invgraphics.scenes.photos.sources import PHONE, Source, find_sources, readable
 from invgraphics.scenes.pictures.images import image_files
 from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
@@ -107,8 +108,11 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
 
 
 def _working_names(names: Sequence[str]) -> list[str]:
-    """PNG names without spaces (which part the words of COLMAP's text files), told apart as simply as possible."""
-    plain = ["_".join(name.split()) for name in names]
+    """PNG names told apart as simply as possible, of letters and digits that COLMAP's text files take for a name.
+
+    They part words at spaces, and a line that begins with # is a comment.
+    """
+    plain = [re.sub(r"[^A-Za-z0-9._-]", "_", name) for name in names]
     candidates = ([Path(name).stem for name in plain], plain, [f"{index:04}-{name}" for index, name in enumerate(plain)])
     return next([f"{stem}.png" for stem in stems] for stems in candidates if len(set(stems)) == len(stems))
 
@@ -161,7 +165,7 @@ def _reason(name: str, error: InputError) -> str:
     suffix = Path(name).suffix.lower()
     if suffix in PHONE:
         return f"nothing here decodes {suffix[1:].upper()}; convert it to JPEG, or `pip install pillow-heif`"
-    return error.sentence.rstrip(".")
+    return readable(error.sentence).rstrip(".")
 
 
 def _check(job: PhotoJob, photos: list[Prepared], skipped: dict[str, str]) -> None:

@@ -53,7 +53,12 @@ def natural(name: str) -> list[tuple[int, str]]:
     """Sorting key: digits count as numbers, so that photograph 9 comes before photograph 10."""
     import re
 
-    return [(int(part), "") if part.isdigit() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]
+
+
+def readable(text: str) -> str:
+    """A text that any file and terminal takes: bytes of a file's name that are not UTF-8 are spelled out."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def _files(folder: Path, skipped: dict[str, str]) -> list[Source]:
@@ -62,11 +67,11 @@ def _files(folder: Path, skipped: dict[str, str]) -> list[Source]:
     for path in sorted(folder.iterdir(), key=lambda path: natural(path.name)):
         suffix = path.suffix.lower()
         if suffix in RAW:
-            skipped[path.name] = "raw sensor data; export it as JPEG or PNG"
+            skipped[readable(path.name)] = "raw sensor data; export it as JPEG or PNG"
         elif suffix in SUFFIXES + PHONE and path.is_file() and not path.name.startswith("._"):
             exif = _exif(path)
             group = "/".join(str(exif.get(tag, "")) for tag in _LENS_TAGS)
-            found.append(Source(path.name, lambda path=path: read_pixels(path), group, _focal_share(path)))
+            found.append(Source(readable(path.name), lambda path=path: read_pixels(path), group, _focal_share(path)))
     return found
 
 
@@ -125,7 +130,7 @@ def _data_set(job: PhotoJob) -> list[Source]:
     sources: list[Source] = []
     for split in ("train", "val", "test"):
         for view in getattr(scene, split):
-            name = Path(view.name).name
+            name = readable(Path(view.name).name)
             label = name if Path(name).suffix.lower() in SUFFIXES else f"{split}-{name}"
 
             def load(view: Any = view) -> UInt8[np.ndarray, "h w c"]:
