@@ -356,6 +356,62 @@ def _script(folder: Path, body: str) -> str:
     return str(path)
 
 
+def test_a_request_is_known_by_what_is_read(tmp_path: Path, monkeypatch) -> None:
+    """However its folder is spelled, whatever else lies there; of photographs, size and date count."""
+    folder = tmp_path / "photos"
+    for index in range(3):
+        save(noise(index, 64, 64), folder / f"{index}.png")
+    job = PhotoJob(str(folder))
+    keys = [job.key(), job.matches_key()]
+    monkeypatch.chdir(tmp_path)
+    for spelled in ("photos", "./photos/", "photos/../photos"):
+        assert [PhotoJob(spelled).key(), PhotoJob(spelled).matches_key()] == keys
+    for name in (".DS_Store", "._0.png", "Thumbs.db", "notes.txt", ".hidden.jpg", "below/0.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"anything")
+        assert [job.key(), job.matches_key()] == keys, name
+    assert len(prepared(folder, tmp_path).photos) == 3
+    (folder / "3.dng").write_bytes(b"told as left out")
+    assert job.key() != keys[0]
+    (folder / "3.dng").unlink()
+    save(noise(9, 64, 64), folder / "0.png")
+    assert job.key() != keys[0] and job.matches_key() != keys[1]
+
+
+def test_the_files_of_a_data_set_count_but_for_hidden_ones(tmp_path: Path) -> None:
+    save(noise(0, 64, 64), tmp_path / "images/0.png")
+    (tmp_path / "transforms.json").write_text("{}")
+    key = PhotoJob(str(tmp_path)).key()
+    for name in (".DS_Store", "images/.DS_Store", "images/Thumbs.db", ".git/index"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"anything")
+        assert PhotoJob(str(tmp_path)).key() == key, name
+    (tmp_path / "transforms.json").write_text('{"w": 1}')
+    assert PhotoJob(str(tmp_path)).key() != key
+
+
+def test_an_import_is_gone_on_with_from_another_folder(tmp_path: Path, monkeypatch) -> None:
+    """Working copies that a command with a relative path has left are used by one with an absolute path."""
+    for index in range(3):
+        save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
+
+    def interrupted(*args, **kwargs):
+        (tmp_path / "out" / WORK / "left").write_text("something")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", interrupted)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(PhotoJob("photos"), Path("out"))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    left = tmp_path / "out" / WORK / "left"
+    left.write_text("not written again")
+    monkeypatch.setattr(subprocess, "Popen", lambda *args, **kwargs: pytest.fail(left.read_text()))
+    with pytest.raises(pytest.fail.Exception, match="not written again"):
+        reconstruct(PhotoJob(str(tmp_path / "photos")), tmp_path / "out")
+
+
 def test_an_interrupted_import_is_gone_on_with(tmp_path: Path, monkeypatch) -> None:
     """Working copies of the first attempt are used; those of another request are not."""
     for index in range(3):

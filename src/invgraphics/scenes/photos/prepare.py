@@ -17,8 +17,8 @@ from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.files import write_picture, write_text
 from invgraphics.scenes.photos.job import PhotoJob
-from invgraphics.scenes.photos.sources import PHONE, Source, find_sources, readable
-from invgraphics.scenes.pictures.images import image_files
+from invgraphics.scenes.photos.sources import Source, find_sources, readable
+from invgraphics.scenes.pictures.images import PHONE, image_files
 from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
 from invgraphics.tables import read_json

@@ -15,13 +15,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
 from invgraphics.scenes.pictures import png
-from invgraphics.scenes.pictures.images import SUFFIXES, UNREADABLE, image_files, read_pixels
-
-PHONE = (".heic", ".heif", ".avif")
-"""Read where Pillow has a decoder for them."""
-
-RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
-"""Sensor data: what Pillow finds in some of them is a thumbnail."""
+from invgraphics.scenes.pictures.images import PHONE, RAW, SUFFIXES, UNREADABLE, image_files, read_pixels
 
 FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length is a mistake
 
@@ -68,7 +62,7 @@ def _files(folder: Path, skipped: dict[str, str]) -> list[Source]:
         suffix = path.suffix.lower()
         if suffix in RAW:
             skipped[readable(path.name)] = "raw sensor data; export it as JPEG or PNG"
-        elif suffix in SUFFIXES + PHONE and path.is_file() and not path.name.startswith("._"):
+        elif suffix in SUFFIXES + PHONE and path.is_file() and not path.name.startswith("."):
             exif = _exif(path)
             group = "/".join(str(exif.get(tag, "")) for tag in _LENS_TAGS)
             found.append(Source(readable(path.name), lambda path=path: read_pixels(path), group, _focal_share(path)))

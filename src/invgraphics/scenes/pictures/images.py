@@ -21,6 +21,12 @@ from invgraphics.scenes.pictures.lens import Lens
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Suffixes of photographs, in lower case."""
 
+PHONE = (".heic", ".heif", ".avif")
+"""Read where Pillow has a decoder for them."""
+
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+"""Sensor data: what Pillow finds in some of them is a thumbnail."""
+
 _ORIENTATION = 0x0112  # EXIF tag
 _TURNED = (5, 6, 7, 8)  # orientations that exchange width and height
 _UPRIGHT = {
