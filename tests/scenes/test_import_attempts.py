@@ -298,9 +298,10 @@ def test_a_scene_repeats_the_inconsistency_of_its_import(key: str, suspicious: b
     assert "poses" not in open_scene(str(tmp_path), SceneOptions()).notes
     quality = {"key": "k", "choice": "global mapper", key: {"suspicious": suspicious, "sentence": "3 of 9 contradict"}}
     (tmp_path / "quality.json").write_text(json.dumps(quality))
-    notes = open_scene(str(tmp_path), SceneOptions()).notes
-    assert notes["poses"] == "global mapper"
-    assert notes.get("inconsistent_poses") == ("3 of 9 contradict" if suspicious else None)
+    for spelled in (".", "sparse", "sparse/0", "images"):  # any of the scene's folders names it
+        notes = open_scene(str(tmp_path / spelled), SceneOptions()).notes
+        assert notes.get("poses") == "global mapper", spelled
+        assert notes.get("inconsistent_poses") == ("3 of 9 contradict" if suspicious else None)
 
 
 @pytest.mark.slow

@@ -134,19 +134,25 @@ def _present(folder: Path, names: Sequence[str]) -> int:
     return sum(file_exists(folder / name) for name in names) if folder.is_dir() else 0
 
 
-def _image_folders(model: Path) -> Iterator[Path]:
-    """List folders that may hold a model's photographs, nearest first: below it, or beside it and its parents.
-
-    The search ends at the folder that holds ``sparse``: photographs farther up are not those of an undistorted model.
-    """
+def parents_in_workspace(model: Path) -> list[Path]:
+    """A model's folder, and those above it up to the one that holds ``sparse`` or ``colmap/sparse``."""
     base = model.resolve()
     bases = [base]
     for convention in (str.isdecimal, "sparse".__eq__, "colmap".__eq__):
         if convention(base.name):
             base = base.parent
             bases.append(base)
+    return bases
+
+
+def _image_folders(model: Path) -> Iterator[Path]:
+    """List folders that may hold a model's photographs, nearest first: below it, or beside it and its parents.
+
+    The search ends at the folder that holds ``sparse``: photographs farther up are not those of an undistorted model.
+    """
+    bases = parents_in_workspace(model)
     for each in bases:
         yield from (each / name for name in IMAGE_FOLDERS)
         yield each
     if len(bases) == 1:  # a model in a folder of any name: photographs beside it
-        yield base.parent / IMAGE_FOLDERS[0]
+        yield bases[0].parent / IMAGE_FOLDERS[0]
