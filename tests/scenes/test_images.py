@@ -5,6 +5,7 @@ import json
 import struct
 import subprocess
 import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -206,6 +207,21 @@ def test_truncated_png_is_named(tmp_path: Path) -> None:
         read_pixels(path)
     with pytest.raises(InputError, match=r"gone\.png does not exist"):
         read_pixels(tmp_path / "gone.png")
+
+
+def test_a_picture_of_too_many_pixels_is_no_damaged_file(tmp_path: Path) -> None:
+    """A phone's 200 megapixels, of which the header is enough."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 16320, 12240, 8, 2, 0, 0, 0))
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", b"x") + chunk(b"IEND", b""))
+    for read in (read_pixels, image_size):
+        with pytest.raises(
+            InputError, match=r"a\.png has 200 million pixels; no more than 179 million are read\.\nMake it smaller"
+        ):
+            read(tmp_path / "a.png")
 
 
 def test_shadow_files_of_macos_are_no_photographs(tmp_path: Path) -> None:

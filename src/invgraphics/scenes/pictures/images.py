@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -146,7 +147,15 @@ def _open(path: Path) -> Any:
         return image
     except FileNotFoundError:
         raise InputError(f"{path} does not exist.") from None
-    except (UnidentifiedImageError, Image.DecompressionBombError, *UNREADABLE) as error:
+    except Image.DecompressionBombError as error:
+        count, limit = (
+            re.search(r"\d+", str(error)),
+            2 * (Image.MAX_IMAGE_PIXELS or 0),
+        )  # Pillow warns at half of what it refuses
+        pixels = f"{int(count[0]) / 1e6:,.0f}" if count else "many"
+        sentence = f"{path} has {pixels} million pixels; no more than {limit / 1e6:,.0f} million are read."
+        raise InputError(sentence, "Make it smaller.") from error
+    except (UnidentifiedImageError, *UNREADABLE) as error:
         raise InputError(f"{path} cannot be read as a picture: {type(error).__name__}.", "Copy or convert the file.") from error
 
 
