@@ -220,6 +220,78 @@ def test_masks_and_calibrations_of_a_data_set_are_kept(tmp_path: Path) -> None:
         assert left_out.sum() == 80 * 10 * (index % 2) and not left_out[:, 10 * (index % 2) :].any()
 
 
+@pytest.mark.parametrize("place", ["masks", "photos/masks"])
+def test_masks_beside_photographs_are_used(place: str, tmp_path: Path) -> None:
+    """By COLMAP's names or the photographs' own, at another size, in part, and of photographs that EXIF turns."""
+    folder, exif = tmp_path / "photos", Image.Exif()
+    exif[0x0112] = 6
+    for index in range(5):
+        save(noise(index, 192, 128), folder / f"{index}.png")
+    for index in (3, 4):
+        Image.fromarray(noise(index, 192, 128)).save(folder / f"{index}.png", exif=exif)
+    left = np.full((128, 192), 255, np.uint8)
+    left[:, :48] = 0
+    save(left, tmp_path / place / "0.png.png")
+    save(left[::2, ::2], tmp_path / place / "1.png")
+    save(left, tmp_path / place / "3.png")  # drawn on the photograph as it is stored
+    save(np.rot90(left, -1), tmp_path / place / "4.png")  # drawn on it as it is shown
+    photos = prepared(folder, tmp_path, max_size=96).photos
+    assert [photo.own_mask for photo in photos] == [True, True, False, True, True]
+    for photo, turns in zip(photos, (0, 0, None, -1, -1), strict=True):
+        expected = np.full((64, 96), 255, np.uint8) if turns is None else np.rot90(left[::2, ::2], turns)
+        np.testing.assert_array_equal(np.array(Image.open(tmp_path / f"work/masks/{photo.name}.png")), expected)
+        if turns is not None:
+            np.testing.assert_array_equal(np.array(Image.open(tmp_path / f"work/own-masks/{photo.name}.png")), expected)
+    key = PhotoJob(str(folder)).key()
+    (tmp_path / place / "other.png").write_bytes(b"of no photograph")
+    assert PhotoJob(str(folder)).key() == key
+    save(left.T, tmp_path / place / "4.png")
+    assert PhotoJob(str(folder)).key() != key
+
+
+def test_a_mask_that_cannot_be_used_leaves_its_photograph_out(tmp_path: Path) -> None:
+    for index in range(5):
+        save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
+    save(np.zeros((64, 64), np.uint8), tmp_path / "masks/0.png")
+    save(np.full((64, 32), 255, np.uint8), tmp_path / "masks/1.png")
+    save(np.eye(64, dtype=np.uint8) * 255, tmp_path / "masks/2.png")
+    preparation = prepared(tmp_path / "photos", tmp_path, max_size=64)
+    assert set(preparation.skipped) == {"0.png", "1.png"}
+    assert "is black" in preparation.skipped["0.png"] and "has 32x64 pixels" in preparation.skipped["1.png"]
+    work = tmp_path / "again"
+    work.mkdir()
+    job = PhotoJob(str(tmp_path / "photos"), max_size=64)
+    save(np.eye(640, dtype=np.uint8) * 255, tmp_path / "masks/2.png")
+    save(noise(2, 640, 640), tmp_path / "photos/2.png")
+    assert prepare(job, work, quiet).skipped["2.png"] == "Its mask leaves no pixel"
+
+
+def test_masks_are_straightened_with_their_pictures(tmp_path: Path) -> None:
+    """A dark disc in the picture is masked: in the straight picture, too, the mask covers it, and little more."""
+    import pycolmap
+
+    grid = np.hypot(*np.meshgrid(np.arange(160) - 30.0, np.arange(120) - 30.0))
+    picture, mask = np.where(grid < 12, 0, 255).astype(np.uint8), np.where(grid < 13, 0, 255).astype(np.uint8)
+    model = pycolmap.Reconstruction()
+    params = [150.0, 80.0, 60.0, -0.2]
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=160, height=120, params=params, camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    for number in (1, 2):
+        changed = picture.copy()
+        changed[-1, -number] = 7  # no two may be the same
+        save(np.repeat(changed[..., None], 3, axis=2), tmp_path / f"photos/{number}.png")
+        save(mask, tmp_path / f"masks/{number}.png")
+        image = pycolmap.Image(f"{number}.png", [], 1, number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([np.eye(3), [number, 0, 0]])))
+    photos = prepared(tmp_path / "photos", tmp_path).photos
+    assert write_scene(model, photos, tmp_path / "work", tmp_path / "result", quiet) > 3
+    for number in (1, 2):
+        dark = np.array(Image.open(tmp_path / f"result/images/{number}.png"))[:100, :100, 0] < 250
+        left_out = np.array(Image.open(tmp_path / f"result/masks/{number}.png.png"))[:100, :100] == 0
+        assert dark.sum() > 300 and (left_out | ~dark).all()
+        assert left_out.sum() < 1.6 * dark.sum()
+
+
 def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None:
     """COLMAP's own synthetic scene through a bent lens: afterwards a plain pinhole explains the same observations."""
     import pycolmap

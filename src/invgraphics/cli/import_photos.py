@@ -27,7 +27,8 @@ class ImportPhotos:
     """
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
-    """A folder of photographs; or a data set, whose pictures are taken without its poses."""
+    """A folder of photographs, with masks of their names in `masks/` in it or beside it if there are any (dark pixels do not
+    count); or a data set, whose pictures are taken without its poses."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: scenes/DIR)")] = None
     """Folder of the scene, new or empty."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -100,6 +101,8 @@ def show_quality(quality: Mapping[str, Any]) -> None:
 def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     pieces = "".join(f", a separate piece of {count}" for count in quality["other_pieces"])
     yield "photographs placed", f"{quality['registered']} of {quality['used']}{pieces}"
+    if quality.get("masked"):
+        yield "masks", f"{quality['masked']} photographs have one: dark pixels do not count"
     if quality["registered"]:
         yield "points", f"{quality['points']}, each in {quality['track_length']:.1f} photographs"
         yield "reprojection error", f"{quality['reprojection_error_px']:.2f} px"

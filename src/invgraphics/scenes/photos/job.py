@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, Literal, get_args
 from invgraphics.config import fill
 from invgraphics.errors import InputError
 from invgraphics.scenes.pictures.images import PHONE, RAW, SUFFIXES, image_files
+from invgraphics.scenes.pictures.masks import mask_of, masks_folder
 from invgraphics.tables import parse_json
 from invgraphics.text import sha256_of
 
@@ -110,16 +112,19 @@ class PhotoJob:
 
     def _hash(self, settings: dict[str, Any]) -> str:
         files = [(path, path.stat()) for path in files_read(self.path)]
-        listing = [(path.relative_to(self.path).as_posix(), state.st_size, state.st_mtime_ns) for path, state in files]
+        listing = [(os.path.relpath(path, self.path), state.st_size, state.st_mtime_ns) for path, state in files]
         content = [SCHEMA, settings, listing, version("pycolmap")]
         return sha256_of(content)[:16]
 
 
 def files_read(folder: Path) -> list[Path]:
-    """List the files that an import of ``folder`` may read: its photographs; of a data set all but what systems leave there."""
-    if image_files(folder):
-        return sorted(path for path in folder.iterdir() if path.suffix.lower() in _KINDS and _counts(path, folder))
-    return sorted(path for path in folder.rglob("*") if _counts(path, folder))
+    """List the files that an import of ``folder`` may read: photographs and their masks; of a data set all but hidden ones."""
+    if not image_files(folder):
+        return sorted(path for path in folder.rglob("*") if _counts(path, folder))
+    photographs = sorted(path for path in folder.iterdir() if path.suffix.lower() in _KINDS and _counts(path, folder))
+    masks = masks_folder(folder)
+    found = [] if masks is None else [mask_of(path.name, masks) for path in photographs]
+    return photographs + [mask for mask in found if mask is not None]
 
 
 def _counts(path: Path, folder: Path) -> bool:

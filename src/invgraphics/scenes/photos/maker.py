@@ -14,6 +14,7 @@ from invgraphics import locks
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, TOP_VIEW, PhotoJob
+from invgraphics.scenes.pictures.masks import FOLDER
 from invgraphics.scenes.process import Progress, run_worker
 from invgraphics.tables import parse_json, read_json
 
@@ -22,7 +23,7 @@ WORK = ".import"
 
 JOB, RESULT = "job.json", "result"
 MATCHES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm")
-RESULTS = ("images", "sparse", TOP_VIEW, QUALITY)
+RESULTS = ("images", FOLDER, "sparse", TOP_VIEW, QUALITY)
 """What the work process leaves for the folder, the proof of completeness last."""
 
 

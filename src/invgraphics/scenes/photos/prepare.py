@@ -42,8 +42,8 @@ class Prepared:
         group: photographs with the same text share a camera.
         focal: focal length from EXIF or from the data set, pixels of the working copy.
         centre: principal point, where the data set knows it.
-        masked: whether no features are looked for in parts of it: where it is transparent, or a data set masks it.
-        own_mask: whether it has a mask of a data set, which the scene keeps.
+        masked: whether no features are looked for in parts of it: where it is transparent, or has a mask.
+        own_mask: whether it has a mask, beside the photographs or of a data set, which the scene keeps.
     """
 
     name: str
@@ -93,7 +93,9 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
     for index, source in enumerate(sources):
         progress(index, len(sources), f"reading {source.name}")
         try:
-            pixels = _reduced(source.load(), job.max_size)
+            whole = source.load()
+            pixels = _reduced(whole, job.max_size)
+            mask = _mask(source, whole, pixels)
         except InputError as error:
             skipped[source.name] = _reason(source.name, error)
             continue
@@ -102,7 +104,7 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
             skipped[source.name] = f"the same picture as {seen[digest]}"
             continue
         seen[digest] = source.name
-        photos.append(_write(work, names[index], source, pixels, job))
+        photos.append(_write(work, names[index], source, pixels, mask, job))
     _check(job, photos, skipped)
     return Preparation(tuple(photos), skipped)
 
@@ -129,17 +131,23 @@ def _reduced(pixels: UInt8[np.ndarray, "h w c"], longest: int) -> UInt8[np.ndarr
     return np.concatenate([view.image.numpy(), *alpha], axis=-1)
 
 
-def _write(work: Path, name: str, source: Source, pixels: UInt8[np.ndarray, "h w c"], job: PhotoJob) -> Prepared:
+def _write(
+    work: Path,
+    name: str,
+    source: Source,
+    pixels: UInt8[np.ndarray, "h w c"],
+    mask: Bool[np.ndarray, "h w"] | None,
+    job: PhotoJob,
+) -> Prepared:
     from PIL import Image
 
     height, width = pixels.shape[:2]
     masked = pixels.shape[2] == 4 and int(pixels[..., 3].min()) < _OPAQUE
     write_picture(work / PHOTOS / name, Image.fromarray(pixels), compress_level=1)
     opaque = pixels[..., 3] >= _OPAQUE if masked else np.ones((height, width), dtype=bool)
-    if source.mask is not None:
-        counts = _at_size(source.mask, width, height)
-        write_picture(work / OWN_MASKS / f"{name}.png", Image.fromarray(255 * counts.astype(np.uint8)), compress_level=1)
-        opaque, masked = opaque & counts, True
+    if mask is not None:
+        write_picture(work / OWN_MASKS / f"{name}.png", Image.fromarray(255 * mask.astype(np.uint8)), compress_level=1)
+        opaque, masked = opaque & mask, True
     write_picture(work / MASKS / f"{name}.png", Image.fromarray(255 * opaque.astype(np.uint8)), compress_level=1)
     focal = None if source.focal_share is None else source.focal_share * max(width, height)
     centre = None
@@ -148,17 +156,28 @@ def _write(work: Path, name: str, source: Source, pixels: UInt8[np.ndarray, "h w
         camera = source.camera.resized(width, height)
         focal = float(camera.focal.mean())
         centre = (float(camera.principal_point[0]), float(camera.principal_point[1]))
-    return Prepared(name, source.name, width, height, group, focal, centre, masked, source.mask is not None)
+    return Prepared(name, source.name, width, height, group, focal, centre, masked, mask is not None)
 
 
-def _at_size(mask: Bool[np.ndarray, "h w"], width: int, height: int) -> Bool[np.ndarray, "height width"]:
-    """A mask at another size; a pixel counts where all of it did, to within a pixel of the mask."""
-    if mask.shape == (height, width):
-        return mask
-    from PIL import Image
+def _mask(source: Source, whole: UInt8[np.ndarray, "h w c"], pixels: np.ndarray) -> Bool[np.ndarray, "height width"] | None:
+    """Read the mask of a picture at the size of its working copy; a pixel counts where all of it did, to within a pixel.
 
-    shrunk = Image.fromarray(255 * mask.astype(np.uint8)).resize((width, height), Image.Resampling.BOX)
-    return np.asarray(shrunk) == 255
+    Args:
+        source: the picture.
+        whole: its pixels as they were read.
+        pixels: those of the working copy.
+    """
+    if source.mask is None:
+        return None
+    mask = source.mask(whole.shape[1], whole.shape[0])
+    if (height_width := pixels.shape[:2]) != mask.shape:
+        from PIL import Image
+
+        shrunk = Image.fromarray(255 * mask.astype(np.uint8)).resize(height_width[::-1], Image.Resampling.BOX)
+        mask = np.asarray(shrunk) == 255
+    if not mask.any():
+        raise InputError("Its mask leaves no pixel.")
+    return mask
 
 
 def _reason(name: str, error: InputError) -> str:

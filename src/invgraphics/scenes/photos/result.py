@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from invgraphics.core import Camera
+from invgraphics.core import Camera, View
 from invgraphics.errors import InputError
 from invgraphics.files import copy_file, write_picture
 from invgraphics.scenes.colmap_sizes import check_sizes
@@ -45,9 +45,9 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
         image = by_name[photo.name]
         lens = lenses[image.camera_id] if bends[image.camera_id] > STRAIGHT else None
         _write_picture(work / PHOTOS / photo.name, result / "images" / photo.name, lens)
-        if photo.own_mask:  # of pictures that are pinholes' already
+        if photo.own_mask:
             (result / FOLDER).mkdir(exist_ok=True)
-            copy_file(work / OWN_MASKS / f"{photo.name}.png", result / FOLDER / f"{photo.name}.png")
+            _write_mask(work / OWN_MASKS / f"{photo.name}.png", result / FOLDER / f"{photo.name}.png", lens)
     for camera_id, camera in model.cameras.items():
         # A camera of removed photographs may have a lens that nothing straightens; no picture of it is written.
         straight = straighten(lenses[camera_id]) if bends.get(camera_id, 0.0) > STRAIGHT else None
@@ -100,12 +100,26 @@ def _write_picture(source: Path, target: Path, lens: Lens | None) -> None:
     if lens is None:
         copy_file(source, target)
         return
-    pixels = read_pixels(source)
-    unit = torch.ones(2, dtype=torch.float64)  # replaced by the lens's own
-    camera = Camera(torch.eye(4, dtype=torch.float64), unit, unit, lens.width, lens.height)
-    view = make_view(camera, pixels, source.name, lens=lens)
+    view = _straight_view(source, lens)
     alpha = [] if view.alpha is None else [view.alpha[..., None].numpy()]
     write_picture(target, Image.fromarray(np.concatenate([view.image.numpy(), *alpha], axis=-1)), compress_level=1)
+
+
+def _write_mask(source: Path, target: Path, lens: Lens | None) -> None:
+    """A mask, straight as its picture; a pixel counts where all that it is made of do."""
+    from PIL import Image
+
+    if lens is None:
+        copy_file(source, target)
+        return
+    counts = _straight_view(source, lens).image[..., 0].numpy() == 255
+    write_picture(target, Image.fromarray(255 * counts.astype(np.uint8)), compress_level=1)
+
+
+def _straight_view(source: Path, lens: Lens) -> View:
+    unit = torch.ones(2, dtype=torch.float64)  # replaced by the lens's own
+    camera = Camera(torch.eye(4, dtype=torch.float64), unit, unit, lens.width, lens.height)
+    return make_view(camera, read_pixels(source), source.name, lens=lens)
 
 
 def _move_points(image: Any, camera: Any, straight: Straight) -> None:

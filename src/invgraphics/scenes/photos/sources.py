@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +17,24 @@ from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
 from invgraphics.scenes.pictures import png
 from invgraphics.scenes.pictures.images import PHONE, RAW, SUFFIXES, UNREADABLE, image_files, read_pixels
+from invgraphics.scenes.pictures.masks import mask_of, masks_folder, read_upright_mask
 
 FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length is a mistake
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """One picture, not read yet: its name, group, known intrinsics (of what ``load`` returns) and the data set's mask."""
+    """One picture, not read yet: its name, group, known intrinsics (of what ``load`` returns) and mask.
+
+    ``mask`` reads which pixels count, at the width and height of what ``load`` returns.
+    """
 
     name: str
     load: Callable[[], UInt8[np.ndarray, "h w c"]]
     group: str
     focal_share: float | None = None  # focal length over the longest side
     camera: Camera | None = None
-    mask: Bool[np.ndarray, "h w"] | None = None
+    mask: Callable[[int, int], Bool[np.ndarray, "h w"]] | None = None
 
 
 def find_sources(job: PhotoJob, skipped: dict[str, str]) -> list[Source]:
@@ -57,7 +62,7 @@ def readable(text: str) -> str:
 
 def _files(folder: Path, skipped: dict[str, str]) -> list[Source]:
     _register_decoders()
-    found = []
+    found, masks = [], masks_folder(folder)
     for path in sorted(folder.iterdir(), key=lambda path: natural(path.name)):
         suffix = path.suffix.lower()
         if suffix in RAW:
@@ -65,7 +70,9 @@ def _files(folder: Path, skipped: dict[str, str]) -> list[Source]:
         elif suffix in SUFFIXES + PHONE and path.is_file() and not path.name.startswith("."):
             exif = _exif(path)
             group = "/".join(str(exif.get(tag, "")) for tag in _LENS_TAGS)
-            found.append(Source(readable(path.name), lambda path=path: read_pixels(path), group, _focal_share(path)))
+            mask = None if masks is None else mask_of(path.name, masks)
+            read = None if mask is None else partial(read_upright_mask, mask, path)
+            found.append(Source(readable(path.name), partial(read_pixels, path), group, _focal_share(path), mask=read))
     return found
 
 
@@ -132,7 +139,7 @@ def _data_set(job: PhotoJob) -> list[Source]:
                 alpha = [] if view.alpha is None else [(view.opacity() * 255 + 0.5).byte().numpy()[..., None]]
                 return np.concatenate([image, *alpha], axis=-1)
 
-            mask = None if view.mask is None else view.mask.numpy()
+            mask = None if view.mask is None else lambda width, height, view=view: view.mask.numpy()
             sources.append(Source(label, load, _calibration(view.camera), camera=view.camera, mask=mask))
     return sorted(sources, key=lambda source: natural(source.name))
 

@@ -100,6 +100,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         "job": parse_json(job.text(), "the job"),
         "given": len(photos) + len(skipped),
         "used": len(photos),
+        "masked": sum(photo.own_mask for photo in photos),
         **figures,
         "bend_px": bend,
         "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],

@@ -123,6 +123,15 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
         return np.array(turned.convert("RGBA" if clear else "RGB"))
 
 
+def turn_like(pixels: UInt8[np.ndarray, "h w c"], photograph: Path) -> UInt8[np.ndarray, "height width c"]:
+    """Turn pixels that belong to a photograph as it is stored the way that makes it upright."""
+    from PIL import Image
+
+    with _open(photograph) as image, _naming_damaged_file(photograph, image):
+        orientation = _orientation(image)
+    return pixels if orientation == 1 else np.array(Image.fromarray(pixels).transpose(Image.Transpose[_UPRIGHT[orientation]]))
+
+
 @contextmanager
 def _naming_damaged_file(path: Path, image: Any) -> Iterator[None]:
     """Turn decoding errors into an `InputError` that names the file; even its EXIF tags may lie behind the pixels."""
