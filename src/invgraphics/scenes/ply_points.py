@@ -51,7 +51,7 @@ def read_points(path: Path) -> Points | None:
     )
     position = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     rgb = np.full(position.shape, _GREY, np.float32)
-    if all(name in table.dtype.names for name in _COLOURS):
+    if all(name in (record.names or ()) for name in _COLOURS):
         largest = 255 if record["red"].kind in "iu" else 1
         rgb = np.stack([table[name].astype(np.float32) for name in _COLOURS], axis=1) / largest
     whole = np.isfinite(position).all(axis=1) & np.isfinite(rgb).all(axis=1)

@@ -82,8 +82,8 @@ def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, in
         InputError: the file is missing, no picture, or cut short.
     """
     with _open(path) as image, _naming_damaged_file(path, image):
-        size = _stored_size(image)
-        return size[::-1] if _is_turned(image, like) else size
+        width, height = _stored_size(image)
+        return (height, width) if _is_turned(image, like) else (width, height)
 
 
 def stored_size(path: Path) -> tuple[int, int]:
